@@ -1,0 +1,59 @@
+# Everything a fresh machine needs is created inside the checkout: uv in .tools/, the
+# environment in .venv/ with the Python named in .python-version. Needs python3 with venv
+# and pip, git and make.
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+UV_VERSION := 0.13.8
+TOOLS := .tools
+UV := $(TOOLS)/bin/uv
+RUN := $(UV) run --frozen
+STAMP := .venv/.synced
+
+# An environment activated by the caller must not leak in.
+unexport VIRTUAL_ENV PYTHONPATH
+
+$(UV):
+	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found; set PYTHON=/path/to/python3" >&2; exit 2; }
+	@echo "installing uv $(UV_VERSION) into $(TOOLS)/"
+	@$(PYTHON) -m venv $(TOOLS)
+	@$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check "uv==$(UV_VERSION)"
+
+$(STAMP): pyproject.toml uv.lock .python-version | $(UV)
+	@$(UV) sync --frozen --quiet
+	@touch $@
+
+.PHONY: help setup demo test soak lint format bench lock clean
+
+help: ## this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+setup: $(STAMP) ## create the environment
+
+demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
+	@$(RUN) dexkit demo --out demo-out
+
+test: $(STAMP) ## the tests (ARGS="-k name" is passed on)
+	$(RUN) pytest -m "not soak" $(ARGS)
+
+soak: $(STAMP) ## the long tests
+	$(RUN) pytest -m soak $(ARGS)
+
+lint: $(STAMP) ## ruff and mypy strict
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) mypy
+
+format: $(STAMP) ## put the code in ruff's format
+	$(RUN) ruff check --fix .
+	$(RUN) ruff format .
+
+bench: $(STAMP) ## the benchmarks; prints ratios and saves benchmarks/results/*.json
+	$(RUN) python -m benchmarks $(ARGS)
+
+lock: | $(UV) ## resolve the dependencies again
+	$(UV) lock --upgrade
+
+clean: ## remove everything that make created
+	rm -rf $(TOOLS) .venv build dist demo-out benchmarks/results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Room of dexkit: imported as dexkit.conformance."""

@@ -1,0 +1,223 @@
+"""Backends by name: the entry-point group ``dexkit.backends`` and ``package.module:Object``.
+
+A backend is a :class:`Backend`: a description and a factory that makes a
+:class:`~dexkit.hand.Hand` from :class:`BackendOptions`. A plug-in package registers one under
+its name::
+
+    [project.entry-points."dexkit.backends"]
+    my-gripper = "my_package.hand:backend"
+
+``package.module:Class`` also takes a plain callable ``(options) -> Hand`` or a Hand class whose
+constructor takes the side.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from importlib import metadata
+
+from dexkit.errors import BackendBroken, BackendConflict, UnknownBackend, UsageError
+from dexkit.hand import Hand, Side
+
+__all__ = ["GROUP", "Backend", "BackendInfo", "BackendOptions", "backend", "list_backends"]
+
+GROUP = "dexkit.backends"
+_OWN_DISTRIBUTION = "dexkit"
+
+
+@dataclass(frozen=True)
+class BackendOptions:
+    """What a user can say about the hand to open.
+
+    :param side: which hand.
+    :param device: path, serial number or address of the device; None where none is needed.
+    :param settings: ``KEY=VALUE`` settings of the particular backend (``--set`` on the command
+        line); a backend refuses those it does not know.
+    """
+
+    side: Side
+    device: str | None = None
+    settings: dict[str, str] = field(default_factory=dict)
+
+    def refuse_unknown(self, known: Iterable[str]) -> None:
+        """Raise when ``settings`` has a key that is not ``known``.
+
+        :raises UsageError: naming the key and the known ones.
+        """
+        names = sorted(known)
+        for key in self.settings:
+            if key not in names:
+                raise UsageError(
+                    f"this backend has no setting {key!r}",
+                    hint=f"known: {', '.join(names)}" if names else "it has no settings",
+                )
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to be a hand.
+
+    :param summary: one line for ``dexkit backends``.
+    :param model: hand model that it implements.
+    :param needs: what must be there: ``"--device PATH or serial number"``, or empty.
+    :param make: makes the hand, without opening it.
+    :param needs_device: refuse to start without a device.
+    :param settings: name and help of each ``--set`` setting.
+    """
+
+    summary: str
+    model: str
+    make: Callable[[BackendOptions], Hand]
+    needs: str = ""
+    needs_device: bool = False
+    settings: dict[str, str] = field(default_factory=dict)
+
+    def create(self, options: BackendOptions) -> Hand:
+        """Make the hand; nothing is opened yet.
+
+        :raises UsageError: a device is needed and missing, or a setting is unknown.
+        """
+        if self.needs_device and not options.device:
+            raise UsageError("this backend needs a device", hint=f"give {self.needs}")
+        options.refuse_unknown(self.settings)
+        return self.make(options)
+
+
+@dataclass(frozen=True)
+class BackendInfo:
+    """One row of ``dexkit backends``.
+
+    :param origin: distribution that registered it, with its version.
+    :param error: why it cannot be used, or empty.
+    """
+
+    name: str
+    origin: str
+    target: str
+    backend: Backend | None
+    error: str = ""
+
+
+def _entry_points() -> list[metadata.EntryPoint]:
+    return list(metadata.entry_points(group=GROUP))
+
+
+def _origin(entry: metadata.EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "unknown"
+
+
+def _is_own(entry: metadata.EntryPoint) -> bool:
+    return entry.dist is not None and entry.dist.name.lower() == _OWN_DISTRIBUTION
+
+
+def _select(name: str) -> metadata.EntryPoint | None:
+    unique = {(e.value, _origin(e)): e for e in _entry_points() if e.name == name}
+    entries = list(unique.values())
+    own = [e for e in entries if _is_own(e)]
+    if own and len(entries) > len(own):
+        others = ", ".join(_origin(e) for e in entries if not _is_own(e))
+        raise BackendConflict(
+            f"backend {name!r} is built in, and {others} registers the same name",
+            hint=f"uninstall that package, or name its hand as package.module:Object "
+            f"instead of {name!r}",
+        )
+    if len(entries) > 1 and not own:
+        owners = ", ".join(_origin(e) for e in entries)
+        raise BackendConflict(
+            f"backend {name!r} is registered by more than one package: {owners}",
+            hint="uninstall one, or name the hand as package.module:Object",
+        )
+    return entries[0] if entries else None
+
+
+def _coerce(target: str, value: object) -> Backend:
+    if isinstance(value, Backend):
+        return value
+    if inspect.isclass(value) and all(
+        hasattr(value, name) for name in ("open", "close", "exchange")
+    ):
+        factory = value
+
+        def make_from_class(options: BackendOptions) -> Hand:
+            hand = factory(options.side)
+            assert isinstance(hand, Hand)
+            return hand
+
+        return Backend(
+            summary=(value.__doc__ or target).strip().splitlines()[0],
+            model="",
+            make=make_from_class,
+        )
+    if callable(value):
+        function = value
+
+        def make(options: BackendOptions) -> Hand:
+            hand = function(options)
+            if not isinstance(hand, Hand):
+                raise BackendBroken(
+                    f"{target} returned {type(hand).__name__}, not a Hand",
+                    hint="a Hand has spec, open, close and exchange (dexkit/hand.py)",
+                )
+            return hand
+
+        return Backend(
+            summary=(value.__doc__ or target).strip().splitlines()[0], model="", make=make
+        )
+    raise BackendBroken(
+        f"{target} is a {type(value).__name__}, not a backend",
+        hint="give a dexkit.backends.Backend, a Hand class, or a function that makes a Hand",
+    )
+
+
+def _load(target: str) -> Backend:
+    module_name, _, attribute = target.partition(":")
+    try:
+        value: object = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            value = getattr(value, part)
+    except Exception as error:  # a plug-in may raise anything while it is imported
+        raise BackendBroken(
+            f"cannot load {target}: {type(error).__name__}: {error}",
+            hint="is the package installed in this environment?",
+        ) from error
+    return _coerce(target, value)
+
+
+def backend(name: str) -> Backend:
+    """The backend called ``name``, or the object at ``package.module:Object``.
+
+    :raises UnknownBackend: no such name.
+    :raises BackendConflict: more than one package claims the name.
+    :raises BackendBroken: it cannot be loaded.
+    """
+    if ":" in name:
+        return _load(name)
+    entry = _select(name)
+    if entry is None:
+        known = ", ".join(sorted({e.name for e in _entry_points()})) or "none"
+        raise UnknownBackend(
+            f"no backend {name!r}",
+            hint=f"installed: {known}; see 'dexkit backends', or give package.module:Object",
+        )
+    return _load(entry.value)
+
+
+def list_backends() -> list[BackendInfo]:
+    """Every registered backend, built-in and plug-in, with what is wrong with it, if anything."""
+    rows = []
+    for entry in sorted(
+        {(e.name, e.value, _origin(e)): e for e in _entry_points()}.values(),
+        key=lambda e: (not _is_own(e), e.name),
+    ):
+        loaded: Backend | None = None
+        error = ""
+        try:
+            _select(entry.name)
+            loaded = _load(entry.value)
+        except (BackendBroken, BackendConflict) as exc:
+            error = exc.message
+        rows.append(BackendInfo(entry.name, _origin(entry), entry.value, loaded, error))
+    return rows

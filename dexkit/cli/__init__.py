@@ -1,0 +1,80 @@
+"""The ``dexkit`` command: one module a sub-command, loaded only when it is called.
+
+This package is the top of the import order: unlike the rest of the core it may import the
+rooms (drivers, emulators, traces, conformance).
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from dexkit import __version__
+from dexkit.errors import DexkitError
+
+__all__ = ["cli", "main"]
+
+# name -> (module, one-line help); the help is here so that `dexkit --help` imports nothing
+_COMMANDS: dict[str, tuple[str, str]] = {
+    "backends": ("dexkit.cli.backends", "List the hands that can be served."),
+    "calibrate": ("dexkit.cli.calibrate", "Find a gripper's zero and speed and store them."),
+    "check": ("dexkit.cli.check", "Judge a recording against the requirements."),
+    "demo": ("dexkit.cli.demo", "The whole story on emulators, in under a minute."),
+    "emulate": ("dexkit.cli.emulate", "Emulate a device on a pseudo-terminal."),
+    "info": ("dexkit.cli.info", "Say what is in a recording."),
+    "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
+    "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),
+    "serve": ("dexkit.cli.serve", "Put a hand on Unitree's topics."),
+}
+
+
+class _LazyGroup(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        entry = _COMMANDS.get(cmd_name)
+        if entry is None:
+            return None
+        command = importlib.import_module(entry[0]).command
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, _COMMANDS[name][1]) for name in sorted(_COMMANDS)])
+
+
+@click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="dexkit")
+def cli() -> None:
+    """Put any gripper or hand on Unitree's Dex topics and prove that it is a drop-in."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line; returns (through ``sys.exit``) the exit code.
+
+    0 success, 1 a negative result or a failed operation, 2 wrong usage or something unusable,
+    130 interrupted.
+    """
+    try:
+        result = cli.main(args=argv, standalone_mode=False)
+        sys.exit(result if isinstance(result, int) else 0)
+    except click.exceptions.Abort:
+        click.echo("interrupted", err=True)
+        sys.exit(130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except DexkitError as error:
+        click.echo(f"error: {error.message}", err=True)
+        if error.hint:
+            click.echo(f"  {error.hint}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        click.echo("interrupted", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(141)
