@@ -139,7 +139,7 @@ def _coerce(target: str, value: object) -> Backend:
     if inspect.isclass(value) and all(
         hasattr(value, name) for name in ("open", "close", "exchange")
     ):
-        factory = value
+        factory: Callable[[Side], object] = value
 
         def make_from_class(options: BackendOptions) -> Hand:
             hand = factory(options.side)
