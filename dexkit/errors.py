@@ -7,11 +7,11 @@
     │   ├── HandLost (ConnectionError)      device unplugged, port closed by the other side
     │   ├── HandTimeout (TimeoutError)      the device did not answer in time
     │   ├── HandFault                       the device reports a hardware error
-    │   ├── HandNotFound                    nothing answers at that path, id, baud rate or serial number
-    │   ├── HandRefused                     the device is there but must not be driven (wrong model,
+    │   ├── HandNotFound                    nothing answers at that path, id or serial number
+    │   ├── HandRefused                     it answers but must not be driven (wrong model,
     │   │                                   Protocol 1.0 firmware, a register that will not take)
     │   └── CommandRejected (ValueError)    NaN, infinity or a wrong shape in a command
-    ├── WireError (ValueError)          bytes that are not the message, frame or packet they claim to be
+    ├── WireError (ValueError)          bytes that are not the message or packet they claim to be
     │   ├── TruncatedError                  the data end too early
     │   ├── OversizeError                   longer than the format or the stated bound allows
     │   ├── ChecksumError                   a CRC does not match
@@ -22,7 +22,7 @@
     │   └── TopicConflict                   another type or a foreign publisher on the topic
     ├── TraceError
     │   ├── TraceUnreadable                 not an mcap file, or nothing in it can be read
-    │   └── TraceUnsupported                readable, but with a schema or encoding dexkit does not know
+    │   └── TraceUnsupported                readable, but of a schema or encoding dexkit lacks
     ├── BackendError
     │   ├── UnknownBackend (LookupError)    no backend has that name
     │   ├── BackendConflict                 two installed packages claim one name
