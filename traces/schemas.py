@@ -1,0 +1,434 @@
+"""Schema texts of recordings, read into one form so that layouts can be compared.
+
+A recording carries the layout its payloads had when they were written. Layouts have changed
+(facts/unitree-dex A.3) and plain CDR does not say which one it is, so a payload of an old
+layout decodes to nonsense without any error. Therefore the recorded schema, in whichever of
+``ros2msg``, ``ros2idl`` and ``omgidl`` it is, is compared with dexkit's own.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from dexkit.errors import TraceUnsupported
+from dexkit.traces.names import dds_type
+
+__all__ = ["ENCODINGS", "Array", "Field", "Node", "Sequence", "Struct", "differences", "parse"]
+
+#: Schema encodings that can be read.
+ENCODINGS = ("ros2msg", "ros2idl", "omgidl")
+
+# A schema text is a few kilobytes; far above that it is not a schema.
+_MAX_TEXT = 1_000_000
+_MAX_DEPTH = 16
+
+_ROS_PRIMITIVES = {
+    "bool": "bool",
+    "byte": "u8",
+    "char": "u8",
+    "uint8": "u8",
+    "int8": "i8",
+    "uint16": "u16",
+    "int16": "i16",
+    "uint32": "u32",
+    "int32": "i32",
+    "uint64": "u64",
+    "int64": "i64",
+    "float32": "f32",
+    "float64": "f64",
+    "string": "string",
+    "wstring": "wstring",
+}
+
+_IDL_PRIMITIVES = {
+    "boolean": "bool",
+    "octet": "u8",
+    "char": "u8",
+    "uint8": "u8",
+    "int8": "i8",
+    "unsigned short": "u16",
+    "uint16": "u16",
+    "short": "i16",
+    "int16": "i16",
+    "unsigned long": "u32",
+    "uint32": "u32",
+    "long": "i32",
+    "int32": "i32",
+    "unsigned long long": "u64",
+    "uint64": "u64",
+    "long long": "i64",
+    "int64": "i64",
+    "float": "f32",
+    "double": "f64",
+    "string": "string",
+    "wstring": "wstring",
+}
+
+# u8 and i8 (and so on) occupy the same bytes: a difference in sign alone is worth saying, but
+# does not shift what follows. unitree_ros2 has a signed motor temperature, the SDKs an unsigned.
+_SAME_BYTES = str.maketrans({"i": "u"})
+
+
+@dataclass(frozen=True)
+class Array:
+    """``length`` elements, no length on the wire."""
+
+    element: Node
+    length: int
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A length on the wire, then so many elements."""
+
+    element: Node
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a struct."""
+
+    name: str
+    type: Node
+
+
+@dataclass(frozen=True)
+class Struct:
+    """Fields in wire order."""
+
+    name: str
+    fields: tuple[Field, ...]
+
+
+Node = str | Array | Sequence | Struct
+
+
+def parse(encoding: str, name: str, text: str) -> Struct:
+    """Read a schema text.
+
+    :param encoding: one of :data:`ENCODINGS`.
+    :param name: the schema's name, in any spelling.
+    :raises TraceUnsupported: the encoding is unknown, or the text cannot be understood.
+    """
+    if len(text) > _MAX_TEXT:
+        raise TraceUnsupported(f"the schema of {name} is {len(text)} characters long")
+    if encoding == "ros2msg":
+        structs = _parse_msg(name, text)
+    elif encoding in ENCODINGS:
+        structs = _IdlParser(text).parse()
+    else:
+        raise TraceUnsupported(f"schema encoding {encoding!r} is not one of {', '.join(ENCODINGS)}")
+    return _resolve(dds_type(name), structs, 0)
+
+
+def differences(recorded: Struct, ours: Struct) -> tuple[list[str], list[str]]:
+    """Compare two layouts.
+
+    :returns: (differences that move or resize bytes, so that payloads cannot be read as ours;
+        differences in names or sign only).
+    """
+    breaking: list[str] = []
+    harmless: list[str] = []
+    _compare("", recorded, ours, breaking, harmless)
+    return breaking, harmless
+
+
+def _compare(path: str, theirs: Node, ours: Node, breaking: list[str], harmless: list[str]) -> None:
+    if isinstance(theirs, Struct) and isinstance(ours, Struct):
+        their_names = [f.name for f in theirs.fields]
+        our_names = [f.name for f in ours.fields]
+        where = f"{path or theirs.name}: "
+        if len(their_names) != len(our_names):
+            missing = [n for n in our_names if n not in their_names]
+            extra = [n for n in their_names if n not in our_names]
+            what = [f"lacks {', '.join(missing)}"] if missing else []
+            what += [f"has {', '.join(extra)}"] if extra else []
+            breaking.append(where + (" and ".join(what) or "has another number of fields"))
+            return
+        if their_names != our_names and sorted(their_names) == sorted(our_names):
+            breaking.append(f"{where}fields in the order {', '.join(their_names)}")
+            return
+        for theirs_f, ours_f in zip(theirs.fields, ours.fields, strict=True):
+            here = f"{path}.{ours_f.name}" if path else ours_f.name
+            if theirs_f.name != ours_f.name:
+                harmless.append(f"{here} is called {theirs_f.name}")
+            _compare(here, theirs_f.type, ours_f.type, breaking, harmless)
+    elif isinstance(theirs, Array) and isinstance(ours, Array):
+        if theirs.length != ours.length:
+            breaking.append(f"{path} has {theirs.length} elements, not {ours.length}")
+        else:
+            _compare(f"{path}[]", theirs.element, ours.element, breaking, harmless)
+    elif isinstance(theirs, Sequence) and isinstance(ours, Sequence):
+        _compare(f"{path}[]", theirs.element, ours.element, breaking, harmless)
+    elif isinstance(theirs, str) and isinstance(ours, str):
+        if theirs == ours:
+            return
+        if theirs.translate(_SAME_BYTES) == ours.translate(_SAME_BYTES):
+            harmless.append(f"{path} is {theirs}, read as {ours}")
+        else:
+            breaking.append(f"{path} is {theirs}, not {ours}")
+    else:
+        breaking.append(f"{path} is {_describe(theirs)}, not {_describe(ours)}")
+
+
+def _describe(node: Node) -> str:
+    if isinstance(node, str):
+        return node
+    if isinstance(node, Array):
+        return f"an array of {_describe(node.element)}"
+    if isinstance(node, Sequence):
+        return f"a sequence of {_describe(node.element)}"
+    return node.name
+
+
+@dataclass(frozen=True)
+class _Ref:
+    """A type named but not yet looked up; candidates from the innermost scope outward."""
+
+    candidates: tuple[str, ...]
+
+
+_Raw = str | _Ref | Array | Sequence
+_Structs = dict[str, list[tuple[str, object]]]
+
+
+def _resolve(name: str, structs: _Structs, depth: int) -> Struct:
+    if depth > _MAX_DEPTH:
+        raise TraceUnsupported(f"the schema nests deeper than {_MAX_DEPTH} levels, or in itself")
+    if name not in structs:
+        raise TraceUnsupported(f"the schema text does not define {name}")
+
+    def node(raw: object) -> Node:
+        if isinstance(raw, str):
+            return raw
+        if isinstance(raw, Array):
+            return Array(node(raw.element), raw.length)
+        if isinstance(raw, Sequence):
+            return Sequence(node(raw.element))
+        assert isinstance(raw, _Ref)
+        for candidate in raw.candidates:
+            if candidate in structs:
+                return _resolve(candidate, structs, depth + 1)
+        raise TraceUnsupported(f"the schema text does not define {raw.candidates[-1]}")
+
+    return Struct(name, tuple(Field(n, node(raw)) for n, raw in structs[name]))
+
+
+def _parse_msg(name: str, text: str) -> _Structs:
+    """``.msg`` definitions: the first is ``name``, others follow ``MSG: pkg/Type`` lines."""
+    structs: _Structs = {}
+    current = dds_type(name)
+    structs[current] = []
+    for number, original in enumerate(text.splitlines(), 1):
+        line = original.split("#", 1)[0].strip()
+        if not line or set(line) == {"="}:
+            continue
+        if line.startswith("MSG:"):
+            current = dds_type(line[4:].strip())
+            structs[current] = []
+            continue
+        parts = line.split(None, 1)
+        if len(parts) != 2:
+            raise TraceUnsupported(f"the schema of {name} has {line[:60]!r} in line {number}")
+        type_text, rest = parts
+        match = re.match(r"\w+", rest)
+        if match is None:
+            raise TraceUnsupported(f"the schema of {name} has {line[:60]!r} in line {number}")
+        if rest[match.end() :].lstrip().startswith("="):
+            continue  # a constant
+        package = current.split("::", 1)[0]
+        structs[current].append((match.group(), _msg_type(type_text, package)))
+    return structs
+
+
+def _msg_type(text: str, package: str) -> object:
+    match = re.fullmatch(r"([\w/]+)(?:<=\d+)?(\[(<=)?(\d*)\])?", text)
+    if match is None:
+        raise TraceUnsupported(f"the schema has a field of type {text[:60]!r}")
+    base, brackets, bounded, size = match.groups()
+    element: object = _ROS_PRIMITIVES.get(base)
+    if element is None:
+        element = _Ref((dds_type(base if "/" in base else f"{package}/msg/{base}"),))
+    if brackets is None:
+        return element
+    if bounded or not size:
+        return Sequence(element)  # type: ignore[arg-type]  # resolved later
+    return Array(element, int(size))  # type: ignore[arg-type]
+
+
+_TOKEN = re.compile(r"::|[A-Za-z_]\w*|\d[\w.+-]*|\"(?:\\.|[^\"\\])*\"|'[^']*'|\S")
+_COMMENT = re.compile(
+    r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^=+\s*$|^IDL:[^\n]*$", re.DOTALL | re.MULTILINE
+)
+
+
+class _IdlParser:
+    """The part of OMG IDL that message definitions use.
+
+    Modules, structs, typedefs, constants and annotations; names are looked up from the
+    innermost scope outward. Types are stored under their wire name (:func:`dds_type`).
+    """
+
+    def __init__(self, text: str) -> None:
+        self._tokens = _TOKEN.findall(_COMMENT.sub(" ", text))
+        self._at = 0
+        self._scope: list[str] = []
+        self._structs: _Structs = {}
+        self._typedefs: dict[str, object] = {}
+        self._constants: dict[str, int] = {}
+
+    def parse(self) -> _Structs:
+        while self._at < len(self._tokens):
+            self._definition()
+        return self._structs
+
+    def _peek(self) -> str:
+        return self._tokens[self._at] if self._at < len(self._tokens) else ""
+
+    def _next(self) -> str:
+        token = self._peek()
+        if not token:
+            raise TraceUnsupported("the schema text ends in the middle of a definition")
+        self._at += 1
+        return token
+
+    def _expect(self, token: str) -> None:
+        found = self._next()
+        if found != token:
+            raise TraceUnsupported(f"the schema has {found!r} where {token!r} belongs")
+
+    def _skip_annotations(self) -> None:
+        while self._peek() == "@":
+            self._next()
+            self._scoped_name()
+            if self._peek() == "(":
+                depth = 0
+                while True:
+                    token = self._next()
+                    depth += (token == "(") - (token == ")")
+                    if depth == 0:
+                        break
+
+    def _definition(self) -> None:
+        self._skip_annotations()
+        keyword = self._next()
+        if keyword == "module":
+            if len(self._scope) >= _MAX_DEPTH:
+                raise TraceUnsupported("the schema nests its modules too deeply")
+            self._scope.append(self._next())
+            self._expect("{")
+            while self._peek() != "}":
+                self._definition()
+            self._expect("}")
+            self._scope.pop()
+        elif keyword == "struct":
+            self._struct()
+        elif keyword == "typedef":
+            base = self._type()
+            for name, wrapped in self._declarators(base):
+                self._typedefs["::".join([*self._scope, name])] = wrapped
+        elif keyword == "const":
+            self._type()
+            name = self._next()
+            self._expect("=")
+            value = self._next()
+            while self._peek() != ";":
+                value = ""
+                self._next()
+            if value.isdigit():
+                self._constants[name] = int(value)
+        elif keyword == ";":
+            return
+        else:
+            raise TraceUnsupported(f"the schema defines a {keyword[:40]!r}, which dexkit lacks")
+        if self._peek() == ";":
+            self._next()
+
+    def _struct(self) -> None:
+        name = self._next()
+        if self._peek() == ";":
+            return  # a forward declaration
+        self._expect("{")
+        fields: list[tuple[str, object]] = []
+        while True:
+            self._skip_annotations()
+            if self._peek() == "}":
+                break
+            base = self._type()
+            fields += self._declarators(base)
+            self._expect(";")
+        self._expect("}")
+        self._structs[dds_type("::".join([*self._scope, name]))] = fields
+
+    def _declarators(self, base: object) -> list[tuple[str, object]]:
+        found = []
+        while True:
+            self._skip_annotations()
+            name = self._next()
+            sizes = []
+            while self._peek() == "[":
+                self._next()
+                sizes.append(self._size())
+                self._expect("]")
+            wrapped = base
+            for size in reversed(sizes):
+                wrapped = Array(wrapped, size)  # type: ignore[arg-type]  # resolved later
+            found.append((name, wrapped))
+            if self._peek() != ",":
+                return found
+            self._next()
+
+    def _size(self) -> int:
+        token = self._next()
+        if token.isdigit():
+            return int(token)
+        if token in self._constants:
+            return self._constants[token]
+        raise TraceUnsupported(f"the schema has the array size {token[:40]!r}")
+
+    def _scoped_name(self) -> str:
+        if self._peek() == "::":
+            self._next()
+        parts = [self._next()]
+        while self._peek() == "::":
+            self._next()
+            parts.append(self._next())
+        return "::".join(parts)
+
+    def _type(self) -> object:
+        token = self._peek()
+        if token == "sequence":
+            self._next()
+            self._expect("<")
+            element = self._type()
+            if self._peek() == ",":
+                self._next()
+                self._next()
+            self._expect(">")
+            return Sequence(element)  # type: ignore[arg-type]  # resolved later
+        if token in ("string", "wstring"):
+            self._next()
+            if self._peek() == "<":
+                self._next()
+                self._next()
+                self._expect(">")
+            return token
+        if token in ("unsigned", "long"):
+            words = [self._next()]
+            while self._peek() in ("long", "short"):
+                words.append(self._next())
+            if self._peek() == "double":
+                raise TraceUnsupported("the schema has a long double, which dexkit lacks")
+            name = " ".join(words)
+        else:
+            name = self._scoped_name()
+        if name in _IDL_PRIMITIVES:
+            return _IDL_PRIMITIVES[name]
+        candidates = [
+            "::".join([*self._scope[:depth], name]) for depth in range(len(self._scope), -1, -1)
+        ]
+        for candidate in candidates:
+            if candidate in self._typedefs:
+                return self._typedefs[candidate]
+        return _Ref(tuple(dds_type(c) for c in candidates))
