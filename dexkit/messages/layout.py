@@ -1,0 +1,317 @@
+"""What the ``.idl`` files say: structs, members, and where each member lies in plain CDR.
+
+The generator, the schema texts, the error messages, the bulk decoder and the CycloneDDS types
+are all made from :data:`STRUCTS`, so a layout is written down once, in ``idl/*.idl``.
+
+The subset of IDL that is read: nested modules, ``@final`` structs of numeric members,
+one-dimensional arrays of them, members that are structs, and unbounded sequences of structs.
+Anything else is refused when it is read, not when it is used.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from dexkit.errors import UsageError
+
+__all__ = [
+    "MAX_ELEMENTS",
+    "PRIMITIVES",
+    "STRUCTS",
+    "Field",
+    "IdlError",
+    "Primitive",
+    "Struct",
+    "load",
+    "max_size",
+    "parse",
+]
+
+MAX_ELEMENTS = 1024
+"""Longest sequence that is encoded or decoded. The largest known has 35 elements (F A.1); the
+bound is only there so that a hostile sample cannot ask for more than a fixed amount of work."""
+
+
+class IdlError(UsageError):
+    """An IDL text that this subset does not cover."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A number type: its size and its name in each of the languages that describe it.
+
+    :param code: format character of :mod:`struct`.
+    :param dtype: numpy type without byte order.
+    """
+
+    idl: str
+    code: str
+    size: int
+    ros: str
+    classic: str
+    dtype: str
+    python: str
+
+
+PRIMITIVES: dict[str, Primitive] = {
+    p.idl: p
+    for p in (
+        Primitive("uint8", "B", 1, "uint8", "octet", "u1", "int"),
+        Primitive("int16", "h", 2, "int16", "short", "i2", "int"),
+        Primitive("uint16", "H", 2, "uint16", "unsigned short", "u2", "int"),
+        Primitive("int32", "i", 4, "int32", "long", "i4", "int"),
+        Primitive("uint32", "I", 4, "uint32", "unsigned long", "u4", "int"),
+        Primitive("float", "f", 4, "float32", "float", "f4", "float"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Field:
+    """One member of a struct.
+
+    :param type: a number type or a struct.
+    :param array: length of a fixed array, or None.
+    :param sequence: whether it is an unbounded sequence.
+    """
+
+    name: str
+    type: Primitive | Struct
+    array: int | None = None
+    sequence: bool = False
+    doc: str = ""
+
+
+@dataclass(frozen=True)
+class Struct:
+    """One message type.
+
+    :param scope: the enclosing modules, outermost first.
+    """
+
+    scope: tuple[str, ...]
+    name: str
+    fields: tuple[Field, ...]
+    doc: str = ""
+
+    @property
+    def dds_name(self) -> str:
+        """Name on the wire: ``unitree_go::msg::dds_::MotorCmd_``."""
+        return "::".join((*self.scope, self.name))
+
+    @property
+    def ros_name(self) -> str:
+        """Name of the ROS 2 type whose DDS type this is: ``unitree_go/msg/MotorCmd``."""
+        return f"{self.scope[0]}/{self.scope[1]}/{self.name.removesuffix('_')}"
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether every sample has the same length."""
+        return not any(
+            f.sequence or (isinstance(f.type, Struct) and not f.type.is_fixed) for f in self.fields
+        )
+
+    def end(self, offset: int) -> int:
+        """Where a fixed struct that starts at ``offset`` ends, in bytes of plain CDR."""
+        for leaf in self.leaves():
+            offset = -(-offset // leaf.type.size) * leaf.type.size + leaf.count * leaf.type.size
+        return offset
+
+    def leaves(self) -> Iterator[Leaf]:
+        """The numbers of a fixed struct in wire order, nested structs taken apart."""
+        for member in self.fields:
+            assert not member.sequence
+            if isinstance(member.type, Struct):
+                for leaf in member.type.leaves():
+                    yield Leaf((member.name, *leaf.path), leaf.type, leaf.array)
+            else:
+                yield Leaf((member.name,), member.type, member.array)
+
+    def depends(self) -> list[Struct]:
+        """The structs that this one contains, each once, inner ones first."""
+        found: list[Struct] = []
+        for member in self.fields:
+            if isinstance(member.type, Struct):
+                found += [s for s in (*member.type.depends(), member.type) if s not in found]
+        return found
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A number, or an array of numbers, inside a fixed struct."""
+
+    path: tuple[str, ...]
+    type: Primitive
+    array: int | None
+
+    @property
+    def count(self) -> int:
+        """How many numbers it holds."""
+        return 1 if self.array is None else self.array
+
+
+def max_size(struct: Struct) -> int:
+    """Bytes of the longest sample, encapsulation header included."""
+    size = 4
+    for member in struct.fields:
+        if member.sequence:
+            assert isinstance(member.type, Struct)
+            size += 4 + MAX_ELEMENTS * member.type.end(0)
+        elif isinstance(member.type, Struct):
+            size = member.type.end(size)
+        else:
+            count = 1 if member.array is None else member.array
+            size = -(-size // member.type.size) * member.type.size + count * member.type.size
+    return size + (-size % 4)
+
+
+_TOKEN = re.compile(r"\s+|(?P<doc>//[^\n]*)|(?P<token>[A-Za-z_]\w*|\d+|[@{}<>\[\];(),]|::)")
+
+
+def _tokens(text: str) -> Iterator[tuple[str, str, int]]:
+    """(kind, text, line) of each token; kind is ``doc`` or ``token``."""
+    at, line = 0, 1
+    while at < len(text):
+        match = _TOKEN.match(text, at)
+        if match is None:
+            raise IdlError(f"IDL line {line}: cannot read {text[at : at + 12]!r}")
+        if match.lastgroup is not None:
+            yield match.lastgroup, match.group(), line
+        line += match.group().count("\n")
+        at = match.end()
+
+
+class _Parser:
+    def __init__(self, text: str) -> None:
+        # comments are kept aside: by the line that they stand on
+        self._docs: dict[int, str] = {}
+        self._tokens: list[tuple[str, int]] = []
+        for kind, token, line in _tokens(text):
+            if kind == "doc":
+                self._docs[line] = token.removeprefix("//").strip()
+            else:
+                self._tokens.append((token, line))
+        self._at = 0
+        self.structs: dict[str, Struct] = {}
+
+    def _peek(self) -> str:
+        return self._tokens[self._at][0] if self._at < len(self._tokens) else ""
+
+    def _line(self) -> int:
+        return self._tokens[min(self._at, len(self._tokens) - 1)][1]
+
+    def _next(self, expected: str | None = None) -> str:
+        token = self._peek()
+        if not token or (expected is not None and token != expected):
+            raise IdlError(
+                f"IDL line {self._line()}: expected {expected or 'more'}, found {token or 'end'!r}"
+            )
+        self._at += 1
+        return token
+
+    def definitions(self, scope: tuple[str, ...]) -> None:
+        while self._peek() not in ("", "}"):
+            if self._peek() == "module":
+                self._next()
+                name = self._next()
+                self._next("{")
+                self.definitions((*scope, name))
+                self._next("}")
+                self._next(";")
+            else:
+                self._struct(scope)
+
+    def _struct(self, scope: tuple[str, ...]) -> None:
+        if len(scope) < 2:
+            raise IdlError(f"IDL line {self._line()}: a struct outside PACKAGE::msg")
+        doc = self._docs.get(self._line() - 1, "")
+        # an unannotated struct would be appendable to some DDS versions and final to others
+        self._next("@")
+        self._next("final")
+        self._next("struct")
+        name = self._next()
+        self._next("{")
+        fields = []
+        while self._peek() != "}":
+            fields.append(self._member(scope))
+        self._next("}")
+        self._next(";")
+        if not fields:
+            raise IdlError(f"IDL line {self._line()}: {name} has no members")
+        struct = Struct(scope, name, tuple(fields), doc)
+        self._check(struct)
+        self.structs[struct.dds_name] = struct
+
+    def _member(self, scope: tuple[str, ...]) -> Field:
+        line = self._line()
+        sequence = self._peek() == "sequence"
+        if sequence:
+            self._next()
+            self._next("<")
+        kind = self._type(scope)
+        if sequence:
+            self._next(">")
+        name = self._next()
+        array = None
+        if self._peek() == "[":
+            self._next()
+            array = int(self._next())
+            self._next("]")
+        self._next(";")
+        if sequence and (array is not None or not isinstance(kind, Struct)):
+            raise IdlError(f"IDL line {line}: only plain sequences of structs are supported")
+        if array is not None and isinstance(kind, Struct):
+            raise IdlError(f"IDL line {line}: arrays of structs are not supported")
+        return Field(name, kind, array, sequence, self._docs.get(line, ""))
+
+    def _type(self, scope: tuple[str, ...]) -> Primitive | Struct:
+        token = self._next()
+        if token in PRIMITIVES:
+            return PRIMITIVES[token]
+        name = "::".join((*scope, token))
+        if name not in self.structs:
+            raise IdlError(f"IDL line {self._line()}: unknown type {token!r}")
+        return self.structs[name]
+
+    def _check(self, struct: Struct) -> None:
+        for member in struct.fields:
+            if not member.sequence:
+                if isinstance(member.type, Struct) and not member.type.is_fixed:
+                    raise IdlError(f"{struct.name}.{member.name}: nested sequences")
+                continue
+            assert isinstance(member.type, Struct)
+            # Elements start right after a uint32. When each also ends on a multiple of 4, all
+            # have one layout and the sequence can be packed as a block.
+            if not member.type.is_fixed or member.type.end(0) % 4:
+                raise IdlError(f"{struct.name}.{member.name}: elements of uneven layout")
+
+
+def parse(text: str) -> dict[str, Struct]:
+    """Read IDL; returns the structs by DDS name, in the order of the text.
+
+    :raises IdlError: the text is wrong or outside the supported subset.
+    """
+    parser = _Parser(text)
+    parser.definitions(())
+    if parser._peek():
+        raise IdlError(f"IDL line {parser._line()}: unexpected {parser._peek()!r}")
+    return parser.structs
+
+
+@cache
+def load() -> dict[str, Struct]:
+    """All structs of the package's ``.idl`` files by DDS name."""
+    structs: dict[str, Struct] = {}
+    folder = resources.files("dexkit.messages") / "idl"
+    for file in sorted(folder.iterdir(), key=lambda f: f.name):
+        if file.name.endswith(".idl"):
+            structs.update(parse(file.read_text(encoding="ascii")))
+    return structs
+
+
+STRUCTS = load()
+"""Every struct of ``idl/*.idl`` by DDS name."""

@@ -1,0 +1,145 @@
+"""Message types by name."""
+
+from __future__ import annotations
+
+import importlib
+import struct
+from collections.abc import Callable, Sequence
+from functools import cache, cached_property
+from typing import Any
+
+from dexkit.errors import EncodeError, UsageError
+from dexkit.messages import layout, schemas
+from dexkit.messages.codec import ArrayLengthError, Buffer, explain, is_big
+from dexkit.messages.columns import Columns
+
+__all__ = ["MessageType", "decode", "encode", "message_type", "message_types"]
+
+# what the packing of a value that does not fit can raise
+_PACK_ERRORS = (
+    struct.error,
+    ArrayLengthError,
+    OverflowError,
+    TypeError,
+    AttributeError,
+    ValueError,
+)
+
+
+class MessageType:
+    """One message type. Get it from :func:`message_type`.
+
+    :ivar name: DDS name, ``unitree_go::msg::dds_::MotorCmds_``.
+    :ivar ros_name: name of the ROS 2 type, ``unitree_go/msg/MotorCmds``.
+    :ivar cls: the dataclass.
+    :ivar max_size: bytes of the longest sample that is accepted.
+    """
+
+    def __init__(self, kind: layout.Struct) -> None:
+        module = importlib.import_module(f"dexkit.messages.{kind.scope[0]}")
+        self.layout = kind
+        self.name = kind.dds_name
+        self.ros_name = kind.ros_name
+        self.cls: type[Any] = getattr(module, kind.name)
+        self.max_size = layout.max_size(kind)
+        self._encode: Callable[[Any], bytes] = getattr(module, f"encode_{kind.name}")
+        self._decode: Callable[[Buffer, bool], Any] = getattr(module, f"decode_{kind.name}")
+
+    def __repr__(self) -> str:
+        return f"<MessageType {self.name}>"
+
+    def encode(self, message: Any) -> bytes:
+        """Encapsulation header and plain CDR, little endian.
+
+        :raises EncodeError: another class, a value that its type cannot hold, or a sequence or
+            array of the wrong length. Says which member.
+        """
+        if not isinstance(message, self.cls):
+            raise EncodeError(
+                f"a {type(message).__module__}.{type(message).__name__} is not a {self.name}"
+            )
+        try:
+            return self._encode(message)
+        except _PACK_ERRORS as error:
+            raise explain(message, self.layout, error) from error
+
+    def decode(self, data: Buffer) -> Any:
+        """The message in ``data``: plain CDR of either byte order, header included.
+
+        Arrays come as tuples, sequences as lists.
+
+        :raises TruncatedError: the data end too early.
+        :raises OversizeError: bytes are left over, or a sequence exceeds the bound.
+        :raises WireError: not plain CDR.
+        """
+        return self._decode(data, is_big(data, self.max_size, self.name))
+
+    def columns(self, payloads: Sequence[bytes]) -> Columns:
+        """Many samples at once, as numpy columns; see :class:`~dexkit.messages.Columns`."""
+        return Columns(self.layout, payloads)
+
+    @cached_property
+    def ros2msg(self) -> str:
+        """Concatenated ``.msg`` definition for recordings."""
+        return schemas.ros2msg(self.layout)
+
+    @cached_property
+    def omgidl(self) -> str:
+        """Self-contained IDL text for recordings."""
+        return schemas.omgidl(self.layout)
+
+
+@cache
+def _by_layout(name: str) -> MessageType:
+    return MessageType(layout.STRUCTS[name])
+
+
+_NAMES = {
+    alias: name
+    for name, kind in layout.STRUCTS.items()
+    for alias in (name, kind.ros_name, name.replace("::", "."))
+}
+
+
+def message_type(name: str) -> MessageType:
+    """The type called ``name``.
+
+    :param name: DDS name (``unitree_go::msg::dds_::MotorCmds_``), the same with dots, or ROS 2
+        name (``unitree_go/msg/MotorCmds``).
+    :raises UsageError: dexkit does not know it.
+    """
+    try:
+        return _by_layout(_NAMES[name])
+    except KeyError:
+        known = ", ".join(layout.STRUCTS)
+        raise UsageError(f"unknown message type {name!r}", hint=f"known: {known}") from None
+
+
+def message_types() -> list[MessageType]:
+    """All known types."""
+    return [_by_layout(name) for name in layout.STRUCTS]
+
+
+@cache
+def _by_class() -> dict[type[Any], MessageType]:
+    return {mt.cls: mt for mt in message_types()}
+
+
+def encode(message: Any) -> bytes:
+    """Encode a message of any known class.
+
+    :raises EncodeError: see :meth:`MessageType.encode`.
+    """
+    kind = _by_class().get(type(message))
+    if kind is None:
+        raise EncodeError(f"a {type(message).__name__} is not a message")
+    return kind.encode(message)
+
+
+def decode(name: str, data: Buffer) -> Any:
+    """Decode ``data`` as the type called ``name``.
+
+    :raises UsageError: unknown type.
+    :raises WireError: see :meth:`MessageType.decode`.
+    """
+    return message_type(name).decode(data)

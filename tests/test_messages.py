@@ -1,0 +1,138 @@
+"""Layouts, golden bytes and hostile input; the comparison with CycloneDDS is in test_dds_types."""
+
+from __future__ import annotations
+
+import pytest
+
+from dexkit.errors import EncodeError, OversizeError, TruncatedError, UsageError, WireError
+from dexkit.messages import decode, encode, message_type, message_types
+from dexkit.messages import unitree_go as go
+from dexkit.messages import unitree_hg as hg
+from dexkit.messages.generate import main as generate
+from dexkit.messages.layout import MAX_ELEMENTS
+
+# facts/unitree-dex A.4, measured there on Unitree's SDK classes
+GOLDEN_CMDS = bytes.fromhex(
+    "00010000 01000000 01000000 0000c03f 00000000 00000000"
+    "0000a040 cdcc4c3d 00000000 00000000 00000000"
+)
+GOLDEN_STATES = bytes.fromhex(
+    "00010000 01000000 00000000 0000c03f 0000803e 00000000 000000bf"
+    "00000000 00000000 00000000 00000000 00000000 00000000 00000000"
+)
+
+
+def _hand_state(motors: int, sensors: int) -> hg.HandState_:
+    return hg.HandState_(
+        [hg.MotorState_() for _ in range(motors)],
+        [hg.PressSensorState_() for _ in range(sensors)],
+    )
+
+
+def test_generated_modules_are_up_to_date() -> None:
+    assert generate(["--check"]) == 0
+
+
+def test_golden_commands() -> None:
+    message = go.MotorCmds_([go.MotorCmd_(mode=1, q=1.5, kp=5.0, kd=0.05)])
+    assert encode(message) == GOLDEN_CMDS
+    back = decode("unitree_go/msg/MotorCmds", GOLDEN_CMDS)
+    assert back.cmds[0].q == 1.5
+    assert back.cmds[0].kd == pytest.approx(0.05)
+    assert back.cmds[0].reserve == (0, 0, 0)
+
+
+def test_golden_states() -> None:
+    message = go.MotorStates_([go.MotorState_(q=1.5, dq=0.25, tau_est=-0.5)])
+    assert encode(message) == GOLDEN_STATES
+    assert decode("unitree_go.msg.dds_.MotorStates_", GOLDEN_STATES) == message
+
+
+@pytest.mark.parametrize(
+    ("message", "size"),
+    [
+        (go.MotorCmds_([go.MotorCmd_()]), 44),
+        (go.MotorStates_([go.MotorState_()]), 56),
+        (hg.HandCmd_([hg.MotorCmd_() for _ in range(7)]), 220),
+        (hg.HandCmd_([hg.MotorCmd_() for _ in range(20)]), 584),
+        (_hand_state(7, 0), 492),
+        (_hand_state(7, 7), 1220),
+        (_hand_state(7, 9), 1428),
+        (_hand_state(20, 0), 1220),
+    ],
+    ids=lambda v: type(v).__name__ if not isinstance(v, int) else str(v),
+)
+def test_sizes(message: object, size: int) -> None:
+    # facts/unitree-dex A.4
+    assert len(encode(message)) == size
+
+
+def test_names() -> None:
+    mt = message_type("unitree_hg/msg/HandState")
+    assert mt.name == "unitree_hg::msg::dds_::HandState_"
+    assert mt.ros_name == "unitree_hg/msg/HandState"
+    assert message_type(mt.name) is mt
+    assert mt.cls is hg.HandState_
+    with pytest.raises(UsageError, match="unknown message type"):
+        message_type("unitree_hg::msg::dds_::Nothing_")
+    assert len(message_types()) == 10
+
+
+def test_hostile_sequence_length_allocates_nothing() -> None:
+    mt = message_type("unitree_go/msg/MotorCmds")
+    with pytest.raises(OversizeError):
+        mt.decode(b"\x00\x01\x00\x00\xff\xff\xff\xff")
+    with pytest.raises(TruncatedError):
+        mt.decode(b"\x00\x01\x00\x00\x02\x00\x00\x00" + bytes(36))
+    with pytest.raises(OversizeError):
+        mt.decode(b"\x00\x01\x00\x00" + bytes(mt.max_size))
+
+
+def test_other_representations_are_refused_by_name() -> None:
+    mt = message_type("unitree_go/msg/MotorCmds")
+    with pytest.raises(WireError, match="XCDR2"):
+        mt.decode(b"\x00\x07" + GOLDEN_CMDS[2:])
+    with pytest.raises(WireError, match="0x1234"):
+        mt.decode(b"\x12\x34" + GOLDEN_CMDS[2:])
+    with pytest.raises(TruncatedError):
+        mt.decode(b"\x00\x01")
+
+
+def test_trailing_bytes() -> None:
+    mt = message_type("unitree_go/msg/MotorCmds")
+    with pytest.raises(OversizeError):
+        mt.decode(GOLDEN_CMDS + b"\0")
+    # the data of an IMUState_ end on an odd multiple of 2: padded to 4 on the wire
+    imu = message_type("unitree_hg/msg/IMUState")
+    data = imu.encode(hg.IMUState_(temperature=-5))
+    assert imu.decode(data) == imu.decode(data + b"\0\0") == hg.IMUState_(temperature=-5)
+    for rest in (1, 3, 4):
+        with pytest.raises(OversizeError):
+            imu.decode(data + bytes(rest))
+
+
+@pytest.mark.parametrize(
+    ("message", "text"),
+    [
+        (go.MotorCmds_([go.MotorCmd_(mode=300)]), r"cmds\[0\].mode = 300 does not fit uint8"),
+        (go.MotorCmds_([go.MotorCmd_(mode=-1)]), "does not fit uint8"),
+        (go.MotorCmds_([go.MotorCmd_(q=1e39)]), r"cmds\[0\].q = 1e\+39 does not fit float"),
+        (go.MotorCmds_([go.MotorCmd_(q="1")]), "is not a float"),  # type: ignore[arg-type]
+        (go.MotorCmds_([go.MotorCmd_(mode=1.5)]), "is not a uint8"),  # type: ignore[arg-type]
+        (go.MotorCmds_([go.MotorCmd_(reserve=(1, 2))]), "reserve has 2 elements, not 3"),
+        (go.MotorCmds_([go.MotorCmd_(reserve=(1, 2, 2**32))]), r"reserve\[2\] = 4294967296"),
+        (go.MotorCmds_([object()]), "is a object without mode"),  # type: ignore[list-item]
+        (go.MotorCmds_(None), "not a sequence"),  # type: ignore[arg-type]
+        (go.MotorCmds_([go.MotorCmd_()] * (MAX_ELEMENTS + 1)), "at most 1024"),
+        (hg.HandState_(imu_state=hg.IMUState_(rpy=(0.0,))), r"imu_state.rpy has 1 elements"),
+        (3, "is not a message"),
+    ],
+)
+def test_values_that_do_not_fit(message: object, text: str) -> None:
+    with pytest.raises(EncodeError, match=text):
+        encode(message)
+
+
+def test_another_class_is_refused() -> None:
+    with pytest.raises(EncodeError, match="HandCmd_ is not a unitree_go"):
+        message_type("unitree_go/msg/MotorCmds").encode(hg.HandCmd_())
