@@ -1,6 +1,7 @@
 """Time: a clock that is real or driven by hand, and the rate that keeps absolute deadlines.
 
-Everything that waits takes a :class:`Clock`. :class:`Rate` is the only place that paces a loop.
+Everything that waits takes a :class:`Clock`. :class:`Rate` paces a loop; :func:`wait_until` is the
+wait that it and the player of recordings share.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Protocol
 
 from dexkit.errors import UsageError
 
-__all__ = ["Clock", "ManualClock", "Rate", "RealClock"]
+__all__ = ["Clock", "ManualClock", "Rate", "RealClock", "wait_until"]
 
 
 class Clock(Protocol):
@@ -76,14 +77,27 @@ class ManualClock:
             self._now = max(self._now, deadline)
 
 
+def wait_until(clock: Clock, deadline: float, *, spin: float = 0.0) -> None:
+    """Return when ``clock`` has reached ``deadline``, polling it for the last ``spin`` seconds.
+
+    A sleeping thread wakes some 50 to 100 µs late, a polling one does not, at the price of
+    that much processor time.
+    """
+    if not spin or isinstance(clock, ManualClock):
+        clock.sleep_until(deadline)
+        return
+    clock.sleep_until(deadline - spin)
+    while clock.now() < deadline:
+        pass
+
+
 class Rate:
     """Run a loop at a fixed rate with absolute deadlines, so that error never adds up.
 
     :param hz: loops a second.
     :param clock: where time comes from.
-    :param spin: seconds before each deadline to stop sleeping and poll the clock instead;
-        a sleeping thread wakes some 50 to 100 µs late, a spinning one does not, at the price
-        of that much processor time a period.
+    :param spin: seconds before each deadline to stop sleeping and poll the clock instead
+        (:func:`wait_until`).
     :raises UsageError: if ``hz`` is not positive or ``spin`` is negative.
 
     A deadline that has already passed by a whole period or more is not made up for by a burst:
@@ -126,14 +140,7 @@ class Rate:
             missed = int(late / self.period)
             self._index += missed
             self.misses += missed
-        deadline = self.deadline
-        if self.spin:
-            self._clock.sleep_until(deadline - self.spin)
-            while self._clock.now() < deadline:
-                if isinstance(self._clock, ManualClock):
-                    self._clock.sleep_until(deadline)
-        else:
-            self._clock.sleep_until(deadline)
+        wait_until(self._clock, self.deadline, spin=self.spin)
         self._index += 1
         self.loops += 1
         return missed
