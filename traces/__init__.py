@@ -7,6 +7,7 @@ they were on the wire. See docs/traces.md.
 from __future__ import annotations
 
 from dexkit.traces.names import dds_topic, dds_type
+from dexkit.traces.player import Player, PlayStats
 from dexkit.traces.reader import (
     ChannelInfo,
     SampleArray,
@@ -15,11 +16,15 @@ from dexkit.traces.reader import (
     TraceMessage,
     open_trace,
 )
+from dexkit.traces.recorder import Recorder
 from dexkit.traces.samples import SAMPLES, sample_labels, sample_path
 
 __all__ = [
     "SAMPLES",
     "ChannelInfo",
+    "PlayStats",
+    "Player",
+    "Recorder",
     "SampleArray",
     "Trace",
     "TraceEndpoint",

@@ -1,0 +1,163 @@
+"""Play recordings: messages at their recorded times, towards absolute deadlines.
+
+Each message has its deadline from the start of the pass, so lateness of one never delays the
+next. Gaps are kept unless capped. What is to be played is loaded beforehand (about 150 bytes a
+message beside its payload), so that no chunk is unpacked between two deadlines.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexkit.clock import Clock, RealClock, wait_until
+from dexkit.errors import UsageError
+from dexkit.traces.names import select_topics
+from dexkit.traces.reader import Trace, TraceMessage
+
+__all__ = ["PlayStats", "Player"]
+
+#: Seconds before a deadline at which waiting turns into polling the clock.
+SPIN = 0.0005
+# Seconds of one sleep, so that a stop is noticed within a long gap.
+_NAP = 0.05
+# Errors kept for the percentiles; older ones of a long loop are forgotten.
+_KEPT = 1_000_000
+
+
+@dataclass(frozen=True)
+class PlayStats:
+    """What a play-back did. Errors are seconds from the deadline to the call of ``publish``.
+
+    :param sent: messages published.
+    :param passes: complete passes over the recording.
+    :param stopped: it was stopped before its end.
+    :param duration: seconds from the first deadline to the end.
+    """
+
+    sent: int
+    passes: int
+    stopped: bool
+    duration: float
+    error_p50: float
+    error_p99: float
+    error_max: float
+    per_topic: dict[str, int] = field(default_factory=dict)
+
+
+class Player:
+    """Plays topics of a recording.
+
+    :param topics: which, in any spelling, patterns allowed; None: the command topics, those
+        that end in ``/cmd``.
+    :param speed: 2.0 plays in half the time.
+    :param loop: start over at the end, until stopped.
+    :param max_gap: longest pause between two messages, seconds of recorded time; None keeps all.
+    :raises UsageError: ``speed`` or ``max_gap`` is not positive, a topic is missing, or nothing
+        is to be played.
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        topics: Iterable[str] | None = None,
+        *,
+        speed: float = 1.0,
+        loop: bool = False,
+        max_gap: float | None = None,
+    ) -> None:
+        if not 0 < speed < float("inf"):
+            raise UsageError(f"speed must be a positive number, not {speed}")
+        if max_gap is not None and not max_gap > 0:
+            raise UsageError(f"the longest gap must be positive, not {max_gap}")
+        if topics is None:
+            picked = [t for t in trace.topics if t.endswith("/cmd")]
+            hint = f"name topics to play; there are: {', '.join(trace.topics) or 'none'}"
+            if not picked:
+                raise UsageError(f"{trace.path.name} has no command topics", hint=hint)
+        else:
+            picked, missing = select_topics(trace.topics, topics)
+            if missing:
+                raise UsageError(
+                    f"{trace.path.name} has no topic {', '.join(missing)}",
+                    hint=f"it has: {', '.join(trace.topics) or 'none'}",
+                )
+        columns = trace.load(picked)
+        self.topics = {topic: c.type_name for topic, c in columns.items()}
+        self.loop = loop
+        self.sent = 0
+        self._messages = [
+            TraceMessage(topic, c.type_name, int(log), int(publish), data)
+            for topic, c in columns.items()
+            for log, publish, data in zip(c.log_time_ns, c.publish_time_ns, c.payloads, strict=True)
+        ]
+        if not self._messages:
+            raise UsageError(f"{trace.path.name} has no messages on {', '.join(picked)}")
+        self._messages.sort(key=lambda m: m.log_time_ns)
+        gaps = np.diff([m.log_time_ns for m in self._messages]) / 1e9
+        if max_gap is not None:
+            gaps = np.minimum(gaps, max_gap)
+        offsets = np.concatenate(([0.0], np.cumsum(gaps))) / speed
+        self._offsets: list[float] = offsets.tolist()
+        # the pause between the last message of a pass and the first of the next
+        self._pause = float(np.median(gaps)) / speed if len(gaps) else 1.0 / speed
+
+    def __len__(self) -> int:
+        """Messages of one pass."""
+        return len(self._messages)
+
+    @property
+    def duration(self) -> float:
+        """Seconds of one pass at the chosen speed."""
+        return self._offsets[-1]
+
+    def play(
+        self,
+        publish: Callable[[TraceMessage], None],
+        clock: Clock | None = None,
+        stop: threading.Event | None = None,
+    ) -> PlayStats:
+        """Call ``publish`` with each message at its time.
+
+        :param stop: ends the play-back when set; nothing is published after it is noticed,
+            which takes at most 50 ms.
+        """
+        clock = clock if clock is not None else RealClock()
+        stop = stop if stop is not None else threading.Event()
+        errors: deque[float] = deque(maxlen=_KEPT)
+        counts: Counter[str] = Counter()
+        self.sent = 0
+        passes = 0
+        started = start = clock.now()
+        while not stop.is_set():
+            for offset, message in zip(self._offsets, self._messages, strict=True):
+                deadline = start + offset
+                while deadline - clock.now() > _NAP and not stop.is_set():
+                    clock.sleep_until(min(deadline, clock.now() + _NAP / 2))
+                if stop.is_set():
+                    break
+                wait_until(clock, deadline, spin=SPIN)
+                errors.append(clock.now() - deadline)
+                publish(message)
+                counts[message.topic] += 1
+                self.sent += 1
+            else:
+                passes += 1
+                if not self.loop:
+                    break
+                start += self.duration + self._pause
+        p50, p99, worst = np.percentile(errors, (50, 99, 100)) if errors else (0.0, 0.0, 0.0)
+        return PlayStats(
+            sent=self.sent,
+            passes=passes,
+            stopped=stop.is_set() and not (passes and not self.loop),
+            duration=clock.now() - started,
+            error_p50=float(p50),
+            error_p99=float(p99),
+            error_max=float(worst),
+            per_topic=dict(counts),
+        )

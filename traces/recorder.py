@@ -1,0 +1,341 @@
+"""Write recordings: a bounded queue, a thread of its own, and a file that survives its writer.
+
+Whoever receives samples calls :meth:`Recorder.put`, which only appends to a queue. When the disk
+is slower than the samples, the queue fills up to its bound and further samples are dropped and
+counted, so recording never slows down what is recorded. Every :data:`FLUSH_INTERVAL` what has
+been received is written as a complete chunk and handed to the operating system: killing the
+process (SIGKILL included) costs the last moments, not the file. A power cut may cost more, since
+nothing is forced onto the disk.
+
+Schemas are ``ros2msg`` and the profile is ``ros2``, because that is what PlotJuggler, Foxglove
+and the readers of ROS 2 bags open; topics keep their DDS names (``rt/...``).
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, NamedTuple
+
+from mcap.writer import CompressionType, Writer
+
+from dexkit import __version__
+from dexkit.errors import TraceError, UsageError
+from dexkit.messages import MessageType, message_type
+
+__all__ = ["FLUSH_INTERVAL", "Recorder"]
+
+#: Seconds between complete chunks in the file; less than half of the half second that may be lost.
+FLUSH_INTERVAL = 0.2
+# Seconds that the writer sleeps when nothing wakes it, and queued messages that do.
+_POLL = 0.05
+_WAKE_AT = 512
+
+_COMPRESSION = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+
+class _Item(NamedTuple):
+    channel: _Channel
+    data: bytes
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+
+
+class _Metadata(NamedTuple):
+    name: str
+    values: dict[str, str]
+
+
+class _Channel:
+    """One topic and type; its mcap id once the writer has met it."""
+
+    def __init__(self, topic: str, kind: MessageType, metadata: dict[str, str]) -> None:
+        self.topic = topic
+        self.kind = kind
+        self.metadata = metadata
+        self.id = 0
+        self.offered = 0
+        self.dropped = 0
+
+
+class Recorder:
+    """Records samples to an mcap file; a context manager.
+
+    :param path: the file to write.
+    :param overwrite: replace an existing file.
+    :param max_messages: bound of the queue, messages.
+    :param max_bytes: bound of the queue, bytes of payload.
+    :param compression: ``"zstd"``, ``"lz4"`` or ``"none"``.
+    :param metadata: goes into the metadata record ``dexkit_recorder``, with what the recorder
+        adds: version, messages, drops.
+    :raises UsageError: the file exists and ``overwrite`` is False, or a bound makes no sense.
+
+    Each message's mcap sequence number counts what was offered on its topic, so a dropped sample
+    is also visible as a gap in the numbers.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        max_messages: int = 200_000,
+        max_bytes: int = 128 * 2**20,
+        compression: str = "zstd",
+        metadata: dict[str, str] | None = None,
+    ) -> None:
+        if compression not in _COMPRESSION:
+            raise UsageError(f"compression must be one of {', '.join(_COMPRESSION)}")
+        if max_messages < 1 or max_bytes < 1:
+            raise UsageError("the recorder's queue must hold at least one message and one byte")
+        self.path = Path(path)
+        self._overwrite = overwrite
+        self._max_messages = max_messages
+        self._max_bytes = max_bytes
+        self._compression = _COMPRESSION[compression]
+        self._about = {"version": __version__, **(metadata or {})}
+        self._lock = threading.Lock()
+        self._queue: list[_Item | _Metadata] = []
+        self._queued = 0
+        self._queued_bytes = 0
+        self._channels: dict[tuple[str, str], _Channel] = {}
+        self._wake = threading.Event()
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        self._file: BinaryIO | None = None
+        self._error: OSError | None = None
+        self._written = 0
+        self._bytes = 0
+
+    # -- what has happened ---------------------------------------------------------------------
+
+    @property
+    def written(self) -> int:
+        """Messages written so far."""
+        return self._written
+
+    @property
+    def written_bytes(self) -> int:
+        """Bytes of payload written so far."""
+        return self._bytes
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped because the queue was full or the disk failed."""
+        with self._lock:
+            return sum(c.dropped for c in self._channels.values())
+
+    @property
+    def offered(self) -> dict[str, int]:
+        """Messages offered so far by topic, dropped ones included."""
+        counts: Counter[str] = Counter()
+        with self._lock:
+            for channel in self._channels.values():
+                counts[channel.topic] += channel.offered
+        return dict(counts)
+
+    @property
+    def error(self) -> OSError | None:
+        """Why writing has stopped, or None."""
+        return self._error
+
+    # -- life ----------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Create the file and start the writer.
+
+        :raises UsageError: the file exists and must not be overwritten.
+        :raises TraceError: it cannot be created.
+        """
+        if self._thread is not None:
+            raise UsageError(f"{self.path} is already being recorded")
+        try:
+            self._file = self.path.open("wb" if self._overwrite else "xb")
+        except FileExistsError:
+            raise UsageError(
+                f"{self.path} exists", hint="choose another name, or overwrite it (--force)"
+            ) from None
+        except OSError as error:
+            raise TraceError(f"cannot create {self.path}: {error.strerror}") from error
+        self._writer = Writer(self._file, compression=self._compression)
+        self._schema_ids: dict[str, int] = {}
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write what is queued, finish the file. May be called twice.
+
+        :raises TraceError: writing failed; what was written before can be read.
+        """
+        thread = self._thread
+        if thread is None or self._closing:
+            return
+        with self._lock:
+            self._closing = True
+        self._wake.set()
+        thread.join()
+        if self._error is not None:
+            raise TraceError(
+                f"recording to {self.path} stopped: {self._error.strerror or self._error}",
+                hint=f"{self._written} messages were written and can be read",
+            )
+
+    def __enter__(self) -> Recorder:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # -- from any thread -----------------------------------------------------------------------
+
+    def add_channel(
+        self, topic: str, type_name: str, metadata: dict[str, str] | None = None
+    ) -> None:
+        """Announce a topic, with metadata for its channel. :meth:`put` does so by itself.
+
+        :raises UsageError: dexkit does not know the type.
+        """
+        kind = message_type(type_name)
+        with self._lock:
+            self._channels.setdefault(
+                (topic, type_name),
+                _Channel(topic, kind, {"dds.type": kind.name, **(metadata or {})}),
+            )
+
+    def put(
+        self,
+        topic: str,
+        type_name: str,
+        data: bytes,
+        log_time_ns: int,
+        publish_time_ns: int = 0,
+    ) -> bool:
+        """Queue one sample; returns at once.
+
+        :param data: the payload as on the wire: encapsulation header, then CDR.
+        :param log_time_ns: reception, ns since the epoch.
+        :param publish_time_ns: DDS source timestamp, ns since the epoch; 0 if unknown.
+        :returns: False when it was dropped.
+        :raises UsageError: dexkit does not know the type.
+        """
+        channel = self._channels.get((topic, type_name))
+        if channel is None:
+            self.add_channel(topic, type_name)
+            channel = self._channels[(topic, type_name)]
+        with self._lock:
+            channel.offered += 1
+            if (
+                self._queued >= self._max_messages
+                or self._queued_bytes + len(data) > self._max_bytes
+                or self._closing
+                or self._error is not None
+            ):
+                channel.dropped += 1
+                return False
+            self._queued += 1
+            self._queued_bytes += len(data)
+            self._queue.append(
+                _Item(channel, data, log_time_ns, publish_time_ns, channel.offered & 0xFFFFFFFF)
+            )
+            wake = len(self._queue) == _WAKE_AT
+        if wake:
+            self._wake.set()
+        return True
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Queue a metadata record; of several with one name, readers let later keys win."""
+        with self._lock:
+            if not self._closing:
+                self._queue.append(_Metadata(name, dict(values)))
+
+    # -- the writer's thread -------------------------------------------------------------------
+
+    def _run(self) -> None:
+        assert self._file is not None
+        try:
+            with self._file:
+                self._write_all()
+        except OSError as error:  # a full disk, a vanished mount
+            with self._lock:
+                self._error = error
+
+    def _write_all(self) -> None:
+        writer = self._writer
+        writer.start(profile="ros2", library=f"dexkit {__version__}")
+        writer.add_metadata("dexkit_recorder", self._about)
+        writer.flush()  # type: ignore[no-untyped-call]
+        flushed = time.monotonic()
+        while True:
+            self._wake.wait(_POLL)
+            self._wake.clear()
+            with self._lock:
+                closing = self._closing
+                batch, self._queue = self._queue, []
+            messages = size = 0
+            for item in batch:
+                if isinstance(item, _Metadata):
+                    writer.add_metadata(item.name, item.values)
+                    continue
+                if not item.channel.id:
+                    self._register(item.channel)
+                writer.add_message(
+                    item.channel.id,
+                    item.log_time_ns,
+                    item.data,
+                    item.publish_time_ns,
+                    item.sequence,
+                )
+                messages += 1
+                size += len(item.data)
+            with self._lock:
+                self._queued -= messages
+                self._queued_bytes -= size
+            self._written += messages
+            self._bytes += size
+            if closing:
+                break
+            now = time.monotonic()
+            if now - flushed >= FLUSH_INTERVAL:
+                writer.flush()  # type: ignore[no-untyped-call]
+                flushed = now
+        with self._lock:
+            silent = [c for c in self._channels.values() if not c.id]
+            dropped: Counter[str] = Counter()
+            for channel in self._channels.values():
+                dropped[channel.topic] += channel.dropped
+        for channel in silent:
+            self._register(channel)
+        writer.add_metadata(
+            "dexkit_recorder",
+            {
+                "messages": str(self._written),
+                "dropped": str(dropped.total()),
+                **{f"dropped {topic}": str(count) for topic, count in sorted(dropped.items())},
+            },
+        )
+        writer.finish()  # type: ignore[no-untyped-call]
+
+    def _register(self, channel: _Channel) -> None:
+        kind = channel.kind
+        if kind.name not in self._schema_ids:
+            self._schema_ids[kind.name] = self._writer.register_schema(
+                kind.ros_name, "ros2msg", kind.ros2msg.encode()
+            )
+        channel.id = self._writer.register_channel(
+            channel.topic, "cdr", self._schema_ids[kind.name], channel.metadata
+        )
