@@ -1,0 +1,34 @@
+"""The service that puts a hand on Unitree's topics.
+
+:class:`HandService` is the thing to use. Its parts, each testable alone:
+:mod:`~dexkit.service.core` (watchdog, faults, what to send and what to say),
+:mod:`~dexkit.service.dialects` (values from and to messages),
+:mod:`~dexkit.service.estimator` (prediction between slow measurements).
+"""
+
+from __future__ import annotations
+
+from dexkit.service.core import Backoff, Estimation, HandCore
+from dexkit.service.counters import HandCounters, TopicCounters
+from dexkit.service.diagnose import diagnose
+from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.service.estimator import JointEstimator, StateEstimator
+from dexkit.service.realtime import prepare_process
+from dexkit.service.service import HandService
+
+__all__ = [
+    "Backoff",
+    "DialectMap",
+    "Estimation",
+    "Fill",
+    "HandCore",
+    "HandCounters",
+    "HandService",
+    "JointEstimator",
+    "StateEstimator",
+    "StateView",
+    "TopicCounters",
+    "diagnose",
+    "dialect_map",
+    "prepare_process",
+]

@@ -1,0 +1,316 @@
+"""What the service decides about one hand, without threads, DDS or devices.
+
+:class:`HandCore` is told what happened (a command came, an exchange succeeded or failed, the
+link was opened) and says what follows: the command for the next exchange and the state to
+publish. Its time is the injected clock's, so every rule here is tested on a manual clock.
+
+Who calls it: the receiving thread :meth:`HandCore.submit`, the exchange thread
+:meth:`~HandCore.next_command` and the events, the publishing thread :meth:`~HandCore.view`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from enum import Enum
+
+import numpy as np
+
+from dexkit.clock import Clock
+from dexkit.errors import CommandRejected, HandError, HandFault, HandTimeout
+from dexkit.hand import CommandGate, Floats, HandCommand, HandSpec, HandState, MotorError
+from dexkit.models import HandModel
+from dexkit.service.counters import HandCounters
+from dexkit.service.dialects import StateView
+from dexkit.service.estimator import StateEstimator
+
+__all__ = ["Backoff", "Estimation", "HandCore"]
+
+_PATIENCE = 0.5  # seconds of failed exchanges before the link is given up
+_STALE = 0.25  # seconds beyond the expected exchange before a state counts as stale
+_START_SPEED = 1.0  # strokes a second until a real hand has caught up with its first commands
+_CAUGHT_UP = 1e-3  # of the stroke
+
+
+class Estimation(str, Enum):
+    """When q is predicted between measurements.
+
+    ``AUTO`` predicts while fewer measurements come than clients need (the model's
+    ``min_state_rate``); above that a measurement is published again until the next one comes.
+    """
+
+    AUTO = "auto"
+    OFF = "off"
+    PREDICT = "predict"
+
+
+class Backoff:
+    """Growing delays between attempts: ``first``, twice that, ... up to ``maximum`` seconds."""
+
+    def __init__(self, first: float = 0.1, maximum: float = 2.0) -> None:
+        self._first = first
+        self._maximum = maximum
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin again with the shortest delay."""
+        self._next = self._first
+
+    def next(self) -> float:
+        """Seconds to wait before the next attempt."""
+        delay = self._next
+        self._next = min(2 * delay, self._maximum)
+        return delay
+
+
+class HandCore:
+    """The state of one served hand.
+
+    :param speeds: calibrated speeds per joint for the estimator, see
+        :class:`~dexkit.service.estimator.StateEstimator`.
+    :param soft_start: limit the velocity of the first motion; by default for real hands only.
+    """
+
+    def __init__(
+        self,
+        spec: HandSpec,
+        model: HandModel,
+        clock: Clock,
+        *,
+        estimation: Estimation = Estimation.AUTO,
+        speeds: Sequence[tuple[float, float]] | None = None,
+        soft_start: bool | None = None,
+    ) -> None:
+        self.spec = spec
+        self.counters = HandCounters()
+        self._clock = clock
+        self._timeout = model.command_timeout
+        self._min_rate = model.min_state_rate
+        self._estimation = estimation
+        self._gate = CommandGate(spec)
+        self._brake = HandCommand.brake(spec.n_joints)
+        self._lock = threading.Lock()  # guards the estimator, which all three threads touch
+        self._estimator = StateEstimator(spec, speeds)
+        self._soft_start = not spec.simulated if soft_start is None else soft_start
+        self._starting = self._soft_start
+        self._start_q: Floats | None = None
+        self._start_time = 0.0
+        self._command: tuple[HandCommand, float] | None = None
+        self._not_before = clock.now()
+        self._driving = False
+        self._connected = False
+        self._faulted: tuple[int, ...] | None = None
+        self._good = clock.now()  # time of the last good exchange, or of open
+        self._interval = 1.0 / spec.io_rate
+        self._slow = spec.io_rate < self._min_rate
+        self._missed = 0
+        self._view: StateView | None = None
+
+    # -- what happened ----------------------------------------------------------------------
+
+    def submit(self, command: HandCommand) -> bool:
+        """A command came. False when it was rejected: the one before stays in force, and the
+        watchdog is not fed.
+        """
+        try:
+            admitted = self._gate.admit(command)
+        except CommandRejected:
+            self.counters.rejected = self._gate.rejected
+            return False
+        self.counters.accepted += 1
+        self.counters.clamped = self._gate.clamped
+        now = self._clock.now()
+        self._command = (admitted, now)
+        if self._connected and not self._starting and self._faulted is None:
+            with self._lock:
+                self._estimator.follow(admitted, now)
+        return True
+
+    def opened(self, spec: HandSpec | None = None) -> None:
+        """The link is open. Commands from before do not count any more."""
+        now = self._clock.now()
+        if spec is not None:
+            self.spec = spec
+        self._interval = 1.0 / self.spec.io_rate
+        self._slow = self.spec.io_rate < self._min_rate
+        self._good = now
+        self._not_before = now
+        self._faulted = None
+        self._starting = self._soft_start
+        self._start_q = None
+        self._connected = True
+
+    def measured(self, state: HandState) -> None:
+        """An exchange returned ``state``.
+
+        :raises HandError: the state has the wrong shape or a q that is not finite; count it as
+            a failed exchange.
+        """
+        n = self.spec.n_joints
+        if state.q.shape != (n,) or not np.isfinite(state.q).all():
+            raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")
+        now = self._clock.now()
+        self._observe_interval(min(now - self._good, 1.0))
+        self._good = now
+        self._missed = 0
+        if self._faulted is not None:  # what was commanded before or during a fault is stale
+            self._faulted = None
+            self._not_before = now
+        self.counters.exchanges += 1
+        with self._lock:
+            self._estimator.measure(state, now)
+        self._view = StateView(state, tuple(int(bits) for bits in state.fault))
+
+    def failed(self, error: Exception) -> bool:
+        """An exchange raised ``error``. True when the link should be given up and reopened.
+
+        Time-outs and faults are given half a second to pass; anything else (the device is gone,
+        or the backend is broken) is not.
+        """
+        self.counters.exchange_errors += 1
+        self._missed += 1
+        bits: tuple[int, ...] = ()
+        if isinstance(error, HandFault):
+            self.counters.faults += 1
+            bits = error.bits
+        if self._view is not None:
+            previous = self._view.fault if self._faulted is not None else ()
+            fault = tuple(
+                _at(bits, joint) | _at(previous, joint) for joint in range(self.spec.n_joints)
+            )
+            if isinstance(error, HandFault):
+                self._faulted = fault
+            self._view = StateView(self._view.state, fault, self._missed)
+        elif isinstance(error, HandFault):
+            self._faulted = bits
+        patient = isinstance(error, (HandTimeout, HandFault, CommandRejected))
+        return not patient or self._clock.now() - self._good > _PATIENCE
+
+    def closed(self) -> None:
+        """The link was given up."""
+        self._connected = False
+        self._driving = False
+        self.counters.losses += 1
+        with self._lock:
+            self._estimator.follow(self._brake, self._clock.now())
+
+    def retry_failed(self) -> None:
+        """An attempt to open the link again failed."""
+        self._missed += 1
+        if self._view is not None:
+            self._view = StateView(self._view.state, self._view.fault, self._missed)
+
+    # -- what follows -----------------------------------------------------------------------
+
+    @property
+    def connected(self) -> bool:
+        """Whether the link is open."""
+        return self._connected
+
+    @property
+    def driving(self) -> bool:
+        """Whether the last exchange carried a client's command rather than the brake."""
+        return self._driving
+
+    @property
+    def predicting(self) -> bool:
+        """Whether q is predicted between measurements now."""
+        if self._estimation is Estimation.AUTO:
+            return self._slow
+        return self._estimation is Estimation.PREDICT
+
+    @property
+    def measured_rate(self) -> float:
+        """Measurements a second, smoothed."""
+        return 1.0 / self._interval if self._interval > 0 else self.spec.io_rate
+
+    @property
+    def resyncs(self) -> int:
+        """Times that the prediction was more than 10 % of the stroke off."""
+        return self._estimator.resyncs
+
+    def next_command(self) -> HandCommand:
+        """What the next exchange sends: the newest command, or the brake.
+
+        The brake before the first command, when the last one is older than the model's command
+        time-out, during a fault, and after a (re)connection or a fault until a command comes
+        that is newer.
+        """
+        now = self._clock.now()
+        held = self._command
+        if (
+            held is None
+            or held[1] < self._not_before
+            or now - held[1] >= self._timeout
+            or self._faulted is not None
+        ):
+            if self._driving:
+                self._driving = False
+                self.counters.brakes += 1
+            self._start_q = None
+            with self._lock:
+                self._estimator.follow(self._brake, now)
+            return self._brake
+        self._driving = True
+        command = held[0]
+        if self._starting:
+            command = self._slew(command, now)
+            with self._lock:
+                self._estimator.follow(command, now)
+        return command
+
+    def view(self) -> StateView | None:
+        """What is to be published now; None before the first exchange.
+
+        The same object is returned until something changes.
+        """
+        view = self._view
+        if view is None:
+            return None
+        now = self._clock.now()
+        expected = 2 * self._interval + self.spec.exchange_timeout
+        if not self._connected or now - self._good > expected + _STALE:
+            return self._stale(view)
+        if self.predicting:
+            with self._lock:
+                state = self._estimator.predict(now)
+            if state is not None:
+                return replace(view, state=state)
+        return view
+
+    # -- details ----------------------------------------------------------------------------
+
+    def _stale(self, view: StateView) -> StateView:
+        link = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+        if all(bits & link for bits in view.fault):
+            return view
+        stale = StateView(view.state, tuple(b | link for b in view.fault), max(view.missed, 1))
+        if self._view is view:
+            self._view = stale
+        return stale
+
+    def _observe_interval(self, interval: float) -> None:
+        self._interval += 0.1 * (interval - self._interval)
+        # a margin, so that a rate near the limit does not switch to and fro
+        limit = self._min_rate * (1.1 if self._slow else 0.9)
+        self._slow = self._interval * limit > 1.0
+
+    def _slew(self, command: HandCommand, now: float) -> HandCommand:
+        """Limit the velocity of the position command until it has been caught up with."""
+        stroke = self.spec.q_max - self.spec.q_min
+        if self._start_q is None:
+            view = self._view
+            self._start_q = np.array(view.state.q) if view is not None else np.array(command.q)
+            self._start_time = now
+        step = _START_SPEED * stroke * (now - self._start_time)
+        self._start_time = now
+        self._start_q = self._start_q + np.clip(command.q - self._start_q, -step, step)
+        if (np.abs(command.q - self._start_q) <= _CAUGHT_UP * stroke).all():
+            self._starting = False
+            return command
+        return replace(command, q=self._start_q)
+
+
+def _at(bits: Sequence[int], joint: int) -> int:
+    return bits[joint] if joint < len(bits) else 0

@@ -1,0 +1,63 @@
+"""What the service counts; logged at exit and on SIGUSR1."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+__all__ = ["HandCounters", "TopicCounters"]
+
+
+@dataclass
+class TopicCounters:
+    """Counts of one topic pair.
+
+    :ivar received: command samples taken.
+    :ivar undecodable: of those, samples that are not the message they claim to be.
+    :ivar empty: samples with no motor for a hand that is served here.
+    :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
+    :ivar published: state samples written.
+    :ivar publish_misses: publish deadlines missed by a whole period.
+    :ivar publish_errors: samples that DDS or the codec refused.
+    """
+
+    received: int = 0
+    undecodable: int = 0
+    empty: int = 0
+    overlong: int = 0
+    published: int = 0
+    publish_misses: int = 0
+    publish_errors: int = 0
+
+    def snapshot(self) -> dict[str, int]:
+        """The counts now."""
+        return asdict(self)
+
+
+@dataclass
+class HandCounters:
+    """Counts of one hand.
+
+    :ivar accepted: commands that are in force or were.
+    :ivar rejected: commands with NaN or infinity.
+    :ivar clamped: accepted commands that had to be brought within the limits.
+    :ivar brakes: times that driving stopped because no fresh command was there.
+    :ivar exchanges: exchanges done.
+    :ivar exchange_errors: exchanges that failed.
+    :ivar faults: of those, hardware errors that the device reported.
+    :ivar losses: times that the link was given up.
+    :ivar reconnects: times that it was opened again.
+    """
+
+    accepted: int = 0
+    rejected: int = 0
+    clamped: int = 0
+    brakes: int = 0
+    exchanges: int = 0
+    exchange_errors: int = 0
+    faults: int = 0
+    losses: int = 0
+    reconnects: int = 0
+
+    def snapshot(self) -> dict[str, int]:
+        """The counts now."""
+        return asdict(self)

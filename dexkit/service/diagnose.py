@@ -1,0 +1,65 @@
+"""Why a client and this service do not meet, from what discovery shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+from dexkit.hand import Side
+from dexkit.models import DIALECTS, Dialect
+
+__all__ = ["diagnose"]
+
+
+class _Endpoint(Protocol):
+    @property
+    def topic(self) -> str: ...
+    @property
+    def type_name(self) -> str: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def own(self) -> bool: ...
+
+
+def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[Side]) -> list[str]:
+    """Sentences about clients that use another topic or type than those served here.
+
+    A client on another topic or with another type gets no error and no data; it just waits.
+    """
+    foreign = [e for e in endpoints if not e.own]
+    served = {}
+    for side in sides:
+        cmd, state = dialect.topics(side)
+        served[cmd] = dialect.cmd_type
+        served[state] = dialect.state_type
+    found = []
+    for topic, type_name in served.items():
+        for other in sorted({e.type_name for e in foreign if e.topic == topic} - {type_name}):
+            found.append(
+                f"{topic}: a peer uses {other}, this service {type_name}; they never match"
+                + _advice(topic, other)
+            )
+    for other_dialect in DIALECTS.values():
+        topics = {t for side in Side for t in other_dialect.topics(side)} - set(served)
+        for topic in sorted({e.topic for e in foreign} & topics):
+            if other_dialect.topics(Side.LEFT) == other_dialect.topics(Side.RIGHT):
+                found.append(
+                    f"a peer is on {topic}, which is not served here; "
+                    f"try --dialect {other_dialect.name}"
+                )
+    return found
+
+
+def _advice(topic: str, type_name: str) -> str:
+    for candidate in DIALECTS.values():
+        pairs = {
+            pair
+            for side in Side
+            for pair in zip(
+                candidate.topics(side), (candidate.cmd_type, candidate.state_type), strict=True
+            )
+        }
+        if (topic, type_name) in pairs:
+            return f". Try --dialect {candidate.name}"
+    return ""

@@ -1,0 +1,299 @@
+"""Dialects: what a command message means to a hand, and how a hand's state is put in a message.
+
+Pure functions of values; which topics and types a dialect uses is in :mod:`dexkit.models`.
+
+=================  ================================================================================
+unitree_go         q, dq, tau, kp, kd as they are; the mode byte is ignored (facts/unitree-dex B.2),
+                   so kp = kd = 0 is limp and not a brake.
+unitree_actuator   the same, two motors in one message: 0 right, 1 left (A.1).
+unitree_hg         seed 000: q runs to 2 pi; a command at or below 0.1 closes, at or above 6.0
+                   opens; dq, tau, kp and kd of a command are unused (clients send 0), the gains
+                   are those of xr_teleoperate; tau_est of the state is grip strength, not signed.
+=================  ================================================================================
+
+**What a state holds.** ``Fill.VENDOR`` fills what the reference fills and leaves the rest 0:
+q, dq, tau_est for unitree_go (the vendor's service, B.2); q, tau_est and the fixed temperature
+25, 25 and vol 12.0 for unitree_hg (seed 000). ``Fill.KNOWN``, the default, adds what the backend
+really measured, and what is wrong:
+
+======================  ===========================  ==============================================
+what                    unitree_go, _actuator        unitree_hg
+======================  ===========================  ==============================================
+braking or driven       mode 0 or 1                  mode stays 0 (it means "position" in seed 000)
+ddq                     ddq                          ddq
+dq                      dq                           dq
+temperature             temperature, 0..127          temperature, twice; 25 where unknown (seed 000)
+voltage                 no field                     vol; 12.0 where unknown (seed 000); supply in
+                                                     power_v, power_a, system_v, device_v
+MotorError bits         reserve[0]                   motorstate; all joints together in error[0]
+exchanges missed since  lost                         error[1]
+the last good one
+q is predicted          reserve[1] = 1               reserve[0] = 1
+======================  ===========================  ==============================================
+
+``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more (A.7).
+What a backend does not know (NaN) is sent as 0.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from dexkit.errors import UsageError
+from dexkit.hand import (
+    Floats,
+    HandCommand,
+    HandSpec,
+    HandState,
+    ImuState,
+    JointMode,
+    Side,
+    SupplyState,
+)
+from dexkit.messages import unitree_go, unitree_hg
+from dexkit.models import Dialect
+
+__all__ = ["DialectMap", "Fill", "StateView", "dialect_map"]
+
+# what xr_teleoperate sends to a Dex1 (facts/unitree-dex B.1)
+_KP, _KD = 5.0, 0.05
+_HG_CLOSED, _HG_OPEN = 0.1, 6.0  # seed 000, "Position Conversion"
+_HG_TEMPERATURE, _HG_VOL = 25, 12.0  # seed 000, "MotorState_"
+_U32 = 0xFFFFFFFF
+
+
+class Fill(str, Enum):
+    """Which fields of a state are filled."""
+
+    KNOWN = "known"
+    VENDOR = "vendor"
+
+
+@dataclass(frozen=True)
+class StateView:
+    """What is to be said of one hand.
+
+    :param fault: :class:`~dexkit.hand.MotorError` bits per joint, the link's included.
+    :param missed: exchanges missed since the last good one.
+    """
+
+    state: HandState
+    fault: tuple[int, ...]
+    missed: int = 0
+
+
+class DialectMap(ABC):
+    """Messages of one dialect from and to the values of the hands that share a topic pair.
+
+    :param specs: the hands by side; exactly one where each side has its own topics.
+    :raises UsageError: the hand model does not speak this dialect.
+    """
+
+    def __init__(
+        self, dialect: Dialect, specs: Mapping[Side, HandSpec], fill: Fill = Fill.KNOWN
+    ) -> None:
+        for spec in specs.values():
+            if spec.model != dialect.model:
+                raise UsageError(f"a {spec.model} does not speak {dialect.name}")
+        self.dialect = dialect
+        self.fill = fill
+        self._specs = dict(specs)
+        # one joint: its motor is one element of the sequence; more: they are the sequence
+        self._first = {
+            side: dialect.index[side] if spec.n_joints == 1 else 0 for side, spec in specs.items()
+        }
+        self._length = max(
+            max(self._first[s] + spec.n_joints for s, spec in specs.items()), dialect.length
+        )
+
+    def motors(self, message: Any) -> int:
+        """How many motors a command message has; more or fewer than :attr:`length` is odd."""
+        return len(self._motor_commands(message))
+
+    @property
+    def length(self) -> int:
+        """Motors in a well-formed message."""
+        return self._length
+
+    def command(self, message: Any, side: Side) -> HandCommand | None:
+        """The command for a side, not yet through the gate; None when it holds none."""
+        first, spec = self._first[side], self._specs[side]
+        motors = self._motor_commands(message)[first : first + spec.n_joints]
+        if len(motors) < spec.n_joints:
+            return None
+        return HandCommand(
+            q=np.array(
+                [self._q_in(m.q, j.q_max) for m, j in zip(motors, spec.joints, strict=True)]
+            ),
+            dq=self._feed_forward([m.dq for m in motors]),
+            tau=self._feed_forward([m.tau for m in motors]),
+            kp=self._gains([m.kp for m in motors], _KP),
+            kd=self._gains([m.kd for m in motors], _KD),
+            mode=np.full(len(motors), JointMode.FOC, dtype=np.uint8),
+        )
+
+    @abstractmethod
+    def state(self, views: Mapping[Side, StateView]) -> Any:
+        """The state message; a hand of the topic pair that is not in ``views`` is all 0."""
+
+    @abstractmethod
+    def _motor_commands(self, message: Any) -> list[Any]:
+        """The motors of a command message."""
+
+    def _q_in(self, q: float, q_max: float) -> float:
+        # 5.4 as float32 is 1e-7 above 5.4: not a command beyond the limit
+        return q_max if 0 < q - q_max < 1e-6 else q
+
+    def _feed_forward(self, values: list[float]) -> Floats:
+        return np.array(values)
+
+    def _gains(self, values: list[float], default: float) -> Floats:
+        return np.array(values)
+
+
+class _GoMap(DialectMap):
+    def _motor_commands(self, message: Any) -> list[Any]:
+        motors: list[Any] = message.cmds
+        return motors
+
+    def state(self, views: Mapping[Side, StateView]) -> unitree_go.MotorStates_:
+        motors = [unitree_go.MotorState_() for _ in range(self._length)]
+        for side, view in views.items():
+            s = view.state
+            for joint in range(self._specs[side].n_joints):
+                m = motors[self._first[side] + joint]
+                m.q = _known(s.q[joint])
+                m.dq = _known(s.dq[joint])
+                m.tau_est = _known(s.tau_est[joint])
+                if self.fill is Fill.VENDOR:
+                    continue
+                m.mode = int(s.mode[joint])
+                m.ddq = _known(s.ddq[joint])
+                m.temperature = _celsius(s.temperature[joint], low=0, high=127)
+                m.lost = min(view.missed, _U32)
+                m.reserve = (view.fault[joint] & _U32, 0 if s.measured else 1)
+        return unitree_go.MotorStates_(motors)
+
+
+class _HgMap(DialectMap):
+    def state(self, views: Mapping[Side, StateView]) -> unitree_hg.HandState_:
+        (side,) = self._specs
+        view = views[side]
+        s, spec = view.state, self._specs[side]
+        known = self.fill is Fill.KNOWN
+        motors = []
+        for joint, limits in enumerate(spec.joints):
+            scale = self._scale(limits.q_max)
+            m = unitree_hg.MotorState_(
+                q=_known(s.q[joint]) * scale,
+                tau_est=abs(_known(s.tau_est[joint])),
+                temperature=(_HG_TEMPERATURE, _HG_TEMPERATURE),
+                vol=_HG_VOL,
+            )
+            if known:
+                m.dq = _known(s.dq[joint]) * scale
+                m.ddq = _known(s.ddq[joint]) * scale
+                if math.isfinite(s.temperature[joint]):
+                    celsius = _celsius(s.temperature[joint], low=-32768, high=32767)
+                    m.temperature = (celsius, celsius)
+                if math.isfinite(s.voltage[joint]):
+                    m.vol = float(s.voltage[joint])
+                m.motorstate = view.fault[joint] & _U32
+                m.reserve = (0 if s.measured else 1, 0, 0, 0)
+            motors.append(m)
+        message = unitree_hg.HandState_(motors)
+        if known:
+            self._fill(message, s, view)
+        return message
+
+    def _fill(self, message: unitree_hg.HandState_, s: HandState, view: StateView) -> None:
+        bits = 0
+        for fault in view.fault:
+            bits |= fault
+        message.error = (bits & _U32, min(view.missed, _U32))
+        if s.imu is not None:
+            message.imu_state = _imu(s.imu)
+        if s.supply is not None:
+            _supply(message, s.supply)
+        if s.pressure is not None:
+            message.press_sensor_state = [
+                unitree_hg.PressSensorState_(pressure=tuple(_known(p) for p in sensor))
+                for sensor in s.pressure
+            ]
+
+    def _scale(self, q_max: float) -> float:
+        return self.dialect.q_open / q_max
+
+    def _motor_commands(self, message: Any) -> list[Any]:
+        motors: list[Any] = message.motor_cmd
+        return motors
+
+    def _q_in(self, q: float, q_max: float) -> float:
+        if not math.isfinite(q):
+            return q  # for the gate to reject: minus infinity is not "closed"
+        if q <= _HG_CLOSED:
+            return 0.0
+        if q >= _HG_OPEN:
+            return q_max
+        return q / self._scale(q_max)
+
+    def _feed_forward(self, values: list[float]) -> Floats:
+        return _zero_where_finite(values)
+
+    def _gains(self, values: list[float], default: float) -> Floats:
+        return _zero_where_finite(values) + default
+
+
+_MAPS: dict[str, type[DialectMap]] = {
+    "unitree_go": _GoMap,
+    "unitree_actuator": _GoMap,
+    "unitree_hg": _HgMap,
+}
+
+
+def dialect_map(
+    dialect: Dialect, specs: Mapping[Side, HandSpec], fill: Fill = Fill.KNOWN
+) -> DialectMap:
+    """The mapping of ``dialect`` for the hands of one topic pair.
+
+    :raises UsageError: a hand is of another model.
+    """
+    return _MAPS[dialect.name](dialect, specs, fill)
+
+
+def _known(value: float) -> float:
+    number = float(value)
+    return number if math.isfinite(number) else 0.0
+
+
+def _celsius(value: float, *, low: int, high: int) -> int:
+    return min(max(round(_known(value)), low), high)
+
+
+def _zero_where_finite(values: list[float]) -> Floats:
+    # unused fields are not obeyed, but NaN in one still rejects the command
+    return np.array([0.0 if math.isfinite(v) else v for v in values])
+
+
+def _imu(imu: ImuState) -> unitree_hg.IMUState_:
+    return unitree_hg.IMUState_(
+        quaternion=imu.quaternion,
+        gyroscope=imu.gyroscope,
+        accelerometer=imu.accelerometer,
+        rpy=imu.rpy,
+        temperature=_celsius(imu.temperature, low=-32768, high=32767),
+    )
+
+
+def _supply(message: unitree_hg.HandState_, supply: SupplyState) -> None:
+    message.power_v = _known(supply.power_v)
+    message.power_a = _known(supply.power_a)
+    message.system_v = _known(supply.system_v)
+    message.device_v = _known(supply.device_v)

@@ -1,0 +1,457 @@
+"""The service: threads and DDS around :class:`~dexkit.service.core.HandCore`.
+
+Three activities, each with its own clock:
+
+* *receive* waits for samples and hands the newest command to the core;
+* *exchange*, one thread a hand, talks to the hand as fast as its ``io_rate`` allows, and opens
+  it again with growing delays when it was lost;
+* *publish* writes state at fixed deadlines, whatever the hand does meanwhile.
+
+All three share one interpreter lock, so the publishing thread does little: it writes bytes that
+were encoded once for each new state.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from dexkit.clock import Clock, Rate, RealClock
+from dexkit.errors import DexkitError, HandError, TopicConflict, UsageError, WireError
+from dexkit.hand import Hand, HandCommand, Side
+from dexkit.messages import message_type
+from dexkit.models import Dialect, HandModel, model
+from dexkit.models import dialect as dialect_by_name
+from dexkit.service.core import Backoff, Estimation, HandCore
+from dexkit.service.counters import TopicCounters
+from dexkit.service.dialects import Fill, StateView, dialect_map
+from dexkit.service.realtime import precise_timers
+
+__all__ = ["HandService", "Node"]
+
+log = logging.getLogger("dexkit.service")
+
+_SPIN = 150e-6  # covers the 50..100 us by which a sleeping thread wakes late
+_DISCOVERY = 0.3  # seconds to look for another publisher of the state topic
+_JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-out
+
+
+class _Writer(Protocol):
+    @property
+    def matched(self) -> int: ...
+    def write_raw(self, data: bytes, source_timestamp_ns: int | None = None) -> None: ...
+    def close(self) -> None: ...
+
+
+class _Reader(Protocol):
+    def take(self) -> Sequence[Any]: ...
+    def close(self) -> None: ...
+
+
+class Node(Protocol):
+    """The part of :class:`dexkit.dds.DdsNode` that the service needs."""
+
+    def writer(self, topic: str, type_name: str) -> _Writer: ...  # noqa: D102
+    def reader(  # noqa: D102
+        self, topic: str, type_name: str, *, on_data: Callable[[], None] | None = None
+    ) -> _Reader: ...
+    def endpoints(self) -> Sequence[Any]: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class _Unit:
+    """One served hand and its thread."""
+
+    def __init__(self, hand: Hand, core: HandCore) -> None:
+        self.hand = hand
+        self.core = core
+        self.side: Side = hand.spec.side
+        self.thread: threading.Thread | None = None
+        self.problem = ""  # the last error logged, to log each only once
+
+
+class HandService:
+    """Serve one hand, or the two hands that share a topic pair, until :meth:`stop`.
+
+    :param hands: a hand, or one of each side for a dialect whose message holds both.
+    :param node: DDS node to use; it stays open at stop. Without it one is made and closed.
+    :param state_rate: Hz; by default that of the model.
+    :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
+    :param speeds: calibrated speeds by side for the estimator; by default what the hand says in
+        an attribute ``joint_speeds``, if it has one.
+    :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
+    :param force: start even if somebody else publishes the state topic.
+    :raises UsageError: hands and dialect do not fit.
+    """
+
+    def __init__(
+        self,
+        hands: Hand | Sequence[Hand],
+        *,
+        node: Node | None = None,
+        domain: int = 1,
+        interface: str = "lo",
+        dialect: str | Dialect = "unitree_go",
+        state_rate: float | None = None,
+        estimation: Estimation = Estimation.AUTO,
+        fill: Fill = Fill.KNOWN,
+        wait_for_device: bool = False,
+        force: bool = False,
+        soft_start: bool | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        group = list(hands) if isinstance(hands, Sequence) else [hands]
+        self.dialect = dialect_by_name(dialect) if isinstance(dialect, str) else dialect
+        self.model: HandModel = _one_model(group)
+        sides = [hand.spec.side for hand in group]
+        topics = {self.dialect.topics(side) for side in sides}
+        if len(set(sides)) != len(sides) or len(topics) != 1:
+            raise UsageError(
+                f"{len(group)} hands do not share one topic pair of {self.dialect.name}",
+                hint="serve each side by its own HandService",
+            )
+        ((self.cmd_topic, self.state_topic),) = topics
+        self.state_rate = state_rate if state_rate is not None else self.model.state_rate
+        self.counters = TopicCounters()
+        self.domain, self.interface = domain, interface
+        self._clock: Clock = clock if clock is not None else RealClock()
+        self._node, self._own_node = node, node is None
+        self._wait_for_device, self._force = wait_for_device, force
+        self._units = [
+            _Unit(
+                hand,
+                HandCore(
+                    hand.spec,
+                    self.model,
+                    self._clock,
+                    estimation=estimation,
+                    speeds=getattr(hand, "joint_speeds", None),
+                    soft_start=soft_start,
+                ),
+            )
+            for hand in group
+        ]
+        self._map = dialect_map(self.dialect, {u.side: u.core.spec for u in self._units}, fill)
+        self._cmd_type = message_type(self.dialect.cmd_type)
+        self._state_type = message_type(self.dialect.state_type)
+        self._stop = threading.Event()
+        self._wake = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._reader: _Reader | None = None
+        self._writer: _Writer | None = None
+        self._views: tuple[StateView | None, ...] = ()
+        self._payload: bytes | None = None
+        self._started = False
+        self.failure: Exception | None = None  #: what ended a thread of the service, if anything
+
+    # -- life -------------------------------------------------------------------------------
+
+    def __enter__(self) -> HandService:
+        self.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Open the hands, then bring the topics up.
+
+        :raises HandError: a hand cannot be opened (unless ``wait_for_device``).
+        :raises DdsError: no CycloneDDS, no such interface, ...
+        :raises TopicConflict: somebody else publishes the state topic (unless ``force``).
+        """
+        if self._started:
+            raise UsageError("a service starts once")
+        self._started = True
+        try:
+            self._start()
+        except BaseException:
+            self._release()
+            raise
+
+    def _start(self) -> None:
+        if self._node is None:
+            from dexkit.dds import DdsNode
+
+            self._node = DdsNode(domain=self.domain, interface=self.interface)
+        self._refuse_conflict(self._node)
+        for unit in self._units:
+            self._open_first(unit)
+        self._writer = self._node.writer(self.state_topic, self.dialect.state_type)
+        self._reader = self._node.reader(
+            self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set
+        )
+        for unit in self._units:
+            unit.thread = self._thread(f"exchange-{unit.side}", self._exchange_loop, unit)
+        self._threads = [
+            self._thread("receive", self._receive_loop),
+            self._thread("publish", self._publish_loop),
+        ]
+        for thread in [*self._threads, *(u.thread for u in self._units)]:
+            assert thread is not None
+            thread.start()
+
+    def stop(self) -> None:
+        """Brake, release the hands, publish the last state, leave DDS. May be called twice."""
+        if not self._stop.is_set():
+            self._release()
+
+    def _release(self) -> None:
+        self._stop.set()
+        self._wake.set()
+        for unit in self._units:
+            thread = unit.thread
+            if thread is not None and thread.ident is not None:
+                thread.join(_JOIN + unit.core.spec.exchange_timeout)
+                if thread.is_alive():
+                    log.error("%s: the backend hangs in an exchange; closing it", unit.side)
+                    self._close_hand(unit)
+            else:
+                self._close_hand(unit)
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
+        if self._writer is not None and self._threads:
+            self._write(self._compose())
+        for entity in (self._reader, self._writer):
+            if entity is not None:
+                entity.close()
+        if self._own_node and self._node is not None:
+            self._node.close()
+            self._node = None
+
+    def _thread(self, name: str, target: Callable[..., None], *args: object) -> threading.Thread:
+        def run() -> None:
+            try:
+                target(*args)
+            except Exception as error:  # nothing may die in silence
+                log.exception("the %s thread died", name)
+                self.failure = error
+
+        return threading.Thread(target=run, name=f"dexkit-{name}", daemon=True)
+
+    # -- what it says of itself -------------------------------------------------------------
+
+    @property
+    def node(self) -> Node | None:
+        """The DDS node while the service runs."""
+        return self._node
+
+    @property
+    def clients(self) -> int:
+        """Readers of the state topic."""
+        return self._writer.matched if self._writer is not None else 0
+
+    @property
+    def cores(self) -> dict[Side, HandCore]:
+        """What the service knows of each hand."""
+        return {unit.side: unit.core for unit in self._units}
+
+    def snapshot(self) -> dict[str, Any]:
+        """All counters: of the topic pair and, by side, of the hands."""
+        hands = {}
+        for unit in self._units:
+            hands[str(unit.side)] = {
+                **unit.core.counters.snapshot(),
+                "resyncs": unit.core.resyncs,
+                "connected": unit.core.connected,
+            }
+        return {
+            "cmd_topic": self.cmd_topic,
+            "state_topic": self.state_topic,
+            **self.counters.snapshot(),
+            "hands": hands,
+        }
+
+    def log_counters(self) -> None:
+        """Log :meth:`snapshot` as one line of JSON."""
+        log.info("counters %s", json.dumps(self.snapshot()))
+
+    # -- receive ----------------------------------------------------------------------------
+
+    def _receive_loop(self) -> None:
+        assert self._reader is not None
+        while not self._stop.is_set():
+            self._wake.wait()
+            self._wake.clear()
+            for sample in self._reader.take():
+                self._receive(sample.data)
+
+    def _receive(self, data: bytes) -> None:
+        count = self.counters
+        count.received += 1
+        try:
+            message = self._cmd_type.decode(data)
+        except WireError as error:
+            count.undecodable += 1
+            if count.undecodable == 1:
+                log.warning("%s: undecodable command: %s", self.cmd_topic, error)
+            return
+        motors = self._map.motors(message)
+        if motors > self._map.length:
+            count.overlong += 1
+        empty = False
+        for unit in self._units:
+            command = self._map.command(message, unit.side)
+            if command is None:
+                empty = True
+            elif not unit.core.submit(command) and unit.core.counters.rejected == 1:
+                log.warning("%s: rejected a command that is not finite", self.cmd_topic)
+        if empty:
+            count.empty += 1
+
+    # -- exchange ---------------------------------------------------------------------------
+
+    def _open_first(self, unit: _Unit) -> None:
+        try:
+            self._open(unit)
+        except HandError as error:
+            if not self._wait_for_device:
+                raise
+            log.warning("%s: %s; waiting for it", unit.side, error)
+            unit.problem = str(error)
+
+    def _open(self, unit: _Unit) -> None:
+        """Open the hand and do one exchange, so that there is a state from the first sample on."""
+        unit.hand.open()
+        unit.core.opened(unit.hand.spec)
+        try:
+            unit.core.measured(unit.hand.exchange(unit.core.next_command()))
+        except Exception as error:
+            if unit.core.failed(error):
+                unit.core.closed()
+                self._close_hand(unit)
+                raise
+
+    def _exchange_loop(self, unit: _Unit) -> None:
+        core = unit.core
+        backoff = Backoff()
+        try:
+            while not self._stop.is_set():
+                if not core.connected and not self._reconnect(unit, backoff):
+                    continue
+                rate = Rate(core.spec.io_rate, self._clock)
+                while core.connected and not self._stop.is_set():
+                    rate.wait()
+                    if self._exchange(unit):
+                        backoff.reset()
+        finally:
+            if core.connected:
+                self._exchange(unit, HandCommand.brake(core.spec.n_joints))
+            self._close_hand(unit)
+
+    def _exchange(self, unit: _Unit, command: HandCommand | None = None) -> bool:
+        core = unit.core
+        try:
+            core.measured(unit.hand.exchange(command or core.next_command()))
+        except Exception as error:  # a backend is other people's code
+            self._report(unit, error)
+            if core.failed(error):
+                core.closed()
+                self._close_hand(unit)
+            return False
+        if unit.problem:
+            log.info("%s: the hand answers again", unit.side)
+            unit.problem = ""
+        return True
+
+    def _reconnect(self, unit: _Unit, backoff: Backoff) -> bool:
+        if self._stop.wait(backoff.next()):
+            return False
+        try:
+            self._open(unit)
+        except Exception as error:  # a backend is other people's code
+            unit.core.retry_failed()
+            self._report(unit, error)
+            return False
+        unit.core.counters.reconnects += 1
+        return True
+
+    def _close_hand(self, unit: _Unit) -> None:
+        try:
+            unit.hand.close()
+        except Exception as error:  # it must not keep the rest from being released
+            log.warning("%s: closing the hand: %s", unit.side, error)
+
+    def _report(self, unit: _Unit, error: Exception) -> None:
+        text = f"{type(error).__name__}: {error}"
+        if text == unit.problem:
+            return
+        unit.problem = text
+        if isinstance(error, DexkitError):
+            log.warning("%s: %s%s", unit.side, error, f" ({error.hint})" if error.hint else "")
+        else:
+            log.error("%s: the backend failed", unit.side, exc_info=error)
+
+    # -- publish ----------------------------------------------------------------------------
+
+    def _publish_loop(self) -> None:
+        precise_timers()
+        rate = Rate(self.state_rate, self._clock, spin=min(_SPIN, 0.2 / self.state_rate))
+        while not self._stop.is_set():
+            self.counters.publish_misses += rate.wait()
+            self._write(self._compose())
+
+    def _compose(self) -> bytes | None:
+        """The sample for now, encoded again only if something changed; None without a state."""
+        views = tuple(unit.core.view() for unit in self._units)
+        if len(views) == len(self._views) and all(
+            a is b for a, b in zip(views, self._views, strict=True)
+        ):
+            return self._payload
+        known = {u.side: v for u, v in zip(self._units, views, strict=True) if v is not None}
+        self._views = views
+        try:
+            self._payload = self._state_type.encode(self._map.state(known)) if known else None
+        except WireError as error:  # a value that the wire cannot hold
+            self._count_publish_error(error)
+            self._payload = None
+        return self._payload
+
+    def _write(self, payload: bytes | None) -> None:
+        if payload is None:
+            return
+        assert self._writer is not None
+        try:
+            self._writer.write_raw(payload)
+        except DexkitError as error:
+            self._count_publish_error(error)
+        else:
+            self.counters.published += 1
+
+    def _count_publish_error(self, error: Exception) -> None:
+        self.counters.publish_errors += 1
+        if self.counters.publish_errors == 1:
+            log.error("%s: cannot publish: %s", self.state_topic, error)
+
+    # -- conflicts --------------------------------------------------------------------------
+
+    def _refuse_conflict(self, node: Node) -> None:
+        if self._force:
+            return
+
+        def others() -> list[Any]:
+            return [
+                e
+                for e in node.endpoints()
+                if e.topic == self.state_topic and e.kind == "writer" and not e.own
+            ]
+
+        discovery = getattr(node, "discovery", None)
+        if discovery is not None:
+            discovery.wait(lambda *_: bool(others()), _DISCOVERY)
+        if others():
+            raise TopicConflict(
+                f"somebody already publishes {self.state_topic} on domain {self.domain}",
+                hint="stop the other service, choose another --domain, or add --force",
+            )
+
+
+def _one_model(hands: Sequence[Hand]) -> HandModel:
+    names = {hand.spec.model for hand in hands}
+    if len(names) != 1:
+        raise UsageError(f"a service needs hands of one model, got {sorted(names)}")
+    return model(names.pop())
