@@ -163,7 +163,7 @@ def test_a_lagging_hand_makes_it_wait_and_not_turn_round() -> None:
     e.measure(ahead - 0.05 * STROKE, 0.2)
     seen = [e.predict(0.2 + 0.001 * i) for i in range(1, 100)]
     assert seen[0] == ahead
-    assert all(b >= a for a, b in zip(seen, seen[1:], strict=False))
+    assert seen == sorted(seen)
     # it resumes once the corrected model (a tenth of 5 % back) has come up to it
     wait = CORRECTION * 0.05 * STROKE / 5.0
     resumed = next(i for i, q in enumerate(seen, 1) if q > ahead)

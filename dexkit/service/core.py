@@ -29,6 +29,7 @@ __all__ = ["Backoff", "Estimation", "HandCore"]
 
 _PATIENCE = 0.5  # seconds of failed exchanges before the link is given up
 _STALE = 0.25  # seconds beyond the expected exchange before a state counts as stale
+_RATE_WINDOW = 0.5  # seconds over which the rate of measurements is taken
 _START_SPEED = 1.0  # strokes a second until a real hand has caught up with its first commands
 _CAUGHT_UP = 1e-3  # of the stroke
 
@@ -102,8 +103,9 @@ class HandCore:
         self._connected = False
         self._faulted: tuple[int, ...] | None = None
         self._good = clock.now()  # time of the last good exchange, or of open
-        self._interval = 1.0 / spec.io_rate
+        self.measured_rate = spec.io_rate  #: measurements a second; at first what the hand says
         self._slow = spec.io_rate < self._min_rate
+        self._window = (clock.now(), 0)  # start, exchanges since
         self._missed = 0
         self._view: StateView | None = None
 
@@ -132,8 +134,9 @@ class HandCore:
         now = self._clock.now()
         if spec is not None:
             self.spec = spec
-        self._interval = 1.0 / self.spec.io_rate
+        self.measured_rate = self.spec.io_rate
         self._slow = self.spec.io_rate < self._min_rate
+        self._window = (now, 0)
         self._good = now
         self._not_before = now
         self._faulted = None
@@ -151,7 +154,7 @@ class HandCore:
         if state.q.shape != (n,) or not np.isfinite(state.q).all():
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")
         now = self._clock.now()
-        self._observe_interval(min(now - self._good, 1.0))
+        self._observe_rate(now)
         self._good = now
         self._missed = 0
         if self._faulted is not None:  # what was commanded before or during a fault is stale
@@ -221,11 +224,6 @@ class HandCore:
         return self._estimation is Estimation.PREDICT
 
     @property
-    def measured_rate(self) -> float:
-        """Measurements a second, smoothed."""
-        return 1.0 / self._interval if self._interval > 0 else self.spec.io_rate
-
-    @property
     def resyncs(self) -> int:
         """Times that the prediction was more than 10 % of the stroke off."""
         return self._estimator.resyncs
@@ -269,8 +267,7 @@ class HandCore:
         if view is None:
             return None
         now = self._clock.now()
-        expected = 2 * self._interval + self.spec.exchange_timeout
-        if not self._connected or now - self._good > expected + _STALE:
+        if not self._connected or now - self._good > self._overdue():
             return self._stale(view)
         if self.predicting:
             with self._lock:
@@ -290,11 +287,22 @@ class HandCore:
             self._view = stale
         return stale
 
-    def _observe_interval(self, interval: float) -> None:
-        self._interval += 0.1 * (interval - self._interval)
+    def _observe_rate(self, now: float) -> None:
+        """Count exchanges over half a second; one hiccup must not switch the estimator on."""
+        if self._missed or now - self._good > self._overdue():
+            self._window = (now, 0)
+            return
+        start, count = self._window[0], self._window[1] + 1
+        self._window = (start, count)
+        if count < 3 or now - start < _RATE_WINDOW:
+            return
+        self.measured_rate = count / (now - start)
+        self._window = (now, 0)
         # a margin, so that a rate near the limit does not switch to and fro
-        limit = self._min_rate * (1.1 if self._slow else 0.9)
-        self._slow = self._interval * limit > 1.0
+        self._slow = self.measured_rate < self._min_rate * (1.1 if self._slow else 0.9)
+
+    def _overdue(self) -> float:
+        return 2 / self.measured_rate + self.spec.exchange_timeout + _STALE
 
     def _slew(self, command: HandCommand, now: float) -> HandCommand:
         """Limit the velocity of the position command until it has been caught up with."""

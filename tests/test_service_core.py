@@ -1,0 +1,334 @@
+"""What the service decides about one hand: watchdog, rejection, faults, what is published."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.clock import ManualClock
+from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
+from dexkit.hand import HandCommand, HandState, MotorError, Side
+from dexkit.models import DEX1_1
+from dexkit.service.core import Backoff, Estimation, HandCore
+
+TIMEOUT = DEX1_1.command_timeout
+LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+
+class Bench:
+    """A core on a manual clock with an exchange loop that is stepped by hand."""
+
+    def __init__(
+        self, *, io_rate: float = 500.0, simulated: bool = True, **options: object
+    ) -> None:
+        self.clock = ManualClock(100.0)
+        self.spec = DEX1_1.spec(Side.LEFT, io_rate=io_rate, simulated=simulated)
+        self.core = HandCore(self.spec, DEX1_1, self.clock, **options)  # type: ignore[arg-type]
+        self.q = 1.0
+        self.core.opened(self.spec)
+        self.exchange()
+
+    def exchange(self, **state: object) -> HandCommand:
+        command = self.core.next_command()
+        self.core.measured(HandState.of(self.q, stamp=self.clock.now(), **state))  # type: ignore[arg-type]
+        return command
+
+    def command(self, q: float, **fields: float) -> bool:
+        return self.core.submit(HandCommand.position(q, **fields))
+
+
+def test_it_brakes_before_the_first_command() -> None:
+    bench = Bench()
+    assert bench.exchange().is_brake
+    assert bench.core.counters.brakes == 0  # nothing was driven, so nothing stopped
+    assert bench.core.view() is not None
+
+
+def test_the_newest_command_wins() -> None:
+    bench = Bench()
+    for q in (1.1, 1.2, 1.3):
+        bench.command(q)
+    assert bench.exchange().q[0] == 1.3
+
+
+@given(st.floats(0.0, 0.999), st.floats(1.0, 10.0))
+@settings(deadline=None)
+def test_the_watchdog_brakes_after_a_second_and_not_before(early: float, late: float) -> None:
+    bench = Bench()
+    bench.command(2.0)
+    bench.clock.advance(early * TIMEOUT)
+    assert not bench.exchange().is_brake
+    assert bench.core.driving
+    bench.clock.advance((late - early) * TIMEOUT)
+    assert bench.exchange().is_brake
+    assert not bench.core.driving
+    assert bench.core.counters.brakes == 1
+    bench.command(2.5)
+    assert bench.exchange().q[0] == 2.5
+
+
+def test_state_goes_on_while_braking() -> None:
+    bench = Bench()
+    bench.command(2.0)
+    bench.clock.advance(5.0)
+    bench.q = 1.7
+    bench.exchange()
+    view = bench.core.view()
+    assert view is not None
+    assert (view.state.q[0], view.fault) == (1.7, (0,))
+
+
+@pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_rejected_command_leaves_the_last_one_in_force(field: str, value: float) -> None:
+    bench = Bench()
+    assert bench.command(2.0)
+    bad = HandCommand.position(3.0)
+    getattr(bad, field)[0] = value
+    assert not bench.core.submit(bad)
+    assert bench.exchange().q[0] == 2.0
+    assert (bench.core.counters.accepted, bench.core.counters.rejected) == (1, 1)
+
+
+def test_rejected_commands_do_not_feed_the_watchdog() -> None:
+    bench = Bench()
+    bench.command(2.0)
+    for _ in range(11):
+        bench.clock.advance(TIMEOUT / 10)
+        bench.command(math.nan)
+    assert bench.exchange().is_brake
+
+
+def test_commands_outside_the_limits_are_clamped_and_counted() -> None:
+    bench = Bench()
+    bench.command(99.0)
+    assert bench.exchange().q[0] == pytest.approx(5.4)
+    assert bench.core.counters.clamped == 1
+
+
+class TestLostLink:
+    def test_what_is_published_shows_it(self) -> None:
+        bench = Bench()
+        assert bench.core.failed(HandLost("unplugged"))
+        bench.core.closed()
+        view = bench.core.view()
+        assert view is not None
+        assert view.state.q[0] == 1.0  # the last that is known
+        assert view.fault == (LINK,)
+        assert view.missed == 1
+        bench.core.retry_failed()
+        view = bench.core.view()
+        assert view is not None
+        assert (view.missed, view.fault) == (2, (LINK,))
+
+    def test_after_it_only_a_new_command_moves(self) -> None:
+        bench = Bench()
+        bench.command(3.0)
+        assert not bench.exchange().is_brake
+        bench.core.failed(HandLost("unplugged"))
+        bench.core.closed()
+        bench.clock.advance(0.1)
+        bench.command(3.5)  # still while it is away
+        bench.clock.advance(0.1)
+        bench.core.opened(bench.spec)
+        assert bench.exchange().is_brake
+        view = bench.core.view()
+        assert view is not None
+        assert (view.fault, view.missed) == ((0,), 0)
+        bench.clock.advance(0.001)
+        bench.command(3.6)
+        assert bench.exchange().q[0] == 3.6
+
+    def test_a_hang_shows_although_nothing_fails(self) -> None:
+        bench = Bench()
+        bench.clock.advance(0.1)
+        first = bench.core.view()
+        assert first is not None
+        assert first.fault == (0,)
+        bench.clock.advance(0.5)
+        view = bench.core.view()
+        assert view is not None
+        assert (view.fault, view.missed) == ((LINK,), 1)
+        assert bench.core.view() is view  # nothing new to encode
+        bench.exchange()
+        view = bench.core.view()
+        assert view is not None
+        assert (view.fault, view.missed) == ((0,), 0)
+
+
+class TestFailedExchanges:
+    def test_single_timeouts_pass_and_show(self) -> None:
+        bench = Bench()
+        bench.command(3.0)
+        bench.clock.advance(0.01)
+        assert not bench.core.failed(HandTimeout("no answer"))
+        view = bench.core.view()
+        assert view is not None
+        assert (view.missed, view.fault) == (1, (0,))
+        assert bench.exchange().q[0] == 3.0  # it goes on
+        assert bench.core.counters.exchange_errors == 1
+
+    def test_half_a_second_of_timeouts_is_a_loss(self) -> None:
+        bench = Bench()
+        for _ in range(5):
+            bench.clock.advance(0.1)
+            assert not bench.core.failed(HandTimeout("no answer"))
+        bench.clock.advance(0.1)
+        assert bench.core.failed(HandTimeout("no answer"))
+
+    def test_a_fault_brakes_and_shows_its_bits(self) -> None:
+        bench = Bench()
+        bench.command(3.0)
+        bench.exchange()
+        bits = int(MotorError.OVERCURRENT)
+        bench.clock.advance(0.01)
+        assert not bench.core.failed(HandFault("overload", bits=[bits]))
+        assert bench.core.next_command().is_brake
+        bench.command(3.1)
+        assert bench.core.next_command().is_brake
+        view = bench.core.view()
+        assert view is not None
+        assert (view.fault, view.missed) == ((bits,), 1)
+        # the bits stay when the next exchange merely times out
+        bench.core.failed(HandTimeout("no answer"))
+        view = bench.core.view()
+        assert view is not None
+        assert (view.fault, view.missed) == ((bits,), 2)
+        assert bench.core.counters.faults == 1
+        assert bench.core.counters.brakes == 1
+
+    def test_after_a_fault_only_a_new_command_moves(self) -> None:
+        bench = Bench()
+        bench.command(3.0)
+        bench.core.failed(HandFault("overload", bits=[1]))
+        bench.clock.advance(0.01)
+        bench.command(3.1)
+        bench.clock.advance(0.01)
+        assert bench.exchange().is_brake
+        assert bench.exchange().is_brake
+        bench.clock.advance(0.01)
+        bench.command(3.2)
+        assert bench.exchange().q[0] == 3.2
+
+    @pytest.mark.parametrize("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
+    def test_anything_else_is_a_loss(self, error: Exception) -> None:
+        assert Bench().core.failed(error)
+
+    def test_a_rejection_by_the_hand_is_not(self) -> None:
+        assert not Bench().core.failed(CommandRejected("it does not like it"))
+
+    @pytest.mark.parametrize("q", [[math.nan], [math.inf], [0.0, 0.0]])
+    def test_a_state_that_is_none_is_a_failure(self, q: list[float]) -> None:
+        bench = Bench()
+        with pytest.raises(HandError, match="backend returned"):
+            bench.core.measured(HandState.of(q, stamp=0.0))
+        view = bench.core.view()
+        assert view is not None
+        assert view.state.q[0] == 1.0
+
+    def test_fault_bits_of_a_state_are_published(self) -> None:
+        bench = Bench()
+        bench.exchange(fault=int(MotorError.CASE_TEMPERATURE))
+        view = bench.core.view()
+        assert view is not None
+        assert view.fault == (0x80,)
+
+
+class TestPrediction:
+    def test_auto_goes_by_what_clients_need(self) -> None:
+        assert not Bench(io_rate=300.0).core.predicting
+        assert Bench(io_rate=30.0).core.predicting
+
+    def test_auto_sees_a_link_that_is_slower_than_it_says(self) -> None:
+        bench = Bench(io_rate=300.0)
+        bench.clock.advance(0.1)
+        bench.exchange()
+        assert not bench.core.predicting  # one hiccup is not a slow link
+        for _ in range(50):
+            bench.clock.advance(1 / 30)
+            bench.exchange()
+        assert bench.core.predicting
+        assert bench.core.measured_rate == pytest.approx(30, rel=0.05)
+        for _ in range(400):
+            bench.clock.advance(1 / 300)
+            bench.exchange()
+        assert not bench.core.predicting
+
+    def test_off_and_predict_are_what_they_say(self) -> None:
+        assert not Bench(io_rate=5.0, estimation=Estimation.OFF).core.predicting
+        assert Bench(io_rate=900.0, estimation=Estimation.PREDICT).core.predicting
+
+    def test_a_slow_link_is_predicted_from_the_command_on(self) -> None:
+        bench = Bench(io_rate=5.0, speeds=[(2.0, 2.0)])
+        bench.command(5.0)
+        bench.clock.advance(0.1)
+        view = bench.core.view()
+        assert view is not None
+        assert view.state.q[0] == pytest.approx(1.2)
+        assert not view.state.measured
+
+    def test_a_lost_link_is_not_predicted(self) -> None:
+        bench = Bench(io_rate=5.0, speeds=[(2.0, 2.0)])
+        bench.command(5.0)
+        bench.core.failed(HandLost("unplugged"))
+        bench.core.closed()
+        bench.clock.advance(0.3)
+        view = bench.core.view()
+        assert view is not None
+        assert (view.state.q[0], view.state.measured) == (1.0, True)
+
+    def test_the_watchdog_stops_the_prediction_too(self) -> None:
+        bench = Bench(io_rate=5.0, speeds=[(0.1, 0.1)])
+        bench.command(5.0)
+        bench.clock.advance(TIMEOUT)
+        bench.q = 1.1  # where the prediction is
+        bench.exchange()
+        first = bench.core.view()
+        bench.clock.advance(0.1)
+        second = bench.core.view()
+        assert first is not None
+        assert second is not None
+        assert np.array_equal(first.state.q, second.state.q)
+
+
+class TestSoftStart:
+    def drive(self, bench: Bench, q: float, seconds: float) -> float:
+        fastest = 0.0
+        for _ in range(round(seconds * 100)):
+            bench.clock.advance(0.01)
+            bench.command(q)
+            sent = bench.exchange().q[0]
+            fastest = max(fastest, abs(sent - bench.q) / 0.01)
+            bench.q = float(sent)
+        return fastest
+
+    def test_a_real_hand_starts_at_one_stroke_a_second(self) -> None:
+        bench = Bench(simulated=False)
+        assert self.drive(bench, 5.4, 2.0) <= 5.4 + 1e-6
+        assert bench.q == 5.4
+        # it has caught up: from now on commands go through as they are
+        assert self.drive(bench, 0.0, 0.01) == pytest.approx(540.0)
+
+    def test_and_again_after_a_reconnection(self) -> None:
+        bench = Bench(simulated=False)
+        self.drive(bench, 2.0, 2.0)
+        bench.core.failed(HandLost("x"))
+        bench.core.closed()
+        bench.core.opened(bench.spec)
+        assert self.drive(bench, 5.0, 0.2) <= 5.4 + 1e-6
+
+    def test_a_simulated_hand_does_not(self) -> None:
+        bench = Bench()
+        bench.command(5.4)
+        assert bench.exchange().q[0] == 5.4
+
+
+def test_backoff_doubles_up_to_its_maximum() -> None:
+    backoff = Backoff()
+    assert [backoff.next() for _ in range(7)] == [0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0]
+    backoff.reset()
+    assert backoff.next() == 0.1
