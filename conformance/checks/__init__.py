@@ -1,0 +1,151 @@
+"""The checks: each judges a recording for one requirement and one side.
+
+A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes on
+missing evidence, and takes every figure from its requirement's tolerances. Modules, by what
+they look at: :mod:`~dexkit.conformance.checks.discovery`, :mod:`~.timing`, :mod:`~.fields`,
+:mod:`~.motion`, :mod:`~.force`, :mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+from dexkit.conformance.phases import Phase
+from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.results import Evidence
+from dexkit.conformance.view import Commands, Recording, SideView, States
+from dexkit.hand import Side
+
+__all__ = ["Check", "Context", "Outcome", "all_checks", "check"]
+
+_MODULES = (
+    "discovery",
+    "timing",
+    "fields",
+    "motion",
+    "force",
+    "safety",
+    "lifecycle",
+    "tracking",
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a check found.
+
+    :param met: whether the requirement is met; None when it could not be judged.
+    :param harness: it could not be judged because of the kit's own machine.
+    """
+
+    met: bool | None
+    figure: str = ""
+    observed: str = ""
+    reason: str = ""
+    evidence: tuple[Evidence, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    harness: bool = False
+
+
+@dataclass(frozen=True)
+class Context:
+    """One requirement to be judged for one side of a recording."""
+
+    recording: Recording
+    hand: SideView
+    requirement: Requirement
+
+    @property
+    def side(self) -> Side:
+        """The side to be judged."""
+        return self.hand.side
+
+    @property
+    def states(self) -> States:
+        """Its states."""
+        return self.hand.states
+
+    @property
+    def commands(self) -> Commands:
+        """The commands to it."""
+        return self.hand.commands
+
+    @property
+    def stroke(self) -> float:
+        """Full stroke in the dialect's radians."""
+        return self.recording.dialect.q_open
+
+    def tolerance(self, name: str) -> float:
+        """A figure of the requirement; ``NAME_stroke`` comes in radians."""
+        value = self.requirement.tolerance(name)
+        return value * self.stroke if name.endswith("_stroke") else value
+
+    def phases(self, name: str | None = None) -> list[Phase]:
+        """The phases of this side, by default those that the requirement needs."""
+        return self.recording.phases(name or self.requirement.phase or "", self.side)
+
+    def span(self, phase: Phase) -> tuple[float, float]:
+        """Begin and end of a phase, seconds."""
+        return self.recording.seconds(phase.begin_ns), self.recording.seconds(phase.end_ns)
+
+    @property
+    def object_q(self) -> float | None:
+        """Where this side touches its object, as far as is known."""
+        return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
+
+    # -- outcomes ---------------------------------------------------------------------------
+
+    def at(self, topic: str, seconds: float, end: float | None = None) -> Evidence:
+        """A place in the recording."""
+        return Evidence(
+            topic=topic,
+            time_s=round(seconds, 4),
+            log_time_ns=self.recording.log_time(seconds),
+            end_s=None if end is None else round(end, 4),
+        )
+
+    def passed(self, figure: str, observed: str = "", **values: float) -> Outcome:
+        """The requirement is met."""
+        return Outcome(True, figure, observed, values=_plain(values))
+
+    def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
+        """It is not."""
+        return Outcome(False, figure, observed, evidence=places[:5], values=_plain(values))
+
+    def skipped(self, reason: str) -> Outcome:
+        """It cannot be judged here."""
+        return Outcome(None, reason=reason)
+
+    def disturbed(self, reason: str) -> Outcome:
+        """It cannot be judged because of the kit's own machine."""
+        return Outcome(None, reason=reason, harness=True)
+
+
+def _plain(values: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items()}
+
+
+Check = Callable[[Context], Outcome]
+_REGISTRY: dict[str, Check] = {}
+
+
+def check(requirement_id: str) -> Callable[[Check], Check]:
+    """Register the decorated function as the check of a requirement."""
+
+    def register(function: Check) -> Check:
+        assert requirement_id not in _REGISTRY, f"{requirement_id} has two checks"
+        _REGISTRY[requirement_id] = function
+        return function
+
+    return register
+
+
+@cache
+def all_checks() -> Mapping[str, Check]:
+    """Every check, by requirement id."""
+    for name in _MODULES:
+        importlib.import_module(f"{__name__}.{name}")
+    return dict(_REGISTRY)

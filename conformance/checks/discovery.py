@@ -1,0 +1,86 @@
+"""Topics, types and quality of service."""
+
+from __future__ import annotations
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.traces import TraceEndpoint
+
+
+def _endpoints(ctx: Context, topic: str, kind: str) -> list[TraceEndpoint]:
+    return [e for e in ctx.recording.endpoints if e.topic == topic and e.kind == kind]
+
+
+@check("DEX1-TOPIC-01")
+def state_topic(ctx: Context) -> Outcome:
+    """The state topic carries samples of the right type."""
+    dialect = ctx.recording.dialect
+    topic, wanted = ctx.states.topic, dialect.state_type
+    channels = [c for c in ctx.recording.channels if c.topic == topic]
+    right = [c for c in channels if c.type_name == wanted and c.message_count]
+    if right and right[0].problem:
+        return ctx.failed("unreadable", f"samples on {topic}, but {right[0].problem}")
+    if right:
+        return ctx.passed(wanted.rpartition("::")[2], f"{len(ctx.states)} samples of {wanted}")
+    types = {c.type_name for c in channels if c.message_count}
+    types |= {e.type_name for e in _endpoints(ctx, topic, "writer") if e.type_name}
+    others = types - {wanted}
+    if others:
+        return ctx.failed("wrong type", f"{topic} has type {', '.join(sorted(others))}")
+    if types or _endpoints(ctx, topic, "writer"):
+        return ctx.failed("no sample", f"a publisher of {topic} was seen, but no sample came")
+    similar = sorted(
+        {c.topic for c in ctx.recording.channels if c.topic.endswith("state")} - {topic}
+    )
+    seen = f"; other state topics: {', '.join(similar)}" if similar else ""
+    return ctx.failed("no topic", f"nobody publishes {topic}{seen}")
+
+
+@check("DEX1-TOPIC-02")
+def command_topic(ctx: Context) -> Outcome:
+    """Somebody subscribes to the command topic with the right type."""
+    topic, wanted = ctx.commands.topic, ctx.recording.dialect.cmd_type
+    readers = _endpoints(ctx, topic, "reader")
+    if not readers:
+        return ctx.failed("no reader", f"nobody subscribes to {topic}")
+    types = {r.type_name for r in readers}
+    if wanted in types:
+        return ctx.passed(wanted.rpartition("::")[2], f"a reader of {wanted}")
+    if "" in types:
+        return ctx.skipped(f"{topic} has a reader, but the recording does not say of which type")
+    return ctx.failed("wrong type", f"{topic} is read as {', '.join(sorted(types))}")
+
+
+@check("DEX1-QOS-01")
+def command_qos(ctx: Context) -> Outcome:
+    """The command reader is compatible with a RELIABLE, VOLATILE writer."""
+    readers = _endpoints(ctx, ctx.commands.topic, "reader")
+    if not any(r.durability for r in readers):
+        return ctx.skipped("the recording does not say the reader's durability")
+    bad = [r for r in readers if r.durability and r.durability.lower() != "volatile"]
+    if len(bad) == len(readers):
+        return ctx.failed(
+            bad[0].durability,
+            f"the reader asks for {bad[0].durability}; official clients offer VOLATILE",
+        )
+    shown = next(r for r in readers if r not in bad)
+    return ctx.passed(_qos(shown), f"the reader asks for {_qos(shown)}")
+
+
+@check("DEX1-QOS-02")
+def state_qos(ctx: Context) -> Outcome:
+    """The state writer is reliable."""
+    writers = _endpoints(ctx, ctx.states.topic, "writer")
+    if not writers:
+        return ctx.skipped("the recording names no writer of the state topic")
+    bad = [w for w in writers if w.reliability.lower() != "reliable"]
+    if bad:
+        return ctx.failed(bad[0].reliability, f"the writer offers {_qos(bad[0])}")
+    return ctx.passed(_qos(writers[0]), f"the writer offers {_qos(writers[0])}")
+
+
+def _qos(endpoint: TraceEndpoint) -> str:
+    return ", ".join(
+        part.lower().replace("_", " ")
+        for part in (endpoint.reliability, endpoint.durability)
+        if part
+    )

@@ -1,0 +1,90 @@
+"""tau_est: in contact, at rest, and its sign."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+
+
+def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
+    """(median tau_est, begin, end) over the last half second of the last squeeze."""
+    for phase in reversed(ctx.phases()):
+        begin, end = ctx.span(phase)
+        begin = max(begin, end - 0.5)
+        tau = ctx.states.tau[ctx.states.between(begin, end)]
+        tau = tau[np.isfinite(tau)]
+        if len(tau):
+            return float(np.median(tau)), begin, end
+    return None
+
+
+@check("DEX1-FORCE-01")
+def in_contact(ctx: Context) -> Outcome:
+    """tau_est while squeezing an object."""
+    if ctx.object_q is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = _squeeze(ctx)
+    if found is None:
+        return ctx.skipped("no state while it squeezed")
+    tau, begin, end = found
+    text = f"tau_est {tau:.3f} N m while squeezing"
+    if abs(tau) >= ctx.tolerance("min_tau_nm"):
+        return ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
+    return ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
+
+
+@check("DEX1-FORCE-02")
+def at_rest(ctx: Context) -> Outcome:
+    """tau_est where the gripper stands at its target, free."""
+    states, commands = ctx.states, ctx.commands
+    if len(commands) < 2:
+        return ctx.skipped("no commands to this hand")
+    window = ctx.tolerance("min_rest_s")
+    known = ctx.recording.stimulus is not None
+    taus: list[tuple[float, float]] = []
+    begin = float(commands.t[0])
+    while begin + window <= float(commands.t[-1]):
+        end = begin + window
+        rows = states.between(begin, end)
+        asked = slice(*np.searchsorted(commands.t, [begin, end]))
+        q, tau, goal = states.q[rows], states.tau[rows], commands.q[asked]
+        free = (
+            len(q) >= 5
+            and len(goal) >= 3
+            and np.isfinite(q).all()
+            and np.isfinite(goal).all()
+            and float(np.ptp(q)) <= ctx.tolerance("max_ripple_stroke")
+            and float(np.ptp(goal)) <= ctx.tolerance("max_ripple_stroke")
+            and float(np.abs(np.median(q) - np.median(goal))) <= ctx.tolerance("max_error_stroke")
+            and (commands.kp[asked] > 0).all()
+            and not (known and ctx.object_q is not None and float(q.min()) <= ctx.object_q + 0.1)
+        )
+        if free:
+            taus.append((float(np.median(np.abs(tau))), begin))
+        begin = end
+    if not taus:
+        return ctx.skipped("the gripper never rests at its target in this recording")
+    # the middle of all rests: one of them may be a touch that nobody announced
+    level, begin = sorted(taus)[len(taus) // 2]
+    text = f"tau_est {level:.3f} N m at rest (median of {len(taus)} rests)"
+    if level <= ctx.tolerance("max_tau_nm"):
+        return ctx.passed(f"{level:.3f} N m", text, tau_nm=level)
+    return ctx.failed(
+        f"{level:.2f} N m", text, ctx.at(states.topic, begin, begin + window), tau_nm=level
+    )
+
+
+@check("DEX1-FORCE-03")
+def sign(ctx: Context) -> Outcome:
+    """Sign of tau_est while squeezing."""
+    if ctx.object_q is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = _squeeze(ctx)
+    if found is None or found[0] == 0.0:
+        return ctx.skipped("no force was reported while it squeezed")
+    tau, begin, end = found
+    text = f"tau_est {tau:+.3f} N m while closing on an object"
+    if tau < 0:
+        return ctx.passed("negative", text, tau_nm=tau)
+    return ctx.failed("positive", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)

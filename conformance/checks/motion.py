@@ -1,0 +1,257 @@
+"""Steps: direction, arrival, settling, speed, overshoot, independence, zero gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.phases import Phase
+from dexkit.hand import Floats
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the target and what q did.
+
+    :param start: q before it.
+    :param final: q at its end (median of the last 0.2 s).
+    """
+
+    begin: float
+    end: float
+    target: float
+    start: float
+    final: float
+    t: Floats
+    q: Floats
+
+    @property
+    def size(self) -> float:
+        """How far it was to go, with sign."""
+        return self.target - self.start
+
+    @property
+    def error(self) -> float:
+        """How far from the target it ended."""
+        return abs(self.final - self.target)
+
+    def __str__(self) -> str:
+        return (
+            f"commanded from {self.start:.2f} to {self.target:.2f} rad, q went to {self.final:.2f}"
+        )
+
+
+def step_of(ctx: Context, phase: Phase) -> Step | None:
+    """A phase with a target as a step of this side; None without states in it."""
+    begin, end = ctx.span(phase)
+    states = ctx.states
+    rows = states.between(begin, end)
+    t, q = states.t[rows], states.q[rows]
+    before = states.q[states.between(begin - 0.1, begin)]
+    before = before[np.isfinite(before)]
+    good = np.isfinite(q)
+    t, q = t[good], q[good]
+    if not len(q) or ctx.side not in phase.targets:
+        return None
+    return Step(
+        begin=begin,
+        end=end,
+        target=phase.targets[ctx.side],
+        start=float(np.median(before)) if len(before) else float(q[0]),
+        final=float(np.median(q[t >= end - 0.2])) if (t >= end - 0.2).any() else float(q[-1]),
+        t=t,
+        q=q,
+    )
+
+
+def steps(ctx: Context) -> list[Step]:
+    """The steps of this side."""
+    return [s for p in ctx.phases() if (s := step_of(ctx, p)) is not None]
+
+
+@check("DEX1-MOVE-01")
+def direction(ctx: Context) -> Outcome:
+    """Progress towards the target, as a part of the step."""
+    found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * ctx.stroke]
+    if not found:
+        return ctx.failed(
+            "no step",
+            "no step could be made: there is no state during the steps, or q already "
+            "was at every target",
+        )
+    progress = [(s.final - s.start) / s.size for s in found]
+    worst = int(np.argmin(progress))
+    if progress[worst] >= ctx.tolerance("min_progress"):
+        return ctx.passed(
+            f"{len(found)} of {len(found)}",
+            f"{len(found)} steps, all the right way",
+            steps=len(found),
+        )
+    step = found[worst]
+    moved = float(np.ptp(step.q))
+    verdict = "it did not move" if moved < 0.02 * ctx.stroke else "that is the wrong way"
+    if progress[worst] > -0.05 and moved >= 0.02 * ctx.stroke:
+        verdict = "it did not get there"
+    return ctx.failed(
+        f"{progress[worst]:+.0%}",
+        f"{step}: {verdict}",
+        ctx.at(ctx.states.topic, step.begin, step.end),
+        progress=progress[worst],
+    )
+
+
+@check("DEX1-MOVE-02")
+def arrives(ctx: Context) -> Outcome:
+    """Distance from the target at the end of each step."""
+    found = steps(ctx)
+    if not found:
+        return ctx.failed("no state", f"no state of the {ctx.side} hand during the steps")
+    worst = max(found, key=lambda s: s.error)
+    if worst.error <= ctx.tolerance("max_error_stroke"):
+        return ctx.passed(
+            f"{worst.error:.3f} rad",
+            f"{len(found)} steps, ending at most {worst.error:.3f} rad off",
+            error_rad=worst.error,
+        )
+    return ctx.failed(
+        f"{worst.error:.2f} rad",
+        f"{worst}",
+        ctx.at(ctx.states.topic, worst.begin, worst.end),
+        error_rad=worst.error,
+    )
+
+
+@check("DEX1-MOVE-03")
+def settles(ctx: Context) -> Outcome:
+    """Ripple of q at the end of each step."""
+    ripples = []
+    window = ctx.tolerance("window_s")
+    for step in steps(ctx):
+        tail = step.q[step.t >= step.end - window]
+        if len(tail) >= 5:
+            ripples.append((float(np.ptp(tail)), step))
+    if not ripples:
+        return ctx.skipped("too few states at the end of the steps")
+    ripple, step = max(ripples, key=lambda r: r[0])
+    if ripple <= ctx.tolerance("max_ripple_stroke"):
+        return ctx.passed(
+            f"{ripple:.3f} rad", f"ripple of at most {ripple:.3f} rad", ripple_rad=ripple
+        )
+    return ctx.failed(
+        f"{ripple:.2f} rad",
+        f"at the target {step.target:.2f} rad q still moves by {ripple:.2f} rad, peak to peak",
+        ctx.at(ctx.states.topic, step.end - window, step.end),
+        ripple_rad=ripple,
+    )
+
+
+@check("DEX1-MOVE-04")
+def speed(ctx: Context) -> Outcome:
+    """Speed from 10 to 90 % of each large step."""
+    found = []
+    for step in steps(ctx):
+        if abs(step.size) < ctx.tolerance("min_step_stroke"):
+            continue
+        part = (step.q - step.start) / step.size
+        low, high = np.argmax(part >= 0.1), np.argmax(part >= 0.9)
+        if part[high] < 0.9 or high <= low:
+            continue
+        seconds = max(float(step.t[high] - step.t[low]), 1e-3)
+        found.append((0.8 * abs(step.size) / seconds, step))
+    if not found:
+        return ctx.skipped("no step of that size was finished")
+    slowest, step = min(found, key=lambda f: f[0])
+    text = f"{slowest:.2f} rad/s in the slowest of {len(found)} large steps"
+    if slowest >= ctx.tolerance("min_speed_rad_s"):
+        return ctx.passed(f"{slowest:.1f} rad/s", text, speed_rad_s=slowest)
+    return ctx.failed(
+        f"{slowest:.1f} rad/s",
+        text,
+        ctx.at(ctx.states.topic, step.begin, step.end),
+        speed_rad_s=slowest,
+    )
+
+
+@check("DEX1-MOVE-05")
+def overshoot(ctx: Context) -> Outcome:
+    """How far q goes beyond the target."""
+    found = [
+        (float(np.max((s.q - s.target) * np.sign(s.size))), s)
+        for s in steps(ctx)
+        if abs(s.size) >= 0.1 * ctx.stroke
+    ]
+    if not found:
+        return ctx.skipped("no step of that size")
+    beyond, step = max(found, key=lambda f: f[0])
+    beyond = max(beyond, 0.0)
+    if beyond <= ctx.tolerance("max_overshoot_stroke"):
+        return ctx.passed(
+            f"{beyond:.3f} rad", f"at most {beyond:.3f} rad beyond the target", overshoot_rad=beyond
+        )
+    return ctx.failed(
+        f"{beyond:.2f} rad",
+        f"{beyond:.2f} rad beyond the target {step.target:.2f} rad",
+        ctx.at(ctx.states.topic, step.begin, step.end),
+        overshoot_rad=beyond,
+    )
+
+
+@check("DEX1-SIDE-01")
+def independent(ctx: Context) -> Outcome:
+    """Motion of this hand while only the other one's target changes."""
+    others = [p for p in ctx.recording.phases("step") if ctx.side not in p.sides]
+    if not others:
+        return ctx.skipped("only one side was commanded")
+    moved: list[tuple[float, float, float]] = []
+    for phase in others:
+        begin, end = ctx.span(phase)
+        q = ctx.states.q[ctx.states.between(begin, end)]
+        q = q[np.isfinite(q)]
+        if len(q):
+            moved.append((float(np.ptp(q)), begin, end))
+    if not moved:
+        return ctx.skipped("no state of this hand while the other one moved")
+    most, begin, end = max(moved)
+    other = "right" if ctx.side == "left" else "left"
+    if most <= ctx.tolerance("max_motion_stroke"):
+        return ctx.passed(
+            f"{most:.3f} rad",
+            f"moved by {most:.3f} rad in {len(moved)} steps of the {other} hand",
+            motion_rad=most,
+        )
+    return ctx.failed(
+        f"{most:.2f} rad",
+        f"moved by {most:.2f} rad while only the {other} hand was commanded to move",
+        ctx.at(ctx.states.topic, begin, end),
+        motion_rad=most,
+    )
+
+
+@check("DEX1-GAIN-01")
+def zero_gains(ctx: Context) -> Outcome:
+    """Motion towards q while all gains are zero."""
+    worst: tuple[float, Step] | None = None
+    for phase in ctx.phases():
+        step = step_of(ctx, phase)
+        if step is None:
+            continue
+        towards = float(np.max((step.q - step.start) * np.sign(step.size)))
+        if worst is None or towards > worst[0]:
+            worst = (towards, step)
+    if worst is None:
+        return ctx.skipped("no state while the gains were zero")
+    towards, step = max(worst[0], 0.0), worst[1]
+    if towards <= ctx.tolerance("max_motion_stroke"):
+        return ctx.passed(
+            f"{towards:.3f} rad",
+            f"moved {towards:.3f} rad towards a q that was {abs(step.size):.2f} rad away",
+            motion_rad=towards,
+        )
+    return ctx.failed(
+        f"{towards:.2f} rad",
+        f"moved {towards:.2f} rad towards q = {step.target:.2f} with kp = kd = 0",
+        ctx.at(ctx.states.topic, step.begin, step.end),
+        motion_rad=towards,
+    )

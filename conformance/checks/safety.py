@@ -1,0 +1,241 @@
+"""Bad commands and no commands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.motion import Step, step_of
+from dexkit.conformance.checks.timing import blame, gaps
+from dexkit.conformance.phases import Phase
+
+
+def _recovery(ctx: Context, phase: Phase) -> Step | None:
+    """The step that follows a bad command."""
+    for after in ctx.phases("recover"):
+        if after.params.get("after") == phase.name and after.begin_ns >= phase.end_ns:
+            return step_of(ctx, after)
+    return None
+
+
+def _unharmed(ctx: Context, what: str) -> Outcome:
+    """State goes on, and the hand obeys afterwards. ``met`` None: nothing wrong so far."""
+    topic = ctx.states.topic
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        found = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end + 0.2)
+        guilty = blame(ctx, found)
+        if guilty:
+            a, b = guilty[0]
+            return ctx.failed(
+                "state stops",
+                f"state stopped at {a:.3f} s, during {what}",
+                ctx.at(topic, a, b),
+            )
+        if found:
+            return ctx.disturbed("the kit's own machine stood still during this stimulus")
+        step = _recovery(ctx, phase)
+        if step is None:
+            return ctx.failed(
+                "no state", f"no state after {what}, when a good command came", ctx.at(topic, end)
+            )
+        if step.error > ctx.tolerance("max_error_stroke"):
+            return ctx.failed(
+                "disobeys",
+                f"after {what}: {step}",
+                ctx.at(topic, step.begin, step.end),
+                error_rad=step.error,
+            )
+    return Outcome(None)
+
+
+def _stays(ctx: Context, what: str) -> Outcome:
+    """Nothing moves, then :func:`_unharmed`."""
+    most = 0.0
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        rows = ctx.states.between(begin, end)
+        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+        q = ctx.states.q[rows]
+        if not len(before) or not len(q):
+            continue
+        with np.errstate(invalid="ignore"):
+            deviation = np.abs(q - np.median(before))
+        if not np.isfinite(deviation).all():
+            i = int(np.argmin(np.isfinite(deviation)))
+            return ctx.failed(
+                "q not finite",
+                f"q became {q[i]} during {what}",
+                ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+            )
+        i = int(np.argmax(deviation))
+        most = max(most, float(deviation[i]))
+        if most > ctx.tolerance("max_motion_stroke"):
+            return ctx.failed(
+                f"{most:.2f} rad",
+                f"moved by {most:.2f} rad during {what}",
+                ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                motion_rad=most,
+            )
+    outcome = _unharmed(ctx, what)
+    if outcome.met is False or outcome.harness:
+        return outcome
+    return ctx.passed(
+        f"{most:.3f} rad", f"moved by {most:.3f} rad during {what}, then obeyed", motion_rad=most
+    )
+
+
+@check("DEX1-SAFE-01")
+def not_finite(ctx: Context) -> Outcome:
+    """NaN and infinity in every field."""
+    return _stays(ctx, "commands with NaN and infinity")
+
+
+@check("DEX1-SAFE-02")
+def out_of_range(ctx: Context) -> Outcome:
+    """Positions far outside the stroke."""
+    margin = ctx.tolerance("margin_rad")
+    low, high = np.inf, -np.inf
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        rows = ctx.states.between(begin, end + 0.1)
+        q = ctx.states.q[rows]
+        if not len(q):
+            continue
+        bad = ~((q >= -margin) & (q <= ctx.stroke + margin))
+        if bad.any():
+            i = int(np.argmax(bad))
+            return ctx.failed(
+                f"{q[i]:.2f} rad",
+                f"q became {q[i]:.2f} rad; the stroke is 0 to {ctx.stroke:.2f} rad",
+                ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+            )
+        low, high = min(low, float(q.min())), max(high, float(q.max()))
+    outcome = _unharmed(ctx, "commands far out of range")
+    if outcome.met is False or outcome.harness:
+        return outcome
+    return ctx.passed(
+        f"{low:.2f} .. {high:.2f} rad",
+        "q stayed within the stroke, then obeyed",
+        q_min=low,
+        q_max=high,
+    )
+
+
+@check("DEX1-SAFE-03")
+def empty(ctx: Context) -> Outcome:
+    """Commands without a motor in them."""
+    return _stays(ctx, "empty commands")
+
+
+def _silences(ctx: Context) -> list[tuple[float, float]]:
+    """(last command, end) of each silence."""
+    found = []
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        sent = ctx.commands.t[ctx.commands.t <= end]
+        last = float(sent[-1]) if len(sent) else begin
+        found.append((max(last, begin) if last <= begin + 0.05 else last, end))
+    return found
+
+
+@check("DEX1-WDOG-01")
+def brakes(ctx: Context) -> Outcome:
+    """Motion and force after the time-out, of a hand that moved or pressed when silence began.
+
+    A hand that merely stands at its target looks the same with and without a brake; so the
+    silence begins while it is driven by a velocity, or presses on an object.
+    """
+    timeout = ctx.tolerance("timeout_s")
+    states = ctx.states
+    proofs: list[str] = []
+    values: dict[str, float] = {}
+    for last, end in _silences(ctx):
+        free = states.between(last, last + timeout)
+        late = states.between(last + timeout + ctx.tolerance("grace_s"), end)
+        q_free, q_late = states.q[free], states.q[late]
+        before = states.tau[states.between(last - 0.2, last)]
+        if len(q_late) < 5 or not len(q_free) or not len(before):
+            continue
+        moved = float(np.ptp(q_late))
+        if moved > ctx.tolerance("max_motion_stroke"):
+            return ctx.failed(
+                f"{moved:.2f} rad",
+                f"moved by {moved:.2f} rad more than {timeout:g} s after the last command",
+                ctx.at(states.topic, last + timeout, end),
+                motion_rad=moved,
+            )
+        if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke"):
+            proofs.append(f"was moving, then moved only {moved:.3f} rad")
+            values["motion_rad"] = moved
+        pressed = float(np.median(np.abs(before)))
+        if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_q is not None:
+            still = float(np.median(np.abs(states.tau[late])))
+            if still > ctx.tolerance("max_tau_part") * pressed:
+                return ctx.failed(
+                    f"{still:.2f} N m",
+                    f"pressed with {pressed:.2f} N m at the last command, and still with "
+                    f"{still:.2f} N m after the time-out",
+                    ctx.at(states.topic, last + timeout, end),
+                    tau_nm=still,
+                )
+            proofs.append(f"pressed with {pressed:.2f} N m, then with {still:.2f} N m")
+            values["tau_nm"] = still
+    if not proofs:
+        return ctx.skipped(
+            "this hand neither moved (it does not follow velocity commands) nor pressed on an "
+            "object when the commands stopped: braking cannot be told from holding"
+        )
+    figure = "stops" if "motion_rad" in values else "lets go"
+    return ctx.passed(figure, "; ".join(proofs), **values)
+
+
+@check("DEX1-WDOG-02")
+def state_in_silence(ctx: Context) -> Outcome:
+    """Gaps of the state while no command comes."""
+    limit = ctx.tolerance("max_gap_s")
+    spans = [(a, b) for a, b in _silences(ctx) if b - a >= ctx.tolerance("min_silence_s")]
+    if not spans:
+        return ctx.skipped("no silence that was long enough")
+    longest = 0.0
+    for begin, end in spans:
+        found = gaps(ctx, limit, begin, end)
+        guilty = blame(ctx, found)
+        if guilty:
+            a, b = guilty[0]
+            return ctx.failed(
+                f"{b - a:.2f} s",
+                f"no state from {a:.3f} s to {b:.3f} s, in the silence that began at {begin:.3f} s",
+                ctx.at(ctx.states.topic, a, b),
+                max_gap_s=b - a,
+            )
+        if found:
+            return ctx.disturbed("the kit's own machine stood still during the silence")
+        clock = ctx.states.clock
+        inside = clock[(clock >= begin) & (clock <= end)]
+        longest = max(longest, float(np.diff(inside).max()) if len(inside) > 1 else 0.0)
+    return ctx.passed(
+        f"{longest * 1e3:.1f} ms", f"longest gap {longest * 1e3:.1f} ms", max_gap_s=longest
+    )
+
+
+@check("DEX1-WDOG-03")
+def resumes(ctx: Context) -> Outcome:
+    """The step after a silence."""
+    return arrival(ctx, "after a silence")
+
+
+def arrival(ctx: Context, when: str) -> Outcome:
+    """Whether the phase's step arrives."""
+    found = [s for p in ctx.phases() if (s := step_of(ctx, p)) is not None]
+    if not found:
+        return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
+    worst = max(found, key=lambda s: s.error)
+    if worst.error <= ctx.tolerance("max_error_stroke"):
+        return ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
+    return ctx.failed(
+        "disobeys",
+        f"{when}: {worst}",
+        ctx.at(ctx.states.topic, worst.begin, worst.end),
+        error_rad=worst.error,
+    )

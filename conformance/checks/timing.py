@@ -1,0 +1,197 @@
+"""Rates, gaps, order and freshness. Judged by source timestamps where the recording has them,
+so that a late reception is not taken for a late hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.hand import Floats
+
+# stimuli whose own requirements judge the state's flow
+OWN_GAP_RULE = ("silence", "nan", "out-of-range", "empty")
+
+
+def gaps(ctx: Context, longer_than: float, begin: float, end: float) -> list[tuple[float, float]]:
+    """Stretches within [begin, end] without state, longer than ``longer_than`` seconds."""
+    clock = ctx.states.clock
+    inside = clock[(clock >= begin) & (clock <= end)]
+    edges = np.concatenate(([begin], inside, [end]))
+    where = np.flatnonzero(np.diff(edges) > longer_than)
+    return [(float(edges[i]), float(edges[i + 1])) for i in where]
+
+
+def blame(ctx: Context, found: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those stretches for which the kit's own machine has no excuse: it ran for half of them."""
+    return [(a, b) for a, b in found if ctx.recording.stalled(a, b) < 0.5 * (b - a)]
+
+
+def _observed(ctx: Context) -> tuple[Floats, float]:
+    """Intervals between states, and the seconds that they add up to."""
+    intervals = np.diff(ctx.states.clock)
+    return intervals, float(intervals.sum())
+
+
+def _rate(ctx: Context) -> tuple[float, float] | None:
+    """(mean rate outside of gaps, seconds observed), or None if that is too short."""
+    intervals, _ = _observed(ctx)
+    steady = intervals[intervals <= 0.1]  # longer ones are DEX1-RATE-03's finding
+    seconds = float(steady.sum())
+    if seconds < ctx.tolerance("min_observed_s"):
+        return None
+    return len(steady) / seconds, seconds
+
+
+def _too_short(ctx: Context) -> Outcome:
+    return ctx.skipped(
+        f"less than {ctx.tolerance('min_observed_s'):g} s of steady state in the recording"
+    )
+
+
+@check("DEX1-RATE-01")
+def mean_rate(ctx: Context) -> Outcome:
+    """Mean rate outside of gaps."""
+    clock = ctx.states.clock
+    measured = _rate(ctx)
+    if measured is None:
+        # too slow to have any steady stretch is a finding, not a missing one
+        seconds = float(clock[-1] - clock[0]) if len(clock) > 1 else 0.0
+        if seconds < ctx.tolerance("min_observed_s"):
+            return _too_short(ctx)
+        rate = (len(clock) - 1) / seconds
+    else:
+        rate, seconds = measured
+    if rate < ctx.tolerance("min_rate_hz"):
+        return ctx.failed(
+            f"{rate:.1f} Hz",
+            f"{len(ctx.states)} states, {rate:.1f} Hz over {seconds:.1f} s",
+            ctx.at(ctx.states.topic, float(ctx.states.t[0]), float(ctx.states.t[-1])),
+            rate_hz=rate,
+        )
+    return ctx.passed(f"{rate:.1f} Hz", f"{rate:.1f} Hz over {seconds:.1f} s", rate_hz=rate)
+
+
+@check("DEX1-RATE-02")
+def vendor_rate(ctx: Context) -> Outcome:
+    """Mean rate compared with the vendor's."""
+    measured = _rate(ctx)
+    if measured is None:
+        return _too_short(ctx)
+    rate, seconds = measured
+    text = f"{rate:.1f} Hz over {seconds:.1f} s"
+    if ctx.tolerance("min_rate_hz") <= rate <= ctx.tolerance("max_rate_hz"):
+        return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
+    return ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
+
+
+@check("DEX1-RATE-03")
+def no_gap(ctx: Context) -> Outcome:
+    """Longest silence of the state."""
+    limit = ctx.tolerance("max_gap_s")
+    clock = ctx.states.clock
+    if len(clock) < 2:
+        return ctx.skipped("fewer than two states")
+    # up to the end of the recording: a state that stops for good is a gap as well
+    end = max(float(clock[-1]), ctx.recording.duration)
+    found = gaps(ctx, limit, float(clock[0]), end)
+    excluded = [ctx.span(p) for name in OWN_GAP_RULE for p in ctx.recording.phases(name, ctx.side)]
+    found = [(a, b) for a, b in found if not any(x < b and a < y for x, y in excluded)]
+    guilty = blame(ctx, found)
+    if guilty:
+        longest = max(b - a for a, b in guilty)
+        first = guilty[0]
+        return ctx.failed(
+            f"{longest:.3f} s",
+            f"{len(guilty)} gap(s); the first from {first[0]:.3f} s to {first[1]:.3f} s",
+            *(ctx.at(ctx.states.topic, a, b) for a, b in guilty),
+            max_gap_s=longest,
+            gaps=len(guilty),
+        )
+    if found:
+        a, b = found[0]
+        return ctx.disturbed(
+            f"a gap from {a:.3f} s to {b:.3f} s, during which the kit's own machine stood still"
+        )
+    longest = float(np.diff(clock).max())
+    return ctx.passed(
+        f"{longest * 1e3:.1f} ms", f"longest gap {longest * 1e3:.1f} ms", max_gap_s=longest
+    )
+
+
+@check("DEX1-RATE-04")
+def regular(ctx: Context) -> Outcome:
+    """99th percentile of the intervals."""
+    intervals, seconds = _observed(ctx)
+    if seconds < ctx.tolerance("min_observed_s"):
+        return _too_short(ctx)
+    p50, p99 = np.percentile(intervals, [50, 99])
+    text = f"p50 {p50 * 1e3:.2f} ms, p99 {p99 * 1e3:.2f} ms, longest {intervals.max() * 1e3:.1f} ms"
+    if p99 <= ctx.tolerance("max_p99_s"):
+        return ctx.passed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
+    stalled = ctx.recording.stalled(0.0, ctx.recording.duration)
+    if stalled > 0.005 * ctx.recording.duration:
+        return ctx.disturbed(
+            f"{text}; the kit's own machine stood still for {stalled:.2f} s in the meantime"
+        )
+    return ctx.failed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
+
+
+@check("DEX1-ORDER-01")
+def order(ctx: Context) -> Outcome:
+    """Source timestamps rise from sample to sample."""
+    sent = ctx.states.sent
+    if len(sent) < 2 or not np.isfinite(sent).all():
+        return ctx.skipped("the recording has no source timestamps")
+    steps = np.diff(sent)
+    wrong = np.flatnonzero(steps <= 0)
+    if not len(wrong):
+        return ctx.passed("in order", f"{len(sent)} source timestamps, each later than the last")
+    back = int((steps < 0).sum())
+    return ctx.failed(
+        f"{len(wrong)} of {len(sent)}",
+        f"{back} samples older than the one before, {len(wrong) - back} with the same timestamp",
+        *(ctx.at(ctx.states.topic, float(ctx.states.t[i + 1])) for i in wrong[:5]),
+        out_of_order=len(wrong),
+    )
+
+
+@check("DEX1-FRESH-01")
+def fresh(ctx: Context) -> Outcome:
+    """How long a value stays while the gripper moves."""
+    t, q = ctx.states.t, ctx.states.q
+    good = np.isfinite(q)
+    t, q = t[good], q[good]
+    if len(q) < 2:
+        return ctx.skipped("fewer than two states with a position")
+    changes = np.flatnonzero(np.diff(q) != 0) + 1
+    if len(changes) < 3:
+        return ctx.skipped("the gripper does not move in this recording")
+    size = np.diff(q)[changes - 1]
+    big = np.abs(size) >= ctx.tolerance("min_change_stroke")
+    same_way = np.sign(size[1:]) == np.sign(size[:-1])
+    # a value held between two large changes of one direction was old when it was sent again
+    moving = big[1:] & big[:-1] & same_way
+    holds = np.diff(t[changes])[moving]
+    travel = float(np.ptp(q))
+    if len(holds) < ctx.tolerance("min_intervals"):
+        if travel < ctx.tolerance("min_change_stroke"):
+            return ctx.skipped("the gripper does not move in this recording")
+        # changes too small to be called steps: fresher than the rule asks for
+        fastest = float(np.median(np.diff(t[changes])))
+        return ctx.passed(
+            f"{fastest * 1e3:.1f} ms", "changes from sample to sample", hold_s=fastest
+        )
+    hold = float(np.median(holds))
+    text = f"a new value every {hold * 1e3:.1f} ms while moving (median of {len(holds)})"
+    if hold <= ctx.tolerance("max_hold_s"):
+        return ctx.passed(f"{hold * 1e3:.1f} ms", text, hold_s=hold)
+    starts = t[changes][:-1][moving]
+    return ctx.failed(
+        f"{hold * 1e3:.0f} ms",
+        text,
+        *(ctx.at(ctx.states.topic, float(s), float(s) + hold) for s in starts[:3]),
+        hold_s=hold,
+    )

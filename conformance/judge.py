@@ -1,0 +1,138 @@
+"""Judge a recording: every selected requirement, each side, in the catalogue's order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+
+import numpy as np
+
+from dexkit.conformance.checks import Check, Context, Outcome, all_checks
+from dexkit.conformance.requirements import Level, Requirement, catalogue
+from dexkit.conformance.results import Result, RunResult, Verdict
+from dexkit.conformance.view import Recording, SideView
+from dexkit.hand import Side
+
+__all__ = ["judge"]
+
+_OPEN = (Verdict.FAIL, Verdict.BLOCKED, Verdict.ERROR)
+
+
+def judge(
+    recording: Recording,
+    *,
+    requirements: Sequence[Requirement] | None = None,
+    subject: Mapping[str, str] | None = None,
+) -> RunResult:
+    """Judge ``recording``.
+
+    :param requirements: those to report; what they depend on is judged as well. None for all.
+    :param subject: what to say of what was judged.
+    """
+    wanted = {r.id for r in (catalogue() if requirements is None else requirements)}
+    checks = all_checks()
+    results: list[Result] = []
+    for side in recording.judged:
+        found: dict[str, Result] = {}
+        for requirement in catalogue():
+            found[requirement.id] = _judge_one(
+                recording, recording.sides[side], requirement, found, checks
+            )
+        results += [r for r in found.values() if r.requirement.id in wanted]
+    order = {r.id: i for i, r in enumerate(catalogue())}
+    results.sort(key=lambda r: order[r.requirement.id])
+    about = {
+        "model": catalogue()[0].model,
+        "dialect": recording.dialect.name,
+        "sides": ", ".join(str(s) for s in recording.judged),
+    }
+    when = datetime.fromtimestamp(recording.origin_ns / 1e9, tz=timezone.utc)
+    return RunResult(
+        subject={**about, **(subject or {})},
+        results=results,
+        stage={str(s): _stage(recording, s) for s in recording.judged},
+        duration_s=recording.duration,
+        notes=list(recording.notes),
+        recorded_at=when.isoformat(timespec="seconds"),
+    )
+
+
+def _judge_one(
+    recording: Recording,
+    hand: SideView,
+    requirement: Requirement,
+    found: Mapping[str, Result],
+    checks: Mapping[str, Check],
+) -> Result:
+    def result(verdict: Verdict, outcome: Outcome) -> Result:
+        return Result(
+            requirement=requirement,
+            side=str(hand.side),
+            verdict=verdict,
+            figure=outcome.figure,
+            observed=outcome.observed,
+            reason=outcome.reason,
+            evidence=outcome.evidence,
+            values=outcome.values,
+        )
+
+    def unjudged(reason: str) -> Result:
+        return result(Verdict.NOT_APPLICABLE, Outcome(None, reason=reason))
+
+    context = Context(recording, hand, requirement)
+    dialect = recording.dialect.name
+    if dialect not in requirement.dialects:
+        return unjudged(f"does not apply to the dialect {dialect}")
+    missing = _missing(context)
+    if missing:
+        return unjudged(missing)
+    for before in requirement.after:
+        if found[before].verdict in _OPEN:
+            return result(Verdict.BLOCKED, Outcome(None, reason=f"blocked by {before}"))
+    check = checks.get(requirement.id)
+    if check is None:
+        return result(Verdict.ERROR, Outcome(None, reason="no check judges this requirement"))
+    try:
+        outcome = check(context)
+    except Exception as error:  # a check that breaks must not look like a hand that does
+        text = f"the check itself failed: {type(error).__name__}: {error}"
+        return result(Verdict.ERROR, Outcome(None, reason=text))
+    if outcome.met is None:
+        return result(Verdict.BLOCKED if outcome.harness else Verdict.NOT_APPLICABLE, outcome)
+    if outcome.met:
+        return result(Verdict.PASS, outcome)
+    return result(Verdict.FAIL if requirement.level is Level.MUST else Verdict.WARN, outcome)
+
+
+def _missing(context: Context) -> str:
+    """What the recording lacks for this requirement, or nothing."""
+    requirement, recording = context.requirement, context.recording
+    if requirement.phase:
+        if recording.stimulus is None:
+            return f"needs the stimulus '{requirement.phase}', which only a live run applies"
+        if not recording.phases(requirement.phase):
+            return f"the stimulus '{requirement.phase}' was not applied in this run"
+        other = requirement.needs.startswith("other-")
+        if not other and not context.phases():
+            return f"the stimulus '{requirement.phase}' was not applied to the {context.side} hand"
+    if requirement.needs == "endpoints" and not recording.endpoints:
+        return "the recording does not say who published and subscribed (record dds_endpoints)"
+    if requirement.needs == "commands" and not len(context.commands):
+        return "no commands to this hand in the recording"
+    return ""
+
+
+def _stage(recording: Recording, side: Side) -> str:
+    """How far a hand got: the first question when it fails."""
+    hand = recording.sides[side]
+    topic = hand.states.topic
+    if len(hand.states):
+        q = hand.states.q[np.isfinite(hand.states.q)]
+        if len(q) and float(np.ptp(q)) > 0.05 * recording.dialect.q_open:
+            return "moving"
+        return "samples flowing"
+    if any(c.topic == topic for c in recording.channels) or any(
+        e.topic == topic for e in recording.endpoints
+    ):
+        return "topic seen, no sample of the right type"
+    return "nothing seen"

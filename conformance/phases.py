@@ -1,0 +1,116 @@
+"""The stimulus as the recording remembers it: what was done when, in a metadata record.
+
+A live run writes the record :data:`RECORD` into its recording, so that the recording alone says
+what the hand was asked to do and can be judged again at any time.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dexkit.errors import TraceUnsupported
+from dexkit.hand import Side
+
+__all__ = ["RECORD", "Phase", "Stall", "Stimulus"]
+
+RECORD = "dexkit.stimulus"
+VERSION = 1
+
+
+@dataclass
+class Phase:
+    """One stretch of the stimulus.
+
+    :param name: what was done: ``listen``, ``step``, ``silence``, ...
+    :param sides: the sides that it is about.
+    :param begin_ns: log time at which it began.
+    :param targets: q that each side was to reach, in the dialect's radians.
+    :param observed: what the kit saw beside the recording (a late joiner's reception).
+    """
+
+    name: str
+    sides: tuple[Side, ...]
+    begin_ns: int
+    end_ns: int = 0
+    targets: dict[Side, float] = field(default_factory=dict)
+    params: dict[str, str] = field(default_factory=dict)
+    observed: dict[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Stall:
+    """A stretch in which the kit's own machine did not run on time."""
+
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass
+class Stimulus:
+    """The whole record.
+
+    :param phases: in order of time.
+    :param objects: where each side touches its object, rad, or None where there is none.
+    :param stalls: when the kit itself was late, so that the hand is not blamed for it.
+    """
+
+    phases: list[Phase] = field(default_factory=list)
+    objects: dict[Side, float | None] = field(default_factory=dict)
+    stalls: list[Stall] = field(default_factory=list)
+
+    def to_metadata(self) -> dict[str, str]:
+        """The record's content."""
+        return {
+            "version": str(VERSION),
+            "phases": json.dumps(
+                [
+                    {
+                        "name": p.name,
+                        "sides": [str(s) for s in p.sides],
+                        "begin_ns": p.begin_ns,
+                        "end_ns": p.end_ns,
+                        "targets": {str(s): q for s, q in p.targets.items()},
+                        "params": p.params,
+                        "observed": p.observed,
+                    }
+                    for p in self.phases
+                ]
+            ),
+            "objects": json.dumps({str(s): q for s, q in self.objects.items()}),
+            "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
+        }
+
+    @classmethod
+    def from_metadata(cls, record: Mapping[str, str]) -> Stimulus:
+        """Read it back.
+
+        :raises TraceUnsupported: of another version, or damaged.
+        """
+        if record.get("version") != str(VERSION):
+            raise TraceUnsupported(
+                f"stimulus record of version {record.get('version')!r}",
+                hint="judge it with the dexkit that recorded it, or a newer one",
+            )
+        try:
+            phases: list[dict[str, Any]] = json.loads(record["phases"])
+            return cls(
+                phases=[
+                    Phase(
+                        name=p["name"],
+                        sides=tuple(Side(s) for s in p["sides"]),
+                        begin_ns=int(p["begin_ns"]),
+                        end_ns=int(p["end_ns"]),
+                        targets={Side(s): float(q) for s, q in p["targets"].items()},
+                        params=dict(p["params"]),
+                        observed=dict(p["observed"]),
+                    )
+                    for p in phases
+                ],
+                objects={Side(s): q for s, q in json.loads(record["objects"]).items()},
+                stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])],
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error

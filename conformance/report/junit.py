@@ -1,0 +1,54 @@
+"""The result as JUnit XML: one test case for each requirement and side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from dexkit.conformance.results import RunResult, Verdict
+
+__all__ = ["write_junit"]
+
+
+def write_junit(result: RunResult, path: Path) -> None:
+    """Write the file. A warning passes; what was not judged is skipped; the rest fails."""
+    verdicts = [r.verdict for r in result.results]
+    suite = ElementTree.Element(
+        "testsuite",
+        name=f"dexkit conformance: {result.subject.get('backend') or result.subject['model']}",
+        tests=str(len(verdicts)),
+        failures=str(verdicts.count(Verdict.FAIL)),
+        errors=str(verdicts.count(Verdict.ERROR) + verdicts.count(Verdict.BLOCKED)),
+        skipped=str(verdicts.count(Verdict.NOT_APPLICABLE)),
+        time=f"{result.duration_s:.3f}",
+        timestamp=result.recorded_at,
+    )
+    properties = ElementTree.SubElement(suite, "properties")
+    for name, value in {
+        **result.subject,
+        **result.environment,
+        "overall": str(result.overall),
+    }.items():
+        ElementTree.SubElement(properties, "property", name=name, value=value)
+    for entry in result.results:
+        case = ElementTree.SubElement(
+            suite,
+            "testcase",
+            classname=f"{entry.requirement.model}.{entry.requirement.area}",
+            name=f"{entry.requirement.id}-{entry.side}",
+            time="0",
+        )
+        if entry.verdict is Verdict.FAIL:
+            failure = ElementTree.SubElement(case, "failure", message=entry.observed)
+            failure.text = entry.explain()
+        elif entry.verdict in (Verdict.ERROR, Verdict.BLOCKED):
+            error = ElementTree.SubElement(case, "error", message=entry.reason)
+            error.text = entry.explain()
+        elif entry.verdict is Verdict.NOT_APPLICABLE:
+            ElementTree.SubElement(case, "skipped", message=entry.reason)
+        else:
+            out = ElementTree.SubElement(case, "system-out")
+            out.text = entry.explain()
+    tree = ElementTree.ElementTree(suite)
+    ElementTree.indent(tree)
+    tree.write(path, encoding="utf-8", xml_declaration=True)

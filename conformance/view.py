@@ -1,0 +1,297 @@
+"""A recording as the checks see it: per side, columns of commands and states in seconds.
+
+Times are seconds from the beginning of the recording: ``t`` is reception, ``sent`` the source
+timestamp. Positions are in the dialect's radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.phases import RECORD, Phase, Stimulus
+from dexkit.conformance.wire import Wire
+from dexkit.errors import ConformanceError, UsageError
+from dexkit.hand import Floats, Side
+from dexkit.models import DEX1_1, Dialect, dialect
+from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
+
+__all__ = ["Commands", "Recording", "SideView", "States", "TraceLike", "detect_dialect"]
+
+
+class TraceLike(Protocol):
+    """What is asked of a recording; :class:`dexkit.traces.Trace` is one."""
+
+    metadata: dict[str, dict[str, str]]
+    warnings: list[str]
+    truncated: bool
+
+    @property
+    def channels(self) -> list[ChannelInfo]:
+        """Every channel."""
+        ...
+
+    @property
+    def endpoints(self) -> list[TraceEndpoint]:
+        """What discovery saw."""
+        ...
+
+    def load(self, topics: Iterable[str] | None = None) -> dict[str, SampleArray]:
+        """Samples by topic."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """A side's states. What a sample lacks is NaN.
+
+    :param length: motors in the sequence; -1 where the sample does not decode.
+    :param errors: what is wrong with samples that do not decode, by index.
+    """
+
+    topic: str
+    t: Floats
+    sent: Floats
+    length: NDArray[np.intp]
+    q: Floats
+    dq: Floats
+    ddq: Floats
+    tau: Floats
+    errors: Mapping[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def clock(self) -> Floats:
+        """The times to judge the publisher by: source timestamps where the recording has them."""
+        return self.sent if len(self.sent) and np.isfinite(self.sent).all() else self.t
+
+    def between(self, begin: float, end: float) -> slice:
+        """The samples received in [begin, end]."""
+        return slice(
+            int(np.searchsorted(self.t, begin)), int(np.searchsorted(self.t, end, "right"))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """The commands to a side, from whichever writer. What a sample lacks is NaN."""
+
+    topic: str
+    t: Floats
+    length: NDArray[np.intp]
+    q: Floats
+    dq: Floats
+    tau: Floats
+    kp: Floats
+    kd: Floats
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+@dataclass(frozen=True, eq=False)
+class SideView:
+    """One hand in the recording."""
+
+    side: Side
+    states: States
+    commands: Commands
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording, decoded.
+
+    :param origin_ns: log time of second 0.
+    :param duration: seconds.
+    :param sides: every side that has a topic; ``judged`` names those to be judged.
+    :param stimulus: what the kit did, or None in a recording of somebody else's session.
+    """
+
+    dialect: Dialect
+    origin_ns: int
+    duration: float
+    sides: Mapping[Side, SideView]
+    channels: Sequence[ChannelInfo]
+    endpoints: Sequence[TraceEndpoint]
+    stimulus: Stimulus | None
+    judged: tuple[Side, ...]
+    notes: Sequence[str] = ()
+
+    @classmethod
+    def of(
+        cls,
+        trace: TraceLike,
+        *,
+        dialect_name: str | None = None,
+        sides: Sequence[Side] = (),
+    ) -> Recording:
+        """Decode ``trace``.
+
+        :param dialect_name: None to take the one that the topics and types show.
+        :param sides: the sides to judge; none for those that have a topic.
+        :raises ConformanceError: it has no topic of this model.
+        :raises TraceUnsupported: its stimulus record cannot be read.
+        """
+        chosen = dialect(dialect_name) if dialect_name else detect_dialect(trace)
+        stimulus = (
+            Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
+        )
+        present = {c.topic for c in trace.channels if c.message_count}
+        known = present | {e.topic for e in trace.endpoints}
+        judged = tuple(sides) or tuple(
+            s for s in Side if any(topic in known for topic in chosen.topics(s))
+        )
+        if not judged:
+            names = ", ".join(sorted(present)) or "no messages"
+            raise ConformanceError(
+                f"no {DEX1_1.title} topic of dialect {chosen.name} in this recording",
+                hint=f"it has: {names}",
+            )
+        # the other side is decoded too: independence is judged with it
+        topics = {t for s in Side for t in chosen.topics(s)} & present
+        samples = trace.load(sorted(topics)) if topics else {}
+        times = [s.log_time_ns for s in samples.values() if len(s)]
+        marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
+        origin = min([int(t[0]) for t in times] + marks, default=0)
+        end = max([int(t[-1]) for t in times] + marks, default=0)
+        wire = Wire(chosen)
+        views = {
+            s: SideView(
+                s,
+                _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
+                _commands(wire, s, samples.get(chosen.topics(s)[0]), origin),
+            )
+            for s in sorted(Side, key=lambda s: s is not Side.LEFT)
+            if s in judged or any(topic in present for topic in chosen.topics(s))
+        }
+        notes = list(trace.warnings)
+        if trace.truncated:
+            notes.append("the recording is unfinished; it is judged as far as it goes")
+        return cls(
+            dialect=chosen,
+            origin_ns=origin,
+            duration=(end - origin) / 1e9,
+            sides=views,
+            channels=trace.channels,
+            endpoints=trace.endpoints,
+            stimulus=stimulus,
+            judged=judged,
+            notes=notes,
+        )
+
+    def seconds(self, time_ns: int) -> float:
+        """A log time as seconds of this recording."""
+        return (time_ns - self.origin_ns) / 1e9
+
+    def log_time(self, seconds: float) -> int:
+        """The other way round."""
+        return self.origin_ns + round(seconds * 1e9)
+
+    def phases(self, name: str, side: Side | None = None) -> list[Phase]:
+        """The phases of that name, about that side."""
+        if self.stimulus is None:
+            return []
+        return [
+            p for p in self.stimulus.phases if p.name == name and (side is None or side in p.sides)
+        ]
+
+    def stalled(self, begin: float, end: float) -> float:
+        """Seconds in [begin, end] for which the kit's own machine stood still."""
+        if self.stimulus is None:
+            return 0.0
+        return sum(
+            max(0.0, min(end, self.seconds(s.end_ns)) - max(begin, self.seconds(s.begin_ns)))
+            for s in self.stimulus.stalls
+        )
+
+
+def detect_dialect(trace: TraceLike) -> Dialect:
+    """The dialect whose topics and types are in the recording.
+
+    :raises ConformanceError: none.
+    """
+    present = {(c.topic, c.type_name) for c in trace.channels}
+    present |= {(e.topic, e.type_name) for e in trace.endpoints}
+    topics = {topic for topic, _ in present}
+
+    def score(d: Dialect) -> tuple[int, int]:
+        cmd = [(d.topics(s)[0], d.cmd_type) for s in Side]
+        state = [(d.topics(s)[1], d.state_type) for s in Side]
+        exact = sum(pair in present for pair in cmd + state)
+        named = sum(topic in topics for topic, _ in cmd + state)
+        return exact, named
+
+    best = max(DEX1_1.dialects, key=score)  # the first, unitree_go, wins a tie
+    if score(best) == (0, 0):
+        names = ", ".join(sorted(c.topic for c in trace.channels)) or "no topics at all"
+        wanted = ", ".join(sorted({d.topics(s)[1] for d in DEX1_1.dialects for s in Side}))
+        raise ConformanceError(
+            f"no {DEX1_1.title} in this recording: it has {names}",
+            hint=f"a {DEX1_1.title} publishes one of {wanted}",
+        )
+    return best
+
+
+def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
+    return np.asarray((times - origin) / 1e9, dtype=np.float64)
+
+
+def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> States:
+    topic = wire.dialect.topics(side)[1]
+    if samples is None or samples.type_name != wire.dialect.state_type:
+        none = np.empty(0)
+        return States(topic, none, none, np.empty(0, np.intp), none, none, none, none)
+    columns = wire.state.columns(samples.payloads)
+    place = f"{wire.state_sequence}[{wire.dialect.index[side]}]"
+    sent = _seconds(samples.publish_time_ns, origin)
+    sent[samples.publish_time_ns == 0] = np.nan
+    return States(
+        topic=topic,
+        t=_seconds(samples.log_time_ns, origin),
+        sent=sent,
+        length=columns.count(wire.state_sequence),
+        q=columns[f"{place}.q"],
+        dq=columns[f"{place}.dq"],
+        ddq=columns[f"{place}.ddq"],
+        tau=columns[f"{place}.tau_est"],
+        errors={i: str(e) for i, e in columns.errors.items()},
+    )
+
+
+def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> Commands:
+    topic = wire.dialect.topics(side)[0]
+    if samples is None or samples.type_name != wire.dialect.cmd_type:
+        none = np.empty(0)
+        return Commands(topic, none, np.empty(0, np.intp), none, none, none, none, none)
+    columns = wire.command.columns(samples.payloads)
+    place = f"{wire.command_sequence}[{wire.dialect.index[side]}]"
+    return Commands(
+        topic=topic,
+        t=_seconds(samples.log_time_ns, origin),
+        length=columns.count(wire.command_sequence),
+        q=columns[f"{place}.q"],
+        dq=columns[f"{place}.dq"],
+        tau=columns[f"{place}.tau"],
+        kp=columns[f"{place}.kp"],
+        kd=columns[f"{place}.kd"],
+    )
+
+
+def sides_of(name: str) -> tuple[Side, ...]:
+    """``left``, ``right`` or ``both`` as sides.
+
+    :raises UsageError: anything else.
+    """
+    if name == "both":
+        return (Side.LEFT, Side.RIGHT)
+    try:
+        return (Side(name),)
+    except ValueError:
+        raise UsageError(f"no side {name!r}", hint="sides: left, right, both") from None
