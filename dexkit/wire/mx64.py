@@ -176,7 +176,7 @@ class Item:
         except OverflowError:
             raise EncodeError(f"{self.name}: {value} does not fit {self.size} byte(s)") from None
 
-    def decode(self, data: bytes, base: int | None = None) -> int:
+    def decode(self, data: bytes | bytearray, base: int | None = None) -> int:
         """The item's value in ``data``.
 
         :param base: address of ``data[0]``; by default the item's own.

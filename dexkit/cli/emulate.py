@@ -1,0 +1,215 @@
+"""``dexkit emulate``: emulated devices on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from dexkit.cli.common import stop_on_signals
+from dexkit.clock import RealClock
+from dexkit.errors import DexkitError, EmulatorError
+from dexkit.wire import mx64
+
+__all__ = ["command"]
+
+
+@click.group()
+def command() -> None:
+    """Emulate a device on a pseudo-terminal."""
+
+
+@command.command("mx64", context_settings={"show_default": True})
+@click.option("--link", required=True, metavar="PATH", help="Link that clients open.")
+@click.option(
+    "--id",
+    "ids",
+    type=click.IntRange(0, 252),
+    multiple=True,
+    default=(1,),
+    help="Id of the servo; repeat it for several grippers on one line.",
+)
+@click.option(
+    "--baudrate",
+    type=click.Choice([str(rate) for rate in mx64.BAUD_RATES.values()]),
+    default="1000000",
+    metavar="B",
+    help="Bits a second that the servo is set to.",
+)
+@click.option(
+    "--object",
+    "object_pct",
+    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    metavar="PCT",
+    help="Percent of opening at which the fingers touch an object.  [default: no object]",
+)
+@click.option(
+    "--start", type=click.FloatRange(0, 100), default=50.0, metavar="PCT", help="Opening at first."
+)
+@click.option(
+    "--closed-at",
+    type=click.IntRange(0, mx64.TICKS_PER_TURN - 1),
+    default=1510,
+    metavar="TICK",
+    help="Encoder tick at which the fingers are closed.",
+)
+@click.option("--line-time/--no-line-time", default=True, help="Bytes take their time.")
+@click.option(
+    "--latency-timer",
+    type=click.FloatRange(0, 255),
+    default=1.0,
+    metavar="MS",
+    help="Of the USB-serial adapter; an untuned one has 16, a ttyACM device 0.",
+)
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="SPEC",
+    help="Have a fault, e.g. overload@3s, drop:p=0.05, unplug@5s:for=2s; may be repeated.",
+)
+@click.option("--faults-from-stdin", is_flag=True, help="Also take faults as lines of input.")
+@click.option("--seed", type=int, default=0, help="Of the faults' chance and of noise.")
+@click.option(
+    "--eeprom",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Keep the servos' EEPROM here from run to run; it wins over --id and --baudrate.",
+)
+@click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
+@click.option("--fast-reads", is_flag=True, help="Firmware with Fast Sync and Fast Bulk Read.")
+@click.option("--backup", is_flag=True, help="Firmware with Control Table Backup.")
+@click.option("--protocol-1", is_flag=True, help="Old firmware that speaks Protocol 1.0 only.")
+def emulate_mx64(
+    link: str,
+    ids: tuple[int, ...],
+    baudrate: str,
+    object_pct: float | None,
+    start: float,
+    closed_at: int,
+    line_time: bool,
+    latency_timer: float,
+    faults: tuple[str, ...],
+    faults_from_stdin: bool,
+    seed: int,
+    eeprom: Path | None,
+    any_baudrate: bool,
+    fast_reads: bool,
+    backup: bool,
+    protocol_1: bool,
+) -> None:
+    """Emulate a DYNAMIXEL MX-64 (Protocol 2.0) with an EZGripper on its shaft.
+
+    Prints "ready: PATH ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
+    link.
+    """
+    from dexkit.emulators.faults import parse_fault
+    from dexkit.emulators.mx64 import Bus, Firmware, GripperBody, Physics, Port, Servo
+    from dexkit.emulators.mx64.protocol1 import Protocol1Servo
+
+    plan = [parse_fault(spec) for spec in faults]
+    body = GripperBody(closed_at=closed_at, start=start, object_pct=object_pct)
+    physics = dataclasses.replace(Physics(), gripper=body)
+    firmware = Firmware(fast_reads=fast_reads, backup=backup)
+    store = _EepromFile(eeprom) if eeprom is not None else None
+    with stop_on_signals() as request:
+        now = RealClock().now()
+        servos = []
+        if not protocol_1:
+            for index, servo_id in enumerate(ids):
+                servo = Servo(
+                    servo_id,
+                    baudrate=int(baudrate),
+                    physics=physics,
+                    firmware=firmware,
+                    now=now,
+                    eeprom=store.load(index) if store else None,
+                    seed=seed + index,
+                )
+                servos.append(servo)
+        bus = Bus(
+            servos,
+            line_time=line_time,
+            latency_timer=latency_timer * 1e-3,
+            faults=plan,
+            start=now,
+            seed=seed,
+            protocol_1=[Protocol1Servo(i, baudrate=int(baudrate)) for i in ids]
+            if protocol_1
+            else (),
+        )
+        if store is not None:
+            for servo in servos:
+                servo.on_eeprom = lambda: store.save([s.eeprom for s in servos])
+        with Port(bus, link, check_baudrate=not any_baudrate) as port:
+            if faults_from_stdin:
+                threading.Thread(
+                    target=_read_faults,
+                    args=(lambda spec: port.inject(parse_fault(spec)),),
+                    daemon=True,
+                ).start()
+            port.start()
+            answering = ",".join(
+                [str(s.id) for s in bus.servos] + [str(s.id) for s in bus.protocol_1]
+            )
+            rate = servos[0].baudrate if servos else int(baudrate)
+            click.echo(f"ready: {link} id={answering} baudrate={rate} pty={port.terminal}")
+            sys.stdout.flush()
+            while not request.wait(0.2):
+                if port.error is not None:
+                    raise EmulatorError(f"the emulator stopped: {port.error}") from port.error
+        summary = bus.counters.summary() or "nothing was sent"
+        if port.overruns:
+            summary += f", {port.overruns} bytes not read by the client"
+        click.echo(f"stopped: {summary}")
+
+
+def _read_faults(inject: Callable[[str], None]) -> None:
+    for line in sys.stdin:
+        if line.strip():
+            try:
+                inject(line)
+            except DexkitError as error:
+                click.echo(f"error: {error.message}", err=True)
+
+
+class _EepromFile:
+    """EEPROM contents of the servos on a line, in one JSON file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._contents: list[bytes] = []
+        if path.exists():
+            try:
+                data = json.loads(path.read_text())
+                if data["device"] != "mx64":
+                    raise ValueError(f"it is for a {data['device']}")
+                self._contents = [bytes.fromhex(text) for text in data["eeprom"]]
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise EmulatorError(
+                    f"{path} is not an EEPROM file of this emulator: {error}",
+                    hint="remove it to start with factory values",
+                ) from error
+
+    def load(self, index: int) -> bytes | None:
+        """What servo ``index`` on the line had, or None."""
+        return self._contents[index] if index < len(self._contents) else None
+
+    def save(self, contents: list[bytes]) -> None:
+        """Replace the file atomically."""
+        text = json.dumps({"device": "mx64", "eeprom": [c.hex() for c in contents]}, indent=1)
+        fd, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.")
+        try:
+            with os.fdopen(fd, "w") as file:
+                file.write(text + "\n")
+            os.replace(temporary, self.path)
+        except BaseException:
+            os.unlink(temporary)
+            raise

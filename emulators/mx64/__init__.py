@@ -1,0 +1,25 @@
+"""An emulated ROBOTIS MX-64(2.0) with SAKE's EZGripper on its shaft.
+
+From the inside out: :mod:`settings` (uncertain points and body), :mod:`drive` (controllers and
+physics), :mod:`servo` (control table and instructions), :mod:`bus` (several servos, line time,
+faults) are sans-IO; :mod:`port` puts a bus on a pseudo-terminal; :mod:`gripper` has the helper
+:func:`emulated_ezgripper` for tests.
+"""
+
+from dexkit.emulators.mx64.bus import Bus
+from dexkit.emulators.mx64.gripper import EmulatedProcess, EmulatedThread, emulated_ezgripper
+from dexkit.emulators.mx64.port import Port
+from dexkit.emulators.mx64.servo import Servo
+from dexkit.emulators.mx64.settings import Firmware, GripperBody, Physics
+
+__all__ = [
+    "Bus",
+    "EmulatedProcess",
+    "EmulatedThread",
+    "Firmware",
+    "GripperBody",
+    "Physics",
+    "Port",
+    "Servo",
+    "emulated_ezgripper",
+]

@@ -1,0 +1,229 @@
+"""An emulated EZGripper, ready to be opened: in a thread or in a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from typing import IO
+
+from dexkit.clock import RealClock
+from dexkit.emulators.faults import parse_fault
+from dexkit.emulators.mx64.bus import Bus
+from dexkit.emulators.mx64.port import Port
+from dexkit.emulators.mx64.servo import Servo
+from dexkit.emulators.mx64.settings import Firmware, Physics
+from dexkit.errors import EmulatorError, UsageError
+
+__all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
+
+
+class EmulatedThread:
+    """A gripper in a thread of this process, whose servos can be looked into.
+
+    Reading ``servos`` while a client talks to them is a snapshot of a moving thing.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self.port = port
+        port.start()
+
+    @property
+    def path(self) -> str:
+        """What a client opens."""
+        return self.port.path
+
+    @property
+    def bus(self) -> Bus:
+        """The line."""
+        return self.port.bus
+
+    @property
+    def servos(self) -> list[Servo]:
+        """The servos on it."""
+        return self.port.bus.servos
+
+    @property
+    def servo(self) -> Servo:
+        """The only or first servo."""
+        return self.port.bus.servos[0]
+
+    def inject(self, spec: str) -> None:
+        """Have a fault now (or at its ``@TIME`` from now)."""
+        self.port.inject(parse_fault(spec))
+
+    def close(self) -> None:
+        """Stop it and remove the path."""
+        self.port.close()
+
+
+class EmulatedProcess:
+    """A gripper in a process of its own: ``dexkit emulate mx64``.
+
+    :param arguments: of that command, without ``--link``.
+    :param link: where to put the link; None for a name in a temporary directory.
+    :raises EmulatorError: it did not become ready.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        link: str | os.PathLike[str] | None = None,
+        *,
+        timeout: float = 20.0,
+    ) -> None:
+        self._directory: tempfile.TemporaryDirectory[str] | None = None
+        if link is None:
+            self._directory = tempfile.TemporaryDirectory(prefix="dexkit-mx64-")
+            link = os.path.join(self._directory.name, "tty")
+        self.path = os.path.abspath(os.fspath(link))
+        command = [sys.executable, "-m", "dexkit", "emulate", "mx64", "--link", self.path]
+        self.process = subprocess.Popen(
+            [*command, "--faults-from-stdin", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        self.output = ""
+        try:
+            self.ready_line = self._await_ready(timeout)
+        except BaseException:
+            self.close()
+            raise
+
+    def _await_ready(self, timeout: float) -> str:
+        stdout = self.process.stdout
+        assert stdout is not None
+        deadline = time.monotonic() + timeout
+        line = b""
+        while not line.endswith(b"\n"):
+            left = max(0.0, deadline - time.monotonic())
+            ready, _, _ = select.select([stdout], [], [], left)
+            piece = os.read(stdout.fileno(), 1) if ready else b""
+            if not piece:
+                if self.process.poll() is None and left > 0:
+                    self.process.kill()
+                _, stderr = self.process.communicate()
+                raise EmulatorError(
+                    "the emulated gripper did not start",
+                    hint=stderr.decode(errors="replace").strip(),
+                )
+            line += piece
+        return line.decode().strip()
+
+    def inject(self, spec: str) -> None:
+        """Have a fault now (or at its ``@TIME`` from now)."""
+        fault = parse_fault(spec)  # complain here, not over there
+        assert fault
+        stdin: IO[bytes] | None = self.process.stdin
+        assert stdin is not None
+        stdin.write(spec.encode() + b"\n")
+        stdin.flush()
+
+    def close(self) -> None:
+        """Stop it; ``output`` then holds what it printed behind the ready line."""
+        if self.process.returncode is None:
+            self.process.terminate()
+            try:
+                stdout, _ = self.process.communicate(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                stdout, _ = self.process.communicate()
+            self.output = stdout.decode(errors="replace")
+        if self._directory is not None:
+            self._directory.cleanup()
+            self._directory = None
+
+
+@contextlib.contextmanager
+def emulated_ezgripper(
+    object_pct: float | None = None,
+    *,
+    process: bool = False,
+    baudrate: int = 1_000_000,
+    servo_id: int = 1,
+    line_time: bool = True,
+    latency_timer: float = 1e-3,
+    faults: Sequence[str] = (),
+    start: float = 50.0,
+    closed_at: int | None = None,
+    link: str | os.PathLike[str] | None = None,
+    check_baudrate: bool = True,
+    seed: int = 0,
+    firmware: Firmware | None = None,
+    physics: Physics | None = None,
+    extra: Sequence[str] = (),
+) -> Iterator[EmulatedThread | EmulatedProcess]:
+    """An emulated EZGripper that answers at ``.path``, and takes faults by ``.inject``.
+
+    :param object_pct: opening at which an object is touched, percent; None for none.
+    :param process: run it as ``dexkit emulate mx64`` in a process of its own instead of a
+        thread of this one. A client in the same process competes with the thread for the
+        interpreter, so rates are measured against a process; a thread's servos can be looked
+        into (``.servo``).
+    :param latency_timer: of the USB-serial adapter, seconds.
+    :param faults: specifications, see :mod:`dexkit.emulators.faults`.
+    :param start: opening at power-on, percent.
+    :param closed_at: encoder tick at which it is closed.
+    :param firmware: and ``physics``: only in a thread.
+    :param extra: more arguments of the command: only for a process.
+    :raises EmulatorError: it did not become ready.
+    :raises UsageError: an option that cannot be.
+    """
+    gripper: EmulatedThread | EmulatedProcess
+    if process:
+        if firmware is not None or physics is not None:
+            raise UsageError("firmware and physics can be given to a thread only")
+        gripper = EmulatedProcess(
+            [
+                f"--baudrate={baudrate}",
+                f"--id={servo_id}",
+                f"--latency-timer={latency_timer * 1e3:g}",
+                f"--start={start:g}",
+                f"--seed={seed}",
+                *(f"--fault={spec}" for spec in faults),
+                *([] if line_time else ["--no-line-time"]),
+                *([] if check_baudrate else ["--any-baudrate"]),
+                *([] if object_pct is None else [f"--object={object_pct:g}"]),
+                *([] if closed_at is None else [f"--closed-at={closed_at}"]),
+                *extra,
+            ],
+            link,
+        )
+    else:
+        if extra:
+            raise UsageError("extra arguments can be given to a process only")
+        physics = physics or Physics()
+        body = dataclasses.replace(physics.gripper, start=start)
+        if object_pct is not None:
+            body = dataclasses.replace(body, object_pct=object_pct)
+        if closed_at is not None:
+            body = dataclasses.replace(body, closed_at=closed_at)
+        now = RealClock().now()
+        servo = Servo(
+            servo_id,
+            baudrate=baudrate,
+            physics=dataclasses.replace(physics, gripper=body),
+            firmware=firmware,
+            now=now,
+            seed=seed,
+        )
+        bus = Bus(
+            [servo],
+            line_time=line_time,
+            latency_timer=latency_timer,
+            faults=[parse_fault(spec) for spec in faults],
+            start=now,
+            seed=seed,
+        )
+        gripper = EmulatedThread(Port(bus, link, check_baudrate=check_baudrate))
+    try:
+        yield gripper
+    finally:
+        gripper.close()
