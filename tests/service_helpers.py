@@ -79,6 +79,7 @@ class FakeEndpoint:
     type_name: str
     kind: str
     own: bool = False
+    process: str = ""
 
 
 @dataclass
@@ -88,7 +89,7 @@ class FakeNode:
     foreign: list[FakeEndpoint] = field(default_factory=list)
     sent: list[tuple[str, bytes]] = field(default_factory=list)
     inbox: dict[str, list[FakeSample]] = field(default_factory=dict)
-    wake: dict[str, Callable[[], None]] = field(default_factory=dict)
+    wake: dict[str, Callable[[], object]] = field(default_factory=dict)
     types: dict[str, str] = field(default_factory=dict)
     open_entities: int = 0
     closed: bool = False
@@ -99,7 +100,7 @@ class FakeNode:
         return FakeWriter(self, topic)
 
     def reader(
-        self, topic: str, type_name: str, *, on_data: Callable[[], None] | None = None
+        self, topic: str, type_name: str, *, on_data: Callable[[], object] | None = None
     ) -> FakeReader:
         self.types[topic] = type_name
         self.open_entities += 1
@@ -124,8 +125,9 @@ class FakeWriter:
     topic: str
     matched: int = 1
 
-    def write_raw(self, data: bytes, source_timestamp_ns: int | None = None) -> None:
+    def write_raw(self, data: bytes, source_timestamp_ns: int | None = None) -> bool:
         self.node.sent.append((self.topic, data))
+        return True
 
     def close(self) -> None:
         self.node.open_entities -= 1

@@ -67,6 +67,7 @@ _KP, _KD = 5.0, 0.05
 _HG_CLOSED, _HG_OPEN = 0.1, 6.0  # seed 000, "Position Conversion"
 _HG_TEMPERATURE, _HG_VOL = 25, 12.0  # seed 000, "MotorState_"
 _U32 = 0xFFFFFFFF
+_FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
 class Fill(str, Enum):
@@ -192,14 +193,14 @@ class _HgMap(DialectMap):
         for joint, limits in enumerate(spec.joints):
             scale = self._scale(limits.q_max)
             m = unitree_hg.MotorState_(
-                q=_known(s.q[joint]) * scale,
+                q=_known(s.q[joint] * scale),
                 tau_est=abs(_known(s.tau_est[joint])),
                 temperature=(_HG_TEMPERATURE, _HG_TEMPERATURE),
                 vol=_HG_VOL,
             )
             if known:
-                m.dq = _known(s.dq[joint]) * scale
-                m.ddq = _known(s.ddq[joint]) * scale
+                m.dq = _known(s.dq[joint] * scale)
+                m.ddq = _known(s.ddq[joint] * scale)
                 if math.isfinite(s.temperature[joint]):
                     celsius = _celsius(s.temperature[joint], low=-32768, high=32767)
                     m.temperature = (celsius, celsius)
@@ -269,8 +270,9 @@ def dialect_map(
 
 
 def _known(value: float) -> float:
+    """``value`` as the wire's float32 can hold it; 0 where it is not known."""
     number = float(value)
-    return number if math.isfinite(number) else 0.0
+    return min(max(number, -_FLOAT_MAX), _FLOAT_MAX) if math.isfinite(number) else 0.0
 
 
 def _celsius(value: float, *, low: int, high: int) -> int:

@@ -42,7 +42,7 @@ _JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-
 class _Writer(Protocol):
     @property
     def matched(self) -> int: ...
-    def write_raw(self, data: bytes, source_timestamp_ns: int | None = None) -> None: ...
+    def write_raw(self, data: bytes, source_timestamp_ns: int | None = None) -> bool: ...
     def close(self) -> None: ...
 
 
@@ -56,7 +56,7 @@ class Node(Protocol):
 
     def writer(self, topic: str, type_name: str) -> _Writer: ...  # noqa: D102
     def reader(  # noqa: D102
-        self, topic: str, type_name: str, *, on_data: Callable[[], None] | None = None
+        self, topic: str, type_name: str, *, on_data: Callable[[], object] | None = None
     ) -> _Reader: ...
     def endpoints(self) -> Sequence[Any]: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
@@ -173,17 +173,16 @@ class HandService:
             raise
 
     def _start(self) -> None:
-        if self._node is None:
+        node = self._node
+        if node is None:
             from dexkit.dds import DdsNode
 
-            self._node = DdsNode(domain=self.domain, interface=self.interface)
-        self._refuse_conflict(self._node)
+            node = self._node = DdsNode(domain=self.domain, interface=self.interface)
+        self._refuse_conflict(node)
         for unit in self._units:
             self._open_first(unit)
-        self._writer = self._node.writer(self.state_topic, self.dialect.state_type)
-        self._reader = self._node.reader(
-            self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set
-        )
+        self._writer = node.writer(self.state_topic, self.dialect.state_type)
+        self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
         for unit in self._units:
             unit.thread = self._thread(f"exchange-{unit.side}", self._exchange_loop, unit)
         self._threads = [
@@ -416,11 +415,14 @@ class HandService:
             return
         assert self._writer is not None
         try:
-            self._writer.write_raw(payload)
+            written = self._writer.write_raw(payload)
         except DexkitError as error:
             self._count_publish_error(error)
-        else:
+            return
+        if written:
             self.counters.published += 1
+        else:
+            self._count_publish_error(TimeoutError("a reliable reader does not keep up"))
 
     def _count_publish_error(self, error: Exception) -> None:
         self.counters.publish_errors += 1
@@ -443,9 +445,10 @@ class HandService:
         discovery = getattr(node, "discovery", None)
         if discovery is not None:
             discovery.wait(lambda *_: bool(others()), _DISCOVERY)
-        if others():
+        if found := others():
+            who = ", ".join(sorted({e.process for e in found if e.process})) or "somebody"
             raise TopicConflict(
-                f"somebody already publishes {self.state_topic} on domain {self.domain}",
+                f"{who} already publishes {self.state_topic} on domain {self.domain}",
                 hint="stop the other service, choose another --domain, or add --force",
             )
 
