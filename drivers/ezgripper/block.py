@@ -1,0 +1,139 @@
+"""What is exchanged with the servo each cycle: one write and one contiguous read.
+
+The items wanted are scattered over the control table (64, 70, 98, 102, 112 to 120, 126 to 146),
+so their bytes are mapped side by side through Indirect Address 1 to 28 (facts/mx64 B2)::
+
+    Indirect Data   1..4    5..6    7..10      11    12     13       14..15 16.. ..28
+                    profile goal    goal       torque error watchdog tick   present current,
+                    speed   current position                                velocity, position,
+                    |------ written -------|                                voltage, temperature
+                            |--------------------- read ----------------------------------|
+
+- The write (10 bytes, 25 on the line) is a Sync Write, which has no status packet. A status
+  would cost 110 µs on the line and, more, another wait for the USB adapter's latency timer.
+- Because goal current and goal position are read back in the same block, a write that was lost
+  or refused (bus watchdog tripped) shows in the very next sample; torque, hardware error and
+  watchdog are seen in every sample too.
+- At 1 Mbaud: 250 µs write, 140 µs read instruction, 350 µs answer, 4 µs return delay, up to
+  1 ms latency timer: at most 1.74 ms, or 573 exchanges a second.
+
+A spanning write of 102..119 would be 18 bytes and would touch Goal Velocity, a read of 102..146
+45 bytes, without torque and error (facts/mx64 C1).
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from dexkit.errors import TruncatedError
+from dexkit.wire import mx64
+
+__all__ = [
+    "MAPPED",
+    "READ_ADDRESS",
+    "READ_SIZE",
+    "WRITE_ADDRESS",
+    "WRITE_SIZE",
+    "Goal",
+    "Sample",
+    "decode",
+    "encode",
+    "mapping",
+]
+
+_WRITTEN = (mx64.PROFILE_VELOCITY, mx64.GOAL_CURRENT, mx64.GOAL_POSITION)
+_READ = (
+    mx64.GOAL_CURRENT,
+    mx64.GOAL_POSITION,
+    mx64.TORQUE_ENABLE,
+    mx64.HARDWARE_ERROR_STATUS,
+    mx64.BUS_WATCHDOG,
+    mx64.REALTIME_TICK,
+    mx64.PRESENT_CURRENT,
+    mx64.PRESENT_VELOCITY,
+    mx64.PRESENT_POSITION,
+    mx64.PRESENT_INPUT_VOLTAGE,
+    mx64.PRESENT_TEMPERATURE,
+)
+MAPPED = (mx64.PROFILE_VELOCITY, *_READ)
+"""The items behind Indirect Data 1 and up, in order."""
+
+_BLOCK = mx64.INDIRECT_BLOCKS[0]
+WRITE_ADDRESS = _BLOCK.data
+WRITE_SIZE = sum(item.size for item in _WRITTEN)
+READ_ADDRESS = _BLOCK.data + mx64.PROFILE_VELOCITY.size
+READ_SIZE = sum(item.size for item in _READ)
+assert mx64.PROFILE_VELOCITY.size + READ_SIZE <= _BLOCK.count
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is written in one exchange.
+
+    :param position: ticks, in the servo's present count of turns.
+    :param current: units; 0 leaves the fingers limp.
+    :param profile_velocity: register units.
+    """
+
+    position: int
+    current: int
+    profile_velocity: int
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What is read in one exchange, register units; positions in the servo's count of turns.
+
+    :param time: monotonic time of measurement, seconds.
+    """
+
+    time: float
+    goal_current: int
+    goal_position: int
+    torque: bool
+    error: mx64.HardwareError
+    watchdog: int
+    tick: int
+    current: int
+    velocity: int
+    position: int
+    voltage: int
+    temperature: int
+
+
+def mapping() -> bytes:
+    """Bytes for Indirect Address 1 and up that map :data:`MAPPED`."""
+    return b"".join(
+        address.to_bytes(2, "little")
+        for item in MAPPED
+        for address in range(item.address, item.end)
+    )
+
+
+_CODES = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"}
+_CODES |= {(4, False): "I", (4, True): "i"}
+
+
+def _layout(items: tuple[mx64.Item, ...]) -> struct.Struct:
+    return struct.Struct("<" + "".join(_CODES[item.size, item.signed] for item in items))
+
+
+_WRITE_LAYOUT = _layout(_WRITTEN)
+_READ_LAYOUT = _layout(_READ)
+
+
+def encode(goal: Goal) -> bytes:
+    """The bytes to write at :data:`WRITE_ADDRESS`."""
+    return _WRITE_LAYOUT.pack(goal.profile_velocity, goal.current, goal.position)
+
+
+def decode(data: bytes, time: float) -> Sample:
+    """The sample in the bytes read at :data:`READ_ADDRESS`.
+
+    :raises TruncatedError: there are not :data:`READ_SIZE` of them.
+    """
+    if len(data) != READ_SIZE:
+        raise TruncatedError(f"a sample has {READ_SIZE} bytes, not {len(data)}")
+    goal_current, goal_position, torque, error, *rest = _READ_LAYOUT.unpack(data)
+    return Sample(time, goal_current, goal_position, bool(torque), mx64.HardwareError(error), *rest)

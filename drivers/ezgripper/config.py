@@ -1,0 +1,195 @@
+"""What is known of each gripper: its zero, its speed, its force table, in a user's JSON file.
+
+The layout is that of seed 003, so that a file of SAKE's driver can be read as it is::
+
+    {"calibration":    {"DA1Z9T40": 3010},
+     "movement_speed": {"DA1Z9T40": {"opening": 131.0, "closing": 127.5}},
+     "force_lookup":   {"DA1Z9T40": {"0": 0.0, "100": 0.5}}}
+
+Keys are the USB serial number of the adapter, or the device path where there is none (a
+pseudo-terminal); ``#2`` is appended for servo id 2. Zero in ticks within the turn, speed in
+percent of stroke a second (one number serves for both directions), force over current units.
+Entries that this module does not know are kept.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from dexkit.drivers.ezgripper.force import ForceTable
+from dexkit.errors import UsageError
+from dexkit.wire import mx64
+
+__all__ = ["ENVIRONMENT", "GripperRecord", "Store", "default_path", "record_key"]
+
+ENVIRONMENT = "DEXKIT_EZGRIPPER_CONFIG"
+"""Environment variable that names another file."""
+
+_ZERO, _SPEED, _FORCE = "calibration", "movement_speed", "force_lookup"
+
+
+def default_path() -> Path:
+    """The user's file: ``$DEXKIT_EZGRIPPER_CONFIG``, or ezgripper.json in the user's config."""
+    named = os.environ.get(ENVIRONMENT)
+    return Path(named) if named else platformdirs.user_config_path("dexkit") / "ezgripper.json"
+
+
+def record_key(device: str, servo_id: int) -> str:
+    """Key of a gripper.
+
+    :param device: USB serial number, or path.
+    """
+    return device if servo_id == 1 else f"{device}#{servo_id}"
+
+
+@dataclass(frozen=True)
+class GripperRecord:
+    """What is stored of one gripper; None is unknown.
+
+    :param zero: position of the closed gripper, ticks within the turn.
+    :param opening: percent of stroke a second.
+    :param closing: percent of stroke a second.
+    """
+
+    zero: int | None = None
+    opening: float | None = None
+    closing: float | None = None
+    force_table: ForceTable | None = None
+
+
+class Store:
+    """The file.
+
+    :param path: by default :func:`default_path`.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.path = path if path is not None else default_path()
+
+    def _load(self) -> dict[str, Any]:
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return {}
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"cannot read {self.path}: {error}") from error
+        try:
+            # NaN and Infinity are no JSON, and no calibration either
+            content = json.loads(text, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError) as error:
+            raise UsageError(
+                f"{self.path} is not valid JSON: {error}",
+                hint="correct it, or remove it and calibrate again",
+            ) from error
+        if not isinstance(content, dict):
+            raise UsageError(f"{self.path} must hold a JSON object")
+        return content
+
+    def _section(self, content: dict[str, Any], name: str) -> dict[str, Any]:
+        section = content.get(name, {})
+        if not isinstance(section, dict):
+            raise UsageError(f"{self.path}: {name!r} must be an object")
+        return section
+
+    def keys(self) -> list[str]:
+        """Every gripper in the file.
+
+        :raises UsageError: the file cannot be read.
+        """
+        content = self._load()
+        names: set[str] = set()
+        for section in (_ZERO, _SPEED, _FORCE):
+            names.update(self._section(content, section))
+        return sorted(names)
+
+    def read(self, key: str) -> GripperRecord:
+        """What is known of a gripper; an empty record when nothing is.
+
+        :raises UsageError: the file cannot be read, or this gripper's entries make no sense.
+        """
+        content = self._load()
+        where = f"{self.path}: {key}"
+        zero = self._section(content, _ZERO).get(key)
+        if zero is not None and (
+            isinstance(zero, bool) or not isinstance(zero, int) or abs(zero) > mx64.POSITION_SPAN
+        ):
+            raise UsageError(f"{where}: zero {zero!r} is not a position in ticks")
+        opening, closing = self._speeds(where, self._section(content, _SPEED).get(key))
+        table = self._section(content, _FORCE).get(key)
+        if table is not None and not isinstance(table, dict):
+            raise UsageError(f"{where}: the force table must be an object")
+        return GripperRecord(
+            zero=None if zero is None else zero % mx64.TICKS_PER_TURN,
+            opening=opening,
+            closing=closing,
+            force_table=None if table is None else ForceTable.from_mapping(table),
+        )
+
+    @staticmethod
+    def _speeds(where: str, value: object) -> tuple[float | None, float | None]:
+        if value is None:
+            return None, None
+        pair = value if isinstance(value, dict) else {"opening": value, "closing": value}
+        speeds = []
+        for direction in ("opening", "closing"):
+            speed = pair.get(direction)
+            if speed is not None and (
+                isinstance(speed, bool)
+                or not isinstance(speed, int | float)
+                or not 0 < speed < math.inf
+            ):
+                raise UsageError(f"{where}: {direction} speed {speed!r} is not a positive number")
+            speeds.append(None if speed is None else float(speed))
+        return speeds[0], speeds[1]
+
+    def write(self, key: str, record: GripperRecord) -> None:
+        """Store what ``record`` knows; what it does not know stays as it is in the file.
+
+        The file is replaced in one step, so that it is whole at any moment.
+
+        :raises UsageError: the file cannot be read or written.
+        """
+        content = self._load()
+        if record.zero is not None:
+            content[_ZERO] = self._section(content, _ZERO) | {
+                key: record.zero % mx64.TICKS_PER_TURN
+            }
+        speeds = {
+            name: round(value, 2)
+            for name, value in (("opening", record.opening), ("closing", record.closing))
+            if value is not None
+        }
+        if speeds:
+            content[_SPEED] = self._section(content, _SPEED) | {key: speeds}
+        if record.force_table is not None:
+            content[_FORCE] = self._section(content, _FORCE) | {
+                key: record.force_table.to_mapping()
+            }
+        text = json.dumps(content, indent=2, sort_keys=True) + "\n"
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(
+                "w", dir=self.path.parent, prefix=self.path.name, delete=False, encoding="utf-8"
+            ) as file:
+                try:
+                    file.write(text)
+                    file.flush()
+                    os.fsync(file.fileno())
+                    os.replace(file.name, self.path)
+                except BaseException:
+                    os.unlink(file.name)
+                    raise
+        except OSError as error:
+            raise UsageError(f"cannot write {self.path}: {error}") from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number")

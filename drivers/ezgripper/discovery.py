@@ -1,0 +1,185 @@
+"""Finding the gripper: its port, its servo's id and baud rate, and what slows the line down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from serial.tools import list_ports
+
+from dexkit.drivers.ezgripper.bus import Ping, ServoBus
+from dexkit.errors import HandNotFound, HandRefused, HandTimeout
+from dexkit.wire import mx64
+
+__all__ = [
+    "SCAN_BAUD_RATES",
+    "Device",
+    "find_device",
+    "find_servo",
+    "latency_timer",
+    "latency_warning",
+]
+
+SCAN_BAUD_RATES = (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600)
+"""In the order of likelihood: SAKE's driver, ROBOTIS' and SAKE's factory setting, the others of
+the servo that the SDK can set (facts/mx64 B3)."""
+
+_UPGRADE = (
+    "upgrade it to Protocol 2.0 with ROBOTIS DYNAMIXEL Wizard 2 (firmware recovery, model "
+    "MX-64(2.0)); its registers are others, so it must not be driven as it is"
+)
+
+
+@dataclass(frozen=True)
+class Device:
+    """A serial port.
+
+    :param path: as given, or as the system names it.
+    :param serial_number: of the USB adapter, or None where there is none (a pseudo-terminal).
+    """
+
+    path: str
+    serial_number: str | None
+
+    @property
+    def key(self) -> str:
+        """What names this device in the configuration file."""
+        return self.serial_number or self.path
+
+
+def find_device(name: str) -> Device:
+    """The port that is meant by a device path or a USB serial number.
+
+    :raises HandNotFound: there is no such port; names those that there are.
+    """
+    ports = list_ports.comports()
+    path = Path(name)
+    if "/" in name or path.exists():
+        # /dev/serial/by-id/... and other links lead to the name that the system lists
+        resolved = str(path.resolve())
+        for port in ports:
+            if port.device in (name, resolved):
+                return Device(name, port.serial_number)
+        if not path.exists():
+            raise HandNotFound(f"there is no device {name}", hint=_known(ports))
+        return Device(str(path.absolute()), None)
+    matches = [port for port in ports if port.serial_number == name]
+    if len(matches) == 1:
+        return Device(matches[0].device, name)
+    if matches:
+        found = ", ".join(port.device for port in matches)
+        raise HandNotFound(
+            f"serial number {name} is that of more than one port: {found}", hint="give the path"
+        )
+    raise HandNotFound(f"no adapter has the serial number {name}", hint=_known(ports))
+
+
+def _known(ports: list[list_ports.ListPortInfo]) -> str:  # type: ignore[name-defined]
+    if not ports:
+        return "there are no serial ports at all: is the adapter plugged in?"
+    listed = ", ".join(
+        f"{port.device} (serial number {port.serial_number or 'none'})" for port in ports
+    )
+    return f"there are: {listed}"
+
+
+def latency_timer(path: str, sysfs: Path = Path("/sys")) -> int | None:
+    """Milliseconds of the latency timer of a USB-serial adapter, or None where it has none."""
+    name = Path(path).resolve().name
+    try:
+        return int((sysfs / "bus/usb-serial/devices" / name / "latency_timer").read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def latency_warning(path: str, sysfs: Path = Path("/sys")) -> str:
+    """What to tell the user of the latency timer, or an empty text when it is well set.
+
+    An FTDI chip holds a short answer back until its timer ends; at the usual 16 ms that leaves
+    some 60 exchanges a second (facts/mx64 C2). Nothing is changed here.
+    """
+    milliseconds = latency_timer(path, sysfs)
+    if milliseconds is None or milliseconds <= 1:
+        return ""
+    name = Path(path).resolve().name
+    return (
+        f"the latency timer of {path} is {milliseconds} ms, which allows about "
+        f"{1000 // (milliseconds + 1)} exchanges a second; set it to 1 ms: "
+        f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer, or for good with "
+        'the udev rule: ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", '
+        'ATTR{latency_timer}="1"'
+    )
+
+
+def find_servo(
+    bus: ServoBus,
+    servo_id: int | None,
+    baudrate: int | None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Ping:
+    """Find the gripper's servo and leave the bus open at its baud rate.
+
+    :param servo_id: or None for whichever single servo there is.
+    :param baudrate: or None to try all of :data:`SCAN_BAUD_RATES`.
+    :param progress: told what is being tried.
+    :raises HandNotFound: nothing (or more than one servo) answers; says what did.
+    :raises HandRefused: what answers is no MX-64, or speaks Protocol 1.0.
+    :raises HandLost: the port has gone away.
+    """
+    rates = SCAN_BAUD_RATES if baudrate is None else (baudrate,)
+    if servo_id is not None:
+        # a ping takes milliseconds, a broadcast seconds: ask by name everywhere first
+        for rate in rates:
+            progress(f"looking for servo {servo_id} at {rate} baud")
+            bus.set_baudrate(rate)
+            try:
+                return _checked(bus.ping(servo_id), bus)
+            except HandTimeout:
+                pass
+    others: list[str] = []
+    old: list[str] = []
+    for rate in rates:
+        progress(f"looking for any servo at {rate} baud")
+        bus.set_baudrate(rate)
+        found = bus.ping_all()
+        if len(found) == 1 and servo_id in (None, found[0].id):
+            return _checked(found[0], bus)
+        if len(found) > 1 and servo_id is None:
+            listed = ", ".join(f"id {p.id} (model {p.model})" for p in found)
+            raise HandNotFound(
+                f"more than one servo answers on {bus.path} at {rate} baud: {listed}",
+                hint="say which: id=N",
+            )
+        others += [f"id {p.id} (model {p.model}) at {rate} baud" for p in found]
+        for candidate in (1,) if servo_id is None else (servo_id,):
+            model = bus.ping_protocol_1(candidate)
+            if model is not None:
+                old.append(f"id {candidate} (model {model}) at {rate} baud")
+    if old:
+        raise HandRefused(
+            f"a servo on {bus.path} speaks Protocol 1.0: {', '.join(old)}", hint=_UPGRADE
+        )
+    who = "any id" if servo_id is None else f"id {servo_id}"
+    tried = ", ".join(str(rate) for rate in rates)
+    hint = f"answering instead: {', '.join(others)}" if others else "nothing answers at all"
+    if baudrate is not None:
+        hint += "; baudrate=auto tries every baud rate (a new servo has 57600)"
+    elif servo_id is not None:
+        hint += "; id=auto takes any id"
+    raise HandNotFound(
+        f"no servo answers on {bus.path}: tried {who} at {tried} baud",
+        hint=hint + "; is the 12 V supply on?",
+    )
+
+
+def _checked(ping: Ping, bus: ServoBus) -> Ping:
+    where = f"the servo with id {ping.id} on {bus.path}"
+    if ping.model == mx64.MODEL:
+        return ping
+    if ping.model == mx64.MODEL_PROTOCOL_1:
+        raise HandRefused(f"{where} is an MX-64 with Protocol 1.0 firmware", hint=_UPGRADE)
+    raise HandRefused(
+        f"{where} is model {ping.model}, not an MX-64(2.0) (model {mx64.MODEL})",
+        hint="the EZGripper is an MX-64; is this another device's port or id?",
+    )

@@ -1,0 +1,92 @@
+"""Force from motor current, through a table that can be calibrated (seed 003).
+
+The table maps Present Current (absolute value, units of 3.36 mA) to grip force; between its
+points it is interpolated, beyond them it stays at its end. The state's ``tau_est`` is the force
+divided by ten, as seed 003 and the interface specification (seed 000) have it.
+
+Present Current of an MX-64 is a noisy estimate (facts/mx64 D10 11): good for feedback, never
+for a decision.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from dexkit.errors import UsageError
+
+__all__ = ["DEFAULT_FORCE_TABLE", "TAU_PER_FORCE", "ForceTable"]
+
+TAU_PER_FORCE = 0.1
+"""tau_est of one unit of force (seed 003: ``tau_est = grip_force / 10``)."""
+
+
+@dataclass(frozen=True)
+class ForceTable:
+    """Grip force over motor current: points of rising current.
+
+    :param points: (current units, force), current rising strictly, force never falling.
+    :raises UsageError: the points are no such table.
+    """
+
+    points: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        if not self.points:
+            raise UsageError("a force table needs at least one point")
+        previous = (-math.inf, 0.0)
+        for current, force in self.points:
+            if not (math.isfinite(current) and math.isfinite(force)):
+                raise UsageError(f"force table: {current}: {force} is not finite")
+            if current < 0 or force < 0:
+                raise UsageError(f"force table: {current}: {force} is negative")
+            if current <= previous[0]:
+                raise UsageError(f"force table: current {current} appears twice or out of order")
+            if force < previous[1]:
+                raise UsageError(
+                    f"force table: force falls from {previous[1]} to {force} at {current}"
+                )
+            previous = (current, force)
+
+    @classmethod
+    def from_mapping(cls, table: Mapping[str, object]) -> ForceTable:
+        """A table as seed 003 stores it: ``{"0": 0.0, "100": 0.5, ...}``.
+
+        :raises UsageError: keys or values are not numbers, or make no table.
+        """
+        points = []
+        for key, value in table.items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise UsageError(f"force table: {key}: {value!r} is not a number")
+            try:
+                points.append((float(key), float(value)))
+            except ValueError:
+                raise UsageError(f"force table: current {key!r} is not a number") from None
+        return cls(tuple(sorted(points)))
+
+    def to_mapping(self) -> dict[str, float]:
+        """The table as seed 003 stores it."""
+        return {f"{current:g}": force for current, force in self.points}
+
+    def force(self, current: float) -> float:
+        """Force at ``current`` units; the sign of the current does not matter."""
+        current = abs(current)
+        index = bisect_right(self.points, current, key=lambda p: p[0])
+        if index == 0:
+            return self.points[0][1]
+        if index == len(self.points):
+            return self.points[-1][1]
+        (c0, f0), (c1, f1) = self.points[index - 1], self.points[index]
+        return f0 + (f1 - f0) * (current - c0) / (c1 - c0)
+
+    def tau(self, current: float) -> float:
+        """Magnitude of ``tau_est`` at ``current`` units, N·m as the seed counts it."""
+        return self.force(current) * TAU_PER_FORCE
+
+
+DEFAULT_FORCE_TABLE = ForceTable(
+    ((0.0, 0.0), (100.0, 0.5), (200.0, 1.2), (300.0, 2.0), (1023.0, 10.0))
+)
+"""The example of seed 003, used until a gripper has a table of its own."""

@@ -1,0 +1,563 @@
+"""The EZGripper as a Dex1-1: opening, exchanging, and coming back from faults."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from enum import Enum
+from pathlib import Path
+from typing import NoReturn
+
+from dexkit.backends import Backend, BackendOptions
+from dexkit.clock import Clock, RealClock
+from dexkit.drivers.ezgripper import calibration, settings
+from dexkit.drivers.ezgripper.block import Goal, Sample
+from dexkit.drivers.ezgripper.bus import BusStatistics, Ping, ServoBus
+from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
+from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
+from dexkit.drivers.ezgripper.discovery import Device, find_device, find_servo, latency_warning
+from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE, ForceTable
+from dexkit.drivers.ezgripper.recovery import RebootPolicy, describe, motor_error
+from dexkit.drivers.ezgripper.scaling import (
+    TICKS_PER_PERCENT,
+    joint_of_ticks,
+    joint_speed,
+)
+from dexkit.drivers.ezgripper.servo import BOOT_TIME, Servo, ServoStatistics, exchange_time
+from dexkit.errors import HandError, HandFault, HandLost, HandRefused, HandTimeout, UsageError
+from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
+from dexkit.models import DEX1_1
+from dexkit.wire import mx64
+from dexkit.wire.mx64 import HardwareError
+
+__all__ = ["Calibrate", "EZGripper", "GripperSettings", "GripperStatistics", "backend"]
+
+log = logging.getLogger(__name__)
+
+
+class Calibrate(str, Enum):
+    """Whether opening may move the gripper to find its zero."""
+
+    NO = "no"
+    AUTO = "auto"
+    YES = "yes"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+@dataclass(frozen=True)
+class GripperSettings:
+    """How to reach a gripper and how it shall behave.
+
+    :param id: servo id, or None to take the one that answers.
+    :param baudrate: bits a second, or None to try those known.
+    :param control: the behaviour.
+    :param calibrate: NO needs a stored zero, and opening never moves; AUTO closes and opens the
+        gripper if there is none; YES does so at every opening.
+    :param zero: zero in ticks, instead of the stored one.
+    :param config: file of the stored calibration; None is the user's.
+    :param force_table: instead of the stored one.
+    :param timeout: seconds to wait for one reply.
+    :param retries: how often an unanswered transaction is sent again within an exchange.
+    """
+
+    id: int | None = 1
+    baudrate: int | None = 1_000_000
+    control: ControlSettings = field(default_factory=ControlSettings)
+    calibrate: Calibrate = Calibrate.NO
+    zero: int | None = None
+    config: Path | None = None
+    force_table: ForceTable | None = None
+    timeout: float = 0.03
+    retries: int = 2
+
+    def __post_init__(self) -> None:
+        if self.id is not None and not 0 <= self.id <= 252:
+            raise UsageError(f"id must be 0 to 252, not {self.id}")
+        if self.baudrate is not None and self.baudrate not in mx64.BAUD_RATES.values():
+            raise UsageError(
+                f"an MX-64 has no baud rate {self.baudrate}",
+                hint="known: " + ", ".join(str(b) for b in mx64.BAUD_RATES.values()),
+            )
+        if not 0 < self.timeout <= 1:
+            raise UsageError(f"timeout must be within 0 and 1 s, not {self.timeout:g}")
+        if not 0 <= self.retries <= 10:
+            raise UsageError(f"retries must be 0 to 10, not {self.retries}")
+
+
+@dataclass
+class GripperStatistics:
+    """Counters since the gripper was made.
+
+    :ivar faults: hardware shutdowns seen.
+    :ivar reboots: made to recover from them.
+    :ivar resets: times that the servo lost its settings by itself (a supply dip).
+    """
+
+    faults: int = 0
+    reboots: int = 0
+    resets: int = 0
+
+
+class _Trouble(Enum):
+    NONE = 0
+    FAULT = 1
+    BOOTING = 2
+
+
+class EZGripper:
+    """A SAKE EZGripper (dual, one MX-64 with Protocol 2.0 firmware) behind the common interface.
+
+    :param device: path of the serial port, or USB serial number of the adapter.
+    :param side: which hand it stands for.
+    :param configuration: how to reach it and how it shall behave.
+
+    ``open`` finds the servo, sets its registers and loads the calibration; nothing moves
+    (unless asked to calibrate). The motor is first energised by the first command that needs
+    it. ``close`` switches it off. If the process dies, the servo's own watchdog stops it within
+    half a second.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        side: Side = Side.RIGHT,
+        configuration: GripperSettings | None = None,
+        *,
+        clock: Clock | None = None,
+    ) -> None:
+        self.configuration = configuration if configuration is not None else GripperSettings()
+        self.device_name = device
+        self.statistics = GripperStatistics()
+        self.record = GripperRecord()
+        self.ping: Ping | None = None
+        self.device: Device | None = None
+        self._clock: Clock = clock if clock is not None else RealClock()
+        self._servo: Servo | None = None
+        self._control: Control | None = None
+        self._last: Sample | None = None
+        self._force = DEFAULT_FORCE_TABLE
+        self._limits = settings.ServoLimits(80, 9.5, 16.0)
+        self._policy = RebootPolicy()
+        self._trouble = _Trouble.NONE
+        self._error = HardwareError.NONE
+        self._fault = MotorError.NONE
+        self._message = ""
+        self._since = 0.0
+        self._commanded: HandCommand | None = None
+        self._overload_at: float | None = None
+        self._was_warm = False
+        self._spec = self._make_spec(side, self.configuration.baudrate or 1_000_000)
+
+    def _make_spec(self, side: Side, baudrate: int) -> HandSpec:
+        attempts = 1 + self.configuration.retries
+        return DEX1_1.spec(
+            side,
+            io_rate=1.0 / exchange_time(baudrate),
+            # the first exchange switches the motor on: two transactions
+            exchange_timeout=2 * attempts * (self.configuration.timeout + exchange_time(baudrate)),
+        )
+
+    @property
+    def spec(self) -> HandSpec:
+        """What this hand is; ``io_rate`` is that of the line at its baud rate."""
+        return self._spec
+
+    @property
+    def phase(self) -> Phase | None:
+        """What the gripper is doing, or None when it is not open."""
+        return self._control.phase if self._control is not None else None
+
+    @property
+    def bus_statistics(self) -> BusStatistics:
+        """Counters of the line since it was opened."""
+        return self._servo.bus.statistics if self._servo is not None else BusStatistics()
+
+    @property
+    def servo_statistics(self) -> ServoStatistics:
+        """Counters of the exchanges since it was opened."""
+        return self._servo.statistics if self._servo is not None else ServoStatistics()
+
+    @property
+    def speed(self) -> float | None:
+        """Slower one of the calibrated speeds, rad/s of the joint, or None if not measured."""
+        known = [s for s in (self.record.opening, self.record.closing) if s is not None]
+        return min(known) / 100 * self._spec.joints[0].stroke if known else None
+
+    # --- opening and closing
+
+    def open(self) -> None:
+        """Find the servo, set it up, load the calibration; without moving (see ``calibrate``).
+
+        :raises HandNotFound: no such port, or nothing answers.
+        :raises HandRefused: no MX-64(2.0), no calibration, a register that does not take its
+            value, or a port that another program uses.
+        :raises HandFault: the servo is in shutdown and may not be restarted yet.
+        :raises HandLost, HandTimeout: it goes away meanwhile.
+        """
+        if self._servo is not None:
+            return
+        try:
+            servo = self.connect()
+            self._control = Control(self._zero(servo), self.configuration.control)
+            self._last = servo.sample()
+        except BaseException:
+            self.close()
+            raise
+        log.info(
+            "EZGripper on %s: servo %d, firmware %d, at %.1f %% of its stroke, %d degC, %.1f V",
+            servo.bus.path,
+            servo.id,
+            self.ping.firmware if self.ping else 0,
+            self._control.position(self._last) / TICKS_PER_PERCENT,
+            self._last.temperature,
+            self._last.voltage * mx64.VOLTAGE_UNIT,
+        )
+
+    def connect(self, progress: Callable[[str], None] = log.info) -> Servo:
+        """The first half of :meth:`open`: a configured servo, no calibration needed.
+
+        For calibration; :meth:`close` ends it. Raises as :meth:`open`.
+        """
+        configuration = self.configuration
+        device = find_device(self.device_name)
+        self.device = device
+        warning = latency_warning(device.path)
+        if warning:
+            log.warning("%s", warning)
+        bus = ServoBus(
+            device.path,
+            configuration.baudrate or 1_000_000,
+            timeout=configuration.timeout,
+            retries=configuration.retries,
+        )
+        try:
+            self.ping = find_servo(bus, configuration.id, configuration.baudrate, progress)
+            servo = Servo(bus, self.ping.id, self._clock)
+            self._servo = servo
+            self._spec = self._make_spec(self._spec.side, bus.baudrate)
+            self._clear_shutdown(servo)
+            self._limits = servo.configure()
+        except BaseException:
+            bus.close()
+            self._servo = None
+            raise
+        self._trouble = _Trouble.NONE
+        self.record = Store(configuration.config).read(self.key)
+        self._force = configuration.force_table or self.record.force_table or DEFAULT_FORCE_TABLE
+        return servo
+
+    @property
+    def key(self) -> str:
+        """Key of this gripper in the calibration file; known once it is connected."""
+        if self.device is None or self.ping is None:
+            raise UsageError("the gripper has not been opened yet")
+        return record_key(self.device.key, self.ping.id)
+
+    def _zero(self, servo: Servo) -> int:
+        configuration = self.configuration
+        if configuration.zero is not None:
+            return configuration.zero
+        if configuration.calibrate is not Calibrate.YES and self.record.zero is not None:
+            return self.record.zero
+        if configuration.calibrate is Calibrate.NO:
+            raise HandRefused(
+                f"the gripper {self.key} has not been calibrated",
+                hint=f"empty it and run: dexkit calibrate ezgripper --device {self.device_name}"
+                " (or calibrate at every start with --set calibrate=yes)",
+            )
+        zero = calibration.find_zero(servo, progress=log.info)
+        self.record = replace(self.record, zero=zero)
+        if self.device is not None and self.device.serial_number:
+            Store(configuration.config).write(self.key, GripperRecord(zero=zero))
+        return zero
+
+    def close(self) -> None:
+        """Switch the motor off and release the port, as far as it is still there."""
+        servo, self._servo = self._servo, None
+        self._control = None
+        self._last = None
+        if servo is None:
+            return
+        try:
+            servo.set_torque(False)
+        except HandError as error:
+            # gone or silent: its watchdog has stopped it, or will within half a second
+            log.warning("could not switch the motor off: %s", error)
+        finally:
+            servo.bus.close()
+
+    def __enter__(self) -> EZGripper:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    # --- exchanging
+
+    def exchange(self, command: HandCommand) -> HandState:
+        """Send the goal that ``command`` makes, return what was measured.
+
+        :raises HandFault: the servo has shut down, or is being restarted; further calls carry
+            the recovery on, one bounded step each.
+        :raises HandLost: the port has gone away, or the gripper is not open.
+        :raises HandTimeout: no intact answer to any of the attempts.
+        """
+        servo, control, last = self._servo, self._control, self._last
+        if servo is None or control is None or last is None:
+            raise HandLost("the gripper is not open", hint="call open() first")
+        if self._trouble is not _Trouble.NONE:
+            last = self._recover(servo, control)
+        goal = control.plan(command, last)
+        if goal.current and not last.torque:
+            servo.engage(Goal(last.position, goal.current, goal.profile_velocity))
+        sample = servo.exchange(goal)
+        self._examine(servo, control, command, sample, engaged=goal.current > 0)
+        self._commanded = command
+        self._last = sample
+        return self._state(control, sample)
+
+    def _examine(
+        self,
+        servo: Servo,
+        control: Control,
+        command: HandCommand,
+        sample: Sample,
+        *,
+        engaged: bool,
+    ) -> None:
+        if sample.voltage == 0:
+            # the indirect addresses are back at their defaults: the servo has restarted
+            self.statistics.resets += 1
+            self._fail(
+                HardwareError.NONE,
+                MotorError.ABNORMAL_RESET,
+                command,
+                "the servo has restarted by itself",
+                hint="is the supply strong enough?",
+            )
+        shutdown = sample.error & ~HardwareError.INPUT_VOLTAGE
+        if shutdown or (sample.error and engaged and not sample.torque):
+            self.statistics.faults += 1
+            if sample.error & HardwareError.OVERLOAD:
+                self._overload_at = float(control.position(sample))
+            self._policy.fault(self._clock.now())
+            self._fail(
+                sample.error,
+                self._motor_error(sample),
+                command,
+                f"the servo has shut down: {describe(sample.error)}",
+            )
+        if engaged and not sample.torque:
+            # switched off behind the driver's back: start over as after a reset
+            self._fail(
+                HardwareError.NONE,
+                MotorError.ABNORMAL_RESET,
+                command,
+                "the servo's torque was switched off by something else",
+            )
+        if sample.watchdog == mx64.WATCHDOG_TRIPPED:
+            log.warning("nothing was sent to the servo for too long; it stopped, going on")
+            servo.rearm_watchdog(settings.WATCHDOG_UNITS)
+        if sample.temperature >= control.settings.warm and not self._was_warm:
+            log.warning("the servo is at %d degC: effort is reduced", sample.temperature)
+        self._was_warm = sample.temperature >= control.settings.warm
+
+    def _motor_error(self, sample: Sample) -> MotorError:
+        return motor_error(
+            sample.error, sample.voltage * mx64.VOLTAGE_UNIT, self._limits.voltage_max
+        )
+
+    def _state(self, control: Control, sample: Sample) -> HandState:
+        contact = control.contact
+        # signed as the joint: closing is toward smaller q, so squeezing is negative, as the
+        # vendor's gripper reports it (facts/unitree-dex B.7)
+        tau = contact.direction * self._force.tau(sample.current) if contact else 0.0
+        return HandState.of(
+            joint_of_ticks(control.position(sample)),
+            stamp=sample.time,
+            dq=joint_speed(sample.velocity),
+            tau_est=tau,
+            temperature=float(sample.temperature),
+            voltage=sample.voltage * mx64.VOLTAGE_UNIT,
+            mode=JointMode.BRAKE if control.phase is Phase.BRAKE else JointMode.FOC,
+            fault=int(self._motor_error(sample)),
+        )
+
+    # --- faults
+
+    def _fail(
+        self,
+        error: HardwareError,
+        fault: MotorError,
+        command: HandCommand,
+        message: str,
+        hint: str = "",
+    ) -> NoReturn:
+        self._error = error
+        self._fault = fault
+        self._commanded = command
+        self._since = self._clock.now()
+        # without an error the servo only needs its settings again
+        self._trouble = _Trouble.FAULT if error else _Trouble.BOOTING
+        self._message = message
+        log.error("%s", message)
+        raise HandFault(message, bits=(fault,), hint=hint)
+
+    def _recover(self, servo: Servo, control: Control) -> Sample:
+        """One bounded step towards a working servo; the sample when it works again.
+
+        Nothing moves: torque is off after the restart, and the control holds the position
+        where the fingers then are, until a command comes that differs from the last one.
+        """
+        now = self._clock.now()
+        if self._trouble is _Trouble.FAULT:
+            temperature = servo.temperature()
+            if not self._policy.due(now, self._error, temperature, self._limits.temperature):
+                raise self._still(f"waiting before the restart ({temperature} degC)")
+            self._reboot(servo, now)
+            raise self._still("restarting")
+        if not servo.answers():
+            if now - self._since > BOOT_TIME:
+                raise HandTimeout(
+                    f"servo {servo.id} on {servo.bus.path} does not come back after its restart",
+                    hint="switch its supply off and on",
+                )
+            raise self._still("restarting")
+        error = servo.hardware_error()
+        if error & ~HardwareError.INPUT_VOLTAGE:
+            self._error = error
+            self._trouble = _Trouble.FAULT
+            self._policy.fault(now)
+            raise self._still("the restart did not help")
+        self._limits = servo.configure()
+        sample = servo.sample()
+        control.recovered(self._commanded, overload_at=self._overload_at)
+        self._overload_at = None
+        self._trouble = _Trouble.NONE
+        self._fault = MotorError.NONE
+        self._last = sample
+        log.warning("the servo works again; holding until a new command comes")
+        return sample
+
+    def _reboot(self, servo: Servo, now: float) -> None:
+        self.statistics.reboots += 1
+        log.warning("restarting the servo after: %s", describe(self._error))
+        servo.reboot()
+        self._since = now
+        self._trouble = _Trouble.BOOTING
+
+    def _still(self, what: str) -> HandFault:
+        return HandFault(f"{self._message}; {what}", bits=(self._fault,))
+
+    def _clear_shutdown(self, servo: Servo) -> None:
+        """Restart a servo that is found in shutdown, if it may be restarted soon."""
+        error = servo.hardware_error()
+        if not error & ~HardwareError.INPUT_VOLTAGE:
+            return
+        self.statistics.faults += 1
+        self._error = error
+        self._policy.fault(self._clock.now())
+        if error & HardwareError.OVERHEATING or self._policy.delay > 2.0:
+            temperature = servo.temperature()
+            limit = servo.bus.read_item(servo.id, mx64.TEMPERATURE_LIMIT)
+            if not self._policy.due(self._clock.now(), error, temperature, limit):
+                raise HandFault(
+                    f"the servo is in shutdown: {describe(error)} ({temperature} degC)",
+                    bits=(motor_error(error, 0.0, 0.0),),
+                    hint="let it cool down, free the fingers, and try again",
+                )
+        self._clock.sleep_until(self._clock.now() + min(self._policy.delay, 2.0))
+        self._reboot(servo, self._clock.now())
+        deadline = self._clock.now() + BOOT_TIME
+        while not servo.answers():
+            if self._clock.now() > deadline:
+                raise HandTimeout(f"servo {servo.id} does not come back after its restart")
+        error = servo.hardware_error()
+        if error & ~HardwareError.INPUT_VOLTAGE:
+            raise HandFault(
+                f"the servo is in shutdown and a restart does not help: {describe(error)}",
+                bits=(motor_error(error, 0.0, 0.0),),
+            )
+
+
+# --- the backend
+
+
+def _number(low: float, high: float) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise ValueError(f"not within {low:g} and {high:g}")
+        return value
+
+    return parse
+
+
+def _or_auto(text: str) -> int | None:
+    return None if text == "auto" else int(text)
+
+
+def _table(text: str) -> ForceTable:
+    if text == "default":
+        return DEFAULT_FORCE_TABLE
+    content = json.loads(Path(text).read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise ValueError("the file must hold a JSON object")
+    return ForceTable.from_mapping(content)
+
+
+_CONTROL = {f.name for f in fields(ControlSettings)}
+
+_SETTINGS: dict[str, tuple[Callable[[str], object], str]] = {
+    "id": (_or_auto, "servo id, or auto for the one that answers [1]"),
+    "baudrate": (_or_auto, "bits a second, or auto to try those known [1000000]"),
+    "calibrate": (
+        Calibrate,
+        "no: a stored zero is needed; auto: find it, moving, if none is stored; yes: always [no]",
+    ),
+    "zero": (int, "zero in servo ticks, instead of the stored one"),
+    "config": (Path, "calibration file [the user's]"),
+    "force_table": (_table, "JSON file {current units: force}, or default [the stored one]"),
+    "effort": (_number(0, 100), "force limit while moving, % [50]"),
+    "hold_effort": (_number(0, 100), "force limit while holding and braking, % [15]"),
+    "hold_after": (_number(0, 60), "seconds of contact until hold_effort [0.5]"),
+    "speed": (_number(0, 1000), "speed limit, % of stroke a second [300: none]"),
+    "startup_speed": (_number(0, 1000), "speed limit of the first motion, %/s [50]"),
+    "startup_time": (_number(0, 60), "seconds after which that limit ends at the latest [3]"),
+    "warm": (_number(0, 80), "degC from which effort is reduced to hold_effort [70]"),
+    "timeout": (_number(0, 1), "seconds to wait for a reply [0.03]"),
+    "retries": (int, "times that an unanswered request is repeated [2]"),
+}
+
+
+def _settings(options: BackendOptions) -> GripperSettings:
+    values: dict[str, object] = {}
+    for name, text in options.settings.items():
+        parse, meaning = _SETTINGS[name]
+        try:
+            values[name] = parse(text)
+        except (ValueError, OSError) as error:
+            raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
+    control = ControlSettings(**{k: v for k, v in values.items() if k in _CONTROL})  # type: ignore[arg-type]
+    rest = {k: v for k, v in values.items() if k not in _CONTROL}
+    return GripperSettings(control=control, **rest)  # type: ignore[arg-type]
+
+
+def _make(options: BackendOptions) -> EZGripper:
+    assert options.device is not None  # Backend.create has checked it
+    return EZGripper(options.device, options.side, _settings(options))
+
+
+backend = Backend(
+    summary="SAKE EZGripper with an MX-64 servo (Protocol 2.0) on a serial port",
+    model=DEX1_1.name,
+    make=_make,
+    needs="--device PATH or USB serial number",
+    needs_device=True,
+    settings={name: meaning for name, (_, meaning) in _SETTINGS.items()},
+)

@@ -1,0 +1,88 @@
+"""Units: servo ticks, percent of stroke, joint radians, effort, current, speed.
+
+Everything here is relative to the calibrated zero: 0 ticks is closed, 2500 ticks, 100 %, and
+5.4 rad of the Dex1 joint are fully open (facts/mx64 D2, D7; conflicts D10 3 to 5).
+"""
+
+from __future__ import annotations
+
+from dexkit.hand import Side
+from dexkit.models import DEX1_1
+from dexkit.wire import mx64
+
+__all__ = [
+    "CURRENT_LIMIT",
+    "JOINT_PER_TICK",
+    "STROKE",
+    "TICKS_PER_PERCENT",
+    "amperes",
+    "current_of_effort",
+    "joint_of_ticks",
+    "joint_speed",
+    "profile_velocity",
+    "relative_position",
+    "ticks_of_joint",
+    "ticks_per_second",
+]
+
+STROKE = mx64.EZGRIPPER_STROKE
+TICKS_PER_PERCENT = STROKE / 100
+
+_JOINT = DEX1_1.joints[Side.LEFT][0]
+JOINT_PER_TICK = _JOINT.stroke / STROKE
+"""rad of the Dex1 joint in one servo tick: 2500 ticks are 5.4 rad."""
+
+CURRENT_LIMIT = 1600
+"""Current units that are 100 % effort (facts/mx64 D2); 76 % already stalls the servo at 12 V."""
+
+_TICKS_PER_SECOND = mx64.VELOCITY_UNIT_RPM / 60 * mx64.TICKS_PER_TURN
+"""ticks/s of one velocity unit (0.229 rpm): 15.63."""
+
+
+def joint_of_ticks(ticks: float) -> float:
+    """Joint angle, rad, of a position relative to the zero."""
+    return _JOINT.q_min + ticks * JOINT_PER_TICK
+
+
+def ticks_of_joint(q: float) -> int:
+    """Position relative to the zero, in whole ticks within the stroke, of a joint angle in rad."""
+    return min(max(round((q - _JOINT.q_min) / JOINT_PER_TICK), 0), STROKE)
+
+
+def ticks_per_second(velocity: float) -> float:
+    """ticks/s of a velocity register's value."""
+    return velocity * _TICKS_PER_SECOND
+
+
+def joint_speed(velocity: float) -> float:
+    """rad/s of the joint of a velocity register's value; positive opens."""
+    return ticks_per_second(velocity) * JOINT_PER_TICK
+
+
+def profile_velocity(percent_per_second: float) -> int:
+    """Profile Velocity register value for a speed; at least 1, because 0 means no limit."""
+    return max(1, round(percent_per_second * TICKS_PER_PERCENT / _TICKS_PER_SECOND))
+
+
+def current_of_effort(effort: float) -> int:
+    """Goal Current units of an effort in percent, clamped to 0..100 (facts/mx64 D2)."""
+    return round(min(max(effort, 0.0), 100.0) * CURRENT_LIMIT / 100)
+
+
+def amperes(units: float) -> float:
+    """A of current units."""
+    return units * mx64.CURRENT_UNIT
+
+
+def relative_position(present: int, zero: int) -> int:
+    """Ticks between the zero and ``present``, whatever turn either was counted in.
+
+    The encoder is absolute only within one turn: after power-on or a reboot the servo reports
+    0..4095, while the zero may have been stored in another turn (facts/mx64 B4, D4). The
+    difference modulo 4096 is still unique, because the stroke is 2500 ticks: a closed gripper
+    is near 0 and an open one near 2500, which leaves 1596 ticks that no position can be in.
+    Their middle is where the answer flips: up to 798 ticks (32 %) past open still read as open,
+    up to 798 below the zero as negative.
+    """
+    margin = (mx64.TICKS_PER_TURN - STROKE) // 2
+    return (present - zero + margin) % mx64.TICKS_PER_TURN - margin

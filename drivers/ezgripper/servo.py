@@ -1,0 +1,135 @@
+"""One servo on a bus: goals in, samples out, with a dead man's switch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dexkit.clock import Clock, RealClock
+from dexkit.drivers.ezgripper import block
+from dexkit.drivers.ezgripper.block import Goal, Sample
+from dexkit.drivers.ezgripper.bus import ServoBus
+from dexkit.drivers.ezgripper.settings import ServoLimits, apply_settings
+from dexkit.errors import HandTimeout
+from dexkit.wire import mx64
+
+__all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "exchange_time"]
+
+BOOT_TIME = 5.0
+"""Seconds after which a rebooted servo should answer again; the real time is not published
+(facts/mx64 D6: 0.5 to 1.5 s were waited)."""
+
+_SYNC_WRITE_OVERHEAD = 15
+_READ_INSTRUCTION = 14
+_STATUS_OVERHEAD = 11
+_RETURN_DELAY = 4e-6
+
+
+def exchange_bytes() -> tuple[int, int]:
+    """Bytes on the line of one exchange: (to the servo, from the servo)."""
+    sent = _SYNC_WRITE_OVERHEAD + block.WRITE_SIZE + _READ_INSTRUCTION
+    return sent, _STATUS_OVERHEAD + block.READ_SIZE
+
+
+def exchange_time(baudrate: int, latency_timer: float = 1e-3) -> float:
+    """Least seconds of one exchange: time on the line and one wait for the USB adapter."""
+    return sum(exchange_bytes()) * 10 / baudrate + _RETURN_DELAY + latency_timer
+
+
+@dataclass
+class ServoStatistics:
+    """What happened in the exchanges.
+
+    :ivar exchanges: completed.
+    :ivar lost_writes: goals that the next sample did not show.
+    :ivar stale: samples with the same servo time as the one before.
+    :ivar watchdog_trips: times that the servo stopped because nothing was said to it.
+    """
+
+    exchanges: int = 0
+    lost_writes: int = 0
+    stale: int = 0
+    watchdog_trips: int = 0
+
+
+class Servo:
+    """A configured servo.
+
+    :param bus: open, at the servo's baud rate.
+    :param servo_id: its id.
+    """
+
+    def __init__(self, bus: ServoBus, servo_id: int, clock: Clock | None = None) -> None:
+        self.bus = bus
+        self.id = servo_id
+        self.statistics = ServoStatistics()
+        self._clock: Clock = clock if clock is not None else RealClock()
+        self._tick = -1
+        sent, _ = exchange_bytes()
+        self._to_measurement = bus.wire_time(sent)
+        self._read_to_measurement = bus.wire_time(_READ_INSTRUCTION)
+
+    def configure(self) -> ServoLimits:
+        """Set and verify all registers. Raises as :func:`settings.apply_settings`."""
+        return apply_settings(self.bus, self.id)
+
+    def exchange(self, goal: Goal) -> Sample:
+        """One write, one read.
+
+        :raises HandTimeout: no answer.
+        :raises HandLost: the port has gone away.
+        """
+        started = self._clock.now()
+        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, block.encode(goal))
+        sample = self._read(started + self._to_measurement)
+        self.statistics.exchanges += 1
+        if sample.goal_current != goal.current or sample.goal_position != goal.position:
+            self.statistics.lost_writes += 1
+        return sample
+
+    def sample(self) -> Sample:
+        """One read, nothing written. Raises as :meth:`exchange`."""
+        return self._read(self._clock.now() + self._read_to_measurement)
+
+    def _read(self, measured_at: float) -> Sample:
+        data, _ = self.bus.read(self.id, block.READ_ADDRESS, block.READ_SIZE)
+        # a repeated read was measured later than planned; never claim a time in the future
+        sample = block.decode(data, min(measured_at, self._clock.now()))
+        if sample.tick == self._tick:
+            self.statistics.stale += 1
+        self._tick = sample.tick
+        return sample
+
+    def set_torque(self, on: bool) -> None:
+        """Switch the motor; raises as the bus, and ServoError in a shutdown."""
+        self.bus.write_item(self.id, mx64.TORQUE_ENABLE, int(on))
+
+    def engage(self, goal: Goal) -> None:
+        """Switch the motor on with ``goal`` already in its registers."""
+        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, block.encode(goal))
+        self.set_torque(True)
+
+    def rearm_watchdog(self, period: int) -> None:
+        """Make a servo that stopped by its watchdog take goals again."""
+        self.statistics.watchdog_trips += 1
+        self.bus.write_item(self.id, mx64.BUS_WATCHDOG, 0)
+        self.bus.write_item(self.id, mx64.BUS_WATCHDOG, period)
+
+    def hardware_error(self) -> mx64.HardwareError:
+        """Hardware Error Status(70), one byte: 71 does not exist."""
+        return mx64.HardwareError(self.bus.read_item(self.id, mx64.HARDWARE_ERROR_STATUS))
+
+    def temperature(self) -> int:
+        """Present Temperature, °C."""
+        return self.bus.read_item(self.id, mx64.PRESENT_TEMPERATURE)
+
+    def reboot(self) -> None:
+        """Restart the servo. Raises as the bus."""
+        self.bus.reboot(self.id)
+
+    def answers(self) -> bool:
+        """Whether the servo answers a ping now."""
+        try:
+            self.bus.ping(self.id, retries=0)
+        except HandTimeout:
+            return False
+        return True

@@ -1,0 +1,136 @@
+"""The servo's registers: what they must hold, compared before they are written and verified after.
+
+EEPROM is written only where it differs (its life is limited), with torque off, because the
+servo refuses otherwise (facts/mx64 A4, D3). RAM is lost at power-off and reboot, so it is set
+at every start. The order matters: the operating mode resets Goal Current and the profile, and
+Velocity Limit bounds the profile (facts/mx64 B4, B5).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from dexkit.drivers.ezgripper import block
+from dexkit.drivers.ezgripper.bus import ServoBus, ServoError
+from dexkit.drivers.ezgripper.scaling import CURRENT_LIMIT
+from dexkit.errors import HandRefused
+from dexkit.wire import mx64
+from dexkit.wire.mx64 import OperatingMode, StatusReturnLevel
+
+__all__ = ["EEPROM", "RAM", "WATCHDOG_TIME", "WATCHDOG_UNITS", "ServoLimits", "apply_settings"]
+
+log = logging.getLogger(__name__)
+
+EEPROM: tuple[tuple[mx64.Item, int], ...] = (
+    # current-based position: force is Goal Current, and changing it needs no torque-off (D10 8)
+    (mx64.OPERATING_MODE, OperatingMode.CURRENT_BASED_POSITION),
+    (mx64.DRIVE_MODE, 0),  # closing is toward smaller ticks; profile in velocities
+    (mx64.HOMING_OFFSET, 0),
+    (mx64.RETURN_DELAY_TIME, 2),  # 4 us (D3)
+    (mx64.CURRENT_LIMIT, CURRENT_LIMIT),
+    (mx64.VELOCITY_LIMIT, 1023),
+)
+"""EEPROM items and the values that they must have (facts/mx64 D3)."""
+
+RAM: tuple[tuple[mx64.Item, int], ...] = (
+    (mx64.STATUS_RETURN_LEVEL, StatusReturnLevel.ALL),
+    (mx64.PROFILE_ACCELERATION, 800),
+)
+"""RAM items and their values (facts/mx64 D3); the rest is in every exchange."""
+
+WATCHDOG_TIME = 0.5
+"""Seconds without an instruction after which the servo stops by itself: the dead man's switch
+for a driver that is killed or a cable that is pulled."""
+WATCHDOG_UNITS = round(WATCHDOG_TIME / mx64.WATCHDOG_UNIT)
+"""The same as Bus Watchdog(98) takes it."""
+
+
+@dataclass(frozen=True)
+class ServoLimits:
+    """The servo's own limits, read from it.
+
+    :param temperature: °C at which it shuts down.
+    :param voltage_min: V.
+    :param voltage_max: V.
+    """
+
+    temperature: int
+    voltage_min: float
+    voltage_max: float
+
+
+def _verify(bus: ServoBus, servo_id: int, item: mx64.Item, value: int) -> None:
+    found = bus.read_item(servo_id, item)
+    if found != value:
+        raise HandRefused(
+            f"servo {servo_id}: {item.name}({item.address}) was set to {value} but reads {found}",
+            hint="another program may be writing to the same servo",
+        )
+
+
+def _hold_here(bus: ServoBus, servo_id: int) -> None:
+    present = bus.read_item(servo_id, mx64.PRESENT_POSITION)
+    bus.write_item(servo_id, mx64.GOAL_POSITION, present)
+
+
+def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
+    """Bring the registers of a servo to what the driver needs. Nothing moves.
+
+    Torque is switched off only if EEPROM has to change; a servo that holds something goes on
+    holding it, at the position where it is.
+
+    :returns: the limits that the servo watches itself.
+    :raises HandRefused: a register does not take its value.
+    :raises HandTimeout, HandLost: as the bus.
+    """
+    # with the level at "ping" nothing else would be answered, and at "read" writes would not
+    bus.write_unacknowledged(
+        servo_id,
+        mx64.STATUS_RETURN_LEVEL.address,
+        mx64.STATUS_RETURN_LEVEL.encode(StatusReturnLevel.ALL),
+    )
+    if bus.read_item(servo_id, mx64.BUS_WATCHDOG) != 0:
+        bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
+    differing = [(item, value) for item, value in EEPROM if bus.read_item(servo_id, item) != value]
+    if bus.read_item(servo_id, mx64.TORQUE_ENABLE):
+        if differing:
+            bus.write_item(servo_id, mx64.TORQUE_ENABLE, 0)
+        else:
+            _hold_here(bus, servo_id)
+    for item, value in differing:
+        log.info("servo %d: setting %s(%d) to %d", servo_id, item.name, item.address, value)
+        try:
+            bus.write_item(servo_id, item, value)
+        except ServoError as error:
+            raise HandRefused(
+                f"servo {servo_id} does not take {item.name}({item.address}) = {value}: "
+                f"{error.message}"
+            ) from error
+        _verify(bus, servo_id, item, value)
+    for item, value in RAM:
+        bus.write_item(servo_id, item, value)
+        _verify(bus, servo_id, item, value)
+    _map_block(bus, servo_id)
+    bus.write_item(servo_id, mx64.BUS_WATCHDOG, WATCHDOG_UNITS)
+    _verify(bus, servo_id, mx64.BUS_WATCHDOG, WATCHDOG_UNITS)
+    return ServoLimits(
+        temperature=bus.read_item(servo_id, mx64.TEMPERATURE_LIMIT),
+        voltage_min=bus.read_item(servo_id, mx64.MIN_VOLTAGE_LIMIT) * mx64.VOLTAGE_UNIT,
+        voltage_max=bus.read_item(servo_id, mx64.MAX_VOLTAGE_LIMIT) * mx64.VOLTAGE_UNIT,
+    )
+
+
+def _map_block(bus: ServoBus, servo_id: int) -> None:
+    first = mx64.INDIRECT_BLOCKS[0].address
+    wanted = block.mapping()
+    found, _ = bus.read(servo_id, first, len(wanted))
+    if found == wanted:
+        return
+    bus.write(servo_id, first, wanted)
+    found, _ = bus.read(servo_id, first, len(wanted))
+    if found != wanted:
+        raise HandRefused(
+            f"servo {servo_id}: the indirect addresses do not take the driver's mapping",
+            hint="update the servo's firmware with DYNAMIXEL Wizard 2",
+        )
