@@ -40,13 +40,19 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
                 f"{topic}: a peer uses {other}, this service {type_name}; they never match"
                 + _advice(topic, other)
             )
-    for other_dialect in DIALECTS.values():
-        topics = {t for side in Side for t in other_dialect.topics(side)} - set(served)
-        for topic in sorted({e.topic for e in foreign} & topics):
-            if other_dialect.topics(Side.LEFT) == other_dialect.topics(Side.RIGHT):
+    foreign_topics = {e.topic for e in foreign}
+    for other in DIALECTS.values():
+        pairs = {side: set(other.topics(side)) for side in Side}
+        # a client of the other side is somebody else's business, unless the dialect differs
+        shared = pairs[Side.LEFT] == pairs[Side.RIGHT]
+        ours = dialect.topics(Side.LEFT) == dialect.topics(Side.RIGHT)
+        if shared == ours:
+            continue
+        for topic in sorted(foreign_topics & (pairs[Side.LEFT] | pairs[Side.RIGHT])):
+            types = {e.type_name for e in foreign if e.topic == topic}
+            if types & {other.cmd_type, other.state_type}:
                 found.append(
-                    f"a peer is on {topic}, which is not served here; "
-                    f"try --dialect {other_dialect.name}"
+                    f"a peer is on {topic}, which is not served here. Try --dialect {other.name}"
                 )
     return found
 

@@ -1,0 +1,366 @@
+"""The service's threads, with a scripted hand and a DDS node that is not DDS."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+
+import pytest
+
+from dexkit.errors import DdsError, HandLost, HandTimeout, TopicConflict, UsageError
+from dexkit.hand import HandState, MotorError, Side
+from dexkit.messages import encode, message_type, unitree_go, unitree_hg
+from dexkit.models import dialect
+from dexkit.service import HandService, diagnose
+from tests.service_helpers import FakeEndpoint, FakeNode, FakeWriter, ScriptedHand, wait_until
+
+CMD, STATE = dialect("unitree_go").topics(Side.LEFT)
+STATES = message_type(dialect("unitree_go").state_type)
+LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+
+def cmd(q: float, **fields: float) -> bytes:
+    return encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05, **fields)]))
+
+
+def newest(node: FakeNode, topic: str = STATE) -> unitree_go.MotorState_:
+    return states(node, topic)[0]
+
+
+def states(node: FakeNode, topic: str = STATE) -> list[unitree_go.MotorState_]:
+    wait_until(lambda: node.sent, what="the first state")
+    data = next(data for t, data in reversed(node.sent) if t == topic)
+    found: list[unitree_go.MotorState_] = STATES.decode(data).states
+    return found
+
+
+def serve(hand: ScriptedHand, node: FakeNode, **options: object) -> HandService:
+    return HandService(hand, node=node, **options)  # type: ignore[arg-type]
+
+
+def test_state_flows_before_any_command_and_is_measured() -> None:
+    hand, node = ScriptedHand(q=1.25), FakeNode()
+    with serve(hand, node):
+        wait_until(lambda: len(node.sent) > 20)
+        assert newest(node).q == 1.25
+        assert STATES.decode(node.sent[0][1]).states[0].q == 1.25
+        assert hand.last is not None
+        assert hand.last.is_brake
+    assert node.types == {CMD: dialect("unitree_go").cmd_type, STATE: STATES.name}
+
+
+def test_a_command_moves_the_hand_and_the_state_follows() -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    with serve(hand, node) as service:
+        node.deliver(CMD, cmd(2.5))
+        wait_until(lambda: node.sent and newest(node).q == 2.5)
+        assert newest(node).mode == 1
+        assert service.cores[Side.LEFT].driving
+
+
+def test_the_newest_of_several_wins() -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    with serve(hand, node) as service:
+        hand.hang.clear()
+        for q in (1.0, 2.0, 3.0):
+            node.deliver(CMD, cmd(q))
+        wait_until(lambda: service.counters.received == 3)
+        hand.hang.set()
+        wait_until(lambda: newest(node).q == 3.0)
+
+
+@pytest.mark.realtime
+def test_silence_brakes_after_a_second() -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    with serve(hand, node) as service:
+        node.deliver(CMD, cmd(2.5))
+        start = time.monotonic()
+        core = service.cores[Side.LEFT]
+        wait_until(lambda: core.driving)
+        wait_until(lambda: not core.driving)
+        elapsed = time.monotonic() - start
+        sent = len(node.sent)
+        wait_until(lambda: len(node.sent) > sent + 20)  # state goes on
+    assert 1.0 <= elapsed < 1.5
+    assert core.counters.brakes == 1
+
+
+def test_bad_commands_do_no_harm_and_are_counted() -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    motor = unitree_go.MotorCmd_
+    with serve(hand, node) as service:
+        bad = [
+            cmd(math.nan),
+            cmd(math.inf),
+            cmd(1.0, tau=math.nan),
+            encode(unitree_go.MotorCmds_([])),
+            b"\x00\x01\x00\x00\xff\xff\xff\xff",
+            b"\x00\x01",
+            encode(unitree_go.MotorCmds_([motor(q=2.0, kp=5.0), motor(q=5.0, kp=5.0)])),
+            cmd(77.0),
+        ]
+        for data in bad:
+            node.deliver(CMD, data)
+        wait_until(lambda: service.counters.received == len(bad))
+        wait_until(lambda: newest(node).q == pytest.approx(5.4))
+        count, core = service.counters, service.cores[Side.LEFT].counters
+    assert (count.empty, count.overlong, count.undecodable) == (1, 1, 2)
+    assert (core.accepted, core.rejected, core.clamped) == (2, 3, 1)
+
+
+class TestLink:
+    def test_unplugged_and_back(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        with serve(hand, node) as service:
+            node.deliver(CMD, cmd(2.0))
+            wait_until(lambda: node.sent and newest(node).q == 2.0)
+            hand.plugged = False
+            wait_until(lambda: newest(node).lost >= 2)
+            lost = newest(node)
+            assert (lost.q, lost.reserve[0]) == (2.0, LINK)
+            assert not hand.is_open
+            node.deliver(CMD, cmd(3.0))  # commanded while away: stale when it is back
+            while not hand.commands.empty():
+                hand.commands.get()
+            hand.plugged = True
+            wait_until(lambda: newest(node).lost == 0)
+            assert newest(node).reserve[0] == 0
+            seen = [hand.commands.get(timeout=1) for _ in range(20)]
+            assert all(command.is_brake for command in seen)
+            assert hand.q == 2.0
+            node.deliver(CMD, cmd(4.0))
+            wait_until(lambda: newest(node).q == 4.0)
+            counters = service.cores[Side.LEFT].counters
+            assert (counters.losses, counters.reconnects) == (1, 1)
+        assert hand.closes == 2
+
+    def test_lost_in_the_middle_of_a_stop(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        service = serve(hand, node)
+        service.start()
+        hand.plugged = False
+        service.stop()
+        assert not hand.is_open
+
+    def test_any_exception_of_a_backend_is_survived(self, caplog: pytest.LogCaptureFixture) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        with serve(hand, node) as service:
+            hand.errors.append(ZeroDivisionError("a bug"))
+            wait_until(lambda: service.cores[Side.LEFT].counters.reconnects == 1)
+            assert service.failure is None
+        assert "the backend failed" in caplog.text
+        assert "ZeroDivisionError" in caplog.text
+
+    def test_single_timeouts_do_not_reopen(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        with serve(hand, node) as service:
+            hand.errors += [HandTimeout("no answer")] * 3
+            counters = service.cores[Side.LEFT].counters
+            wait_until(lambda: counters.exchange_errors == 3)
+            wait_until(lambda: counters.exchanges > 20)
+            assert (counters.losses, hand.opens) == (0, 1)
+
+    def test_a_hang_shows_while_state_goes_on(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        with serve(hand, node) as service:
+            hand.hang.clear()
+            wait_until(lambda: newest(node).reserve[0] == LINK)
+            assert newest(node).lost == 1
+            sent = len(node.sent)
+            wait_until(lambda: len(node.sent) > sent + 20)
+            hand.hang.set()
+            wait_until(lambda: newest(node).lost == 0)
+            assert service.cores[Side.LEFT].counters.losses == 0
+
+    def test_missing_at_the_start_fails_and_releases(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        hand.plugged = False
+        with pytest.raises(HandLost):
+            serve(hand, node).start()
+        assert node.open_entities == 0
+
+    def test_missing_at_the_start_can_be_waited_for(self) -> None:
+        hand, node = ScriptedHand(q=0.5), FakeNode()
+        hand.plugged = False
+        with serve(hand, node, wait_for_device=True):
+            assert node.types.keys() == {CMD, STATE}
+            assert node.sent == []  # nothing is known, so nothing is said
+            hand.plugged = True
+            wait_until(lambda: node.sent)
+            assert newest(node).q == 0.5
+
+
+class TestStop:
+    def test_it_brakes_says_so_and_leaves(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        service = serve(hand, node)
+        service.start()
+        node.deliver(CMD, cmd(2.0))
+        wait_until(lambda: node.sent and newest(node).q == 2.0)
+        service.stop()
+        service.stop()
+        assert hand.last is not None
+        assert hand.last.is_brake
+        assert not hand.is_open
+        assert (newest(node).q, newest(node).mode) == (2.0, 0)
+        assert node.open_entities == 0
+        assert not node.closed  # it was lent
+
+    def test_a_service_starts_once(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        with serve(hand, node) as service, pytest.raises(UsageError, match="once"):
+            service.start()
+
+    def test_a_hanging_backend_does_not_hang_the_stop(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("dexkit.service.service._JOIN", 0.05)
+        hand, node = ScriptedHand(), FakeNode()
+        service = serve(hand, node)
+        service.start()
+        hand.hang.clear()
+        wait_until(lambda: newest(node).reserve[0] == LINK)
+        service.stop()
+        assert hand.closes == 1
+        assert node.open_entities == 0
+        hand.hang.set()
+
+
+def test_publishing_errors_are_counted_and_survived(monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    with serve(hand, node) as service:
+        wait_until(lambda: node.sent)
+
+        def refuse(self: FakeWriter, data: bytes, source_timestamp_ns: int | None = None) -> bool:
+            raise DdsError("no")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(FakeWriter, "write_raw", refuse)
+            wait_until(lambda: service.counters.publish_errors > 3)
+        sent = len(node.sent)
+        wait_until(lambda: len(node.sent) > sent)
+
+
+class TestTwoHands:
+    def test_one_topic_pair_for_both(self) -> None:
+        right, left, node = ScriptedHand(Side.RIGHT), ScriptedHand(Side.LEFT), FakeNode()
+        d = dialect("unitree_actuator")
+        motors = [unitree_go.MotorCmd_(q=q, kp=5.0) for q in (1.0, 2.0)]
+        with HandService([left, right], node=node, dialect=d):
+            node.deliver(d.cmd_topic, encode(unitree_go.MotorCmds_(motors)))
+            wait_until(lambda: (right.q, left.q) == (1.0, 2.0))
+            wait_until(lambda: [m.q for m in states(node, d.state_topic)] == [1.0, 2.0])
+        assert {topic for topic, _ in node.sent} == {d.state_topic}
+
+    def test_one_lost_hand_leaves_the_other_alone(self) -> None:
+        right, left, node = ScriptedHand(Side.RIGHT), ScriptedHand(Side.LEFT), FakeNode()
+        d = dialect("unitree_actuator")
+        motors = [unitree_go.MotorCmd_(q=q, kp=5.0) for q in (1.0, 2.0)]
+        with HandService([left, right], node=node, dialect=d):
+            right.plugged = False
+            wait_until(lambda: states(node, d.state_topic)[0].lost > 0)
+            node.deliver(d.cmd_topic, encode(unitree_go.MotorCmds_(motors)))
+            wait_until(lambda: states(node, d.state_topic)[1].q == 2.0)
+            assert states(node, d.state_topic)[1].lost == 0
+
+    def test_hands_of_different_topics_need_two_services(self) -> None:
+        with pytest.raises(UsageError, match="share one topic pair"):
+            HandService([ScriptedHand(Side.LEFT), ScriptedHand(Side.RIGHT)], node=FakeNode())
+
+    def test_the_same_side_twice(self) -> None:
+        hands = [ScriptedHand(Side.LEFT), ScriptedHand(Side.LEFT)]
+        with pytest.raises(UsageError, match="share one topic pair"):
+            HandService(hands, node=FakeNode(), dialect="unitree_actuator")
+
+
+def test_counters_are_one_line_of_json(caplog: pytest.LogCaptureFixture) -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    with caplog.at_level(logging.INFO, "dexkit.service"), serve(hand, node) as service:
+        node.deliver(CMD, cmd(1.0))
+        wait_until(lambda: service.counters.received == 1)
+        service.log_counters()
+    line = next(m for m in caplog.messages if m.startswith("counters "))
+    counters = json.loads(line.removeprefix("counters "))
+    assert counters["received"] == 1
+    assert counters["state_topic"] == STATE
+    assert counters["hands"]["left"]["accepted"] == 1
+
+
+def test_an_endless_state_is_not_sent() -> None:
+    """What the wire cannot hold is a backend's fault, not the end of the service."""
+
+    class Broken(ScriptedHand):
+        def exchange(self, command: object) -> HandState:
+            return HandState.of(1e300, stamp=0.0)
+
+    node = FakeNode()
+    with serve(Broken(), node):
+        wait_until(lambda: node.sent)
+        assert math.isfinite(newest(node).q)
+
+
+class TestConflict:
+    HG = dialect("unitree_hg").state_type
+
+    def test_another_publisher_of_the_state_is_refused(self) -> None:
+        node = FakeNode([FakeEndpoint(STATE, self.HG, "writer", process="dex1_service (7)")])
+        hand = ScriptedHand()
+        with pytest.raises(TopicConflict, match=r"dex1_service \(7\) already publishes"):
+            serve(hand, node).start()
+        assert hand.opens == 0
+
+    def test_unless_forced(self) -> None:
+        node = FakeNode([FakeEndpoint(STATE, self.HG, "writer")])
+        with serve(ScriptedHand(), node, force=True):
+            wait_until(lambda: node.sent)
+
+    def test_readers_and_other_topics_do_not_matter(self) -> None:
+        node = FakeNode([FakeEndpoint(STATE, self.HG, "reader"), FakeEndpoint(CMD, "x", "writer")])
+        with serve(ScriptedHand(), node):
+            wait_until(lambda: node.sent)
+
+
+class TestDiagnose:
+    GO, HG, LEGACY = (dialect(n) for n in ("unitree_go", "unitree_hg", "unitree_actuator"))
+
+    def test_all_is_well(self) -> None:
+        peers = [
+            FakeEndpoint(STATE, self.GO.state_type, "reader"),
+            FakeEndpoint(CMD, self.GO.cmd_type, "writer"),
+            FakeEndpoint("rt/lowstate", "unitree_hg::msg::dds_::LowState_", "writer"),
+        ]
+        assert diagnose(peers, self.GO, [Side.LEFT]) == []
+
+    def test_the_other_type_on_the_right_topic(self) -> None:
+        (text,) = diagnose([FakeEndpoint(CMD, self.HG.cmd_type, "writer")], self.GO, [Side.LEFT])
+        assert "HandCmd_" in text
+        assert "never match" in text
+        assert "--dialect unitree_hg" in text
+
+    def test_the_legacy_topic(self) -> None:
+        """xr_teleoperate issue 100: client and hand wait for each other on other topics."""
+        peers = [FakeEndpoint("rt/unitree_actuator/cmd", self.LEGACY.cmd_type, "writer")]
+        (text,) = diagnose(peers, self.GO, [Side.LEFT])
+        assert "--dialect unitree_actuator" in text
+        assert diagnose(peers, self.LEGACY, [Side.LEFT]) == []
+
+    def test_a_client_of_the_new_topics_at_a_legacy_service(self) -> None:
+        peers = [FakeEndpoint(CMD, self.GO.cmd_type, "writer")]
+        (text,) = diagnose(peers, self.LEGACY, list(Side))
+        assert "--dialect unitree_go" in text
+
+    def test_own_endpoints_are_not_peers(self) -> None:
+        peers = [FakeEndpoint(CMD, self.HG.cmd_type, "writer", own=True)]
+        assert diagnose(peers, self.GO, [Side.LEFT]) == []
+
+
+def test_hg_messages_on_an_hg_service() -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    d = dialect("unitree_hg")
+    with serve(hand, node, dialect="unitree_hg"):
+        node.deliver(CMD, encode(unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=math.pi)])))
+        wait_until(lambda: hand.q == pytest.approx(2.7))
+        mt = message_type(d.state_type)
+        wait_until(lambda: mt.decode(node.sent[-1][1]).motor_state[0].q == pytest.approx(math.pi))
