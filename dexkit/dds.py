@@ -1,0 +1,1033 @@
+"""DDS: one participant on a chosen domain and interface, raw readers and writers, discovery.
+
+The only module that touches CycloneDDS; it is imported when the first :class:`DdsNode` is made.
+
+    with DdsNode(domain=1) as node:
+        states = node.writer("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+        commands = node.reader("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
+        states.write(MotorStates_([MotorState_(q=2.7)]))
+        if commands.wait(timeout=1.0):
+            for sample in commands.take():
+                print(sample.source_timestamp_ns, sample.message)
+
+Samples are bytes, encapsulation header included; :mod:`dexkit.messages` gives them meaning.
+
+Threads: each node has one dispatcher thread that sleeps in a CycloneDDS waitset. CycloneDDS
+never calls into Python (listeners that do can deadlock on the interpreter lock), so ``on_data``
+and discovery callbacks run in the dispatcher. They must only note that something happened.
+
+On loopback a node finds every other process of the machine, whether or not ``lo`` carries the
+MULTICAST flag, without changing the system (facts/unitree-dex A.6).
+
+``DEXKIT_DDS_LOG=PATH`` appends CycloneDDS's own log to a file; otherwise its warnings only become
+part of a :class:`~dexkit.errors.DdsSetupError`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import logging
+import os
+import socket
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from xml.sax.saxutils import escape, quoteattr
+
+from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
+from dexkit.messages import MessageType, layout, message_type
+
+__all__ = [
+    "DdsNode",
+    "Discovery",
+    "DiscoveryEvent",
+    "Endpoint",
+    "Participant",
+    "Qos",
+    "Reader",
+    "Sample",
+    "Writer",
+    "interfaces",
+]
+
+_log = logging.getLogger(__name__)
+
+_INFINITY = 0x7FFFFFFFFFFFFFFF
+_OK = 0
+_TIMEOUT = -10
+_PRECONDITION_NOT_MET = -4
+_ALIVE = 16  # DDS_ALIVE_INSTANCE_STATE
+_MAX_PARTICIPANT_INDEX = 60  # processes on one machine and domain; each is probed at start-up
+_TAKE_CHUNK = 64
+
+
+@dataclass(frozen=True)
+class Qos:
+    """The policies that decide whether two endpoints match and what is kept.
+
+    :param reliability: ``"reliable"`` or ``"best_effort"``.
+    :param durability: ``"volatile"``, ``"transient_local"``, ``"transient"``, ``"persistent"``.
+    :param depth: samples kept of the history; None keeps all.
+
+    Unitree's SDKs write reliable and read best-effort, volatile, keep-last 1
+    (facts/unitree-dex A.5).
+    """
+
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    depth: int | None = 1
+
+    def __post_init__(self) -> None:
+        if self.reliability not in ("reliable", "best_effort"):
+            raise UsageError(f"reliability {self.reliability!r}")
+        if self.durability not in ("volatile", "transient_local", "transient", "persistent"):
+            raise UsageError(f"durability {self.durability!r}")
+        if self.depth is not None and self.depth < 1:
+            raise UsageError(f"a history keeps at least 1 sample, not {self.depth}")
+
+    @classmethod
+    def writer_default(cls) -> Qos:
+        """What Unitree's writers offer."""
+        return cls("reliable")
+
+    @classmethod
+    def reader_default(cls) -> Qos:
+        """What Unitree's readers request."""
+        return cls("best_effort")
+
+    def __str__(self) -> str:
+        keep = "keep_all" if self.depth is None else f"keep_last({self.depth})"
+        return f"{self.reliability}, {self.durability}, {keep}"
+
+
+@dataclass(slots=True)
+class Sample:
+    """One received sample.
+
+    :ivar data: as on the wire, encapsulation header included.
+    :ivar source_timestamp_ns: when the writer wrote it, wall clock, ns.
+    :ivar reception_ns: when it was taken from the reader, wall clock, ns.
+    :ivar writer: handle of the writer, the same for all samples of one writer.
+    """
+
+    data: bytes
+    source_timestamp_ns: int
+    reception_ns: int
+    writer: int
+    type: MessageType = field(repr=False)
+    _message: Any = field(default=None, repr=False, compare=False)
+
+    @property
+    def message(self) -> Any:
+        """The decoded message (decoded once).
+
+        :raises WireError: the bytes are not that message.
+        """
+        if self._message is None:
+            self._message = self.type.decode(self.data)
+        return self._message
+
+
+@dataclass(frozen=True)
+class Participant:
+    """A process's presence on the domain.
+
+    :param process: name and pid if the other side tells them (CycloneDDS does), or empty.
+    """
+
+    key: str
+    process: str
+    host: str
+    own: bool
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A reader or writer somewhere on the domain.
+
+    :param kind: ``"reader"`` or ``"writer"``.
+    :param own: it belongs to this node.
+    :param key: unique id of the endpoint; ``participant`` that of its participant.
+    :param process: name and pid of the process that it lives in, if known.
+    :param type_hash: hash of the complete type if the other side announces one, or empty; two
+        endpoints whose ``type_name`` is the same but whose hash differs disagree on the layout.
+    """
+
+    topic: str
+    type_name: str
+    kind: str
+    qos: Qos
+    own: bool
+    key: str
+    participant: str
+    process: str = ""
+    type_hash: str = ""
+
+
+@dataclass(frozen=True)
+class DiscoveryEvent:
+    """An endpoint that appeared or vanished."""
+
+    appeared: bool
+    endpoint: Endpoint
+
+
+class _MatchedStatus(ctypes.Structure):
+    _fields_ = [
+        ("total_count", ctypes.c_uint32),
+        ("total_count_change", ctypes.c_int32),
+        ("current_count", ctypes.c_uint32),
+        ("current_count_change", ctypes.c_int32),
+        ("last_handle", ctypes.c_int64),
+    ]
+
+
+class _Cyclone:
+    """CycloneDDS, loaded on first use: the Python classes and the C functions needed here."""
+
+    def __init__(self) -> None:
+        try:
+            version = metadata.version("cyclonedds")
+            from cyclonedds import _clayer, builtin, core, domain, idl, internal, pub, qos, sub
+            from cyclonedds import topic as topic_module
+            from cyclonedds.idl import annotations, types
+        except Exception as error:  # its loader raises its own classes, too
+            raise DdsUnavailable(
+                f"CycloneDDS cannot be loaded: {error}",
+                hint="DDS needs CPython 3.10 on x86-64 Linux (the only one with cyclonedds 0.10 "
+                "wheels): 'uv python install 3.10', or 'pip install \"cyclonedds<0.11\"' there. "
+                "Recordings, emulated devices and offline checks work without it.",
+            ) from error
+        if not version.startswith("0.10."):
+            raise DdsUnavailable(
+                f"CycloneDDS {version} is installed, dexkit needs 0.10.x",
+                hint="an 11.x participant with Unitree's types crashes every 0.10.x peer, the "
+                "robot included: pip install 'cyclonedds>=0.10.2,<0.11'",
+            )
+        self.version = version
+        self.layer: Any = _clayer
+        self.builtin: Any = builtin
+        self.core: Any = core
+        self.domain: Any = domain
+        self.idl: Any = idl
+        self.types: Any = types
+        self.annotations: Any = annotations
+        self.qos: Any = qos
+        self.pub: Any = pub
+        self.sub: Any = sub
+        self.topic: Any = topic_module
+        self.error: Any = core.DDSException
+        self.lib: Any = internal.DDS._dll_handle
+        entity, ssize = ctypes.c_int32, ctypes.c_ssize_t
+        status = ctypes.POINTER(ctypes.c_uint32)
+        matched = ctypes.POINTER(_MatchedStatus)
+        for name, arguments in {
+            "dds_delete": (entity,),
+            "dds_create_waitset": (entity,),
+            "dds_waitset_attach": (entity, entity, ssize),
+            "dds_waitset_detach": (entity, entity),
+            "dds_waitset_wait": (entity, ctypes.POINTER(ssize), ctypes.c_size_t, ctypes.c_int64),
+            "dds_waitset_set_trigger": (entity, ctypes.c_bool),
+            "dds_set_status_mask": (entity, ctypes.c_uint32),
+            "dds_take_status": (entity, status, ctypes.c_uint32),
+            "dds_get_publication_matched_status": (entity, matched),
+            "dds_get_subscription_matched_status": (entity, matched),
+            "dds_lookup_participant": (ctypes.c_uint32, ctypes.c_void_p, ctypes.c_size_t),
+        }.items():
+            # a prototype of our own: the wheel's classes set argtypes on the shared objects
+            prototype = ctypes.CFUNCTYPE(ctypes.c_int32, *arguments)
+            setattr(self, name, prototype((name, self.lib)))
+        # nothing on stderr; what goes wrong is asked for when it is needed (_trace)
+        self.lib.dds_set_log_mask(ctypes.c_uint32(0))
+        self.data_available = int(core.DDSStatus.DataAvailable)
+        self.publication_matched = int(core.DDSStatus.PublicationMatched)
+        self.subscription_matched = int(core.DDSStatus.SubscriptionMatched)
+
+    def __getattr__(self, name: str) -> Any:  # the C functions set above
+        raise AttributeError(name)
+
+    def forget(self, entity: Any) -> None:
+        """Keep Python's finaliser from deleting an entity that is deleted explicitly."""
+        self.core.Entity._entities.pop(entity._ref, None)
+
+    def delete(self, entity: Any) -> None:
+        """Delete an entity now, not when Python collects it."""
+        self.forget(entity)
+        self.dds_delete(entity._ref)
+
+    def take_status(self, ref: int, mask: int) -> int:
+        """Read and reset status bits, so that the waitset fires on changes only."""
+        bits = ctypes.c_uint32()
+        if self.dds_take_status(ref, ctypes.byref(bits), mask) != _OK:
+            return 0
+        return bits.value
+
+
+@cache
+def _cyclone() -> _Cyclone:
+    return _Cyclone()
+
+
+@cache
+def _idl_type(name: str) -> Any:
+    """CycloneDDS's class for a message type, made from the layout."""
+    cyclone = _cyclone()
+    struct = layout.STRUCTS[name]
+    numbers = {
+        "uint8": cyclone.types.uint8,
+        "int16": cyclone.types.int16,
+        "uint16": cyclone.types.uint16,
+        "int32": cyclone.types.int32,
+        "uint32": cyclone.types.uint32,
+        "float": cyclone.types.float32,
+    }
+    fields = {}
+    for member in struct.fields:
+        kind = (
+            numbers[member.type.idl]
+            if isinstance(member.type, layout.Primitive)
+            else _idl_type(member.type.dds_name)
+        )
+        if member.sequence:
+            kind = cyclone.types.sequence[kind]
+        elif member.array is not None:
+            kind = cyclone.types.array[kind, member.array]
+        fields[member.name] = kind
+    cls = cyclone.idl.make_idl_struct(struct.name, name.replace("::", "."), fields)
+    # as the SDK's classes: the hash of the type depends on both
+    cyclone.annotations.final(cls)
+    cyclone.annotations.autoid("sequential")(cls)
+    return cls
+
+
+def interfaces() -> list[str]:
+    """Names of this machine's network interfaces."""
+    return [name for _, name in socket.if_nameindex()]
+
+
+def _is_loopback(interface: str) -> bool:
+    try:
+        return bool(int(Path(f"/sys/class/net/{interface}/flags").read_text(), 16) & 0x8)
+    except (OSError, ValueError):
+        return interface.startswith("lo")
+
+
+def _trace(verbosity: str, path: str) -> str:
+    return (
+        f"<Tracing><Verbosity>{verbosity}</Verbosity><AppendToFile>true</AppendToFile>"
+        f"<OutputFile>{escape(path)}</OutputFile></Tracing>"
+    )
+
+
+def _config(interface: str, tracing: str = "") -> str:
+    """CycloneDDS configuration of a domain (facts/unitree-dex A.6).
+
+    On loopback peers are called on 127.0.0.1 by port, since multicast may be off there;
+    ``multicast="default"`` keeps listening to it where it is on, because an SDK process then
+    listens to nothing else.
+    """
+    peers = '<Peers><Peer address="127.0.0.1"/></Peers>' if _is_loopback(interface) else ""
+    return (
+        "<CycloneDDS><Domain>"
+        "<General><Interfaces>"
+        f'<NetworkInterface name={quoteattr(interface)} priority="default" multicast="default"/>'
+        "</Interfaces></General>"
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANT_INDEX}</MaxAutoParticipantIndex>"
+        f"{peers}</Discovery>{tracing}"
+        "</Domain></CycloneDDS>"
+    )
+
+
+@dataclass
+class _Domain:
+    """A domain of this process; its configuration is that of the first node."""
+
+    interface: str
+    entity: Any  # None when somebody else in this process configured the domain
+    nodes: int = 0
+
+
+_domains: dict[int, _Domain] = {}
+_domains_lock = threading.Lock()
+
+
+def _acquire_domain(number: int, interface: str) -> None:
+    """Configure the domain, or use it if it is configured already. Needs ``_domains_lock``."""
+    cyclone = _cyclone()
+    known = _domains.get(number)
+    if known is not None:
+        if known.interface != interface and known.entity is not None:
+            raise DdsSetupError(
+                f"domain {number} of this process is on {known.interface}, not {interface}",
+                hint="a process has one interface per domain: use another domain or process",
+            )
+        known.nodes += 1
+        return
+    if interface not in interfaces():
+        raise DdsSetupError(
+            f"there is no network interface {interface!r}",
+            hint=f"this machine has: {', '.join(interfaces())}",
+        )
+    path = os.environ.get("DEXKIT_DDS_LOG")
+    tracing = _trace("config", path) if path else ""
+    try:
+        entity = cyclone.domain.Domain(number, _config(interface, tracing))
+    except cyclone.error as error:
+        if error.code != _PRECONDITION_NOT_MET:
+            raise DdsSetupError(
+                f"domain {number} cannot be set up on {interface}: "
+                f"{_why(number, interface) or error}",
+                hint=f"this machine has: {', '.join(interfaces())}; at most "
+                f"{_MAX_PARTICIPANT_INDEX} processes share a domain",
+            ) from error
+        _log.warning(
+            "domain %d was configured by other code in this process; its interface is used, not %s",
+            number,
+            interface,
+        )
+        entity = None
+    _domains[number] = _Domain(interface, entity, 1)
+
+
+def _why(number: int, interface: str) -> str:
+    """Try once more, with CycloneDDS's warnings going to a file, and return them."""
+    cyclone = _cyclone()
+    with tempfile.TemporaryDirectory(prefix="dexkit-") as folder:
+        path = Path(folder) / "dds.log"
+        try:
+            config = _config(interface, _trace("warning", str(path)))
+            cyclone.delete(cyclone.domain.Domain(number, config))
+        except cyclone.error:
+            pass
+        text = path.read_text(errors="replace") if path.exists() else ""
+    # "1795254363.143174 [151]     python: message"
+    return "; ".join(line.split(": ", 1)[-1] for line in text.splitlines() if line.strip())
+
+
+def _release_domain(number: int) -> None:
+    """Drop one use; delete the domain after the last. Needs ``_domains_lock``."""
+    domain = _domains[number]
+    domain.nodes -= 1
+    if domain.nodes:
+        return
+    cyclone = _cyclone()
+    if domain.entity is not None and cyclone.dds_lookup_participant(number, None, 0) > 0:
+        return  # other code made participants on it: they would vanish with the domain
+    del _domains[number]
+    if domain.entity is not None:
+        cyclone.delete(domain.entity)
+
+
+class _Handle:
+    """What readers and writers share: the entity, matching, closing."""
+
+    def __init__(self, node: DdsNode, topic: str, kind: MessageType, qos: Qos) -> None:
+        self.node = node
+        self.topic = topic
+        self.type = kind
+        self.qos = qos
+        self._entity: Any = None
+        self._ref = 0
+        self._token = 0
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.topic} {self.type.name}>"
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has been closed."""
+        return self._entity is None
+
+    def _check_open(self) -> None:
+        if self._entity is None:
+            raise DdsError(f"{self!r} is closed")
+
+    def _matched_status(self) -> Any:
+        raise AssertionError  # overridden
+
+    @property
+    def matched(self) -> int:
+        """Number of matching endpoints on the other side; 0 when closed."""
+        if self._entity is None:
+            return 0
+        status = _MatchedStatus()
+        if self._matched_status()(self._ref, ctypes.byref(status)) != _OK:
+            return 0
+        return int(status.current_count)
+
+    def wait_matched(self, timeout: float | None = None, count: int = 1) -> bool:
+        """Wait until at least ``count`` endpoints match.
+
+        :param timeout: seconds; None waits for ever.
+        :returns: False on time-out, or when it is closed meanwhile.
+        """
+        with self.node._changed:
+            self.node._changed.wait_for(
+                lambda: self.closed or self.matched >= count, timeout=timeout
+            )
+        return self.matched >= count
+
+    def _on_status(self) -> None:
+        raise AssertionError  # overridden
+
+    def close(self) -> None:
+        """Delete the endpoint; no callback runs after this. May be called twice."""
+        self.node._drop(self)
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Writer(_Handle):
+    """Writes samples of one type to one topic. Made by :meth:`DdsNode.writer`.
+
+    :ivar timeouts: writes given up after 100 ms because a reliable reader did not keep up.
+    """
+
+    def __init__(self, node: DdsNode, topic: str, kind: MessageType, qos: Qos) -> None:
+        super().__init__(node, topic, kind, qos)
+        self.timeouts = 0
+        self._write = _cyclone().layer.ddspy_write
+        self._write_ts = _cyclone().layer.ddspy_write_ts
+
+    def _matched_status(self) -> Any:
+        return _cyclone().dds_get_publication_matched_status
+
+    def _on_status(self) -> None:
+        cyclone = _cyclone()
+        if cyclone.take_status(self._ref, cyclone.publication_matched):
+            self.node._notify()
+
+    def write(self, message: Any, source_timestamp_ns: int | None = None) -> bool:
+        """Encode and write a message; see :meth:`write_raw`.
+
+        :raises EncodeError: the message does not fit its type.
+        """
+        return self.write_raw(self.type.encode(message), source_timestamp_ns)
+
+    def write_raw(self, data: bytes, source_timestamp_ns: int | None = None) -> bool:
+        """Write ``data`` (encapsulation header included) as it is.
+
+        :param source_timestamp_ns: wall clock, ns since the epoch; None means now.
+        :returns: False when it was given up after 100 ms because a reliable reader does not
+            keep up (:attr:`timeouts` counts them).
+        :raises EncodeError: no room for a header.
+        :raises DdsError: the writer is closed, or CycloneDDS refuses.
+        """
+        if self._entity is None:
+            raise DdsError(f"{self!r} is closed")
+        if len(data) % 4 or len(data) < 4:
+            if len(data) < 4:
+                raise EncodeError(f"{len(data)} bytes are too short for a sample")
+            data = data + bytes(-len(data) % 4)  # the wire unit is 4 bytes
+        if source_timestamp_ns is None:
+            code = self._write(self._ref, data)
+        else:
+            code = self._write_ts(self._ref, data, source_timestamp_ns)
+        if code == _OK:
+            return True
+        if code == _TIMEOUT:
+            self.timeouts += 1
+            return False
+        raise DdsError(f"writing to {self.topic} failed: {_cyclone().error(code)}")
+
+
+class Reader(_Handle):
+    """Reads samples of one type from one topic. Made by :meth:`DdsNode.reader`."""
+
+    def __init__(
+        self,
+        node: DdsNode,
+        topic: str,
+        kind: MessageType,
+        qos: Qos,
+        on_data: Callable[[], object] | None,
+    ) -> None:
+        super().__init__(node, topic, kind, qos)
+        self._on_data = on_data
+        self._arrived = threading.Event()
+        self._take = _cyclone().layer.ddspy_take
+
+    def _matched_status(self) -> Any:
+        return _cyclone().dds_get_subscription_matched_status
+
+    def _on_status(self) -> None:
+        cyclone = _cyclone()
+        bits = cyclone.take_status(self._ref, cyclone.data_available | cyclone.subscription_matched)
+        if bits & cyclone.data_available:
+            self._arrived.set()
+            if self._on_data is not None:
+                self._on_data()
+        if bits & cyclone.subscription_matched:
+            self.node._notify()
+
+    def take(self) -> list[Sample]:
+        """Everything that has arrived since the last call, oldest first; never blocks.
+
+        Of each writer's samples at most ``qos.depth`` are kept, the newest ones.
+
+        :raises DdsError: the reader is closed.
+        """
+        self._check_open()
+        self._arrived.clear()
+        out: list[Sample] = []
+        while True:
+            got = self._take(self._ref, _TAKE_CHUNK)
+            if isinstance(got, int):
+                raise DdsError(f"reading {self.topic} failed: {_cyclone().error(got)}")
+            now = time.time_ns()
+            out += [
+                Sample(data, info.source_timestamp, now, info.publication_handle, self.type)
+                for data, info in got
+                if info.valid_data
+            ]
+            if len(got) < _TAKE_CHUNK:
+                return out
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until something has arrived since the last :meth:`take`.
+
+        :param timeout: seconds; None waits for ever.
+        :returns: False on time-out, or when the reader is closed meanwhile. After True
+            :meth:`take` may, rarely, still return nothing: a writer that goes away wakes, too.
+        """
+        self._check_open()
+        return self._arrived.wait(timeout) and not self.closed
+
+
+class Discovery:
+    """Who publishes and subscribes what. Belongs to a node: :attr:`DdsNode.discovery`."""
+
+    def __init__(self, node: DdsNode) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        self._endpoints: dict[str, Endpoint] = {}
+        self._participants: dict[str, Participant] = {}
+        self._callbacks: list[Callable[[DiscoveryEvent], object]] = []
+
+    def endpoints(self) -> list[Endpoint]:
+        """Every endpoint known now, this node's own included, sorted by topic and kind."""
+        with self._lock:
+            found = list(self._endpoints.values())
+        return sorted(found, key=lambda e: (e.topic, e.kind, e.type_name, e.key))
+
+    def participants(self) -> list[Participant]:
+        """Every participant known now."""
+        with self._lock:
+            return list(self._participants.values())
+
+    def wait(
+        self, predicate: Callable[[list[Endpoint]], object], timeout: float | None = None
+    ) -> bool:
+        """Wait until ``predicate`` of all endpoints is true; it is tried at every change.
+
+        :param timeout: seconds; None waits for ever.
+        :returns: whether it became true.
+        """
+        with self._node._changed:
+            return bool(
+                self._node._changed.wait_for(
+                    lambda: self._node.closed or predicate(self.endpoints()), timeout=timeout
+                )
+                and not self._node.closed
+            )
+
+    def subscribe(self, callback: Callable[[DiscoveryEvent], object]) -> Callable[[], None]:
+        """Call ``callback`` for every endpoint known now and every later change.
+
+        It runs in the dispatcher thread and must only note the event.
+
+        :returns: a function that ends the subscription.
+        """
+        with self._node._dispatching:
+            for endpoint in self.endpoints():
+                callback(DiscoveryEvent(True, endpoint))
+            self._callbacks.append(callback)
+
+        def unsubscribe() -> None:
+            with self._node._dispatching, contextlib.suppress(ValueError):
+                self._callbacks.remove(callback)
+
+        return unsubscribe
+
+    def _put_participant(self, participant: Participant) -> None:
+        with self._lock:
+            self._participants[participant.key] = participant
+
+    def _remove_participant(self, key: str) -> None:
+        with self._lock:
+            self._participants.pop(key, None)
+
+    def _process(self, participant: str) -> str:
+        with self._lock:
+            found = self._participants.get(participant)
+        return found.process if found else ""
+
+    def _put(self, endpoint: Endpoint) -> None:
+        with self._lock:
+            known = endpoint.key in self._endpoints
+            self._endpoints[endpoint.key] = endpoint
+        if not known:
+            self._tell(DiscoveryEvent(True, endpoint))
+
+    def _remove(self, key: str) -> None:
+        with self._lock:
+            endpoint = self._endpoints.pop(key, None)
+        if endpoint is not None:
+            self._tell(DiscoveryEvent(False, endpoint))
+
+    def _tell(self, event: DiscoveryEvent) -> None:
+        for callback in list(self._callbacks):
+            try:
+                callback(event)
+            except Exception:
+                _log.exception("a discovery callback failed")
+
+
+_nodes: weakref.WeakSet[DdsNode] = weakref.WeakSet()
+
+
+class DdsNode:
+    """A participant on one domain and interface, with its readers, writers and discovery.
+
+    :param domain: 0 is the robot, 1 what xr_teleoperate's simulation mode uses.
+    :param interface: network interface; loopback keeps traffic on this machine.
+    :raises DdsUnavailable: CycloneDDS 0.10.x is not installed for this interpreter.
+    :raises DdsSetupError: no such interface, or the domain cannot be set up.
+
+    Several nodes may share a domain (and then an interface) in one process. Use it as a context
+    manager or call :meth:`close`. If other code of this process has configured the domain (an
+    SDK that was initialised first), its configuration is used and that is logged.
+    """
+
+    def __init__(self, domain: int = 1, interface: str = "lo") -> None:
+        if not 0 <= domain <= 230:
+            raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
+        cyclone = _cyclone()
+        self.domain = domain
+        self.interface = interface
+        self.discovery = Discovery(self)
+        self._closed = False
+        self._closing = threading.Lock()
+        # held while callbacks run, so that closing an endpoint waits for them
+        self._dispatching = threading.RLock()
+        self._changed = threading.Condition()
+        self._handles: dict[int, _Handle] = {}
+        self._topics: dict[tuple[str, str], Any] = {}
+        self._next_token = 1
+        with _domains_lock:
+            _acquire_domain(domain, interface)
+            try:
+                self._participant = cyclone.domain.DomainParticipant(domain)
+                self._waitset = cyclone.dds_create_waitset(self._participant._ref)
+            except cyclone.error as error:
+                _release_domain(domain)
+                raise DdsSetupError(f"no participant on domain {domain}: {error}") from error
+        self._key = str(self._participant.guid)
+        self._builtin = [
+            cyclone.builtin.BuiltinDataReader(self._participant, topic)
+            for topic in (
+                cyclone.builtin.BuiltinTopicDcpsParticipant,
+                cyclone.builtin.BuiltinTopicDcpsPublication,
+                cyclone.builtin.BuiltinTopicDcpsSubscription,
+            )
+        ]
+        for reader in self._builtin:
+            cyclone.dds_set_status_mask(reader._ref, cyclone.data_available)
+            cyclone.dds_waitset_attach(self._waitset, reader._ref, 0)
+        # its own trigger wakes a waitset only if it is attached to itself
+        cyclone.dds_waitset_attach(self._waitset, self._waitset, 0)
+        self._thread = threading.Thread(
+            target=self._dispatch, name=f"dds-{domain}-dispatch", daemon=True
+        )
+        self._thread.start()
+        _nodes.add(self)
+
+    def __repr__(self) -> str:
+        return f"<DdsNode domain {self.domain} on {self.interface}>"
+
+    def __enter__(self) -> DdsNode:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether :meth:`close` has been called."""
+        return self._closed
+
+    def writer(self, topic: str, type_name: str | MessageType, *, qos: Qos | None = None) -> Writer:
+        """A writer on ``topic``.
+
+        :param topic: DDS name, ``rt/`` included.
+        :param type_name: a name that :func:`dexkit.messages.message_type` takes, or its result.
+        :param qos: default :meth:`Qos.writer_default`.
+        :raises DdsSetupError: the endpoint cannot be made.
+        """
+        kind = type_name if isinstance(type_name, MessageType) else message_type(type_name)
+        writer = Writer(self, topic, kind, qos or Qos.writer_default())
+        self._add(writer, _cyclone().pub.DataWriter, _cyclone().publication_matched)
+        return writer
+
+    def reader(
+        self,
+        topic: str,
+        type_name: str | MessageType,
+        *,
+        qos: Qos | None = None,
+        depth: int | None = None,
+        on_data: Callable[[], object] | None = None,
+    ) -> Reader:
+        """A reader on ``topic``.
+
+        :param qos: default :meth:`Qos.reader_default`.
+        :param depth: overrides the depth of ``qos``; a recorder wants many.
+        :param on_data: called without arguments, in the dispatcher thread, when something has
+            arrived. It must return at once: set an event, put into a queue.
+        :raises DdsSetupError: the endpoint cannot be made.
+        """
+        kind = type_name if isinstance(type_name, MessageType) else message_type(type_name)
+        chosen = qos or Qos.reader_default()
+        if depth is not None:
+            chosen = Qos(chosen.reliability, chosen.durability, depth)
+        cyclone = _cyclone()
+        reader = Reader(self, topic, kind, chosen, on_data)
+        self._add(
+            reader,
+            cyclone.sub.DataReader,
+            cyclone.data_available | cyclone.subscription_matched,
+        )
+        return reader
+
+    def endpoints(self) -> list[Endpoint]:
+        """Every endpoint on the domain that is known now; see :class:`Discovery`."""
+        return self.discovery.endpoints()
+
+    def close(self) -> None:
+        """Delete everything of this node. No callback runs after this. May be called twice."""
+        with self._closing:
+            if self._closed:
+                return
+            self._closed = True
+            cyclone = _cyclone()
+            cyclone.dds_waitset_set_trigger(self._waitset, True)
+            if threading.current_thread() is not self._thread:
+                self._thread.join()
+            with self._dispatching:
+                handles = list(self._handles.values())
+                self._handles.clear()
+            children = [h._entity for h in handles]
+            for handle in handles:
+                self._mark_closed(handle)
+            for reader in self._builtin:
+                children += [reader, reader._next_condition]
+            children += self._topics.values()
+            for entity in children:
+                cyclone.forget(entity)  # they go with the participant
+            with _domains_lock:
+                cyclone.delete(self._participant)
+                _release_domain(self.domain)
+            self._topics.clear()
+            _nodes.discard(self)
+        self._notify()
+
+    def _topic(self, name: str, kind: MessageType) -> Any:
+        key = (name, kind.name)
+        if key not in self._topics:
+            self._topics[key] = _cyclone().topic.Topic(
+                self._participant, name, _idl_type(kind.name)
+            )
+        return self._topics[key]
+
+    def _add(self, handle: _Handle, factory: Any, mask: int) -> None:
+        cyclone = _cyclone()
+        with self._closing:
+            if self._closed:
+                raise DdsError(f"{self!r} is closed")
+            try:
+                topic = self._topic(handle.topic, handle.type)
+                handle._entity = factory(self._participant, topic, qos=_policies(handle.qos))
+            except (cyclone.error, UnicodeError) as error:
+                raise DdsSetupError(
+                    f"cannot make a {type(handle).__name__.lower()} on {handle.topic!r}: {error}"
+                ) from error
+            handle._ref = handle._entity._ref
+            cyclone.dds_set_status_mask(handle._ref, mask)
+            with self._dispatching:
+                handle._token = self._next_token
+                self._next_token += 1
+                self._handles[handle._token] = handle
+            cyclone.dds_waitset_attach(self._waitset, handle._ref, handle._token)
+
+    def _drop(self, handle: _Handle) -> None:
+        with self._closing:
+            if self._closed or handle.closed:
+                return
+            cyclone = _cyclone()
+            with self._dispatching:  # waits for a callback that runs now
+                self._handles.pop(handle._token, None)
+                cyclone.dds_waitset_detach(self._waitset, handle._ref)
+                entity = handle._entity
+                self._mark_closed(handle)
+            cyclone.delete(entity)
+        self._notify()
+
+    @staticmethod
+    def _mark_closed(handle: _Handle) -> None:
+        handle._entity = None
+        if isinstance(handle, Reader):
+            handle._arrived.set()  # frees a thread in wait()
+
+    def _notify(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _dispatch(self) -> None:
+        cyclone = _cyclone()
+        room = 64
+        tokens = (ctypes.c_ssize_t * room)()
+        while True:
+            count = cyclone.dds_waitset_wait(self._waitset, tokens, room, _INFINITY)
+            if self.closed or count < 0:
+                return
+            # more than `room` triggered entities trigger again at once
+            for token in sorted(set(tokens[: min(count, room)])):
+                with self._dispatching:
+                    if self.closed:
+                        return
+                    try:
+                        if token == 0:
+                            self._read_builtin()
+                        elif token in self._handles:
+                            self._handles[token]._on_status()
+                    except Exception:
+                        _log.exception("a DDS callback failed")
+
+    def _read_builtin(self) -> None:
+        """Bring discovery up to date from CycloneDDS's built-in topics."""
+        cyclone = _cyclone()
+        participants, *endpoints = self._builtin
+        changed = False
+        for reader in self._builtin:
+            cyclone.take_status(reader._ref, cyclone.data_available)
+        # participants first, so that endpoints know their process
+        for sample in _taken(participants):
+            changed = True
+            key = str(sample.key)
+            if sample.sample_info.instance_state != _ALIVE:
+                self.discovery._remove_participant(key)
+            elif sample.qos is not None:
+                self.discovery._put_participant(_participant(sample, own=key == self._key))
+        for kind, reader in zip(("writer", "reader"), endpoints, strict=True):
+            for sample in _taken(reader):
+                changed = True
+                key = str(sample.key)
+                if sample.sample_info.instance_state != _ALIVE:
+                    self.discovery._remove(key)
+                elif sample.topic_name is not None:
+                    owner = str(sample.participant_key)
+                    self.discovery._put(
+                        Endpoint(
+                            topic=sample.topic_name,
+                            type_name=sample.type_name,
+                            kind=kind,
+                            qos=_qos_of(sample.qos),
+                            own=owner == self._key,
+                            key=key,
+                            participant=owner,
+                            process=self.discovery._process(owner),
+                            type_hash=_type_hash(sample.type_id),
+                        )
+                    )
+        if changed:
+            self._notify()
+
+
+def _taken(reader: Any) -> Iterator[Any]:
+    while True:
+        samples: Sequence[Any] = reader.take(_TAKE_CHUNK)
+        yield from samples
+        if len(samples) < _TAKE_CHUNK:
+            return
+
+
+def _participant(sample: Any, *, own: bool) -> Participant:
+    properties = {p.key: p.value for p in sample.qos if hasattr(p, "key") and hasattr(p, "value")}
+    name, pid = properties.get("__ProcessName", ""), properties.get("__Pid", "")
+    return Participant(
+        key=str(sample.key),
+        process=f"{name} (pid {pid})" if name and pid else name,
+        host=properties.get("__Hostname", ""),
+        own=own,
+    )
+
+
+def _type_hash(type_id: Any) -> str:
+    """Hex of the complete type's hash in a TypeIdentifier."""
+    value = getattr(type_id, "value", None)
+    return bytes(value).hex() if isinstance(value, (bytes, bytearray, list)) else ""
+
+
+def _policies(qos: Qos) -> Any:
+    policy = _cyclone().qos.Policy
+    reliability = (
+        policy.Reliability.Reliable(max_blocking_time=100_000_000)  # 100 ms (F A.5)
+        if qos.reliability == "reliable"
+        else policy.Reliability.BestEffort
+    )
+    durability = {
+        "volatile": policy.Durability.Volatile,
+        "transient_local": policy.Durability.TransientLocal,
+        "transient": policy.Durability.Transient,
+        "persistent": policy.Durability.Persistent,
+    }[qos.durability]
+    history = policy.History.KeepAll if qos.depth is None else policy.History.KeepLast(qos.depth)
+    return _cyclone().qos.Qos(reliability, durability, history)
+
+
+def _qos_of(policies: Any) -> Qos:
+    """The policies of a discovered endpoint; what it does not announce has DDS's default."""
+    policy = _cyclone().qos.Policy
+    reliable = isinstance(policies[policy.Reliability], policy.Reliability.Reliable)
+    durability = {
+        policy.Durability.Volatile: "volatile",
+        policy.Durability.TransientLocal: "transient_local",
+        policy.Durability.Transient: "transient",
+        policy.Durability.Persistent: "persistent",
+    }.get(policies[policy.Durability], "volatile")
+    history = policies[policy.History]
+    depth = None if history == policy.History.KeepAll else getattr(history, "depth", 1)
+    return Qos("reliable" if reliable else "best_effort", durability, depth)
+
+
+@atexit.register
+def _close_all() -> None:
+    # a dispatcher that is inside CycloneDDS while the interpreter goes away may crash it
+    for node in list(_nodes):
+        with contextlib.suppress(Exception):
+            node.close()
