@@ -23,13 +23,18 @@ class Bench:
     """A core on a manual clock with an exchange loop that is stepped by hand."""
 
     def __init__(
-        self, *, io_rate: float = 500.0, simulated: bool = True, **options: object
+        self,
+        *,
+        io_rate: float = 500.0,
+        simulated: bool = True,
+        speeds: list[tuple[float, float]] | None = None,
+        **options: object,
     ) -> None:
         self.clock = ManualClock(100.0)
         self.spec = DEX1_1.spec(Side.LEFT, io_rate=io_rate, simulated=simulated)
         self.core = HandCore(self.spec, DEX1_1, self.clock, **options)  # type: ignore[arg-type]
         self.q = 1.0
-        self.core.opened(self.spec)
+        self.core.opened(self.spec, speeds)
         self.exchange()
 
     def exchange(self, **state: object) -> HandCommand:
@@ -213,6 +218,16 @@ class TestFailedExchanges:
         bench.clock.advance(0.01)
         bench.command(3.2)
         assert bench.exchange().q[0] == 3.2
+
+    def test_a_fault_is_not_a_lost_link(self) -> None:
+        """The backend is still recovering, perhaps for minutes while a motor cools."""
+        bench = Bench()
+        for _ in range(100):
+            bench.clock.advance(0.6)
+            assert not bench.core.failed(HandFault("hot", bits=[0x80]))
+            view = bench.core.view()
+            assert view is not None
+            assert view.fault == (0x80,)
 
     @pytest.mark.parametrize("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
     def test_anything_else_is_a_loss(self, error: Exception) -> None:

@@ -68,8 +68,6 @@ class Backoff:
 class HandCore:
     """The state of one served hand.
 
-    :param speeds: calibrated speeds per joint for the estimator, see
-        :class:`~dexkit.service.estimator.StateEstimator`.
     :param soft_start: limit the velocity of the first motion; by default for real hands only.
     """
 
@@ -80,7 +78,6 @@ class HandCore:
         clock: Clock,
         *,
         estimation: Estimation = Estimation.AUTO,
-        speeds: Sequence[tuple[float, float]] | None = None,
         soft_start: bool | None = None,
     ) -> None:
         self.spec = spec
@@ -92,7 +89,7 @@ class HandCore:
         self._gate = CommandGate(spec)
         self._brake = HandCommand.brake(spec.n_joints)
         self._lock = threading.Lock()  # guards the estimator, which all three threads touch
-        self._estimator = StateEstimator(spec, speeds)
+        self._estimator = StateEstimator(spec)
         self._soft_start = not spec.simulated if soft_start is None else soft_start
         self._starting = self._soft_start
         self._start_q: Floats | None = None
@@ -102,7 +99,7 @@ class HandCore:
         self._driving = False
         self._connected = False
         self._faulted: tuple[int, ...] | None = None
-        self._good = clock.now()  # time of the last good exchange, or of open
+        self._answered = clock.now()  # when the device last showed that it is there
         self.measured_rate = spec.io_rate  #: measurements a second; at first what the hand says
         self._slow = spec.io_rate < self._min_rate
         self._window = (clock.now(), 0)  # start, exchanges since
@@ -129,15 +126,21 @@ class HandCore:
                 self._estimator.follow(admitted, now)
         return True
 
-    def opened(self, spec: HandSpec | None = None) -> None:
-        """The link is open. Commands from before do not count any more."""
+    def opened(self, spec: HandSpec, speeds: Sequence[tuple[float, float]] | None = None) -> None:
+        """The link is open. Commands from before do not count any more.
+
+        :param spec: what the hand says now; its ``io_rate`` may have become exact.
+        :param speeds: calibrated speeds per joint, see
+            :class:`~dexkit.service.estimator.StateEstimator`.
+        """
         now = self._clock.now()
-        if spec is not None:
-            self.spec = spec
+        self.spec = spec
+        with self._lock:
+            self._estimator = StateEstimator(spec, speeds)
         self.measured_rate = self.spec.io_rate
         self._slow = self.spec.io_rate < self._min_rate
         self._window = (now, 0)
-        self._good = now
+        self._answered = now
         self._not_before = now
         self._faulted = None
         self._starting = self._soft_start
@@ -155,7 +158,7 @@ class HandCore:
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")
         now = self._clock.now()
         self._observe_rate(now)
-        self._good = now
+        self._answered = now
         self._missed = 0
         if self._faulted is not None:  # what was commanded before or during a fault is stale
             self._faulted = None
@@ -168,14 +171,16 @@ class HandCore:
     def failed(self, error: Exception) -> bool:
         """An exchange raised ``error``. True when the link should be given up and reopened.
 
-        Time-outs and faults are given half a second to pass; anything else (the device is gone,
-        or the backend is broken) is not.
+        A fault is not a lost link: the device answers, and exchanging goes on, so that the
+        backend can recover it. Time-outs are given half a second to pass. Anything else (the
+        device is gone, or the backend is broken) means reopening.
         """
         self.counters.exchange_errors += 1
         self._missed += 1
         bits: tuple[int, ...] = ()
         if isinstance(error, HandFault):
             self.counters.faults += 1
+            self._answered = self._clock.now()
             bits = error.bits
         if self._view is not None:
             previous = self._view.fault if self._faulted is not None else ()
@@ -188,7 +193,7 @@ class HandCore:
         elif isinstance(error, HandFault):
             self._faulted = bits
         patient = isinstance(error, (HandTimeout, HandFault, CommandRejected))
-        return not patient or self._clock.now() - self._good > _PATIENCE
+        return not patient or self._clock.now() - self._answered > _PATIENCE
 
     def closed(self) -> None:
         """The link was given up."""
@@ -267,7 +272,7 @@ class HandCore:
         if view is None:
             return None
         now = self._clock.now()
-        if not self._connected or now - self._good > self._overdue():
+        if not self._connected or now - self._answered > self._overdue():
             return self._stale(view)
         if self.predicting:
             with self._lock:
@@ -289,7 +294,7 @@ class HandCore:
 
     def _observe_rate(self, now: float) -> None:
         """Count exchanges over half a second; one hiccup must not switch the estimator on."""
-        if self._missed or now - self._good > self._overdue():
+        if self._missed or now - self._answered > self._overdue():
             self._window = (now, 0)
             return
         start, count = self._window[0], self._window[1] + 1

@@ -35,10 +35,12 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
         served[state] = dialect.state_type
     found = []
     for topic, type_name in served.items():
-        for other in sorted({e.type_name for e in foreign if e.topic == topic} - {type_name}):
+        for foreign_type in sorted(
+            {e.type_name for e in foreign if e.topic == topic} - {type_name}
+        ):
             found.append(
-                f"{topic}: a peer uses {other}, this service {type_name}; they never match"
-                + _advice(topic, other)
+                f"{topic}: a peer uses {foreign_type}, this service {type_name}; they never match"
+                + _advice(topic, foreign_type)
             )
     foreign_topics = {e.topic for e in foreign}
     for other in DIALECTS.values():

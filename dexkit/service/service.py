@@ -33,6 +33,7 @@ from dexkit.service.realtime import precise_timers
 __all__ = ["HandService", "Node"]
 
 log = logging.getLogger("dexkit.service")
+_counters_log = logging.getLogger("dexkit.service.counters")
 
 _SPIN = 150e-6  # covers the 50..100 us by which a sleeping thread wakes late
 _DISCOVERY = 0.3  # seconds to look for another publisher of the state topic
@@ -80,11 +81,12 @@ class HandService:
     :param node: DDS node to use; it stays open at stop. Without it one is made and closed.
     :param state_rate: Hz; by default that of the model.
     :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
-    :param speeds: calibrated speeds by side for the estimator; by default what the hand says in
-        an attribute ``joint_speeds``, if it has one.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
     :param force: start even if somebody else publishes the state topic.
     :raises UsageError: hands and dialect do not fit.
+
+    A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
+    and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.
     """
 
     def __init__(
@@ -128,7 +130,6 @@ class HandService:
                     self.model,
                     self._clock,
                     estimation=estimation,
-                    speeds=getattr(hand, "joint_speeds", None),
                     soft_start=soft_start,
                 ),
             )
@@ -267,7 +268,7 @@ class HandService:
 
     def log_counters(self) -> None:
         """Log :meth:`snapshot` as one line of JSON."""
-        log.info("counters %s", json.dumps(self.snapshot()))
+        _counters_log.info("counters %s", json.dumps(self.snapshot()))
 
     # -- receive ----------------------------------------------------------------------------
 
@@ -316,7 +317,7 @@ class HandService:
     def _open(self, unit: _Unit) -> None:
         """Open the hand and do one exchange, so that there is a state from the first sample on."""
         unit.hand.open()
-        unit.core.opened(unit.hand.spec)
+        unit.core.opened(unit.hand.spec, getattr(unit.hand, "joint_speeds", None))
         try:
             unit.core.measured(unit.hand.exchange(unit.core.next_command()))
         except Exception as error:

@@ -1,0 +1,266 @@
+"""``dexkit serve``: put a hand on Unitree's topics."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from types import FrameType
+
+import click
+
+from dexkit.backends import Backend, BackendOptions, backend
+from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.errors import DexkitError, UsageError
+from dexkit.hand import Hand, Side
+from dexkit.models import DIALECTS
+from dexkit.models import dialect as dialect_by_name
+from dexkit.service import Estimation, Fill, HandService, diagnose, prepare_process
+
+__all__ = ["command"]
+
+log = logging.getLogger("dexkit.serve")
+
+_STATUS_PERIOD = 0.5  # seconds
+_LONELY = 10.0  # seconds without a client before a hint
+
+
+@click.command("serve")
+@click.argument("backend_name", metavar="BACKEND")
+@click.option(
+    "--side",
+    "side_name",
+    type=click.Choice(["left", "right", "both"]),
+    required=True,
+    help="Which hand; both needs a device for each.",
+)
+@click.option(
+    "--device",
+    "devices",
+    multiple=True,
+    metavar="PATH",
+    help="Path or serial number of the device; with --side both left=PATH and right=PATH.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="A setting of the backend; 'dexkit backends' lists them.",
+)
+@click.option(
+    "--dialect",
+    type=click.Choice(list(DIALECTS)),
+    default="unitree_go",
+    show_default=True,
+    help="Topics, types and units.",
+)
+@dds_options(default_domain=None)
+@click.option(
+    "--state-rate",
+    type=click.FloatRange(1, 1000),
+    metavar="HZ",
+    help="States published a second.  [default: the model's, 500]",
+)
+@click.option(
+    "--estimator",
+    type=click.Choice([e.value for e in Estimation]),
+    default=Estimation.AUTO.value,
+    show_default=True,
+    help="Predict positions between measurements: auto does below 200 measurements a second.",
+)
+@click.option(
+    "--fill",
+    type=click.Choice([f.value for f in Fill]),
+    default=Fill.KNOWN.value,
+    show_default=True,
+    help="Fields of a state: all that is known, or only those the vendor's service fills.",
+)
+@click.option("--wait-for-device", is_flag=True, help="Do not fail if it is not there yet.")
+@click.option("--force", is_flag=True, help="Even if another process publishes the state topic.")
+@click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+def command(
+    backend_name: str,
+    side_name: str,
+    devices: tuple[str, ...],
+    settings: tuple[str, ...],
+    dialect: str,
+    domain: int | None,
+    interface: str,
+    state_rate: float | None,
+    estimator: str,
+    fill: str,
+    wait_for_device: bool,
+    force: bool,
+    quiet: bool,
+) -> int:
+    """Put a hand on Unitree's topics until Ctrl-C or SIGTERM.
+
+    BACKEND is a name from 'dexkit backends' or package.module:Class. Prints "ready: ..." when
+    the topics are up. SIGUSR1 logs the counters.
+
+    Without --domain, a named device is served on domain 0 (the robot's) and everything else on
+    domain 1 (that of xr_teleoperate's simulation mode).
+    """
+    status = sys.stderr.isatty() and not quiet
+    _log_to_stderr(logging.WARNING if quiet else logging.INFO, status)
+    kind = backend(backend_name)
+    sides = list(Side) if side_name == "both" else [Side(side_name)]
+    by_side = _devices(devices, sides)
+    hands = [_make(kind, side, by_side.get(side), settings) for side in sides]
+    chosen = domain if domain is not None else (0 if by_side else 1)
+    groups = _groups(hands, dialect)
+
+    from dexkit.dds import DdsNode
+
+    with stop_on_signals() as stop, DdsNode(domain=chosen, interface=interface) as node:
+        services = [
+            HandService(
+                group,
+                node=node,
+                domain=chosen,
+                dialect=dialect,
+                state_rate=state_rate,
+                estimation=Estimation(estimator),
+                fill=Fill(fill),
+                wait_for_device=wait_for_device,
+                force=force,
+            )
+            for group in groups
+        ]
+        with ExitStack() as running:
+            for service in services:
+                running.enter_context(service)
+            prepare_process()
+            _on_sigusr1(running, services)
+            for service, group in zip(services, groups, strict=True):
+                names = " and ".join(str(hand.spec.side) for hand in group)
+                click.echo(
+                    f"ready: {backend_name} {names} on {service.cmd_topic} and "
+                    f"{service.state_topic} ({dialect}), {service.state_rate:g} Hz, "
+                    f"domain {chosen}, {interface}"
+                )
+            sys.stdout.flush()
+            _watch(services, stop, status)
+        for service in services:
+            service.log_counters()
+    for service in services:
+        if service.failure is not None:
+            raise DexkitError(f"the service died: {service.failure}")
+    return 0
+
+
+def _devices(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:
+    by_side: dict[Side, str] = {}
+    for text in devices:
+        prefix, equals, path = text.partition("=")
+        if equals and prefix in [str(s) for s in Side]:
+            side = Side(prefix)
+        elif len(sides) == 1:
+            side, path = sides[0], text
+        else:
+            raise UsageError(
+                f"which hand is {text}?", hint="--device left=PATH --device right=PATH"
+            )
+        if side not in sides:
+            raise UsageError(f"--device {text}, but only the {sides[0]} hand is served")
+        if side in by_side:
+            raise UsageError(f"two devices for the {side} hand: {by_side[side]} and {path}")
+        by_side[side] = path
+    return by_side
+
+
+def _make(kind: Backend, side: Side, device: str | None, settings: Sequence[str]) -> Hand:
+    values: dict[str, str] = {}
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise UsageError(f"--set {text} is not KEY=VALUE")
+        values[key] = value
+    return kind.create(BackendOptions(side, device, values))
+
+
+def _groups(hands: list[Hand], dialect: str) -> list[list[Hand]]:
+    """The hands by topic pair."""
+    groups: dict[tuple[str, str], list[Hand]] = {}
+    for hand in hands:
+        groups.setdefault(dialect_by_name(dialect).topics(hand.spec.side), []).append(hand)
+    return list(groups.values())
+
+
+def _on_sigusr1(running: ExitStack, services: Sequence[HandService]) -> None:
+    def handle(signum: int, frame: FrameType | None) -> None:
+        for service in services:
+            service.log_counters()
+
+    running.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, handle))
+
+
+def _log_to_stderr(level: int, status: bool) -> None:
+    clear = "\r\x1b[K" if status else ""  # the status line is written over
+    logging.basicConfig(level=level, format=f"{clear}%(levelname)s %(message)s", force=True)
+    # the counters at exit are wanted, however quiet
+    logging.getLogger("dexkit.service.counters").setLevel(logging.INFO)
+
+
+def _watch(services: Sequence[HandService], stop: StopRequest, status: bool) -> None:
+    """Until told to stop: a status line, and hints about clients that cannot find us."""
+    started = time.monotonic()
+    said: set[str] = set()
+    rates = [_Rate(lambda s=service: s.counters.published) for service in services]  # type: ignore[misc]
+    lonely = True
+    while not stop.wait(_STATUS_PERIOD):
+        if any(service.failure is not None for service in services):
+            return
+        for service in services:
+            for text in _mismatches(service):
+                if text not in said:
+                    said.add(text)
+                    log.warning("%s", text)
+        lonely = lonely and not any(service.clients for service in services)
+        if lonely and time.monotonic() - started > _LONELY:
+            lonely = False
+            topics = ", ".join(service.state_topic for service in services)
+            log.info("no client reads %s yet; is it on the same domain and interface?", topics)
+        if status:
+            line = " | ".join(
+                _line(service, rate()) for service, rate in zip(services, rates, strict=True)
+            )
+            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+    if status:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def _mismatches(service: HandService) -> list[str]:
+    if service.node is None:
+        return []
+    return diagnose(service.node.endpoints(), service.dialect, list(service.cores))
+
+
+class _Rate:
+    """Counts a second since the last call."""
+
+    def __init__(self, count: Callable[[], int]) -> None:
+        self._count = count
+        self._last = (time.monotonic(), count())
+
+    def __call__(self) -> float:
+        now = (time.monotonic(), self._count())
+        (t0, n0), self._last = self._last, now
+        return (now[1] - n0) / (now[0] - t0) if now[0] > t0 else 0.0
+
+
+def _line(service: HandService, rate: float) -> str:
+    hands = []
+    for side, core in service.cores.items():
+        view = core.view()
+        q = "q ?" if view is None else f"q {float(view.state.q[0]):.2f}"
+        what = "lost" if not core.connected else "driven" if core.driving else "brake"
+        if core.connected and core.predicting:
+            what += ", predicted"
+        hands.append(f"{side} {q} {what} {core.measured_rate:.0f}/s")
+    clients = f"{service.clients} client{'' if service.clients == 1 else 's'}"
+    return f"{', '.join(hands)}; state {rate:.0f} Hz, {clients}"
