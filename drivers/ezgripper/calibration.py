@@ -21,6 +21,7 @@ from typing import Protocol
 
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import ContactDetector
+from dexkit.drivers.ezgripper.control import at_once
 from dexkit.drivers.ezgripper.scaling import (
     STROKE,
     TICKS_PER_PERCENT,
@@ -138,7 +139,9 @@ def move(
     settled: float | None = None
     try:
         if not first.torque:
-            drive.engage(Goal(first.position, goal.current, goal.profile_velocity))
+            drive.engage(at_once(first.position, goal.current))
+        else:
+            drive.exchange(at_once(first.position, goal.current))
         while True:
             sample = drive.exchange(goal)
             _check(sample)

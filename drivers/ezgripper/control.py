@@ -35,7 +35,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, JointMode
 from dexkit.wire import mx64
 
-__all__ = ["Control", "ControlSettings", "Phase"]
+__all__ = ["Control", "ControlSettings", "Phase", "at_once"]
 
 
 class Phase(str, Enum):
@@ -58,7 +58,8 @@ class ControlSettings:
     :param effort: limit while moving and at first contact, percent (facts/mx64 D2, D3).
     :param hold_effort: limit while an object is held, braking, or hot, percent.
     :param hold_after: seconds of contact after which the limit sinks to ``hold_effort`` (D5).
-    :param speed: limit, percent of stroke a second. 300 is beyond what the motor can do (D1).
+    :param speed: limit, percent of stroke a second. At 12 V the motor can do 172 without load
+        (D1); a profile that it cannot follow runs ahead, and a reversal waits until it is back.
     :param startup_speed: the same from opening until the fingers have once come to rest at
         their goal.
     :param startup_time: seconds after which the start-up limit ends in any case.
@@ -68,7 +69,7 @@ class ControlSettings:
     effort: float = 50.0
     hold_effort: float = 15.0
     hold_after: float = 0.5
-    speed: float = 300.0
+    speed: float = 150.0
     startup_speed: float = 50.0
     startup_time: float = 3.0
     warm: float = 70.0
@@ -98,6 +99,16 @@ _REST_TIME = 0.2
 """Seconds at the goal that end the start-up limit."""
 _COOLED = 5.0
 """°C below ``warm`` at which the full effort comes back."""
+
+
+def at_once(position: int, current: int) -> Goal:
+    """A goal for one exchange that brings the servo's trajectory back to where the fingers are.
+
+    While fingers are blocked the servo's profile runs on to its goal, and the next profile
+    starts from there: told to open, the fingers would wait until it has come all the way back.
+    A Profile Velocity of 0 makes the trajectory jump to the goal (facts/mx64 B5).
+    """
+    return Goal(_bounded(position), current, 0)
 
 
 class Control:
@@ -193,6 +204,7 @@ class Control:
         settings = self.settings
         self._braked_at = None
         target = ticks_of_joint(float(command.q[0]))
+        held = self.detector.contact
         contact = self.detector.update(now, position, target)
         self._end_startup(now, abs(target - position) <= _ARRIVED)
         self._warm = sample.temperature >= settings.warm - (_COOLED if self._warm else 0.0)
@@ -207,7 +219,10 @@ class Control:
         effort = settings.effort
         if self.phase is Phase.HOLDING or self._warm or self._overloaded_at is not None:
             effort = min(effort, settings.hold_effort)
-        return Goal(_bounded(base + target), current_of_effort(effort), self._profile())
+        current = current_of_effort(effort)
+        if held is not None and contact is None:
+            return at_once(sample.position, current)
+        return Goal(_bounded(base + target), current, self._profile())
 
     def _end_startup(self, now: float, at_goal: bool) -> None:
         if not self._starting:

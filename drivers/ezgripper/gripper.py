@@ -514,24 +514,24 @@ def _table(text: str) -> ForceTable:
 _CONTROL = {f.name for f in fields(ControlSettings)}
 
 _SETTINGS: dict[str, tuple[Callable[[str], object], str]] = {
-    "id": (_or_auto, "servo id, or auto for the one that answers [1]"),
-    "baudrate": (_or_auto, "bits a second, or auto to try those known [1000000]"),
+    "id": (_or_auto, "servo id, or auto for the one that answers (default 1)"),
+    "baudrate": (_or_auto, "bits a second, or auto to try those known (default 1000000)"),
     "calibrate": (
         Calibrate,
-        "no: a stored zero is needed; auto: find it, moving, if none is stored; yes: always [no]",
+        "no: needs a stored zero; auto: moves to find one if needed; yes: always (default no)",
     ),
     "zero": (int, "zero in servo ticks, instead of the stored one"),
-    "config": (Path, "calibration file [the user's]"),
-    "force_table": (_table, "JSON file {current units: force}, or default [the stored one]"),
-    "effort": (_number(0, 100), "force limit while moving, % [50]"),
-    "hold_effort": (_number(0, 100), "force limit while holding and braking, % [15]"),
-    "hold_after": (_number(0, 60), "seconds of contact until hold_effort [0.5]"),
-    "speed": (_number(0, 1000), "speed limit, % of stroke a second [300: none]"),
-    "startup_speed": (_number(0, 1000), "speed limit of the first motion, %/s [50]"),
-    "startup_time": (_number(0, 60), "seconds after which that limit ends at the latest [3]"),
-    "warm": (_number(0, 80), "degC from which effort is reduced to hold_effort [70]"),
-    "timeout": (_number(0, 1), "seconds to wait for a reply [0.03]"),
-    "retries": (int, "times that an unanswered request is repeated [2]"),
+    "config": (Path, "calibration file (default the user's)"),
+    "force_table": (_table, "JSON file {current units: force}, or default (default: as stored)"),
+    "effort": (_number(0, 100), "force limit while moving, % (default 50)"),
+    "hold_effort": (_number(0, 100), "force limit while holding and braking, % (default 15)"),
+    "hold_after": (_number(0, 60), "seconds of contact until hold_effort (default 0.5)"),
+    "speed": (_number(0, 1000), "speed limit, % of stroke a second (default 150)"),
+    "startup_speed": (_number(0, 1000), "speed limit of the first motion, %/s (default 50)"),
+    "startup_time": (_number(0, 60), "seconds after which that limit ends anyway (default 3)"),
+    "warm": (_number(0, 80), "degC from which effort is reduced to hold_effort (default 70)"),
+    "timeout": (_number(0, 1), "seconds to wait for a reply (default 0.03)"),
+    "retries": (int, "times that an unanswered request is repeated (default 2)"),
 }
 
 

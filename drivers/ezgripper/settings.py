@@ -18,7 +18,15 @@ from dexkit.errors import HandRefused
 from dexkit.wire import mx64
 from dexkit.wire.mx64 import OperatingMode, StatusReturnLevel
 
-__all__ = ["EEPROM", "RAM", "WATCHDOG_TIME", "WATCHDOG_UNITS", "ServoLimits", "apply_settings"]
+__all__ = [
+    "EEPROM",
+    "RAM",
+    "WATCHDOG_TIME",
+    "WATCHDOG_UNITS",
+    "ServoLimits",
+    "apply_settings",
+    "differences",
+]
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +66,12 @@ class ServoLimits:
     temperature: int
     voltage_min: float
     voltage_max: float
+
+
+def differences(bus: ServoBus, servo_id: int) -> list[tuple[mx64.Item, int, int]]:
+    """EEPROM items that differ: (item, value found, value wanted). Raises as the bus."""
+    found = [(item, bus.read_item(servo_id, item), wanted) for item, wanted in EEPROM]
+    return [entry for entry in found if entry[1] != entry[2]]
 
 
 def _verify(bus: ServoBus, servo_id: int, item: mx64.Item, value: int) -> None:

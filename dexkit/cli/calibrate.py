@@ -1,0 +1,270 @@
+"""``dexkit calibrate``: find a gripper's zero and speed and store them."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from dexkit.cli.common import StopRequest, stop_on_signals
+from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
+from dexkit.drivers.ezgripper.bus import ServoBus
+from dexkit.drivers.ezgripper.config import GripperRecord, Store
+from dexkit.drivers.ezgripper.force import ForceTable
+from dexkit.drivers.ezgripper.scaling import amperes
+from dexkit.drivers.ezgripper.servo import Servo
+from dexkit.errors import UsageError
+from dexkit.wire import mx64
+
+__all__ = ["command"]
+
+_FORCE_EFFORTS = (10.0, 15.0, 20.0, 30.0, 40.0)
+"""Percent; more would heat the motor while the gauge is read."""
+
+
+class _IdOrAuto(click.ParamType):  # type: ignore[type-arg]
+    name = "N|auto"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> object:
+        if value == "auto" or isinstance(value, int):
+            return value
+        try:
+            return int(str(value))
+        except ValueError:
+            self.fail(f"{value!r} is neither a number nor 'auto'", param, ctx)
+
+
+@click.command()
+@click.argument("gripper", type=click.Choice(["ezgripper"]), default="ezgripper")
+@click.option("--device", metavar="PATH|SERIAL", help="Serial port, or its USB serial number.")
+@click.option(
+    "--id", "servo_id", type=_IdOrAuto(), default=1, show_default=True, help="Servo id, or auto."
+)
+@click.option(
+    "--baudrate",
+    type=_IdOrAuto(),
+    default=1_000_000,
+    show_default=True,
+    help="Bits a second, or auto to try those known.",
+)
+@click.option(
+    "--effort",
+    type=click.FloatRange(5, 60),
+    default=calibration.EFFORT,
+    show_default=True,
+    help="Percent of force while looking for the closed position.",
+)
+@click.option("--speed", is_flag=True, help="Also measure the speed, at full effort.")
+@click.option(
+    "--runs",
+    type=click.IntRange(1, 20),
+    default=3,
+    show_default=True,
+    help="Strokes each way for --speed.",
+)
+@click.option("--force", is_flag=True, help="Instead, measure the force table with a gauge.")
+@click.option(
+    "--set-baudrate",
+    type=click.Choice([str(b) for b in mx64.BAUD_RATES.values() if b < 4_500_000]),
+    help="First change the servo's baud rate; 1000000 is what dexkit expects.",
+)
+@click.option(
+    "--config",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File to store in, instead of the user's.",
+)
+@click.option("--dry-run", is_flag=True, help="Only look: nothing moves, nothing is written.")
+@click.option("--yes", is_flag=True, help="Do not ask whether the gripper is empty.")
+@click.option("--show", is_flag=True, help="Print what is stored, and stop.")
+def command(
+    gripper: str,
+    device: str | None,
+    servo_id: int | str,
+    baudrate: int | str,
+    effort: float,
+    speed: bool,
+    runs: int,
+    force: bool,
+    set_baudrate: str | None,
+    config: Path | None,
+    dry_run: bool,
+    yes: bool,
+    show: bool,
+) -> None:
+    """Find a gripper's zero, and with --speed its speed, and store them.
+
+    The gripper MOVES: it closes until it is stopped, then opens. It must be empty and free. The
+    result is stored under the adapter's USB serial number (or the path, where there is none), so
+    that it is found again whatever port it is plugged into.
+    """
+    store = Store(config)
+    if show:
+        _show(store)
+        return
+    if device is None:
+        raise UsageError("say which gripper", hint="--device PATH or USB serial number")
+    console = Console()
+    configuration = GripperSettings(
+        id=servo_id if isinstance(servo_id, int) else None,
+        baudrate=baudrate if isinstance(baudrate, int) else None,
+        config=config,
+    )
+    hand = EZGripper(device, configuration=configuration)
+    if dry_run:
+        _look(hand, console, store)
+        return
+    if not yes and not sys.stdin.isatty():
+        raise UsageError("nobody can be asked whether the gripper is empty", hint="give --yes")
+    if not yes and not click.confirm(
+        "The gripper will move. Put the gauge between the fingers. Ready?"
+        if force
+        else "The gripper will close and open. Is it empty and free to move?"
+    ):
+        raise click.Abort
+    with stop_on_signals() as stop:
+        try:
+            servo = hand.connect(lambda text: console.print(f"[dim]{text}[/dim]"))
+            if set_baudrate is not None:
+                _change_baudrate(servo, int(set_baudrate))
+                console.print(f"servo {servo.id} is at {set_baudrate} baud now")
+            console.print(f"servo {servo.id} on {servo.bus.path} is set up; key {hand.key}")
+            if force:
+                record = GripperRecord(force_table=_force(hand, servo, console, stop))
+            else:
+                record = _zero_and_speed(servo, console, stop, effort, runs if speed else 0)
+        except calibration.CalibrationFailed:
+            if stop:
+                raise click.Abort from None
+            raise
+        finally:
+            hand.close()
+        store.write(hand.key, record)
+    console.print(f"stored for {hand.key} in {store.path}")
+
+
+def _zero_and_speed(
+    servo: Servo, console: Console, stop: StopRequest, effort: float, runs: int
+) -> GripperRecord:
+    def progress(text: str) -> None:
+        console.print(text)
+
+    def cancelled() -> bool:
+        return bool(stop)
+
+    zero = calibration.find_zero(servo, effort=effort, progress=progress, cancelled=cancelled)
+    console.print(f"zero: {zero} ticks")
+    if not runs:
+        return GripperRecord(zero=zero)
+    result = calibration.measure_speed(
+        servo, zero, runs=runs, progress=progress, cancelled=cancelled
+    )
+    console.print(f"speed: opens {result.opening:.0f} %/s, closes {result.closing:.0f} %/s")
+    return GripperRecord(zero=zero, opening=result.opening, closing=result.closing)
+
+
+def _force(hand: EZGripper, servo: Servo, console: Console, stop: StopRequest) -> ForceTable:
+    zero = hand.record.zero
+    if zero is None:
+        raise UsageError(
+            "the zero is not known yet", hint="run 'dexkit calibrate' without --force first"
+        )
+    points = [(0.0, 0.0)]
+    for effort in _FORCE_EFFORTS:
+        asked = _Question()
+        current = calibration.measure_current(
+            servo, zero, effort, asked.holding, cancelled=lambda: bool(stop)
+        )
+        console.print(f"{effort:g} %: {current:.0f} units ({amperes(current):.2f} A)")
+        points.append((round(current, 1), asked.answer))
+    return ForceTable(tuple(points))
+
+
+class _Question:
+    """Asks for the gauge's reading while the gripper goes on holding."""
+
+    def __init__(self) -> None:
+        self.answer = 0.0
+        self._thread: threading.Thread | None = None
+        self._failed: BaseException | None = None
+
+    def _ask(self) -> None:
+        try:
+            self.answer = click.prompt("force that the gauge shows", type=click.FloatRange(0))
+        except BaseException as error:  # end of input, for example: belongs to the main thread
+            self._failed = error
+
+    def holding(self, current: float) -> bool:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._ask, daemon=True)
+            self._thread.start()
+        if self._thread.is_alive():
+            return True
+        if self._failed is not None:
+            raise click.Abort from self._failed
+        return False
+
+
+def _change_baudrate(servo: Servo, baudrate: int) -> None:
+    value = next(k for k, b in mx64.BAUD_RATES.items() if b == baudrate)
+    if servo.bus.baudrate == baudrate:
+        return
+    servo.set_torque(False)
+    # whether the answer comes at the old or the new rate is not documented: ask for none
+    servo.bus.write_unacknowledged(servo.id, mx64.BAUD_RATE.address, mx64.BAUD_RATE.encode(value))
+    servo.bus.set_baudrate(baudrate)
+    servo.bus.ping(servo.id)
+
+
+def _look(hand: EZGripper, console: Console, store: Store) -> None:
+    device = discovery.find_device(hand.device_name)
+    configuration = hand.configuration
+    warning = discovery.latency_warning(device.path)
+    if warning:
+        console.print(f"[yellow]{warning}[/yellow]")
+    bus = ServoBus(device.path, configuration.baudrate or 1_000_000)
+    try:
+        ping = discovery.find_servo(bus, configuration.id, configuration.baudrate, _dim(console))
+        console.print(
+            f"servo {ping.id} at {bus.baudrate} baud: MX-64(2.0), firmware {ping.firmware}"
+        )
+        differing = settings.differences(bus, ping.id)
+        for item, found, wanted in differing:
+            console.print(f"  {item.name}({item.address}) is {found}, would be set to {wanted}")
+        if not differing:
+            console.print("  its EEPROM holds what the driver needs")
+    finally:
+        bus.close()
+    _show(store)
+
+
+def _dim(console: Console) -> Callable[[str], None]:
+    return lambda text: console.print(f"[dim]{text}[/dim]")
+
+
+def _show(store: Store) -> None:
+    console = Console()
+    keys = store.keys()
+    if not keys:
+        console.print(f"nothing is stored in {store.path}")
+        return
+    table = Table(box=None, pad_edge=False, header_style="bold", title=str(store.path))
+    for heading in ("gripper", "zero (ticks)", "opens (%/s)", "closes (%/s)", "force table"):
+        table.add_column(heading)
+    for key in keys:
+        record = store.read(key)
+        table.add_row(
+            key,
+            *(
+                "-" if v is None else f"{v:g}"
+                for v in (record.zero, record.opening, record.closing)
+            ),
+            f"{len(record.force_table.points)} points" if record.force_table else "default",
+        )
+    console.print(table)
