@@ -57,7 +57,9 @@ __all__ = [
     "Reader",
     "Sample",
     "Writer",
+    "cyclone_type",
     "interfaces",
+    "type_hash",
 ]
 
 _log = logging.getLogger(__name__)
@@ -69,6 +71,7 @@ _PRECONDITION_NOT_MET = -4
 _ALIVE = 16  # DDS_ALIVE_INSTANCE_STATE
 _MAX_PARTICIPANT_INDEX = 60  # processes on one machine and domain; each is probed at start-up
 _TAKE_CHUNK = 64
+_BUILTIN = "org::eclipse::cyclonedds::builtin::"  # types of a node's own discovery readers
 
 
 @dataclass(frozen=True)
@@ -143,10 +146,12 @@ class Participant:
     """A process's presence on the domain.
 
     :param process: name and pid if the other side tells them (CycloneDDS does), or empty.
+    :param pid: process id, or 0 if it is not told.
     """
 
     key: str
     process: str
+    pid: int
     host: str
     own: bool
 
@@ -279,8 +284,15 @@ def _cyclone() -> _Cyclone:
 
 
 @cache
-def _idl_type(name: str) -> Any:
-    """CycloneDDS's class for a message type, made from the layout."""
+def cyclone_type(name: str) -> Any:
+    """CycloneDDS's class (an ``IdlStruct``) for a message type, made from the layout.
+
+    Only topics need it; messages are encoded by :mod:`dexkit.messages`, which is several times
+    faster and proven to give the same bytes.
+
+    :param name: DDS name.
+    :raises DdsUnavailable: CycloneDDS 0.10.x is not installed.
+    """
     cyclone = _cyclone()
     struct = layout.STRUCTS[name]
     numbers = {
@@ -296,7 +308,7 @@ def _idl_type(name: str) -> Any:
         kind = (
             numbers[member.type.idl]
             if isinstance(member.type, layout.Primitive)
-            else _idl_type(member.type.dds_name)
+            else cyclone_type(member.type.dds_name)
         )
         if member.sequence:
             kind = cyclone.types.sequence[kind]
@@ -308,6 +320,20 @@ def _idl_type(name: str) -> Any:
     cyclone.annotations.final(cls)
     cyclone.annotations.autoid("sequential")(cls)
     return cls
+
+
+@cache
+def type_hash(name: str) -> str:
+    """Hash of the layout that dexkit knows under a DDS name, as in :attr:`Endpoint.type_hash`.
+
+    Peers whose hash differs have another version of the message (facts/unitree-dex A.3) and do
+    not match.
+    """
+    description = cyclone_type(name).__idl__
+    description.populate()
+    description.fill_type_data()
+    value: bytes = description.get_type_id().value
+    return value.hex()
 
 
 def interfaces() -> list[str]:
@@ -677,10 +703,9 @@ class Discovery:
         with self._lock:
             self._participants.pop(key, None)
 
-    def _process(self, participant: str) -> str:
+    def _participant(self, key: str) -> Participant | None:
         with self._lock:
-            found = self._participants.get(participant)
-        return found.process if found else ""
+            return self._participants.get(key)
 
     def _put(self, endpoint: Endpoint) -> None:
         with self._lock:
@@ -860,7 +885,7 @@ class DdsNode:
         key = (name, kind.name)
         if key not in self._topics:
             self._topics[key] = _cyclone().topic.Topic(
-                self._participant, name, _idl_type(kind.name)
+                self._participant, name, cyclone_type(kind.name)
             )
         return self._topics[key]
 
@@ -907,19 +932,22 @@ class DdsNode:
         with self._changed:
             self._changed.notify_all()
 
+    def _alive(self) -> bool:
+        return not self._closed
+
     def _dispatch(self) -> None:
         cyclone = _cyclone()
         room = 64
         tokens = (ctypes.c_ssize_t * room)()
         while True:
             count = cyclone.dds_waitset_wait(self._waitset, tokens, room, _INFINITY)
-            if self.closed or count < 0:
+            if count < 0 or not self._alive():
                 return
             # more than `room` triggered entities trigger again at once
             for token in sorted(set(tokens[: min(count, room)])):
                 with self._dispatching:
-                    if self.closed:
-                        return
+                    if not self._alive():
+                        return  # a callback has closed the node
                     try:
                         if token == 0:
                             self._read_builtin()
@@ -949,21 +977,9 @@ class DdsNode:
                 key = str(sample.key)
                 if sample.sample_info.instance_state != _ALIVE:
                     self.discovery._remove(key)
-                elif sample.topic_name is not None:
-                    owner = str(sample.participant_key)
-                    self.discovery._put(
-                        Endpoint(
-                            topic=sample.topic_name,
-                            type_name=sample.type_name,
-                            kind=kind,
-                            qos=_qos_of(sample.qos),
-                            own=owner == self._key,
-                            key=key,
-                            participant=owner,
-                            process=self.discovery._process(owner),
-                            type_hash=_type_hash(sample.type_id),
-                        )
-                    )
+                elif sample.topic_name is not None and not sample.type_name.startswith(_BUILTIN):
+                    owner = self.discovery._participant(str(sample.participant_key))
+                    self.discovery._put(_endpoint(sample, kind, owner, self._key))
         if changed:
             self._notify()
 
@@ -982,15 +998,30 @@ def _participant(sample: Any, *, own: bool) -> Participant:
     return Participant(
         key=str(sample.key),
         process=f"{name} (pid {pid})" if name and pid else name,
+        pid=int(pid) if pid.isdigit() else 0,
         host=properties.get("__Hostname", ""),
         own=own,
     )
 
 
-def _type_hash(type_id: Any) -> str:
-    """Hex of the complete type's hash in a TypeIdentifier."""
-    value = getattr(type_id, "value", None)
-    return bytes(value).hex() if isinstance(value, (bytes, bytearray, list)) else ""
+def _endpoint(sample: Any, kind: str, owner: Participant | None, own_key: str) -> Endpoint:
+    key = str(sample.participant_key)
+    value = getattr(sample.type_id, "value", None)  # no bytes: a type that is not a struct
+    hashed = value.hex() if isinstance(value, bytes) else ""
+    if not hashed and owner is not None and owner.pid == os.getpid():
+        # CycloneDDS does not describe the types of its own process
+        hashed = type_hash(sample.type_name) if sample.type_name in layout.STRUCTS else ""
+    return Endpoint(
+        topic=sample.topic_name,
+        type_name=sample.type_name,
+        kind=kind,
+        qos=_qos_of(sample.qos),
+        own=key == own_key,
+        key=str(sample.key),
+        participant=key,
+        process=owner.process if owner else "",
+        type_hash=hashed,
+    )
 
 
 def _policies(qos: Qos) -> Any:

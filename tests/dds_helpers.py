@@ -1,4 +1,7 @@
-"""Shared by tests that use DDS: a domain of one's own, and waiting without sleeping."""
+"""Shared by tests that use DDS: a domain of one's own, and waiting without sleeping.
+
+Importing this skips the test module where CycloneDDS is not installed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
 
 from dexkit.dds import DdsNode, Reader, Sample
 
