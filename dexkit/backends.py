@@ -142,9 +142,7 @@ def _coerce(target: str, value: object) -> Backend:
         factory: Callable[[Side], object] = value
 
         def make_from_class(options: BackendOptions) -> Hand:
-            hand = factory(options.side)
-            assert isinstance(hand, Hand)
-            return hand
+            return _checked(target, factory(options.side))
 
         return Backend(
             summary=(value.__doc__ or target).strip().splitlines()[0],
@@ -155,13 +153,7 @@ def _coerce(target: str, value: object) -> Backend:
         function = value
 
         def make(options: BackendOptions) -> Hand:
-            hand = function(options)
-            if not isinstance(hand, Hand):
-                raise BackendBroken(
-                    f"{target} returned {type(hand).__name__}, not a Hand",
-                    hint="a Hand has spec, open, close and exchange (dexkit/hand.py)",
-                )
-            return hand
+            return _checked(target, function(options))
 
         return Backend(
             summary=(value.__doc__ or target).strip().splitlines()[0], model="", make=make
@@ -170,6 +162,15 @@ def _coerce(target: str, value: object) -> Backend:
         f"{target} is a {type(value).__name__}, not a backend",
         hint="give a dexkit.backends.Backend, a Hand class, or a function that makes a Hand",
     )
+
+
+def _checked(target: str, hand: object) -> Hand:
+    if not isinstance(hand, Hand):
+        raise BackendBroken(
+            f"{target} returned {type(hand).__name__}, not a Hand",
+            hint="a Hand has spec, open, close and exchange (dexkit/hand.py)",
+        )
+    return hand
 
 
 def _load(target: str) -> Backend:

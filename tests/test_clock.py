@@ -1,0 +1,119 @@
+"""Clocks, and the rate that keeps absolute deadlines."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexkit.clock import ManualClock, Rate, RealClock
+from dexkit.errors import UsageError
+
+
+class TestManualClock:
+    def test_it_moves_when_told(self) -> None:
+        clock = ManualClock(10.0)
+        assert clock.advance(0.5) == clock.now() == 10.5
+
+    def test_sleeping_is_jumping_and_never_back(self) -> None:
+        clock = ManualClock(10.0)
+        clock.sleep_until(12.0)
+        assert clock.now() == 12.0
+        clock.sleep_until(11.0)
+        assert clock.now() == 12.0
+
+    def test_time_does_not_go_back(self) -> None:
+        with pytest.raises(UsageError, match="cannot go back"):
+            ManualClock().advance(-1.0)
+
+
+class TestRate:
+    @given(st.lists(st.floats(0.0, 0.0099), min_size=1, max_size=200))
+    def test_work_shorter_than_a_period_never_shifts_a_deadline(self, work: list[float]) -> None:
+        clock = ManualClock(3.0)
+        rate = Rate(100.0, clock)
+        for i, seconds in enumerate(work, 1):
+            assert rate.wait() == 0
+            assert clock.now() == pytest.approx(3.0 + 0.01 * i, abs=1e-9)
+            clock.advance(seconds)
+        assert (rate.misses, rate.loops) == (0, len(work))
+
+    @given(st.lists(st.floats(0.0, 0.1), min_size=1, max_size=100))
+    def test_deadlines_stay_on_the_grid_whatever_happens(self, work: list[float]) -> None:
+        clock = ManualClock()
+        rate = Rate(100.0, clock)
+        last = 0.0
+        for seconds in work:
+            clock.advance(seconds)
+            before = clock.now()
+            rate.wait()
+            assert clock.now() >= before
+            deadline = rate.deadline - rate.period  # the one that was waited for
+            assert deadline / rate.period == pytest.approx(round(deadline / rate.period), abs=1e-6)
+            assert deadline > last - 1e-9
+            assert clock.now() - deadline < rate.period + 1e-9  # no burst to catch up
+            last = deadline
+        assert rate.loops == len(work)
+
+    def test_missed_periods_are_counted_and_skipped(self) -> None:
+        clock = ManualClock()
+        rate = Rate(100.0, clock)
+        rate.wait()
+        clock.advance(0.055)
+        assert rate.wait() == 4  # deadlines 20, 30, 40 and 50 ms are gone; 60 ms is next
+        assert rate.misses == 4
+        rate.wait()
+        assert clock.now() == pytest.approx(0.07)
+        assert rate.misses == 4
+
+    def test_an_hour_adds_no_error(self) -> None:
+        clock = ManualClock()
+        rate = Rate(500.0, clock)
+        for _ in range(500 * 60):
+            rate.wait()
+        assert clock.now() == pytest.approx(60.0, abs=1e-9)
+
+    def test_reset_counts_from_now(self) -> None:
+        clock = ManualClock()
+        rate = Rate(10.0, clock)
+        clock.advance(5.0)
+        rate.reset()
+        assert rate.wait() == 0
+        assert clock.now() == pytest.approx(5.1)
+
+    def test_spinning_on_a_manual_clock_ends(self) -> None:
+        clock = ManualClock()
+        rate = Rate(100.0, clock, spin=0.001)
+        rate.wait()
+        assert clock.now() == pytest.approx(0.01)
+
+    @pytest.mark.parametrize("hz", [0.0, -5.0, float("inf"), float("nan")])
+    def test_a_rate_is_positive(self, hz: float) -> None:
+        with pytest.raises(UsageError, match="positive"):
+            Rate(hz)
+
+    def test_spin_is_not_negative(self) -> None:
+        with pytest.raises(UsageError, match="spin"):
+            Rate(1.0, spin=-0.1)
+
+
+@pytest.mark.realtime
+def test_the_real_clock_is_the_systems_monotonic_one() -> None:
+    clock = RealClock()
+    assert abs(clock.now() - time.monotonic()) < 0.1
+    start = time.monotonic()
+    clock.sleep_until(start + 0.02)
+    assert time.monotonic() >= start + 0.02
+    clock.sleep_until(start)  # the past: at once
+
+
+@pytest.mark.realtime
+def test_a_real_rate_does_not_drift() -> None:
+    """Tolerance: the last of 50 deadlines within 20 ms, on a busy machine."""
+    rate = Rate(500.0, spin=100e-6)
+    start = time.monotonic()
+    while rate.loops + rate.misses < 50:
+        rate.wait()
+    assert 0.098 <= time.monotonic() - start < 0.12

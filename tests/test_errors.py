@@ -1,0 +1,58 @@
+"""The error tree is the one drawn in the docstring, and ordinary except clauses work."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+import pytest
+
+from dexkit import errors
+from dexkit.errors import DexkitError
+
+CLASSES = {
+    name: cls
+    for name, cls in vars(errors).items()
+    if inspect.isclass(cls) and issubclass(cls, DexkitError)
+}
+
+
+def drawn() -> dict[str, tuple[str | None, str | None]]:
+    """Of each class in the drawing: its parent and the built-in in brackets."""
+    tree: dict[str, tuple[str | None, str | None]] = {}
+    path: list[tuple[int, str]] = []
+    for line in (errors.__doc__ or "").splitlines():
+        match = re.match(r"^([ │├└─]*)([A-Z]\w+)(?: \((\w+)\))?(?:  .*)?$", line)
+        if not match or not line.startswith("    "):
+            continue
+        depth = len(match.group(1))
+        while path and path[-1][0] >= depth:
+            path.pop()
+        tree[match.group(2)] = (path[-1][1] if path else None, match.group(3))
+        path.append((depth, match.group(2)))
+    return tree
+
+
+def test_the_drawing_is_complete() -> None:
+    assert drawn().keys() == CLASSES.keys() == set(errors.__all__)
+
+
+@pytest.mark.parametrize("name", sorted(CLASSES))
+def test_each_class_is_where_it_is_drawn(name: str) -> None:
+    parent, builtin = drawn()[name]
+    bases = [base.__name__ for base in CLASSES[name].__bases__]
+    assert bases == [b for b in (parent or "Exception", builtin) if b]
+
+
+@pytest.mark.parametrize("name", sorted(CLASSES))
+def test_each_has_a_message_and_a_hint(name: str) -> None:
+    error = CLASSES[name]("what is wrong", hint="what to do")
+    assert str(error) == error.message == "what is wrong"
+    assert error.hint == "what to do"
+    assert error.exit_code in (1, 2)
+    assert CLASSES[name]("x").hint == ""
+
+
+def test_a_fault_carries_its_bits() -> None:
+    assert errors.HandFault("overload", bits=[1, 0x80]).bits == (1, 0x80)
+    assert errors.HandFault("overload").bits == ()

@@ -1,0 +1,100 @@
+"""The rooms, their links, and who may import whom."""
+
+from __future__ import annotations
+
+import ast
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ROOMS = ("drivers", "emulators", "conformance", "traces")
+# what a room may import besides itself and the core
+MAY_IMPORT = {
+    "drivers": set(),
+    "emulators": set(),
+    "traces": set(),
+    "conformance": {"traces"},
+}
+
+
+def modules(folder: Path) -> Iterator[Path]:
+    """Python files below ``folder``, not through the rooms' links."""
+    for base, folders, files in os.walk(folder):
+        folders[:] = [f for f in folders if not (Path(base) / f).is_symlink()]
+        yield from (Path(base) / f for f in files if f.endswith(".py"))
+
+
+def imported(path: Path) -> set[str]:
+    """Every module that a file imports, at the top or inside a function, as absolute names."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute here"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def rooms_imported(path: Path) -> set[str]:
+    return {
+        name.split(".")[1]
+        for name in imported(path)
+        if name.startswith("dexkit.") and name.split(".")[1] in ROOMS
+    }
+
+
+def files(folder: str) -> list[Path]:
+    found = sorted(modules(ROOT / folder))
+    assert found, f"no modules in {folder}"
+    return found
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_the_room_is_linked_into_the_package(room: str) -> None:
+    link = ROOT / "dexkit" / room
+    assert link.is_symlink()
+    assert os.readlink(link) == f"../{room}"
+    assert (link / "__init__.py").is_file()
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_rooms_keep_their_distance(room: str) -> None:
+    for path in files(room):
+        others = rooms_imported(path) - {room} - MAY_IMPORT[room]
+        assert not others, f"{path.relative_to(ROOT)} imports {', '.join(others)}"
+
+
+def test_the_core_imports_no_room() -> None:
+    for path in files("dexkit"):
+        if path.parent != ROOT / "dexkit" / "cli":
+            assert not rooms_imported(path), f"{path.relative_to(ROOT)}: {rooms_imported(path)}"
+
+
+@pytest.mark.parametrize("folder", ["dexkit", "tests", "benchmarks", *ROOMS])
+def test_nothing_imports_a_room_by_its_bare_name(folder: str) -> None:
+    for path in files(folder):
+        bare = {name for name in imported(path) if name.split(".")[0] in ROOMS}
+        assert not bare, f"{path.relative_to(ROOT)} imports {', '.join(bare)}: say dexkit.…"
+
+
+@pytest.mark.parametrize("folder", ["dexkit", "benchmarks", *ROOMS])
+def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
+    for path in files(folder):
+        touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))
+        # the codec benchmark compares with CycloneDDS's own serialisation
+        allowed = {ROOT / "dexkit" / "dds.py", ROOT / "benchmarks" / "bench_codec.py"}
+        assert not touches or path in allowed, path.relative_to(ROOT)
+
+
+def test_help_imports_no_room_and_no_dds() -> None:
+    """``dexkit --help`` is quick, and works where parts are missing."""
+    for path in (ROOT / "dexkit" / "cli" / "__init__.py", ROOT / "dexkit" / "__init__.py"):
+        tree = ast.parse(path.read_text())
+        top = [n for n in tree.body if isinstance(n, (ast.Import, ast.ImportFrom))]
+        names = {getattr(n, "module", None) or n.names[0].name for n in top}
+        assert not any(name.startswith(("dexkit.dds", *(f"dexkit.{r}" for r in ROOMS)))
+                       for name in names)  # fmt: skip
