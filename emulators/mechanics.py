@@ -94,7 +94,7 @@ class Joint:
             return
         force = torque + contact - self.spring * (q - self.spring_rest)
         gain = dt / self.inertia
-        velocity = (velocity + gain * force) / (1.0 + gain * damping)
+        velocity += gain * force
         stick = gain * (self.coulomb + friction)
         if velocity > stick:
             velocity -= stick
@@ -102,5 +102,6 @@ class Joint:
             velocity += stick
         else:
             velocity = 0.0
+        velocity /= 1.0 + gain * damping
         self.dq = velocity
         self.q = q + dt * velocity

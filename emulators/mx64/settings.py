@@ -143,7 +143,7 @@ class Physics:
     heat_capacity: float = 296.0
     cooling_time: float = 1200.0
     idle_power: float = 1.2
-    drive_power: float = 0.9
+    drive_power: float = 2.0
     ambient: float = 25.0
     supply_voltage: float = 12.0
     supply_resistance: float = 0.15

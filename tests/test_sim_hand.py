@@ -1,0 +1,203 @@
+"""sim-dex1: the motor's law, and motion like that of the recorded teleoperation sessions."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.backends import BackendOptions, backend
+from dexkit.clock import ManualClock
+from dexkit.emulators.sim_hand import SimHand, sim_dex1
+from dexkit.errors import HandLost, UsageError
+from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
+
+
+def opened(**options: float) -> tuple[SimHand, ManualClock]:
+    clock = ManualClock()
+    hand = SimHand(clock=clock, **options)  # type: ignore[arg-type]
+    hand.open()
+    return hand, clock
+
+
+def hold(
+    hand: SimHand, clock: ManualClock, command: HandCommand, seconds: float, hz: float = 500
+) -> HandState:
+    state = hand.exchange(command)
+    for _ in range(int(seconds * hz)):
+        clock.advance(1 / hz)
+        state = hand.exchange(command)
+    return state
+
+
+def test_is_a_hand_and_is_registered() -> None:
+    assert isinstance(SimHand(), Hand)
+    made = backend("sim-dex1").create(BackendOptions(Side.RIGHT, settings={"object": "40"}))
+    assert made.spec.side is Side.RIGHT
+    assert made.spec.simulated
+    assert backend("sim-dex1") is sim_dex1
+
+
+def test_position_is_reached_and_held() -> None:
+    hand, clock = opened()
+    state = hold(hand, clock, HandCommand.position(4.0), 2.0)
+    # friction holds it as soon as kp times the rest is below 0.08 N m
+    assert state.q[0] == pytest.approx(4.0, abs=0.03)
+    assert state.dq[0] == 0.0
+    assert state.mode[0] == JointMode.FOC
+    assert state.measured
+    assert state.stamp == clock.now()
+
+
+def test_initial_position_is_not_exactly_zero() -> None:
+    hand, clock = opened()
+    state = hold(hand, clock, HandCommand.brake(1), 0.1)
+    assert state.q[0] == pytest.approx(0.2 * 5.4)
+    assert state.mode[0] == JointMode.BRAKE
+
+
+def teleoperate(hand: SimHand, clock: ManualClock, target: float) -> list[tuple[float, ...]]:
+    """The rule of the genuine client: 0.18 rad lead on the last state, three-value filter."""
+    goals: deque[float] = deque(maxlen=3)
+    start = clock.now()
+    q = float(hand.joint.q)
+    goal = q
+    rows = []
+    for tick in range(3000):
+        clock.advance(1e-3)
+        if tick % 2 == 0:
+            state = hand.exchange(HandCommand.position(goal))
+            q = float(state.q[0])
+            rows.append((clock.now() - start, q, float(state.dq[0]), float(state.tau_est[0])))
+        if tick % 5 == 0:
+            clipped = min(max(target, q - 0.18), q + 0.18)
+            if not goals or goals[-1] != clipped:
+                goals.append(clipped)
+            weights = (0.2, 0.3, 0.5)[-len(goals) :]
+            goal = sum(w * g for w, g in zip(weights, goals, strict=True)) / sum(weights)
+    return rows
+
+
+def test_moves_like_the_recorded_sessions() -> None:
+    """10 to 90 % of the stroke in 0.68 s at 6.5 rad/s (traces/README)."""
+    hand, clock = opened(start_pct=0.0)
+    rows = teleoperate(hand, clock, 5.4)
+    t10 = next(t for t, q, *_ in rows if q > 0.54)
+    t90 = next(t for t, q, *_ in rows if q > 4.86)
+    assert t90 - t10 == pytest.approx(0.68, rel=0.05)
+    assert max(dq for _, _, dq, _ in rows) == pytest.approx(6.5, rel=0.05)
+    assert max(q for _, q, *_ in rows) < 5.5
+
+
+def test_blocked_feels_like_the_recorded_sessions() -> None:
+    """About -0.9 N m against an object, which gives way by torque over its stiffness."""
+    hand, clock = opened(start_pct=100.0, object_pct=40.0)
+    rows = teleoperate(hand, clock, 0.0)
+    _, q, dq, tau = rows[-1]
+    assert tau == pytest.approx(-0.9, abs=0.03)
+    assert q == pytest.approx(0.4 * 5.4 - 0.9 / 60, abs=0.01)
+    assert dq == pytest.approx(0.0, abs=1e-3)
+
+
+def test_no_gain_is_limp() -> None:
+    hand, clock = opened()
+    limp = HandCommand.position(5.0, kp=0.0, kd=0.0)
+    state = hold(hand, clock, limp, 0.5)
+    assert state.q[0] == pytest.approx(1.08)
+    assert state.tau_est[0] == 0.0
+    hand.joint.dq = 3.0
+    clock.advance(0.1)
+    # nothing but its own friction stops it
+    assert hand.exchange(limp).q[0] - 1.08 == pytest.approx(0.5 * 0.002 * 9 / 0.08, rel=0.5)
+
+
+def test_brake_stops_a_moving_hand_at_once() -> None:
+    hand, clock = opened()
+    hold(hand, clock, HandCommand.position(5.4), 0.1)
+    clock.advance(0.002)
+    moving = hand.exchange(HandCommand.brake(1))
+    assert moving.dq[0] > 5
+    clock.advance(0.05)
+    state = hand.exchange(HandCommand.brake(1))
+    assert state.dq[0] == pytest.approx(0.0, abs=1e-3)
+    assert state.q[0] - moving.q[0] < 0.05
+
+
+def test_feedforward_torque_pushes() -> None:
+    hand, clock = opened()
+    state = hold(hand, clock, HandCommand.position(0.0, kp=0.0, kd=0.0, tau=0.3), 0.2)
+    assert state.dq[0] > 1.0
+    assert state.tau_est[0] == pytest.approx(0.3)
+
+
+def test_hard_stops_hold() -> None:
+    hand, clock = opened()
+    state = hold(hand, clock, HandCommand.position(0.0, kp=0.0, kd=0.0, tau=5.0), 1.0)
+    assert state.q[0] == pytest.approx(math.radians(322) + 5.0 / 200, abs=0.01)
+    state = hold(hand, clock, HandCommand.position(0.0, kp=0.0, kd=0.0, tau=-5.0), 1.0)
+    assert state.q[0] == pytest.approx(-5.0 / 200, abs=0.01)
+
+
+@given(
+    st.floats(0, 5.4),
+    st.floats(0, 2000),
+    st.floats(0, 200),
+    st.floats(-15, 15),
+    st.floats(-24, 24),
+)
+@settings(max_examples=60, deadline=None)
+def test_any_admitted_command_stays_finite_and_within_the_stops(
+    q: float, kp: float, kd: float, tau: float, dq: float
+) -> None:
+    hand, clock = opened()
+    state = hold(hand, clock, HandCommand.position(q, kp=kp, kd=kd, tau=tau, dq=dq), 0.3)
+    assert -0.5 < state.q[0] < 6.2
+    assert abs(state.dq[0]) < 30
+    assert abs(state.tau_est[0]) <= 15
+
+
+def test_is_deterministic() -> None:
+    traces = []
+    for _ in range(2):
+        hand, clock = opened(object_pct=30.0)
+        rng = np.random.default_rng(1)
+        traces.append(
+            [
+                float(hold(hand, clock, HandCommand.position(float(rng.uniform(0, 5.4))), 0.1).q[0])
+                for _ in range(30)
+            ]
+        )
+    assert traces[0] == traces[1]
+
+
+def test_a_long_pause_is_not_lived_through() -> None:
+    hand, clock = opened()
+    hand.exchange(HandCommand.position(0.0, kp=0.0, kd=0.0, tau=0.1))
+    clock.advance(3600.0)
+    state = hand.exchange(HandCommand.brake(1))
+    assert np.isfinite(state.q[0])
+    assert hand._steps == int(3600 / 0.5e-3)
+
+
+def test_only_an_open_hand_exchanges() -> None:
+    hand = SimHand()
+    with pytest.raises(HandLost):
+        hand.exchange(HandCommand.brake(1))
+    hand.open()
+    hand.exchange(HandCommand.brake(1))
+    hand.close()
+    hand.close()
+    with pytest.raises(HandLost):
+        hand.exchange(HandCommand.brake(1))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"object": "0"}, {"object": "many"}, {"start": "101"}, {"colour": "red"}]
+)
+def test_bad_settings_are_refused(settings: dict[str, str]) -> None:
+    with pytest.raises(UsageError):
+        sim_dex1.create(BackendOptions(Side.LEFT, settings=settings))
