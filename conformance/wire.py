@@ -49,13 +49,15 @@ class Wire:
         self.command_sequence, motor = _SEQUENCE[dialect.cmd_type]
         self.state_sequence, self._state_motor = _SEQUENCE[dialect.state_type]
         self._motor = message_type(motor).cls
-        self.shared = dialect.cmd_topic == dialect.cmd_topic.format(side="x")
+        self.command_topics = {s: dialect.topics(s)[0] for s in Side}
+        self.state_topics = {s: dialect.topics(s)[1] for s in Side}
+        self.shared = len(set(self.command_topics.values())) == 1
 
     def encode(self, motors: Mapping[Side, Motor]) -> list[tuple[str, bytes]]:
         """(topic, payload) of the commands to these sides, all in one message if they share it."""
         if not self.shared:
             return [
-                (self.dialect.topics(side)[0], self._payload([motor]))
+                (self.command_topics[side], self._payload([motor]))
                 for side, motor in motors.items()
             ]
         places = [LIMP] * self.dialect.length
@@ -65,7 +67,7 @@ class Wire:
 
     def encode_empty(self, sides: tuple[Side, ...]) -> list[tuple[str, bytes]]:
         """The same with no motor in the sequence."""
-        topics = dict.fromkeys(self.dialect.topics(side)[0] for side in sides)
+        topics = dict.fromkeys(self.command_topics[side] for side in sides)
         return [(topic, self._payload([])) for topic in topics]
 
     def _payload(self, motors: list[Motor]) -> bytes:

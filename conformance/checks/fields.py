@@ -52,7 +52,8 @@ def in_stroke(ctx: Context) -> Outcome:
     # what a wild command does to q is DEX1-SAFE-02's finding
     for phase in ctx.phases("out-of-range"):
         begin, end = ctx.span(phase)
-        outside[states.between(begin, end + 0.5)] = False
+        back = [ctx.span(p)[1] for p in ctx.phases("recover") if p.begin_ns >= phase.end_ns]
+        outside[states.between(begin, min(back, default=end + 0.5))] = False
     q = states.q[np.isfinite(states.q)]
     low, high = float(q.min()), float(q.max())
     text = f"q from {low:.3f} to {high:.3f} rad; the stroke is 0 to {ctx.stroke:.3f} rad"

@@ -207,10 +207,17 @@ def independent(ctx: Context) -> Outcome:
     moved: list[tuple[float, float, float]] = []
     for phase in others:
         begin, end = ctx.span(phase)
-        q = ctx.states.q[ctx.states.between(begin, end)]
-        q = q[np.isfinite(q)]
-        if len(q):
-            moved.append((float(np.ptp(q)), begin, end))
+        rows = ctx.states.between(begin, end)
+        t, q = ctx.states.t[rows], ctx.states.q[rows]
+        before = ctx.states.q[ctx.states.between(begin - 0.25, begin)]
+        if len(q) < 2 or not len(before):
+            continue
+        # the mean of each quarter of a second: a hand that hunts about its target is
+        # DEX1-MOVE-03's finding
+        bins = ((t - begin) / 0.25).astype(np.intp)
+        counts = np.bincount(bins)
+        means = np.bincount(bins, q)[counts > 0] / counts[counts > 0]
+        moved.append((float(np.abs(means - before.mean()).max()), begin, end))
     if not moved:
         return ctx.skipped("no state of this hand while the other one moved")
     most, begin, end = max(moved)
@@ -242,7 +249,7 @@ def zero_gains(ctx: Context) -> Outcome:
             worst = (towards, step)
     if worst is None:
         return ctx.skipped("no state while the gains were zero")
-    towards, step = max(worst[0], 0.0), worst[1]
+    towards, step = max(0.0, worst[0]), worst[1]
     if towards <= ctx.tolerance("max_motion_stroke"):
         return ctx.passed(
             f"{towards:.3f} rad",

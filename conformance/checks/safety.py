@@ -165,7 +165,9 @@ def brakes(ctx: Context) -> Outcome:
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=moved,
             )
-        if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke"):
+        # at its stop it would stand still without a brake, too
+        at_stop = not 0.05 * ctx.stroke < float(np.median(q_late)) < 0.95 * ctx.stroke
+        if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
             proofs.append(f"was moving, then moved only {moved:.3f} rad")
             values["motion_rad"] = moved
         pressed = float(np.median(np.abs(before)))

@@ -1,0 +1,83 @@
+"""Deliberately wrong hands: each does one thing wrong, and the checks must notice exactly that.
+
+A mutant is a small change of :class:`~dexkit.conformance.virtual.ReferenceService` or of its
+hand. :attr:`Mutant.kills` is the requirement that must catch it; ``also`` names what cannot but
+fail with it. No other requirement may fail or warn: it would be caught for the wrong reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dexkit.conformance.judge import judge
+from dexkit.conformance.mutants.zoo import ZOO
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.stimuli import Plan, Session, phases_for
+from dexkit.conformance.view import Recording
+from dexkit.conformance.virtual import ReferenceService, run_virtual
+from dexkit.hand import Side
+from dexkit.models import dialect
+
+__all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
+
+SESSION_SECONDS = 6.0
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One wrong hand.
+
+    :param kills: the requirement that must catch it.
+    :param also: requirements that fail or warn with it.
+    """
+
+    name: str
+    service: type[ReferenceService]
+    kills: str
+    also: tuple[str, ...] = ()
+
+    @property
+    def summary(self) -> str:
+        """What it does wrong, in a line."""
+        return (self.service.__doc__ or "").strip().splitlines()[0]
+
+
+MUTANTS: tuple[Mutant, ...] = tuple(
+    Mutant(service.__name__, service, kills, also) for service, kills, also in ZOO
+)
+
+
+def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(Side)) -> Plan:
+    """Every stimulus, with an object in the right hand."""
+    chosen = dialect(dialect_name)
+    sample = Session.default()
+    return Plan(
+        dialect=chosen,
+        sides=tuple(sides),
+        objects={Side.RIGHT: 0.37 * chosen.q_open} if Side.RIGHT in sides else {},
+        session=sample.first_seconds(SESSION_SECONDS),
+        phases=phases_for(catalogue()),
+    )
+
+
+def run_mutant(service: type[ReferenceService], plan: Plan | None = None) -> RunResult:
+    """Judge one service, on the virtual clock."""
+    chosen = plan or plan_for()
+    trace = run_virtual(chosen, service)
+    recording = Recording.of(trace, dialect_name=chosen.dialect.name, sides=chosen.sides)
+    return judge(recording, subject={"backend": f"virtual {service.__name__}"})
+
+
+def trial(mutant: Mutant, result: RunResult) -> Mapping[str, set[str]]:
+    """What went wrong in a mutant's trial: ``missed`` and ``wrongly`` blamed requirements."""
+    blamed = {
+        r.requirement.id
+        for r in result.results
+        if r.verdict in (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
+    }
+    return {
+        "missed": {mutant.kills, *mutant.also} - blamed,
+        "wrongly": blamed - {mutant.kills, *mutant.also},
+    }
