@@ -119,7 +119,7 @@ def parse(encoding: str, name: str, text: str) -> Struct:
         structs = _IdlParser(text).parse()
     else:
         raise TraceUnsupported(f"schema encoding {encoding!r} is not one of {', '.join(ENCODINGS)}")
-    return _resolve(dds_type(name), structs, 0)
+    return _resolve(dds_type(name), structs)
 
 
 def differences(recorded: Struct, ours: Struct) -> tuple[list[str], list[str]]:
@@ -189,30 +189,38 @@ class _Ref:
     candidates: tuple[str, ...]
 
 
-_Raw = str | _Ref | Array | Sequence
 _Structs = dict[str, list[tuple[str, object]]]
 
 
-def _resolve(name: str, structs: _Structs, depth: int) -> Struct:
-    if depth > _MAX_DEPTH:
-        raise TraceUnsupported(f"the schema nests deeper than {_MAX_DEPTH} levels, or in itself")
-    if name not in structs:
-        raise TraceUnsupported(f"the schema text does not define {name}")
+def _resolve(name: str, structs: _Structs) -> Struct:
+    done: dict[str, Struct] = {}
 
-    def node(raw: object) -> Node:
+    def struct(name: str, depth: int) -> Struct:
+        if name not in structs:
+            raise TraceUnsupported(f"the schema text does not define {name}")
+        if name not in done:
+            fields = tuple(Field(n, node(raw, depth + 1)) for n, raw in structs[name])
+            done[name] = Struct(name, fields)
+        return done[name]
+
+    def node(raw: object, depth: int) -> Node:
+        if depth > _MAX_DEPTH:
+            raise TraceUnsupported(
+                f"the schema nests deeper than {_MAX_DEPTH} levels, or in itself"
+            )
         if isinstance(raw, str):
             return raw
         if isinstance(raw, Array):
-            return Array(node(raw.element), raw.length)
+            return Array(node(raw.element, depth + 1), raw.length)
         if isinstance(raw, Sequence):
-            return Sequence(node(raw.element))
+            return Sequence(node(raw.element, depth + 1))
         assert isinstance(raw, _Ref)
         for candidate in raw.candidates:
             if candidate in structs:
-                return _resolve(candidate, structs, depth + 1)
+                return struct(candidate, depth)
         raise TraceUnsupported(f"the schema text does not define {raw.candidates[-1]}")
 
-    return Struct(name, tuple(Field(n, node(raw)) for n, raw in structs[name]))
+    return struct(name, 0)
 
 
 def _parse_msg(name: str, text: str) -> _Structs:
@@ -254,7 +262,13 @@ def _msg_type(text: str, package: str) -> object:
         return element
     if bounded or not size:
         return Sequence(element)  # type: ignore[arg-type]  # resolved later
-    return Array(element, int(size))  # type: ignore[arg-type]
+    return Array(element, _length(size))  # type: ignore[arg-type]
+
+
+def _length(digits: str) -> int:
+    if len(digits) > 9:
+        raise TraceUnsupported(f"the schema has an array of {digits[:12]}... elements")
+    return int(digits)
 
 
 _TOKEN = re.compile(r"::|[A-Za-z_]\w*|\d[\w.+-]*|\"(?:\\.|[^\"\\])*\"|'[^']*'|\S")
@@ -336,8 +350,8 @@ class _IdlParser:
             while self._peek() != ";":
                 value = ""
                 self._next()
-            if value.isdigit():
-                self._constants[name] = int(value)
+            if value.isdecimal():
+                self._constants[name] = _length(value)
         elif keyword == ";":
             return
         else:
@@ -381,8 +395,8 @@ class _IdlParser:
 
     def _size(self) -> int:
         token = self._next()
-        if token.isdigit():
-            return int(token)
+        if token.isdecimal():
+            return _length(token)
         if token in self._constants:
             return self._constants[token]
         raise TraceUnsupported(f"the schema has the array size {token[:40]!r}")
@@ -396,12 +410,14 @@ class _IdlParser:
             parts.append(self._next())
         return "::".join(parts)
 
-    def _type(self) -> object:
+    def _type(self, depth: int = 0) -> object:
+        if depth > _MAX_DEPTH:
+            raise TraceUnsupported("the schema nests its sequences too deeply")
         token = self._peek()
         if token == "sequence":
             self._next()
             self._expect("<")
-            element = self._type()
+            element = self._type(depth + 1)
             if self._peek() == ",":
                 self._next()
                 self._next()
