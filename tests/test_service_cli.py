@@ -1,0 +1,229 @@
+"""``dexkit serve`` as a process: what it prints, how it ends, and an emulated gripper behind it."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
+
+import pytest
+from click.testing import CliRunner
+
+from dexkit.cli import cli
+from dexkit.dds import DdsNode, Qos
+from dexkit.emulators.mx64 import emulated_ezgripper
+from dexkit.hand import MotorError, Side
+from dexkit.messages import unitree_go
+from dexkit.models import dialect
+from tests.dds_helpers import dds_domain, dds_node, take_until
+
+__all__ = ["dds_domain", "dds_node"]
+
+GO = dialect("unitree_go")
+LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+
+class Process:
+    """A running ``dexkit serve``."""
+
+    def __init__(self, *arguments: object) -> None:
+        self._popen = subprocess.Popen(
+            [sys.executable, "-m", "dexkit", "serve", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def ready(self) -> str:
+        stdout = self._popen.stdout
+        assert stdout is not None
+        line = stdout.readline()
+        assert line.startswith("ready: "), self.end(signal.SIGTERM)
+        return line.strip()
+
+    def line(self, pattern: str) -> str:
+        """The next line of its log that matches."""
+        stderr: IO[str] | None = self._popen.stderr
+        assert stderr is not None
+        for text in stderr:
+            if re.search(pattern, text):
+                return text.strip()
+        raise AssertionError(f"it ended without {pattern}")
+
+    def signal(self, number: int) -> None:
+        self._popen.send_signal(number)
+
+    def end(self, number: int) -> tuple[int, str, str]:
+        """Signal it and wait: exit code, rest of stdout, rest of stderr."""
+        if self._popen.poll() is None:
+            self._popen.send_signal(number)
+        try:
+            out, err = self._popen.communicate(timeout=15)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            raise
+        return self._popen.returncode, out, err
+
+
+@contextmanager
+def serving(*arguments: object) -> Iterator[Process]:
+    process = Process(*arguments)
+    try:
+        yield process
+    finally:
+        process.end(signal.SIGKILL)
+
+
+def counters(line: str) -> dict[str, object]:
+    found: dict[str, object] = json.loads(line.split("counters ", 1)[1])
+    return found
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int) -> None:
+    def there() -> bool:
+        return any(not e.own and e.topic.startswith("rt/dex1/") for e in dds_node.endpoints())
+
+    with serving("sim-dex1", "--side", "left", "--domain", dds_domain) as process:
+        ready = process.ready()
+        for part in ("sim-dex1 left", "rt/dex1/left/cmd", "rt/dex1/left/state", "unitree_go",
+                     "500 Hz", f"domain {dds_domain}"):  # fmt: skip
+            assert part in ready
+        assert dds_node.discovery.wait(lambda _: there(), 10)
+        start = time.monotonic()
+        code, out, err = process.end(number)
+        assert time.monotonic() - start < 5
+        # the participant said goodbye: its endpoints go now, not when a lease runs out (10 s)
+        assert dds_node.discovery.wait(lambda _: not there(), 3)
+    assert (code, out) == (0, "")
+    assert "Traceback" not in err
+    last = counters(next(line for line in err.splitlines() if "counters" in line))
+    assert last["published"]
+
+
+def test_sigusr1_logs_the_counters(dds_domain: int) -> None:
+    with serving("sim-dex1", "--side", "right", "--domain", dds_domain, "--quiet") as process:
+        process.ready()
+        process.signal(signal.SIGUSR1)
+        found = counters(process.line("counters"))
+        assert found["state_topic"] == "rt/dex1/right/state"
+        assert process.end(signal.SIGTERM)[0] == 0
+
+
+def test_both_sides_in_one_process(dds_domain: int, dds_node: DdsNode) -> None:
+    readers = [dds_node.reader(GO.topics(side)[1], GO.state_type) for side in Side]
+    with serving("sim-dex1", "--side", "both", "--domain", dds_domain) as process:
+        process.ready()
+        assert "right" in process.ready()
+        for reader in readers:
+            take_until(reader, bool)
+
+
+def test_a_client_of_another_dialect_is_told(dds_domain: int, dds_node: DdsNode) -> None:
+    dds_node.writer("rt/unitree_actuator/cmd", GO.cmd_type)
+    with serving("sim-dex1", "--side", "left", "--domain", dds_domain) as process:
+        process.ready()
+        line = process.line("WARNING")
+        assert "rt/unitree_actuator/cmd" in line
+        assert "--dialect unitree_actuator" in line
+
+
+class TestEmulatedGripper:
+    """The real driver on an emulated MX-64 behind the service. No real servo was involved."""
+
+    ZERO = ("--set", "zero=1510")
+
+    def test_it_is_driven_and_survives_the_loss_of_its_device(
+        self, dds_domain: int, dds_node: DdsNode
+    ) -> None:
+        cmd, state = GO.topics(Side.LEFT)
+        states = dds_node.reader(state, GO.state_type, qos=Qos("best_effort", depth=5000))
+        commands = dds_node.writer(cmd, GO.cmd_type)
+
+        def drive(q: float, arrived: object = None) -> unitree_go.MotorState_:
+            def there(samples: list[object]) -> bool:
+                commands.write(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05)]))
+                time.sleep(0.005)
+                if not samples:
+                    return False
+                motor = samples[-1].message.states[0]  # type: ignore[attr-defined]
+                if callable(arrived):
+                    return bool(arrived(motor))
+                return abs(motor.q - q) < 0.15 and motor.lost == 0
+
+            return take_until(states, there, 20.0)[-1].message.states[0]  # type: ignore[no-any-return]
+
+        with emulated_ezgripper(process=True, start=50.0) as servo:
+            device = ("--device", servo.path, *self.ZERO)
+            with serving("ezgripper", "--side", "left", "--domain", dds_domain, *device) as p:
+                p.ready()
+                assert take_until(states, bool)[-1].message.states[0].q == pytest.approx(
+                    2.7, abs=0.1
+                )
+                moved = drive(4.0)
+                assert moved.temperature > 0  # the servo measures it, so it is said
+                drive(1.0, lambda m: m.q < 3.5)  # on its way ...
+                servo.inject("unplug:for=1s")  # ... the adapter is pulled out
+                lost = drive(1.0, lambda m: m.lost > 0 and m.reserve[0] == LINK)
+                assert 0.5 < lost.q < 4.2
+                p.line("reconnect|answers again|lost|gone|vanish|went")
+                drive(1.0)  # it came back, and follows commands that are new
+                code, _, err = p.end(signal.SIGTERM)
+                assert code == 0
+                last = counters(next(x for x in err.splitlines() if "counters" in x))
+                assert last["hands"]["left"]["reconnects"] >= 1  # type: ignore[index]
+
+    def test_a_missing_device_is_an_error_with_a_hint(self, dds_domain: int) -> None:
+        with serving("ezgripper", "--side", "left", "--domain", dds_domain,
+                     "--device", "/dev/no-such-port") as process:  # fmt: skip
+            code, out, err = process.end(0)
+            assert (code, out) == (1, "")
+            assert "error: there is no device /dev/no-such-port" in err
+            assert "Traceback" not in err
+
+
+class TestArguments:
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["nope", "--side", "left"], "no backend 'nope'"),
+            (["sim-dex1"], "--side"),
+            (["sim-dex1", "--side", "up"], "--side"),
+            (["sim-dex1", "--side", "left", "--dialect", "x"], "--dialect"),
+            (["sim-dex1", "--side", "left", "--set", "colour=red"], "no setting 'colour'"),
+            (["sim-dex1", "--side", "left", "--set", "colour"], "not KEY=VALUE"),
+            (["ezgripper", "--side", "left"], "needs a device"),
+            (["ezgripper", "--side", "both", "--device", "/dev/x"], "which hand is /dev/x"),
+            (["ezgripper", "--side", "both", "--device", "left=/dev/x"], "needs a device"),
+            (["ezgripper", "--side", "left", "--device", "right=/dev/x"], "only the left"),
+            (
+                ["ezgripper", "--side", "left", "--device", "a", "--device", "left=b"],
+                "two devices",
+            ),
+            (["sim-dex1", "--side", "left", "--state-rate", "0"], "--state-rate"),
+            (["sim-dex1", "--side", "left", "--interface", "nix0"], "no network interface"),
+        ],
+    )
+    def test_what_makes_no_sense_is_said(self, arguments: list[str], message: str) -> None:
+        result = CliRunner().invoke(cli, ["serve", *arguments])
+        assert result.exit_code != 0
+        assert message in result.output + str(result.exception)
+
+    def test_help_says_what_the_defaults_are(self) -> None:
+        result = CliRunner().invoke(cli, ["serve", "--help"])
+        assert result.exit_code == 0
+        for text in (
+            "--side",
+            "unitree_go",
+            "domain 0",
+            "domain 1",
+            "--wait-for-device",
+            "SIGUSR1",
+        ):
+            assert text in result.output

@@ -1,0 +1,190 @@
+"""The service on real DDS, on loopback: a simulated hand and clients that come and go."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from dexkit.dds import DdsNode, Qos, Reader, Sample, Writer
+from dexkit.emulators.sim_hand import SimHand
+from dexkit.errors import TopicConflict
+from dexkit.hand import MotorError, Side
+from dexkit.messages import unitree_go, unitree_hg
+from dexkit.models import dialect
+from dexkit.service import HandService
+from tests.dds_helpers import dds_domain, dds_node, take_until, wait_until
+from tests.service_helpers import ScriptedHand
+
+__all__ = ["dds_domain", "dds_node"]
+
+GO, HG = dialect("unitree_go"), dialect("unitree_hg")
+CMD, STATE = GO.topics(Side.LEFT)
+LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+
+class Client:
+    """A client on a node of its own."""
+
+    def __init__(self, domain: int) -> None:
+        self.node = DdsNode(domain, "lo")
+        self.states: Reader = self.node.reader(
+            STATE, GO.state_type, qos=Qos("best_effort", depth=5000)
+        )
+        self.commands: Writer = self.node.writer(CMD, GO.cmd_type)
+        assert self.commands.wait_matched(10)
+
+    def command(self, q: float, kp: float = 5.0) -> None:
+        self.commands.write(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=kp, kd=0.05)]))
+
+    def state(self) -> unitree_go.MotorState_:
+        """The next state to come."""
+        self.states.take()
+        motor: unitree_go.MotorState_ = take_until(self.states, bool)[-1].message.states[0]
+        return motor
+
+    def drive_to(self, q: float, tolerance: float = 0.1) -> None:
+        """Command at about 200 Hz until the state is there."""
+
+        def there(samples: list[Sample]) -> bool:
+            self.command(q)
+            time.sleep(0.005)
+            return bool(samples) and abs(samples[-1].message.states[0].q - q) < tolerance
+
+        take_until(self.states, there)
+
+    def close(self) -> None:
+        self.node.close()
+
+
+@pytest.fixture
+def service(dds_domain: int) -> Iterator[HandService]:
+    with HandService(SimHand(Side.LEFT), domain=dds_domain) as running:
+        yield running
+
+
+@pytest.fixture
+def client(service: HandService) -> Iterator[Client]:
+    one = Client(service.domain)
+    yield one
+    one.close()
+
+
+def test_state_flows_before_any_command(service: HandService, client: Client) -> None:
+    samples = take_until(client.states, lambda s: len(s) >= 100)
+    motor = samples[0].message.states[0]
+    assert len(samples[0].message.states) == 1
+    assert motor.q == pytest.approx(0.2 * 5.4, abs=1e-3)
+    assert (motor.mode, motor.lost) == (0, 0)
+    assert service.counters.received == 0
+
+
+@pytest.mark.realtime
+def test_state_comes_at_500_hz(client: Client) -> None:
+    """Tolerance: 5 % of the mean rate; single gaps belong to the machine, see the benchmark."""
+    samples = take_until(client.states, lambda s: len(s) >= 600)[100:]
+    stamps = np.array([s.source_timestamp_ns for s in samples]) / 1e9
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
+    assert rate == pytest.approx(500.0, rel=0.05)
+    assert np.median(np.diff(stamps)) == pytest.approx(2e-3, abs=2e-4)
+
+
+def test_commands_move_and_silence_brakes(service: HandService, client: Client) -> None:
+    client.drive_to(4.0)
+    assert client.state().mode == 1
+    core = service.cores[Side.LEFT]
+    wait_until(lambda: not core.driving)
+    assert client.state().mode == 0
+    assert core.counters.brakes == 1
+
+
+def test_the_qos_is_that_of_unitrees_software(service: HandService, dds_node: DdsNode) -> None:
+    def mine() -> list[object]:
+        return [e for e in dds_node.endpoints() if e.topic in (CMD, STATE)]
+
+    assert dds_node.discovery.wait(lambda _: len(mine()) == 2, 10)
+    reader, writer = sorted(
+        (e for e in dds_node.endpoints() if e.topic in (CMD, STATE)), key=lambda e: e.kind
+    )
+    assert (reader.topic, reader.type_name, reader.qos) == (CMD, GO.cmd_type, Qos("best_effort"))
+    assert (writer.topic, writer.type_name, writer.qos) == (STATE, GO.state_type, Qos("reliable"))
+
+
+def test_nan_and_far_away_do_no_harm(service: HandService, client: Client) -> None:
+    client.drive_to(3.0)
+    counters = service.cores[Side.LEFT].counters
+
+    def send_until(count: Callable[[], int], *bad: unitree_go.MotorCmds_) -> None:
+        # the reader keeps the last sample only, so one may be missed
+        wait_until(lambda: [client.commands.write(m) for m in bad] and count() > 0)
+
+    for q in (math.nan, math.inf):
+        counters.rejected = 0
+        send_until(lambda: counters.rejected, unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q)]))
+    send_until(lambda: service.counters.empty, unitree_go.MotorCmds_([]))
+    assert client.state().q == pytest.approx(3.0, abs=0.2)
+    far = unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=1e6, kp=5.0, kd=0.05)])
+    send_until(lambda: counters.clamped, far)
+    assert client.state().q < 5.62  # the vendor's hard stop
+
+
+def test_a_late_client_and_one_that_restarts(service: HandService) -> None:
+    first = Client(service.domain)
+    first.drive_to(2.0)
+    late = Client(service.domain)
+    assert late.state().q == pytest.approx(2.0, abs=0.3)
+    first.close()
+    late.drive_to(3.0)
+    again = Client(service.domain)
+    again.drive_to(1.0)
+    assert late.state().q == pytest.approx(1.0, abs=0.3)
+    again.close()
+    late.close()
+
+
+def test_another_type_on_the_topic_is_not_understood(
+    service: HandService, dds_node: DdsNode
+) -> None:
+    writer = dds_node.writer(CMD, HG.cmd_type)
+    assert not writer.wait_matched(0.5)
+    writer.write(unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=6.0)]))
+    assert service.counters.received == 0
+
+
+def test_a_second_service_on_the_topic_is_refused(service: HandService) -> None:
+    other = ScriptedHand(Side.LEFT)
+    with pytest.raises(TopicConflict, match="already publishes rt/dex1/left/state"):
+        HandService(other, domain=service.domain).start()
+    assert other.opens == 0
+    with HandService(ScriptedHand(Side.RIGHT), domain=service.domain):
+        pass
+
+
+def test_unplugged_in_mid_motion_and_back(dds_domain: int) -> None:
+    hand = ScriptedHand(Side.LEFT)
+    with HandService(hand, domain=dds_domain) as service:
+        client = Client(dds_domain)
+        client.drive_to(2.0)
+        hand.plugged = False
+        lost = take_until(client.states, lambda s: bool(s) and s[-1].message.states[0].lost > 1)
+        motor = lost[-1].message.states[0]
+        assert (motor.q, motor.reserve[0]) == (2.0, LINK)
+        hand.plugged = True
+        core = service.cores[Side.LEFT]
+        wait_until(lambda: core.counters.reconnects == 1)
+        assert client.state().q == 2.0
+        client.drive_to(4.0)
+        assert client.state().lost == 0
+        client.close()
+
+
+def test_leaving_leaves_nothing(dds_domain: int, dds_node: DdsNode) -> None:
+    def there() -> bool:
+        return any(e.topic in (CMD, STATE) for e in dds_node.endpoints())
+
+    with HandService(ScriptedHand(Side.LEFT), domain=dds_domain):
+        assert dds_node.discovery.wait(lambda _: there(), 10)
+    assert dds_node.discovery.wait(lambda _: not there(), 10)
