@@ -85,7 +85,7 @@ def check_end(name: str, data: Buffer, end: int) -> None:
     :raises OversizeError: more bytes than that.
     """
     rest = len(data) - end
-    if rest != -end % 4:
+    if rest not in (0, -end % 4):
         raise OversizeError(f"{name}: {rest} bytes after the end of the message")
 
 

@@ -72,7 +72,7 @@ class MessageType:
         :raises OversizeError: bytes are left over, or a sequence exceeds the bound.
         :raises WireError: not plain CDR.
         """
-        return self._decode(data, is_big(data, self.max_size, self.name))
+        return self._decode(data, is_big(data, self.max_size, self.layout.name))
 
     def columns(self, payloads: Sequence[bytes]) -> Columns:
         """Many samples at once, as numpy columns; see :class:`~dexkit.messages.Columns`."""
