@@ -177,7 +177,7 @@ class ReferenceService:
 
     def command(self, side: Side, motor: Motor) -> None:
         """One side's part of it."""
-        if self.dialect.name == "unitree_hg":
+        if self.dialect.name == "unitree_hg" and math.isfinite(motor.q):
             # seed 000: gains and feed-forward of a command are not used, the ends snap
             q = 0.0 if motor.q <= 0.1 else self.dialect.q_open if motor.q >= 6.0 else motor.q
             motor = Motor(q=q)
@@ -243,7 +243,9 @@ class MemoryTrace:
         return found
 
 
-def run_virtual(plan: Plan, service_class: type[ReferenceService] = ReferenceService) -> MemoryTrace:
+def run_virtual(
+    plan: Plan, service_class: type[ReferenceService] = ReferenceService
+) -> MemoryTrace:
     """Go through the plan with a service of that class, and return the recording."""
     service = service_class(plan.dialect, plan.sides, plan.objects)
     trace = MemoryTrace(endpoints=service.endpoints())

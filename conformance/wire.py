@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from dexkit.hand import Side
 from dexkit.messages import MessageType, message_type
@@ -49,6 +50,7 @@ class Wire:
         self.command_sequence, motor = _SEQUENCE[dialect.cmd_type]
         self.state_sequence, self._state_motor = _SEQUENCE[dialect.state_type]
         self._motor = message_type(motor).cls
+        self._states: dict[int, Any] = {}
         self.command_topics = {s: dialect.topics(s)[0] for s in Side}
         self.state_topics = {s: dialect.topics(s)[1] for s in Side}
         self.shared = len(set(self.command_topics.values())) == 1
@@ -111,13 +113,21 @@ class Wire:
         :param motors: fields of each side's motor.
         :param length: motors in the sequence, if not the dialect's.
         """
-        kind = message_type(self._state_motor).cls
-        places = [kind() for _ in range(self.dialect.length if length is None else length)]
+        count = self.dialect.length if length is None else length
+        message, places = self._blank_state(count)
         for side, fields in motors.items():
             index = self.dialect.index[side]
-            if index < len(places):
+            if index < count:
                 for name, value in fields.items():
                     setattr(places[index], name, value)
-        message = self.state.cls()
-        setattr(message, self.state_sequence, places)
         return self.state.encode(message)
+
+    def _blank_state(self, length: int) -> tuple[Any, list[Any]]:
+        """A state message of that length and its motors; made once, filled again and again."""
+        if length not in self._states:
+            kind = message_type(self._state_motor).cls
+            message = self.state.cls()
+            setattr(message, self.state_sequence, [kind() for _ in range(length)])
+            self._states[length] = message
+        message = self._states[length]
+        return message, getattr(message, self.state_sequence)

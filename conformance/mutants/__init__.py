@@ -22,7 +22,7 @@ from dexkit.models import dialect
 
 __all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
 
-SESSION_SECONDS = 6.0
+SESSION_SECONDS = 4.0
 
 
 @dataclass(frozen=True)

@@ -436,7 +436,9 @@ class Script:
                 if self._obs.dq.get(s, 0.0) < slow:
                     wanted[s] = min(wanted[s] * 1.02, 10 * slow)
             yield from self._command(
-                {**others, **{s: Motor(q=self._goal[s], dq=wanted[s], kp=0.0, kd=0.5) for s in sides}}
+                {
+                    **others,
+                    **{s: Motor(q=self._goal[s], dq=wanted[s], kp=0.0, kd=0.5) for s in sides},
+                }
             )
         self._end(phase)
-

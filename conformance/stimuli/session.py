@@ -80,9 +80,7 @@ class Session:
         """The first command to a side, for a hand of that stroke."""
         return self._motor(side, 0, stroke)
 
-    def timeline(
-        self, sides: Sequence[Side], stroke: float
-    ) -> list[tuple[int, dict[Side, Motor]]]:
+    def timeline(self, sides: Sequence[Side], stroke: float) -> list[tuple[int, dict[Side, Motor]]]:
         """(ns from the beginning, command), in order of time, for hands of that stroke."""
         events = [
             (round(float(t) * 1e9), side, i)

@@ -1,0 +1,334 @@
+"""A live run: bring the hand up, drive it by the script, record; the recording is the result.
+
+The kit is three participants, each in the role of a program that a hand meets: the client that
+commands, the recorder, and later a monitor that joins in mid-session.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dexkit.clock import RealClock
+from dexkit.conformance.phases import RECORD, Stall, Stimulus
+from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
+from dexkit.conformance.stimuli import (
+    Join,
+    Leave,
+    Observation,
+    Plan,
+    Restart,
+    Script,
+    Send,
+    Session,
+)
+from dexkit.conformance.wire import Wire
+from dexkit.dds import DdsNode, Qos, Reader, Writer
+from dexkit.errors import ConformanceError, TopicConflict, WireError
+from dexkit.hand import Side
+from dexkit.traces.dds_recording import DdsRecording
+from dexkit.traces.recorder import Recorder
+
+__all__ = ["LiveOptions", "free_domain", "record_run"]
+
+DISCOVERY_TIMEOUT = 5.0
+_BEAT = 0.005  # seconds between heartbeats
+_LATE = 0.03  # seconds late that count as a stall of the kit's own machine
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """A live run.
+
+    :param phases: of the stimulus.
+    :param force: go on although somebody else commands the hand.
+    """
+
+    rig: RigOptions
+    phases: frozenset[str]
+    session: Session | None = None
+    force: bool = False
+
+    def plan(self) -> Plan:
+        """What the script is to do."""
+        dialect = self.rig.dialect
+        return Plan(
+            dialect=dialect,
+            sides=self.rig.sides,
+            objects={s: pct / 100 * dialect.q_open for s, pct in self.rig.objects.items()},
+            session=self.session,
+            phases=self.phases,
+        )
+
+
+def free_domain(interface: str = "lo") -> int:
+    """A domain from 100 to 200 on which nobody is."""
+    for _ in range(20):
+        domain = random.randint(100, 200)
+        with DdsNode(domain=domain, interface=interface) as node:
+            if not node.discovery.wait(
+                lambda endpoints: any(not e.own for e in endpoints), timeout=0.15
+            ):
+                return domain
+    raise ConformanceError("no DDS domain from 100 to 200 is free", hint="give one: --domain")
+
+
+def record_run(
+    options: LiveOptions,
+    path: Path,
+    *,
+    say: Callable[[str], None] = lambda text: None,
+    stop: threading.Event | None = None,
+) -> bool:
+    """Do the run and write its recording to ``path``.
+
+    :param say: told what happens, in plain words.
+    :param stop: ends the run early when set; what was recorded is kept.
+    :returns: False when it was ended early.
+    :raises ConformanceError: the hand's process cannot be started, or has died.
+    :raises TopicConflict: somebody else commands this hand.
+    """
+    rig_options = options.rig
+    stop = stop or threading.Event()
+    with contextlib.ExitStack() as stack:
+        recorder_node = stack.enter_context(_node(rig_options))
+        recorder = stack.enter_context(
+            Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})
+        )
+        dialect = rig_options.dialect
+        topics = {t for s in Side for t in dialect.topics(s)}
+        # the recorder listens before the hand is there: nothing of its start is missed
+        recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
+        if rig_options.backend != EXTERNAL:
+            say(f"starting {rig_options.backend} on domain {rig_options.domain}")
+        rig = stack.enter_context(Rig(rig_options))
+        _refuse_company(recorder_node, options)
+        plan = options.plan()
+        script = Script(plan, say)
+        heart = stack.enter_context(_Heartbeat())
+        driver = stack.enter_context(_Driver(rig_options, plan))
+        _meet(recorder_node, plan)
+        finished = driver.go_through(script, stop, rig)
+        recording.stop()
+        stimulus = Stimulus(
+            phases=[p for p in script.phases if p.end_ns],
+            objects={s: plan.objects.get(s) for s in plan.sides},
+            stalls=heart.stalls,
+        )
+        recorder.add_metadata(RECORD, stimulus.to_metadata())
+    return finished
+
+
+def _node(options: RigOptions) -> DdsNode:
+    return DdsNode(domain=options.domain, interface=options.interface)
+
+
+def _refuse_company(node: DdsNode, options: LiveOptions) -> None:
+    """Two clients on one hand would fight, and a real one may carry something."""
+    dialect = options.rig.dialect
+    commanded = {dialect.topics(s)[0] for s in options.rig.sides}
+
+    def strangers() -> set[str]:
+        return {
+            e.topic
+            for e in node.endpoints()
+            if e.kind == "writer" and e.topic in commanded and not e.own
+        }
+
+    node.discovery.wait(lambda endpoints: strangers(), timeout=0.3)
+    if strangers() and not options.force:
+        raise TopicConflict(
+            f"somebody else publishes {', '.join(sorted(strangers()))} on domain "
+            f"{options.rig.domain}",
+            hint="stop that client, or choose another --domain",
+        )
+
+
+def _meet(node: DdsNode, plan: Plan) -> None:
+    """Wait until the hands' endpoints are known; a hand without any is the checks' finding."""
+    wanted = {t for s in plan.sides for t in plan.dialect.topics(s)}
+    node.discovery.wait(
+        lambda endpoints: wanted <= {e.topic for e in endpoints if not e.own},
+        timeout=DISCOVERY_TIMEOUT,
+    )
+
+
+class _Heartbeat:
+    """Notes when this process did not get to run: then the machine is late, not the hand."""
+
+    def __init__(self) -> None:
+        self.stalls: list[Stall] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def _beat(self) -> None:
+        clock = RealClock()
+        while not self._stop.is_set():
+            wall, due = time.time_ns(), clock.now() + _BEAT
+            clock.sleep_until(due)
+            if clock.now() - due > _LATE:
+                self.stalls.append(Stall(wall, time.time_ns()))
+
+    def __enter__(self) -> _Heartbeat:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@dataclass
+class _Driver:
+    """Carries out the script's actions on DDS."""
+
+    rig: RigOptions
+    plan: Plan
+    _newest: dict[str, bytes] = field(default_factory=dict)
+
+    def __enter__(self) -> _Driver:
+        self._wire = Wire(self.plan.dialect)
+        self._states = {self._wire.state_topics[s] for s in self.plan.sides}
+        self._clock = RealClock()
+        # wall clock, as recordings have it, on a monotonic footing
+        self._offset = time.time_ns() - round(self._clock.now() * 1e9)
+        self._client: _Client | None = _Client(self.rig, self._wire, self.plan.sides)
+        self._monitor: _Monitor | None = None
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for part in (self._client, self._monitor):
+            if part is not None:
+                part.close()
+        self._client = self._monitor = None
+
+    @property
+    def now_ns(self) -> int:
+        """Now, on the recording's clock."""
+        return round(self._clock.now() * 1e9) + self._offset
+
+    def go_through(self, script: Script, stop: threading.Event, rig: Rig) -> bool:
+        """Run the script; False when it was stopped."""
+        steps = script.run()
+        action = next(steps)
+        while not stop.is_set():
+            self._do(action)
+            dead = rig.dead()
+            if dead is not None:
+                raise ConformanceError(f"{dead!r} has ended", hint=dead.last_words)
+            try:
+                action = steps.send(self._observe())
+            except StopIteration:
+                return True
+        return False
+
+    def _do(self, action: Send | Join | Leave | Restart) -> None:
+        if isinstance(action, Send):
+            assert self._client is not None
+            for topic, payload in action.payloads:
+                self._client.send(topic, payload)
+            self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
+        elif isinstance(action, Join):
+            self._monitor = _Monitor(self.rig, self._wire, self.plan.sides)
+        elif isinstance(action, Leave) and self._monitor is not None:
+            self._monitor.close()
+            self._monitor = None
+        elif isinstance(action, Restart):
+            assert self._client is not None
+            self._client.close()
+            self._client = None
+            time.sleep(0.1)  # a new process takes longer; the hand must see the old one go
+            self._client = _Client(self.rig, self._wire, self.plan.sides)
+            self._client.wait_matched(1.0)
+
+    def _observe(self) -> Observation:
+        q: dict[Side, float] = {}
+        dq: dict[Side, float] = {}
+        if self._client is not None:
+            self._newest.update(self._client.newest())
+        for side in self.plan.sides:
+            payload = self._newest.get(self._wire.state_topics[side])
+            if payload is None:
+                continue
+            with contextlib.suppress(WireError):
+                state = self._wire.read_state(payload, side)
+                if state is not None:
+                    q[side], dq[side] = state[0], state[1]
+        joined = self._monitor.first_states() if self._monitor else {}
+        return Observation(self.now_ns, q, dq, joined)
+
+
+class _Client:
+    """The kit as the commanding program, with the official clients' quality of service."""
+
+    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...]) -> None:
+        self._node = _node(rig)
+        commands = {wire.command_topics[s] for s in sides}
+        states = {wire.state_topics[s] for s in sides}
+        self._writers: dict[str, Writer] = {
+            t: self._node.writer(t, wire.command, qos=Qos.writer_default()) for t in commands
+        }
+        self._readers: dict[str, Reader] = {
+            t: self._node.reader(t, wire.state, qos=Qos.reader_default()) for t in states
+        }
+
+    def send(self, topic: str, payload: bytes) -> None:
+        """Publish a command."""
+        self._writers[topic].write_raw(payload)
+
+    def wait_matched(self, timeout: float) -> None:
+        """Wait until the hands listen to this client."""
+        end = time.monotonic() + timeout
+        for writer in self._writers.values():
+            writer.wait_matched(max(0.0, end - time.monotonic()))
+
+    def newest(self) -> Mapping[str, bytes]:
+        """The newest state on each topic that has got a new one."""
+        found: dict[str, bytes] = {}
+        for topic, reader in self._readers.items():
+            samples = reader.take()
+            if samples:
+                found[topic] = samples[-1].data
+        return found
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._node.close()
+
+
+class _Monitor:
+    """The late joiner."""
+
+    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...]) -> None:
+        self._node = _node(rig)
+        self._sides = sides
+        self._wire = wire
+        self._readers = {
+            t: self._node.reader(t, wire.state) for t in {wire.state_topics[s] for s in sides}
+        }
+        self._begin = time.monotonic()
+        self._matched: dict[str, float] = {}
+        self._first: dict[str, float] = {}
+
+    def first_states(self) -> dict[Side, float]:
+        """Seconds from being matched to the first state, for the sides that have sent one."""
+        now = time.monotonic()
+        for topic, reader in self._readers.items():
+            if topic not in self._matched and reader.matched:
+                self._matched[topic] = now
+            if topic not in self._first and reader.take():
+                self._first[topic] = now - self._matched.get(topic, now)
+        return {
+            s: self._first[self._wire.state_topics[s]]
+            for s in self._sides
+            if self._wire.state_topics[s] in self._first
+        }
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._node.close()

@@ -1,0 +1,272 @@
+"""The processes that a live run starts: emulated devices and services, through the command line.
+
+The kit reaches backends only as a user would; nothing of them runs in its own process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+from dexkit.errors import ConformanceError, UsageError
+from dexkit.hand import Side
+from dexkit.models import Dialect
+
+__all__ = ["EMULATED", "EXTERNAL", "Emulation", "Rig", "RigOptions", "Tool"]
+
+EXTERNAL = "external"
+"""The backend's name for a service that somebody else runs."""
+READY_TIMEOUT = 30.0
+STOP_TIMEOUT = 5.0
+
+
+@dataclass(frozen=True)
+class Emulation:
+    """How to emulate a backend's device.
+
+    :param arguments: of ``dexkit emulate``, without link and object.
+    :param settings: that the backend needs to go with it.
+    """
+
+    arguments: tuple[str, ...]
+    settings: Mapping[str, str]
+
+
+_CLOSED_AT = "1510"  # encoder tick of the emulated zero: told to both, so nothing has to move
+EMULATED: dict[str, Emulation] = {
+    "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), {"zero": _CLOSED_AT}),
+}
+"""Backends whose device the kit can start itself."""
+
+_OBJECT_SETTING = {"sim-dex1": "object"}  # backends that are told of an object by a setting
+
+
+class Tool:
+    """A ``dexkit`` command in a process of its own; a context manager.
+
+    :param arguments: of ``dexkit``.
+    :raises ConformanceError: it ends, or says nothing, before it is ready; its last words are
+        in the message.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        self.arguments = arguments
+        self.ready = threading.Event()
+        self._tail: deque[str] = deque(maxlen=12)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", "from dexkit.cli import main; main()", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            # a Ctrl-C in the terminal is the kit's to act upon: it stops its processes in order
+            start_new_session=True,
+        )
+        self._thread = threading.Thread(target=self._listen, name="tool", daemon=True)
+        self._thread.start()
+
+    def __repr__(self) -> str:
+        return f"dexkit {' '.join(self.arguments)}"
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._tail.append(line.rstrip())
+            if line.startswith("ready:"):
+                self.ready.set()
+        self.ready.set()  # nothing more will come
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    @property
+    def last_words(self) -> str:
+        """The last lines that it printed."""
+        return "\n".join(self._tail)
+
+    def wait_ready(self, timeout: float = READY_TIMEOUT) -> None:
+        """Wait until it says that it is ready."""
+        came = self.ready.wait(timeout)
+        if not came or not any(line.startswith("ready:") for line in self._tail):
+            what = "is not ready" if came is False else "ended before it was ready"
+            raise ConformanceError(f"{self!r} {what}", hint=self.last_words)
+
+    def stop(self) -> None:
+        """End it, politely at first. May be called twice."""
+        if self.running:
+            self._process.send_signal(signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(STOP_TIMEOUT)
+        if self.running:
+            self._process.kill()
+            self._process.wait()
+        self._thread.join(STOP_TIMEOUT)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def __enter__(self) -> Tool:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """What to bring up.
+
+    :param backend: name, ``module:Class``, or :data:`EXTERNAL`.
+    :param devices: path or serial number by side; empty for an emulated one.
+    :param objects: percent of opening at which a side touches an object. Started emulators get
+        such an object; for a device it says what was put between its fingers.
+    """
+
+    backend: str
+    sides: tuple[Side, ...]
+    dialect: Dialect
+    domain: int
+    interface: str = "lo"
+    devices: Mapping[Side, str] = field(default_factory=dict)
+    objects: Mapping[Side, float] = field(default_factory=dict)
+    settings: tuple[str, ...] = ()
+
+    @property
+    def emulated(self) -> bool:
+        """Whether the device is emulated by a process of the kit's."""
+        return self.backend in EMULATED and not self.devices
+
+    def check(self) -> None:
+        """Refuse what makes no sense.
+
+        :raises UsageError: with what to do instead.
+        """
+        if self.backend == EXTERNAL and (self.devices or self.settings):
+            raise UsageError(
+                "--backend external starts nothing, so --device and --set have no meaning",
+                hint="give them to the service that you start yourself",
+            )
+        if self.devices and set(self.devices) != set(self.sides):
+            raise UsageError(
+                "a device is needed for each side",
+                hint="--side left --device PATH, or --device left=PATH --device right=PATH",
+            )
+        for side in self.objects:
+            if side not in self.sides:
+                raise UsageError(f"an object for the {side} hand, which is not under test")
+
+
+class Rig:
+    """Everything that runs during a live run, except the kit itself; a context manager."""
+
+    def __init__(self, options: RigOptions) -> None:
+        options.check()
+        self.options = options
+        self._stack = contextlib.ExitStack()
+        self.tools: list[Tool] = []
+
+    def __enter__(self) -> Rig:
+        try:
+            self._start()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def _start(self) -> None:
+        options = self.options
+        if options.backend == EXTERNAL:
+            return
+        devices = dict(options.devices)
+        settings = list(options.settings)
+        if options.emulated:
+            folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="dexkit-")))
+            emulation = EMULATED[options.backend]
+            devices = {s: str(folder / f"gripper-{s}") for s in options.sides}
+            emulators = [
+                self._tool(
+                    "emulate", *emulation.arguments, "--link", devices[s], *_object(options, s)
+                )
+                for s in options.sides
+            ]
+            for tool in emulators:
+                tool.wait_ready()
+            given = {s.partition("=")[0] for s in settings}
+            settings += [f"{k}={v}" for k, v in emulation.settings.items() if k not in given]
+        services = [self._serve(group, devices, settings) for group in self._groups()]
+        for tool in services:
+            tool.wait_ready()
+
+    def _groups(self) -> list[tuple[Side, ...]]:
+        """The sides that one service serves: one each, unless they share their topics."""
+        topics = {self.options.dialect.topics(s) for s in self.options.sides}
+        if len(topics) == len(self.options.sides):
+            return [(s,) for s in self.options.sides]
+        return [self.options.sides]
+
+    def _serve(
+        self, sides: Sequence[Side], devices: Mapping[Side, str], settings: Sequence[str]
+    ) -> Tool:
+        options = self.options
+        arguments = ["serve", options.backend, "--side"]
+        arguments.append(str(sides[0]) if len(sides) == 1 else "both")
+        for side in sides:
+            if side in devices:
+                place = f"{side}=" if len(sides) > 1 else ""
+                arguments += ["--device", f"{place}{devices[side]}"]
+        own = list(settings)
+        name = _OBJECT_SETTING.get(options.backend)
+        touch = {options.objects.get(s) for s in sides}
+        if name is not None and touch != {None}:
+            if len(touch) > 1:
+                raise UsageError("hands that share a service share its settings: --object for both")
+            own.append(f"{name}={touch.pop():g}")
+        for setting in own:
+            arguments += ["--set", setting]
+        return self._tool(
+            *arguments,
+            *("--dialect", options.dialect.name),
+            *("--domain", str(options.domain)),
+            *("--interface", options.interface),
+        )
+
+    def _tool(self, *arguments: str) -> Tool:
+        tool = Tool(*arguments)
+        self._stack.enter_context(tool)
+        self.tools.append(tool)
+        return tool
+
+    def dead(self) -> Tool | None:
+        """A process that has ended although it should not."""
+        return next((t for t in self.tools if not t.running), None)
+
+
+def _object(options: RigOptions, side: Side) -> tuple[str, ...]:
+    touch = options.objects.get(side)
+    return () if touch is None else ("--object", f"{touch:g}")
