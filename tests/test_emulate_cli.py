@@ -1,0 +1,364 @@
+"""``dexkit emulate mx64``: the port, its link, its end, its files (issue section 4)."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from dexkit.cli.emulate import command
+from dexkit.emulators.faults import FAULT_KINDS
+from dexkit.emulators.mx64 import (
+    Bus,
+    EmulatedProcess,
+    EmulatedThread,
+    Firmware,
+    Port,
+    Servo,
+    emulated_ezgripper,
+)
+from dexkit.emulators.mx64.port import client_baudrate
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.wire import dynamixel as dxl
+from dexkit.wire.dynamixel import Instruction, Packet
+
+PING = dxl.encode(1, Instruction.PING)
+
+
+class Client:
+    """A serial client that sets its baud rate, without pyserial."""
+
+    def __init__(self, path: str, speed: int = termios.B1000000) -> None:
+        self.fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self.fd)
+        settings = termios.tcgetattr(self.fd)
+        settings[4] = settings[5] = speed
+        termios.tcsetattr(self.fd, termios.TCSANOW, settings)
+
+    def ask(self, data: bytes, timeout: float = 2.0) -> Packet | None:
+        os.write(self.fd, data)
+        parser = dxl.PacketParser()
+        deadline = time.monotonic() + timeout
+        while True:
+            ready, _, _ = select.select([self.fd], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                return None
+            data = os.read(self.fd, 1000)
+            packets = parser.feed(data)
+            if packets or not data:
+                return packets[0] if packets else None
+
+    def close(self) -> None:
+        os.close(self.fd)
+
+
+@contextlib.contextmanager
+def client(path: str, speed: int = termios.B1000000) -> Iterator[Client]:
+    opened = Client(path, speed)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def wait_for(what: object, seconds: float = 5.0) -> None:
+    deadline = time.monotonic() + seconds
+    assert callable(what)
+    while not what():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.005)
+
+
+def ping(path: str, servo_id: int = 1) -> bool:
+    with client(path) as opened:
+        return opened.ask(dxl.encode(servo_id, Instruction.PING), 0.3) is not None
+
+
+def is_cut_off(opened: Client) -> bool:
+    """What a pulled cable looks like: an error on writing, or the end of what can be read."""
+    try:
+        return opened.ask(PING, 1.0) is None and os.read(opened.fd, 1) == b""
+    except OSError as error:
+        return error.errno == errno.EIO
+
+
+def emulate(*arguments: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "dexkit", "emulate", "mx64", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+# --- the command
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_ready_answer_stop_and_nothing_left(tmp_path: Path, signum: signal.Signals) -> None:
+    link = tmp_path / "gripper"
+    process = emulate("--link", str(link), "--id", "7", "--baudrate", "57600")
+    assert process.stdout is not None
+    line = process.stdout.readline().decode()
+    assert line.startswith(f"ready: {link} id=7 baudrate=57600 pty=/dev/pts/")
+    assert os.readlink(link) == line.split("pty=")[1].strip()
+    with client(str(link), termios.B57600) as opened:
+        answer = opened.ask(dxl.encode(7, Instruction.PING))
+    assert answer is not None
+    assert answer.id == 7
+    process.send_signal(signum)
+    out, err = process.communicate(timeout=10)
+    assert process.returncode == 0
+    assert "stopped: 10 bytes in, 14 bytes out" in out.decode()
+    assert err == b""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_port_thread_takes_part_in_shutdown_while_a_client_is_connected(tmp_path: Path) -> None:
+    with emulated_ezgripper(process=True, link=tmp_path / "g") as gripper:
+        assert isinstance(gripper, EmulatedProcess)
+        with client(gripper.path) as opened:
+            assert opened.ask(PING) is not None
+            gripper.close()
+            assert is_cut_off(opened)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_grippers_on_one_line(tmp_path: Path) -> None:
+    with emulated_ezgripper(process=True, extra=["--id=2"]) as gripper:
+        assert ping(gripper.path, 1)
+        assert ping(gripper.path, 2)
+        assert not ping(gripper.path, 3)
+
+
+def test_stale_link_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
+    link = tmp_path / "gripper"
+    link.symlink_to("/dev/pts/9999")
+    with emulated_ezgripper(link=link) as gripper:
+        assert ping(gripper.path)
+    assert not link.is_symlink()
+    link.write_text("precious")
+    with pytest.raises(EmulatorError), emulated_ezgripper(link=link):
+        pass
+    assert link.read_text() == "precious"
+    with pytest.raises(EmulatorError), emulated_ezgripper(link=tmp_path / "no" / "such"):
+        pass
+
+
+def test_somebody_elses_link_is_left_alone(tmp_path: Path) -> None:
+    link = tmp_path / "gripper"
+    with emulated_ezgripper(link=link):
+        link.unlink()
+        link.symlink_to("/dev/null")
+    assert os.readlink(link) == "/dev/null"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        ([], 2, "--link"),
+        (["--id", "253"], 2, "253"),
+        (["--id", "1", "--id", "1"], 2, "different ids"),
+        (["--baudrate", "1234"], 2, "1234"),
+        (["--object", "100"], 2, "100"),
+        (["--fault", "fire"], 2, "overload"),
+        (["--latency-timer", "-1"], 2, "-1"),
+    ],
+)
+def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, says: str) -> None:
+    if arguments:
+        arguments = ["--link", str(tmp_path / "g"), *arguments]
+    process = emulate(*arguments)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert says in err.decode()
+    assert "Traceback" not in err.decode()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_option() -> None:
+    result = CliRunner().invoke(command, ["mx64", "--help"])
+    assert result.exit_code == 0
+    for option in ("--link", "--id", "--object", "--no-line-time", "--fault", "--eeprom"):
+        assert option in result.output
+
+
+def test_helper_reports_why_it_did_not_start() -> None:
+    with pytest.raises(EmulatorError) as caught, emulated_ezgripper(process=True, faults=["fire"]):
+        pass
+    assert "fire" in caught.value.hint
+    assert all(kind in caught.value.hint for kind in FAULT_KINDS)
+
+
+def test_helper_refuses_what_it_cannot_do() -> None:
+    with pytest.raises(UsageError), emulated_ezgripper(process=True, firmware=Firmware()):
+        pass
+    with pytest.raises(UsageError), emulated_ezgripper(extra=["--id=2"]):
+        pass
+
+
+# --- EEPROM from run to run
+
+
+def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
+    file = tmp_path / "eeprom.json"
+    with (
+        emulated_ezgripper(process=True, extra=[f"--eeprom={file}"]) as gripper,
+        client(gripper.path) as opened,
+    ):
+        assert not file.exists()
+        assert opened.ask(dxl.encode(1, Instruction.WRITE, b"\x26\0\x40\6")) is not None
+        assert opened.ask(dxl.encode(1, Instruction.WRITE, b"\x07\0\x09")) is not None
+    assert json.loads(file.read_text())["device"] == "mx64"
+    with (
+        emulated_ezgripper(process=True, extra=[f"--eeprom={file}"]) as gripper,
+        client(gripper.path) as opened,
+    ):
+        assert "id=9" in gripper.ready_line
+        answer = opened.ask(dxl.encode(9, Instruction.READ, b"\x26\0\2\0"))
+        assert answer is not None
+        assert answer.data == b"\x40\6"
+    assert [p.name for p in tmp_path.iterdir()] == ["eeprom.json"]
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"device": "mx64", "eeprom": ["00"]}', "[1]"])
+def test_broken_eeprom_file_is_an_error(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "eeprom.json"
+    file.write_text(text)
+    process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(file))
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "EEPROM" in err.decode()
+    assert file.read_text() == text
+
+
+# --- the port
+
+
+def test_port_survives_clients_that_come_and_go() -> None:
+    with emulated_ezgripper() as gripper:
+        for _ in range(5):
+            assert ping(gripper.path)
+        with client(gripper.path) as opened:
+            os.write(opened.fd, PING[:5])
+        time.sleep(0.01)
+        assert ping(gripper.path)
+
+
+@pytest.mark.parametrize(
+    ("speed", "answers"),
+    [(termios.B1000000, True), (termios.B57600, False), (termios.B9600, False)],
+)
+def test_client_must_have_the_servos_baud_rate(speed: int, answers: bool) -> None:
+    with emulated_ezgripper() as gripper, client(gripper.path, speed) as opened:
+        assert (opened.ask(PING, 0.2) is not None) == answers
+        assert isinstance(gripper, EmulatedThread)
+        assert gripper.bus.counters.garbled == (0 if answers else len(PING))
+
+
+def test_any_baud_rate_when_told_so() -> None:
+    with (
+        emulated_ezgripper(check_baudrate=False) as gripper,
+        client(gripper.path, termios.B9600) as opened,
+    ):
+        assert opened.ask(PING) is not None
+
+
+def test_baud_rate_of_a_terminal_is_read() -> None:
+    master, slave = os.openpty()
+    settings = termios.tcgetattr(slave)
+    settings[4] = settings[5] = termios.B2000000
+    termios.tcsetattr(slave, termios.TCSANOW, settings)
+    assert client_baudrate(master) == 2_000_000
+    os.close(master)
+    os.close(slave)
+    read_end, write_end = os.pipe()
+    assert client_baudrate(read_end) is None
+    os.close(read_end)
+    os.close(write_end)
+
+
+def test_unplug_and_replug_under_one_path(tmp_path: Path) -> None:
+    link = tmp_path / "gripper"
+    with emulated_ezgripper(link=link) as gripper:
+        with client(gripper.path) as opened:
+            assert opened.ask(PING) is not None
+            gripper.inject("unplug:for=200ms")
+            wait_for(lambda: not link.is_symlink())
+            assert is_cut_off(opened)
+            wait_for(lambda: link.is_symlink())
+        assert ping(gripper.path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stopped_while_unplugged_leaves_nothing(tmp_path: Path) -> None:
+    with emulated_ezgripper(link=tmp_path / "g") as gripper:
+        gripper.inject("unplug")
+        wait_for(lambda: not (tmp_path / "g").is_symlink())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_faults_can_be_injected(process: bool) -> None:
+    with emulated_ezgripper(process=process) as gripper, client(gripper.path) as opened:
+        answer = opened.ask(PING)
+        assert answer is not None
+        assert not answer.alert
+        gripper.inject("overload")
+
+        def alerts() -> bool:
+            status = opened.ask(PING)
+            return status is not None and status.alert
+
+        wait_for(alerts)
+        with pytest.raises(UsageError):
+            gripper.inject("fire")
+
+
+def test_protocol_1_firmware(tmp_path: Path) -> None:
+    with (
+        emulated_ezgripper(process=True, extra=["--protocol-1"]) as gripper,
+        client(gripper.path) as opened,
+    ):
+        assert opened.ask(PING, 0.2) is None
+        time.sleep(0.01)
+        os.write(opened.fd, bytes.fromhex("ffff010201fb"))
+        data = b""
+        while len(data) < 6:
+            data += os.read(opened.fd, 6)
+        assert data == bytes.fromhex("ffff010200fc")
+
+
+def test_client_that_never_reads_does_not_block_the_servo() -> None:
+    with emulated_ezgripper(line_time=False) as gripper:
+        assert isinstance(gripper, EmulatedThread)
+        read_all = dxl.encode(1, Instruction.READ, b"\xa8\0\x54\0")
+        with client(gripper.path) as opened:
+            for k in range(1, 301):
+                os.write(opened.fd, read_all)
+                wait_for(lambda k=k: gripper.bus.counters.instructions >= k)
+            wait_for(lambda: gripper.port.overruns > 0)
+            termios.tcflush(opened.fd, termios.TCIFLUSH)
+            assert opened.ask(PING) is not None
+
+
+def test_port_in_the_callers_thread_can_be_stopped() -> None:
+    bus = Bus([Servo(now=time.monotonic())], start=time.monotonic())
+    with Port(bus) as port:
+        port.stop()
+        port.run()
+        assert os.path.islink(port.path)
+    assert not os.path.islink(port.path)
+    assert not os.path.exists(os.path.dirname(port.path))
