@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType
 
-from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported, UsageError
+from dexkit.errors import TraceError, TraceUnreadable, TraceUnsupported, UsageError
 from dexkit.traces import SAMPLES, open_trace, sample_labels, sample_path
 from dexkit.traces import reader as reader_module
 from dexkit.traces.names import dds_topic, dds_type, select_topics
@@ -170,7 +170,9 @@ shapes = st.builds(
 @given(
     shape=shapes,
     times=st.lists(
-        st.tuples(st.booleans(), st.integers(0, 1000), st.integers(0, 2**40), st.binary(max_size=40)),
+        st.tuples(
+            st.booleans(), st.integers(0, 1000), st.integers(0, 2**40), st.binary(max_size=40)
+        ),
         max_size=40,
     ),
 )
@@ -187,7 +189,7 @@ def test_reads_what_the_mcap_library_reads(
     ]
     path = write(tmp_path / "a.mcap", data)
     ours = as_rows(path)
-    assert [r[1] for r in ours] == [r[1] for r in theirs]
+    assert ours == sorted(written, key=lambda row: row[1])
     assert Counter(ours) == Counter(theirs)
     trace = open_trace(path)
     for topic, samples in trace.load().items():
@@ -232,11 +234,11 @@ def check_cut(tmp_path: Path, data: bytes, cut: int, expected: list[Row]) -> int
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Shape) -> None:
-    expected = rows(30)
+    expected = rows(20)
     data = mcap_bytes(expected, shape, metadata={"m": {"k": "v"}})
     last = 0
     # every byte around the ends of records, and a comb over the rest
-    offsets = sorted({*range(0, len(data), 7), *range(min(120, len(data))), len(data) - 1})
+    offsets = sorted({*range(0, len(data), 11), *range(min(120, len(data))), len(data) - 1})
     for cut in offsets:
         got = check_cut(tmp_path, data, cut, expected)
         assert got >= last, "a longer file never gives less"
@@ -245,7 +247,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Sh
 
 
 def test_a_cut_costs_no_more_than_the_record_it_falls_in(tmp_path: Path) -> None:
-    expected = rows(12)
+    expected = rows(8)
     data = mcap_bytes(expected, Shape(chunked=False))
     for cut in range(header_end(data), len(data)):
         got = check_cut(tmp_path, data, cut, expected)
@@ -305,8 +307,8 @@ def test_damage_anywhere_is_an_error_of_ours_or_a_warning(
             assert len(samples.payloads) == len(samples.log_time_ns)
         assert trace.duration >= 0
         assert isinstance(trace.endpoints, list)
-    except DexkitError as error:
-        assert isinstance(error, TraceError)
+    except TraceError:
+        pass  # and nothing else
 
 
 def record(opcode: int, body: bytes, length: int | None = None) -> bytes:

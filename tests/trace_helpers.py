@@ -61,7 +61,7 @@ Row = tuple[str, int, int, bytes]  # topic, log time, publish time, payload
 
 def mcap_bytes(
     rows: Iterable[Row],
-    shape: Shape = Shape(),  # noqa: B008 (immutable)
+    shape: Shape = Shape(),
     *,
     types: dict[str, str] | None = None,
     encoding: str = "ros2msg",

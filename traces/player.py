@@ -117,7 +117,7 @@ class Player:
 
     def play(
         self,
-        publish: Callable[[TraceMessage], None],
+        publish: Callable[[TraceMessage], object],
         clock: Clock | None = None,
         stop: threading.Event | None = None,
     ) -> PlayStats:

@@ -268,17 +268,16 @@ class Trace:
         wanted = self._wanted(topics)
         segments = sorted(self._segments, key=lambda s: s.start_ns)
         pending: list[TraceMessage] = []
+        names = {i: self._info[i] for i in wanted}
+        sinks = {i: _Sink() for i in wanted}  # only their keys matter here
         with self.path.open("rb") as file:
             for position, segment in enumerate(segments):
-                sinks = {i: _Sink() for i in wanted}
-                self._parse(self._unpack(file, segment), segment, sinks)
-                for channel_id, sink in sinks.items():
-                    info = self._info[channel_id]
-                    assert sink.payloads is not None
-                    for log, publish, data in zip(
-                        sink.log, sink.publish, sink.payloads, strict=True
-                    ):
-                        pending.append(TraceMessage(info.topic, info.type_name, log, publish, data))
+                found: list[tuple[int, int, int, bytes]] = []
+                self._parse(self._unpack(file, segment), segment, sinks, ordered=found)
+                pending += [
+                    TraceMessage(names[i].topic, names[i].type_name, log, publish, data)
+                    for i, log, publish, data in found
+                ]
                 pending.sort(key=_by_log_time)
                 ready = len(pending)
                 if position + 1 < len(segments):
@@ -553,8 +552,13 @@ class Trace:
         sinks: dict[int, _Sink],
         *,
         survey: dict[int, list[int]] | None = None,
+        ordered: list[tuple[int, int, int, bytes]] | None = None,
     ) -> None:
-        """Go through the records in ``data``; messages into ``sinks``, or counted in ``survey``."""
+        """Go through the records in ``data``.
+
+        Messages of the channels in ``sinks`` go there, or into ``ordered`` as they come; others
+        are counted in ``survey``.
+        """
         at, end = 0, len(data)
         unpack = _MESSAGE.unpack_from
         message_opcode = int(Opcode.MESSAGE)
@@ -568,6 +572,10 @@ class Trace:
                         raise ValueError("a message is longer than what is left")
                     sink = sinks.get(channel_id)
                     if sink is not None:
+                        if ordered is not None:
+                            ordered.append((channel_id, log, publish, data[at + 31 : stop]))
+                            at = stop
+                            continue
                         sink.log.append(log)
                         sink.publish.append(publish)
                         if sink.payloads is not None:

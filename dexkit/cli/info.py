@@ -1,0 +1,144 @@
+"""``dexkit info``: what is in a recording."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+if TYPE_CHECKING:
+    from dexkit.traces import Trace
+
+__all__ = ["command", "summary"]
+
+
+def summary(trace: Trace) -> dict[str, Any]:
+    """Everything that ``dexkit info`` tells, as JSON data."""
+    loaded = trace.load(payloads=False)
+    topics = []
+    for channel in trace.channels:
+        samples = loaded[channel.topic]
+        row: dict[str, Any] = {
+            "topic": channel.topic,
+            "type": channel.type_name,
+            "messages": channel.message_count,
+            "schema_encoding": channel.schema_encoding,
+            "problem": channel.problem,
+        }
+        # of a topic with two types, the columns are those of one of them
+        if samples.type_name == channel.type_name and len(samples):
+            times = samples.log_time_ns
+            row["first_s"] = (int(times[0]) - trace.first_ns) / 1e9
+            if len(times) > 1 and times[-1] > times[0]:
+                gaps = np.diff(times) / 1e6
+                p50, p99, worst = np.percentile(gaps, (50, 99, 100))
+                row["mean_hz"] = (len(times) - 1) * 1e9 / int(times[-1] - times[0])
+                row["gap_ms"] = {"p50": float(p50), "p99": float(p99), "max": float(worst)}
+        topics.append(row)
+    return {
+        "file": str(trace.path),
+        "bytes": trace.path.stat().st_size,
+        "library": trace.library,
+        "profile": trace.profile,
+        "start_ns": trace.first_ns,
+        "duration_s": trace.duration,
+        "messages": trace.message_count,
+        "truncated": trace.truncated,
+        "topics": topics,
+        "endpoints": [
+            {
+                "topic": e.topic,
+                "kind": e.kind,
+                "reliability": e.reliability,
+                "durability": e.durability,
+                "history": e.history,
+                "type": e.type_name,
+            }
+            for e in trace.endpoints
+        ],
+        "metadata": trace.metadata,
+        "warnings": trace.warnings,
+    }
+
+
+@click.command("info")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def command(file: Path, as_json: bool) -> None:
+    """Say what is in a recording: topics, types, rates, gaps, and what is odd about it.
+
+    FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
+    read as far as it goes. Exit code 2 when FILE is not a recording.
+    """
+    from dexkit.traces import open_trace
+
+    trace = open_trace(file)
+    data = summary(trace)
+    if as_json:
+        click.echo(json.dumps(data, indent=1))
+        return
+    _print(data)
+
+
+def _print(data: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    # wide enough for the table: in a pipe rich would cut topics to 80 columns
+    console = Console(width=max(Console().width, 120))
+    start = datetime.fromtimestamp(data["start_ns"] / 1e9, timezone.utc)
+    state = "[red]unfinished[/red]" if data["truncated"] else "complete"
+    console.print(f"[bold]{escape(data['file'])}[/bold]  {data['bytes']:,} bytes, {state}")
+    if data["messages"]:
+        console.print(
+            f"{data['messages']:,} messages in {data['duration_s']:.3f} s "
+            f"from {start:%Y-%m-%d %H:%M:%S} UTC"
+        )
+    else:
+        console.print("no messages")
+    console.print(
+        f"written by {escape(data['library'] or 'an unnamed library')}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if data["topics"]:
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        table.add_column("topic", no_wrap=True)
+        for heading in ("messages", "mean Hz", "p50 ms", "p99 ms", "max ms", "first s"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column("type", no_wrap=True)
+        table.add_column("schema", no_wrap=True)
+        for row in data["topics"]:
+            gaps = row.get("gap_ms", {})
+            table.add_row(
+                escape(row["topic"]),
+                f"{row['messages']:,}",
+                _number(row.get("mean_hz"), 1),
+                _number(gaps.get("p50"), 2),
+                _number(gaps.get("p99"), 2),
+                _number(gaps.get("max"), 1),
+                _number(row.get("first_s"), 2),
+                escape(row["type"].replace("::msg::dds_::", " ") or "?"),
+                escape(row["schema_encoding"] or "none"),
+            )
+        console.print()
+        console.print(table)
+    for name, values in data["metadata"].items():
+        console.print(f"\n[bold]{escape(name)}[/bold]")
+        for key, value in values.items():
+            console.print(f"  {escape(key)}: {escape(value)}", highlight=False, soft_wrap=True)
+    if data["warnings"]:
+        console.print()
+        for warning in data["warnings"]:
+            console.print(
+                f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False, soft_wrap=True
+            )
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,209 @@
+"""``dexkit replay``: publish a recording's commands again, with their timing."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.errors import DdsError, TopicConflict, TraceUnsupported
+
+if TYPE_CHECKING:
+    from dexkit.dds import DdsNode, Writer
+    from dexkit.traces import Player, Trace
+
+__all__ = ["command"]
+
+#: Seconds in which other publishers on the topics are looked for; discovery on one machine takes
+#: a few tens of milliseconds.
+LOOK = 1.0
+# Seconds for the other side's readers after the last message, before the writers vanish.
+_LINGER = 0.1
+
+
+@click.command("replay")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--speed",
+    type=click.FloatRange(min=0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="2 plays in half the time.",
+)
+@click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="Play this topic (patterns such as '/dex1/*' are allowed). May be repeated. "
+    "Default: the command topics, those that end in /cmd.",
+)
+@click.option(
+    "--max-gap",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="Shorten longer pauses to this. Default: keep them.",
+)
+@dds_options(default_domain=1)
+@click.option(
+    "--wait",
+    type=click.FloatRange(min=0),
+    default=10.0,
+    show_default=True,
+    metavar="S",
+    help="Wait so long for somebody to subscribe each topic.",
+)
+@click.option("--no-wait", is_flag=True, help="Start at once, subscribed or not.")
+@click.option(
+    "--force", is_flag=True, help="Play although somebody else publishes on these topics."
+)
+def command(
+    file: Path,
+    speed: float,
+    loop: bool,
+    topics: tuple[str, ...],
+    max_gap: float | None,
+    domain: int,
+    interface: str,
+    wait: float,
+    no_wait: bool,
+    force: bool,
+) -> int:
+    """Publish the commands in a recording on DDS, with their recorded timing.
+
+    Waits until each topic is subscribed, then plays. Refuses to play while somebody else
+    publishes on the same topics. The default domain is 1, the simulation's: --domain 0 with a
+    robot's interface moves real hands.
+    """
+    from dexkit.dds import DdsNode
+    from dexkit.traces import Player, open_trace
+
+    trace = open_trace(file)
+    for warning in trace.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
+    _check_types(trace, player)
+    click.echo(
+        f"{file}: {len(player)} messages of {', '.join(player.topics)}, {player.duration:.1f} s"
+        + (", looped" if loop else "")
+    )
+    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
+        if not force:
+            _refuse_company(node, player)
+        writers = {topic: node.writer(topic, name) for topic, name in player.topics.items()}
+        if not no_wait:
+            _wait_for_readers(node, writers, wait, stop)
+        if stop:
+            return 130
+        click.echo(f"ready: playing on domain {domain}, {interface}")
+        with _smooth(), _status(player):
+            stats = player.play(
+                lambda message: writers[message.topic].write_raw(message.data), stop=stop.event
+            )
+        time.sleep(_LINGER)
+    click.echo(
+        f"sent {stats.sent} messages in {stats.duration:.1f} s"
+        + (f", {stats.passes} passes" if loop else "")
+        + f"; late by {stats.error_p50 * 1e3:.3f} ms (p50), {stats.error_p99 * 1e3:.3f} ms (p99), "
+        f"{stats.error_max * 1e3:.3f} ms (max)"
+    )
+    # for a loop, being stopped is the ordinary end
+    return 130 if stats.stopped and not loop else 0
+
+
+def _check_types(trace: Trace, player: Player) -> None:
+    for channel in trace.channels:
+        chosen = player.topics.get(channel.topic) == channel.type_name
+        if chosen and channel.problem and channel.message_count:
+            raise TraceUnsupported(
+                f"{channel.topic} cannot be played: {channel.problem}",
+                hint="choose other topics with --topic",
+            )
+
+
+def _refuse_company(node: DdsNode, player: Player) -> None:
+    """Two sources of commands fight over the hand.
+
+    :raises TopicConflict: somebody else publishes on a topic that is to be played.
+    """
+
+    def others() -> list[str]:
+        return sorted(
+            f"{e.topic} ({e.process or 'unknown process'})"
+            for e in node.endpoints()
+            if e.kind == "writer" and not e.own and e.topic in player.topics
+        )
+
+    node.discovery.wait(lambda _: others(), timeout=LOOK)
+    if found := others():
+        raise TopicConflict(
+            f"somebody else publishes on domain {node.domain}: {', '.join(found)}",
+            hint="stop that publisher, choose another --domain, or play anyway with --force",
+        )
+
+
+def _wait_for_readers(
+    node: DdsNode, writers: dict[str, Writer], patience: float, stop: StopRequest
+) -> None:
+    """Return when each topic is subscribed, or the user gives up.
+
+    :raises DdsError: a topic is still not subscribed after ``patience`` seconds.
+    """
+    end = time.monotonic() + patience
+    missing = [t for t, w in writers.items() if not w.matched]
+    if missing:
+        click.echo(f"waiting for somebody to subscribe {', '.join(missing)} ...", err=True)
+    while missing and not stop and time.monotonic() < end:
+        writers[missing[0]].wait_matched(timeout=0.1)
+        missing = [t for t, w in writers.items() if not w.matched]
+    if missing and not stop:
+        raise DdsError(
+            f"nobody subscribes {', '.join(missing)} on domain {node.domain}, {node.interface} "
+            f"(waited {patience:g} s)",
+            hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
+            "anyway with --no-wait",
+        )
+
+
+@contextmanager
+def _smooth() -> Iterator[None]:
+    """Let the playing thread have the interpreter within 0.5 ms instead of 5."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextmanager
+def _status(player: Player) -> Iterator[None]:
+    """A line that tells how far it is, on a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    done = threading.Event()
+
+    def show() -> None:
+        while not done.wait(0.5):
+            passes, within = divmod(player.sent, len(player))
+            part = f"{100 * within / len(player):3.0f} %"
+            text = f"{part}  {player.sent:,} messages" + (f"  pass {passes + 1}" if passes else "")
+            click.echo(f"\r\033[K{text}", nl=False, err=True)
+
+    thread = threading.Thread(target=show, name="status", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        click.echo("\r\033[K", nl=False, err=True)

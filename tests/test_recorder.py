@@ -1,0 +1,290 @@
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from dexkit.errors import TraceError, UsageError
+from dexkit.traces import Recorder, open_trace, sample_path
+from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
+
+
+def put_all(recorder: Recorder, count: int) -> int:
+    return sum(
+        recorder.put(STATE, STATE_TYPE, state(0.001 * i), T0 + i * 1000, T0 + i * 1000 - 7)
+        for i in range(count)
+    )
+
+
+def test_what_is_recorded_is_what_was_put(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, metadata={"note": "hello"}) as recorder:
+        assert put_all(recorder, 2000) == 2000
+        recorder.put(CMD, CMD_TYPE, cmd(1.5), T0 + 5, 3)
+        recorder.add_metadata("conditions", {"a": "b"})
+    assert (recorder.written, recorder.dropped) == (2001, 0)
+    assert recorder.offered == {STATE: 2000, CMD: 1}
+    trace = open_trace(path)
+    assert (trace.truncated, trace.warnings, trace.profile) == (False, [], "ros2")
+    samples = trace.samples(STATE)
+    assert samples.payloads == [state(0.001 * i) for i in range(2000)]
+    assert samples.log_time_ns.tolist() == [T0 + i * 1000 for i in range(2000)]
+    assert samples.publish_time_ns.tolist() == [T0 + i * 1000 - 7 for i in range(2000)]
+    assert trace.samples(CMD).payloads == [cmd(1.5)]
+    assert trace.metadata["conditions"] == {"a": "b"}
+    about = trace.metadata["dexkit_recorder"]
+    assert (about["note"], about["messages"], about["dropped"]) == ("hello", "2001", "0")
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    compression=st.sampled_from(["zstd", "lz4", "none"]),
+    puts=st.lists(
+        st.tuples(
+            st.sampled_from([(CMD, CMD_TYPE), (STATE, STATE_TYPE), ("rt/x", STATE_TYPE)]),
+            st.integers(0, 2**62),
+            st.integers(0, 2**62),
+            st.binary(max_size=300),
+        ),
+        max_size=50,
+    ),
+)
+def test_any_samples_survive_the_round_trip(
+    tmp_path: Path,
+    compression: str,
+    puts: list[tuple[tuple[str, str], int, int, bytes]],
+) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, overwrite=True, compression=compression) as recorder:
+        for (topic, type_name), log, publish, data in puts:
+            assert recorder.put(topic, type_name, data, log, publish)
+    got = [tuple(m) for m in open_trace(path).messages()]
+    put = [(t, n, log, publish, data) for (t, n), log, publish, data in puts]
+    assert got == sorted(put, key=lambda row: row[2])
+
+
+def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_text("precious")
+    with pytest.raises(UsageError, match="exists"):
+        Recorder(path).open()
+    assert path.read_text() == "precious"
+    with Recorder(path, overwrite=True):
+        pass
+    assert open_trace(path).message_count == 0
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match="cannot create"):
+        Recorder(tmp_path / "no" / "a.mcap").open()
+
+
+def test_an_unknown_type_is_refused_at_once(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder, pytest.raises(UsageError, match="unknown"):
+        recorder.put("rt/x", "other::msg::dds_::Thing_", b"\0" * 8, T0)
+
+
+class Gate:
+    """Holds the recorder's writer, as a disk that does not answer would."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.reached = threading.Event()
+        self.open = threading.Event()
+        self._add = recorder._writer.add_message
+        recorder._writer.add_message = self  # type: ignore[method-assign, assignment]
+
+    def __call__(self, *args: object) -> None:
+        self.reached.set()
+        assert self.open.wait(20)
+        self._add(*args)  # type: ignore[arg-type]
+
+
+def test_a_blocked_disk_drops_and_counts_and_never_blocks_the_receiver(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    recorder = Recorder(path, max_messages=100)
+    recorder.open()
+    gate = Gate(recorder)
+    assert put_all(recorder, 1) == 1
+    assert gate.reached.wait(10)
+    # the writer holds one message; the queue takes 99 more; nothing waits
+    assert put_all(recorder, 250) == 99
+    recorder.put(CMD, CMD_TYPE, cmd(0.0), T0)
+    assert recorder.dropped == 152
+    gate.open.set()
+    recorder.close()
+    assert (recorder.written, recorder.dropped) == (100, 152)
+    trace = open_trace(path)
+    assert trace.message_count == 100
+    about = trace.metadata["dexkit_recorder"]
+    assert about["messages"] == "100"
+    assert about["dropped"] == "152"
+    assert about[f"dropped {STATE}"] == "151"
+    assert about[f"dropped {CMD}"] == "1"
+
+
+def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", max_bytes=10_000)
+    recorder.open()
+    gate = Gate(recorder)
+    recorder.put(STATE, STATE_TYPE, bytes(4000), T0)
+    assert gate.reached.wait(10)
+    assert recorder.put(STATE, STATE_TYPE, bytes(4000), T0)
+    assert not recorder.put(STATE, STATE_TYPE, bytes(4000), T0)
+    assert recorder.put(STATE, STATE_TYPE, bytes(2000), T0)
+    gate.open.set()
+    recorder.close()
+    assert (recorder.written, recorder.dropped) == (3, 1)
+
+
+def test_drops_show_as_gaps_in_the_sequence_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    recorder = Recorder(path, max_messages=2)
+    recorder.open()
+    gate = Gate(recorder)
+    put_all(recorder, 1)
+    assert gate.reached.wait(10)
+    put_all(recorder, 3)
+    gate.open.set()
+    deadline = time.monotonic() + 10
+    while recorder.written < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    put_all(recorder, 1)
+    recorder.close()
+    with path.open("rb") as file:
+        numbers = [m.sequence for _, _, m in make_reader(file).iter_messages()]
+    assert sorted(numbers) == [1, 2, 5]
+
+
+def test_a_full_disk_ends_the_recording_with_an_error(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap")
+    recorder.open()
+
+    def fail(*args: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    recorder._writer.add_message = fail  # type: ignore[method-assign]
+    put_all(recorder, 1)
+    assert recorder._thread is not None
+    recorder._thread.join(10)
+    assert recorder.error is not None
+    assert put_all(recorder, 5) == 0
+    with pytest.raises(TraceError, match="No space left"):
+        recorder.close()
+
+
+def test_closing_twice_and_putting_after_is_harmless(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap")
+    recorder.open()
+    recorder.close()
+    recorder.close()
+    assert not recorder.put(CMD, CMD_TYPE, cmd(0.0), T0)
+    assert recorder.dropped == 1
+
+
+def test_many_threads_may_put(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        threads = [
+            threading.Thread(
+                target=lambda n=n: [
+                    recorder.put(f"rt/t{n}", STATE_TYPE, bytes([n]) * 8, T0 + i) for i in range(500)
+                ]
+            )
+            for n in range(4)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    trace = open_trace(path)
+    for n in range(4):
+        samples = trace.samples(f"rt/t{n}")
+        assert samples.log_time_ns.tolist() == [T0 + i for i in range(500)]
+        assert set(samples.payloads) == {bytes([n]) * 8}
+
+
+CHILD = textwrap.dedent(
+    """
+    import sys, time
+    from dexkit.traces import Recorder
+    recorder = Recorder(sys.argv[1])
+    recorder.open()
+    recorder.add_metadata("dds_endpoints", {"rt/dex1/left/state writer": "reliable"})
+    n = 0
+    next_line = 0.0
+    while True:
+        n += 1
+        now = time.time_ns()
+        recorder.put("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_",
+                     n.to_bytes(8, "little"), now, now)
+        if now > next_line:
+            print(n, now, flush=True)
+            next_line = now + 10_000_000
+        time.sleep(0.001)
+    """
+)
+
+
+@pytest.mark.realtime
+def test_kill_9_costs_at_most_half_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    first = last = 0
+    try:
+        while not first or last - first < 1_500_000_000:
+            last = int(child.stdout.readline().split()[1])
+            first = first or last
+    finally:
+        child.send_signal(signal.SIGKILL)
+        rest = child.communicate(timeout=10)[0].splitlines()
+    if rest:
+        last = int(rest[-1].split()[1])
+    trace = open_trace(path)
+    assert trace.truncated
+    assert any("unfinished" in w for w in trace.warnings)
+    assert trace.endpoints[0].reliability == "reliable"
+    samples = trace.samples("rt/dex1/left/state")
+    lost = (last - int(samples.log_time_ns[-1])) / 1e9
+    assert lost < 0.5
+    # and nothing before that is missing
+    numbers = [int.from_bytes(p, "little") for p in samples.payloads]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+@pytest.mark.parametrize("name", ["dex1_pick_place", "dex3_pinch"])
+def test_a_recording_recorded_again_is_the_same(tmp_path: Path, name: str) -> None:
+    source = open_trace(sample_path(name))
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for message in source.messages():
+            recorder.put(
+                message.topic,
+                message.type_name,
+                message.data,
+                message.log_time_ns,
+                message.publish_time_ns,
+            )
+    assert recorder.dropped == 0
+    copy = open_trace(path)
+    assert all(c.supported and c.schema_encoding == "ros2msg" for c in copy.channels)
+    for topic, samples in source.load().items():
+        again = copy.samples(topic)
+        assert again.payloads == samples.payloads
+        assert (again.log_time_ns == samples.log_time_ns).all()
+        assert (again.publish_time_ns == samples.publish_time_ns).all()
