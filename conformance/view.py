@@ -61,6 +61,7 @@ class States:
     dq: Floats
     ddq: Floats
     tau: Floats
+    mode: Floats
     errors: Mapping[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -247,7 +248,7 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
     topic = wire.dialect.topics(side)[1]
     if samples is None or samples.type_name != wire.dialect.state_type:
         none = np.empty(0)
-        return States(topic, none, none, np.empty(0, np.intp), none, none, none, none)
+        return States(topic, none, none, np.empty(0, np.intp), none, none, none, none, none)
     columns = wire.state.columns(samples.payloads)
     place = f"{wire.state_sequence}[{wire.dialect.index[side]}]"
     sent = _seconds(samples.publish_time_ns, origin)
@@ -261,6 +262,7 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
         dq=columns[f"{place}.dq"],
         ddq=columns[f"{place}.ddq"],
         tau=columns[f"{place}.tau_est"],
+        mode=columns[f"{place}.mode"],
         errors={i: str(e) for i, e in columns.errors.items()},
     )
 

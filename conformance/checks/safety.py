@@ -144,7 +144,8 @@ def brakes(ctx: Context) -> Outcome:
     """Motion and force after the time-out, of a hand that moved or pressed when silence began.
 
     A hand that merely stands at its target looks the same with and without a brake; so the
-    silence begins while it is driven by a velocity, or presses on an object.
+    silence begins while it is driven by a velocity, or presses on an object. Of a hand that does
+    neither, its own word is taken: ``mode`` that goes from driven to 0.
     """
     timeout = ctx.tolerance("timeout_s")
     states = ctx.states
@@ -183,12 +184,16 @@ def brakes(ctx: Context) -> Outcome:
                 )
             proofs.append(f"pressed with {pressed:.2f} N m, then with {still:.2f} N m")
             values["tau_nm"] = still
+        driven = states.mode[states.between(last - 0.2, last)]
+        if not proofs and (driven > 0).all() and (states.mode[late] == 0).all():
+            proofs.append(f"stood still, and reports the brake: mode {driven[-1]:.0f}, then 0")
     if not proofs:
         return ctx.skipped(
             "this hand neither moved (it does not follow velocity commands) nor pressed on an "
-            "object when the commands stopped: braking cannot be told from holding"
+            "object when the commands stopped, and its mode does not tell: braking cannot be "
+            "told from holding"
         )
-    figure = "stops" if "motion_rad" in values else "lets go"
+    figure = "stops" if "motion_rad" in values else "lets go" if values else "says so"
     return ctx.passed(figure, "; ".join(proofs), **values)
 
 

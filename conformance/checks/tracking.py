@@ -53,7 +53,7 @@ def measure(ctx: Context, search: float) -> Tracking | str:
     ct, cq = ctx.commands.t[good], ctx.commands.q[good]
     if len(ct) < 2 or len(ctx.states) < 2:
         return "too few commands or states"
-    grid: Floats = np.arange(begin + search + 0.1, end, _GRID)
+    grid: Floats = np.asarray(np.arange(begin + search + 0.1, end, _GRID))
     if len(grid) * _GRID < ctx.tolerance("min_session_s") - search - 0.2:
         return f"the session is shorter than {ctx.tolerance('min_session_s'):g} s"
     at = np.searchsorted(ctx.states.t, grid, "right") - 1

@@ -1,5 +1,7 @@
 """The wrong hands themselves, in the catalogue's order."""
 
+# ruff: noqa: D102  (each class says what it does wrong; its methods only override)
+
 from __future__ import annotations
 
 import math
@@ -327,12 +329,11 @@ class NanIsZero(ReferenceService):
     """Takes NaN and infinity for 0."""
 
     def command(self, side: Side, motor: Motor) -> None:
-        clean = {
-            name: value if math.isfinite(value) else 0.0
-            for name in ("q", "dq", "tau", "kp", "kd")
-            for value in (getattr(motor, name),)
-        }
-        super().command(side, replace(motor, **clean))
+        q, dq, tau, kp, kd = (
+            value if math.isfinite(value) else 0.0
+            for value in (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
+        )
+        super().command(side, Motor(q, dq, tau, kp, kd))
 
 
 class _NoLimits(ReferenceHand):

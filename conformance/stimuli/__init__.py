@@ -194,11 +194,12 @@ class Script:
 
     def _other_place(self) -> dict[Side, float]:
         """A place worth moving to: the middle or above it, whichever is farther from here."""
-        above = 0.7 * self._stroke
-        return {
-            s: max(above, self._middle(s), key=lambda q, s=s: abs(q - self._obs.q.get(s, 0.0)))
-            for s in self.plan.sides
-        }
+        places: dict[Side, float] = {}
+        for side in self.plan.sides:
+            here = self._obs.q.get(side, 0.0)
+            above, middle = 0.7 * self._stroke, self._middle(side)
+            places[side] = above if abs(above - here) > abs(middle - here) else middle
+        return places
 
     # -- sending ----------------------------------------------------------------------------
 
@@ -405,7 +406,7 @@ class Script:
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
         if free:
-            targets = {s: 0.15 * self._stroke for s in free}
+            targets = dict.fromkeys(free, 0.15 * self._stroke)
             yield from self._everyone("center", {**self._goal, **targets})
         squeeze = {s: Motor(q=self.plan.objects[s] - 1.5 * LEAD * self._stroke) for s in pressing}
         if pressing:
