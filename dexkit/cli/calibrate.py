@@ -218,6 +218,7 @@ def _change_baudrate(servo: Servo, baudrate: int) -> None:
     servo.set_torque(False)
     # whether the answer comes at the old or the new rate is not documented: ask for none
     servo.bus.write_unacknowledged(servo.id, mx64.BAUD_RATE.address, mx64.BAUD_RATE.encode(value))
+    servo.bus.drain()
     servo.bus.set_baudrate(baudrate)
     servo.bus.ping(servo.id)
 

@@ -67,7 +67,7 @@ READ_SIZE = sum(item.size for item in _READ)
 assert mx64.PROFILE_VELOCITY.size + READ_SIZE <= _BLOCK.count
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Goal:
     """What is written in one exchange.
 
@@ -81,18 +81,19 @@ class Goal:
     profile_velocity: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Sample:
     """What is read in one exchange, register units; positions in the servo's count of turns.
 
     :param time: monotonic time of measurement, seconds.
+    :param error: bits of :class:`~dexkit.wire.mx64.HardwareError`.
     """
 
     time: float
     goal_current: int
     goal_position: int
     torque: bool
-    error: mx64.HardwareError
+    error: int
     watchdog: int
     tick: int
     current: int

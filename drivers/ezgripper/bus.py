@@ -50,8 +50,8 @@ __all__ = ["BITS_PER_BYTE", "BusStatistics", "DevicePort", "Ping", "ServoBus", "
 BITS_PER_BYTE = 10
 """8N1: start bit, eight data bits, stop bit."""
 
-_READ_OVERHEAD = 11
-"""Bytes of a status around its data."""
+_BUFFERED = 0.1
+"""Seconds that a USB adapter may hold bytes that the system has handed over."""
 _HEADER = 8
 """Bytes of a frame before the first parameter (of an instruction) or the error (of a status)."""
 
@@ -125,6 +125,8 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
         self.timeout = timeout
         self._deadline = 0.0
         self._received = bytearray()
+        self._held = b""
+        self.hold_next = False
 
     # names are the SDK's
     def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
@@ -132,6 +134,7 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
         if self.is_open:
             self.closePort()
         self._received.clear()
+        self._held = b""
         self.ser = serial.Serial(self.port_name, cflag_baud, timeout=0, exclusive=True)
         self.is_open = True
         self.tx_time_per_byte = BITS_PER_BYTE * 1000.0 / cflag_baud
@@ -173,8 +176,18 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
         return taken
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
-        """Write a whole packet, or as much as goes within the timeout."""
+        """Write a whole packet, or as much as goes within the timeout.
+
+        With ``hold_next`` set the packet is kept and leaves together with the next one: one
+        system call and, on a USB adapter, one transfer instead of two.
+        """
         data = bytes(packet)
+        if self.hold_next:
+            self.hold_next = False
+            self._held = data
+            return len(data)
+        held = len(self._held)
+        data, self._held = self._held + data, b""
         sent = 0
         deadline = time.monotonic() + self.timeout
         while sent < len(data):
@@ -184,7 +197,7 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
                 remaining = deadline - time.monotonic()
                 if remaining <= 0 or not select.select([], [self.ser.fileno()], [], remaining)[1]:
                     break
-        return sent
+        return sent - held
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         """Start the clock for a reply of ``packet_length`` bytes."""
@@ -251,7 +264,8 @@ def _open_failed(path: str, error: Exception) -> Exception:
             f"another program is using {path}",
             hint="stop it first (lsof or fuser on the device names it); a servo has one master",
         )
-    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or isinstance(error, termios.error):
+    # pyserial wraps a failing tcgetattr without its number
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in str(error):
         return HandNotFound(f"{path} is not a serial port: {error}")
     return HandLost(f"cannot open {path}: {error}", hint="check the cable and the power")
 
@@ -311,6 +325,15 @@ class ServoBus:
                 hint="known: " + ", ".join(str(b) for b in mx64.BAUD_RATES.values()),
             )
 
+    def drain(self) -> None:
+        """Wait until what was written has left the adapter, whatever it buffers.
+
+        :raises HandLost: the port has gone away.
+        """
+        with _port_errors(self.path):
+            self._port.ser.flush()
+        time.sleep(_BUFFERED)
+
     def close(self) -> None:
         """Close the port; may be called twice."""
         self._port.closePort()
@@ -364,11 +387,15 @@ class ServoBus:
         """Set one item. Raises as :meth:`read`."""
         self.write(servo_id, item.address, item.encode(value))
 
-    def write_unacknowledged(self, servo_id: int, address: int, data: bytes) -> None:
+    def write_unacknowledged(
+        self, servo_id: int, address: int, data: bytes, *, with_next: bool = False
+    ) -> None:
         """Write without a status packet (a Sync Write to one servo): half the time, no reply.
 
+        :param with_next: let it leave together with the next transaction.
         :raises HandLost: the port has gone away or takes no more bytes.
         """
+        self._port.hold_next = with_next
         with _port_errors(self.path):
             result = self._packets.syncWriteTxOnly(
                 self._port, address, len(data), [servo_id, *data], 1 + len(data)

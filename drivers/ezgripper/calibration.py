@@ -22,6 +22,7 @@ from typing import Protocol
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import ContactDetector
 from dexkit.drivers.ezgripper.control import at_once
+from dexkit.drivers.ezgripper.recovery import describe
 from dexkit.drivers.ezgripper.scaling import (
     STROKE,
     TICKS_PER_PERCENT,
@@ -46,6 +47,8 @@ EFFORT = 30.0
 """Percent, while looking for the closed position (facts/mx64 D2, D4)."""
 SPEED = 60.0
 """Percent of stroke a second, while looking for it."""
+UNLIMITED = 600.0
+"""Percent of stroke a second that no motor of this kind reaches (facts/mx64 D1)."""
 _BEYOND = 1500
 """Ticks that are closed beyond one stroke before the search is given up: the gripper may
 stand open wider than its stroke."""
@@ -109,7 +112,7 @@ def _never() -> bool:
 def _check(sample: Sample) -> None:
     if sample.error & ~mx64.HardwareError.INPUT_VOLTAGE:
         raise CalibrationFailed(
-            f"the servo reports {sample.error!r} during calibration",
+            f"the servo reports {describe(sample.error)} during calibration",
             hint="let it cool down, free the fingers, and try again",
         )
     if not sample.torque:
@@ -281,8 +284,8 @@ def _stroke(
 
 
 def _timed(drive: Drive, zero: int, target: int, effort: float, cancelled: Cancelled) -> float:
-    # 1000 %/s is beyond the motor: the profile does not limit
-    track = _stroke(drive, zero, target, effort=effort, speed=1000.0, cancelled=cancelled)
+    # beyond the motor: the profile does not limit
+    track = _stroke(drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled)
     points = [(s.time, relative_position(s.position, zero)) for s in track.samples]
     if target == 0:
         points = [(t, STROKE - p) for t, p in points]

@@ -101,8 +101,8 @@ class ContactDetector:
                 self._history.append((now, position))
             return None
         # an object that creeps, or that pushes the fingers back when the force is lowered, is
-        # still the same contact
-        if moved_on < 0 or self._stands_still(now, position):
+        # still the same contact; while it swings, the deepest point counts
+        if self._stands_still(now, position):
             self._anchor = position
         return contact
 

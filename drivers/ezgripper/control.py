@@ -5,7 +5,7 @@ Pure logic on the injected time. The phases:
 - *limp*: command with kp = 0. The motor carries no current (the springs open the fingers), as
   the vendor's motor with zero gains (facts/unitree-dex B.2, D 10). tau and kd do not act.
 - *brake*: command mode BRAKE, and the time after a recovery until a new command comes. The
-  position measured when it began is held, at hold effort.
+  fingers are stopped and then held where they came to rest, at hold effort.
 - *moving*: the fingers go to q at most at the effort limit, or rest there.
 - *contact*: they are stopped short of q (:mod:`contact`). For ``hold_after`` seconds the effort
   stays, so that the grip closes.
@@ -95,6 +95,8 @@ class ControlSettings:
 
 _ARRIVED = 25
 """Ticks (1 %) from the goal within which the fingers count as there (facts/mx64 D5)."""
+_STILL = 2
+"""Velocity units (31 ticks/s, 1.3 %/s) below which the fingers count as stopped."""
 _REST_TIME = 0.2
 """Seconds at the goal that end the start-up limit."""
 _COOLED = 5.0
@@ -124,6 +126,7 @@ class Control:
         self.phase = Phase.LIMP
         self._planned: Goal | None = None
         self._braked_at: int | None = None
+        self._braking = 0
         self._refused: HandCommand | None = None
         self._overloaded_at: float | None = None
         self._warm = False
@@ -192,10 +195,19 @@ class Control:
             self._braked_at = None
 
     def _brake(self, sample: Sample, position: int, base: int) -> Goal:
+        self._leave_drive(Phase.BRAKE)
+        settings = self.settings
+        still = abs(sample.velocity) <= _STILL
         if self._braked_at is None:
             self._braked_at = position
-        self._leave_drive(Phase.BRAKE)
-        current = current_of_effort(min(self.settings.effort, self.settings.hold_effort))
+            self._braking = 0 if still else (1 if sample.velocity > 0 else -1)
+        elif self._braking and (still or sample.velocity * self._braking < 0):
+            # where it came to a stop is where it stays: going back would be a new motion
+            self._braking = 0
+            self._braked_at = position
+            return at_once(sample.position, current_of_effort(settings.effort))
+        effort = settings.effort if self._braking else settings.hold_effort
+        current = current_of_effort(min(effort, settings.effort))
         return Goal(_bounded(base + self._braked_at), current, self._profile())
 
     def _drive(

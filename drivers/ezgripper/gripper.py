@@ -10,6 +10,8 @@ from enum import Enum
 from pathlib import Path
 from typing import NoReturn
 
+import numpy as np
+
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.drivers.ezgripper import calibration, settings
@@ -102,6 +104,11 @@ class GripperStatistics:
     resets: int = 0
 
 
+def _is_shutdown(error: int) -> bool:
+    # an input voltage error does not cut the torque by default (facts/mx64 B6)
+    return error > HardwareError.INPUT_VOLTAGE
+
+
 class _Trouble(Enum):
     NONE = 0
     FAULT = 1
@@ -143,7 +150,7 @@ class EZGripper:
         self._limits = settings.ServoLimits(80, 9.5, 16.0)
         self._policy = RebootPolicy()
         self._trouble = _Trouble.NONE
-        self._error = HardwareError.NONE
+        self._error = 0
         self._fault = MotorError.NONE
         self._message = ""
         self._since = 0.0
@@ -340,8 +347,7 @@ class EZGripper:
                 "the servo has restarted by itself",
                 hint="is the supply strong enough?",
             )
-        shutdown = sample.error & ~HardwareError.INPUT_VOLTAGE
-        if shutdown or (sample.error and engaged and not sample.torque):
+        if _is_shutdown(sample.error) or (sample.error and engaged and not sample.torque):
             self.statistics.faults += 1
             if sample.error & HardwareError.OVERLOAD:
                 self._overload_at = float(control.position(sample))
@@ -377,22 +383,24 @@ class EZGripper:
         # signed as the joint: closing is toward smaller q, so squeezing is negative, as the
         # vendor's gripper reports it (facts/unitree-dex B.7)
         tau = contact.direction * self._force.tau(sample.current) if contact else 0.0
-        return HandState.of(
-            joint_of_ticks(control.position(sample)),
+        mode = JointMode.BRAKE if control.phase is Phase.BRAKE else JointMode.FOC
+        return HandState(
+            q=np.array([joint_of_ticks(control.position(sample))]),
+            dq=np.array([joint_speed(sample.velocity)]),
+            ddq=np.zeros(1),
+            tau_est=np.array([tau]),
+            temperature=np.array([float(sample.temperature)]),
+            voltage=np.array([sample.voltage * mx64.VOLTAGE_UNIT]),
+            mode=np.array([mode], dtype=np.uint8),
+            fault=np.array([self._motor_error(sample)], dtype=np.uint32),
             stamp=sample.time,
-            dq=joint_speed(sample.velocity),
-            tau_est=tau,
-            temperature=float(sample.temperature),
-            voltage=sample.voltage * mx64.VOLTAGE_UNIT,
-            mode=JointMode.BRAKE if control.phase is Phase.BRAKE else JointMode.FOC,
-            fault=int(self._motor_error(sample)),
         )
 
     # --- faults
 
     def _fail(
         self,
-        error: HardwareError,
+        error: int,
         fault: MotorError,
         command: HandCommand,
         message: str,
@@ -429,7 +437,7 @@ class EZGripper:
                 )
             raise self._still("restarting")
         error = servo.hardware_error()
-        if error & ~HardwareError.INPUT_VOLTAGE:
+        if _is_shutdown(error):
             self._error = error
             self._trouble = _Trouble.FAULT
             self._policy.fault(now)
@@ -457,11 +465,14 @@ class EZGripper:
     def _clear_shutdown(self, servo: Servo) -> None:
         """Restart a servo that is found in shutdown, if it may be restarted soon."""
         error = servo.hardware_error()
-        if not error & ~HardwareError.INPUT_VOLTAGE:
+        if not _is_shutdown(error):
             return
-        self.statistics.faults += 1
+        # the fault that made the last exchange or opening fail is not a new one
+        if self._trouble is not _Trouble.FAULT:
+            self.statistics.faults += 1
+            self._policy.fault(self._clock.now())
         self._error = error
-        self._policy.fault(self._clock.now())
+        self._trouble = _Trouble.FAULT
         if error & HardwareError.OVERHEATING or self._policy.delay > 2.0:
             temperature = servo.temperature()
             limit = servo.bus.read_item(servo.id, mx64.TEMPERATURE_LIMIT)
@@ -478,7 +489,7 @@ class EZGripper:
             if self._clock.now() > deadline:
                 raise HandTimeout(f"servo {servo.id} does not come back after its restart")
         error = servo.hardware_error()
-        if error & ~HardwareError.INPUT_VOLTAGE:
+        if _is_shutdown(error):
             raise HandFault(
                 f"the servo is in shutdown and a restart does not help: {describe(error)}",
                 bits=(motor_error(error, 0.0, 0.0),),

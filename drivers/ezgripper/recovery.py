@@ -26,13 +26,15 @@ _MOTOR_ERRORS = {
 }
 
 
-def motor_error(error: HardwareError, voltage: float, voltage_max: float) -> MotorError:
+def motor_error(error: int, voltage: float, voltage_max: float) -> MotorError:
     """The servo's error bits in the vocabulary of all hands (facts/unitree-dex B.6).
 
     :param voltage: present supply, V; tells which limit an input voltage error broke.
     :param voltage_max: upper limit, V.
     """
     bits = MotorError.NONE
+    if not error:
+        return bits
     if error & HardwareError.INPUT_VOLTAGE:
         bits |= MotorError.OVERVOLTAGE if voltage > voltage_max else MotorError.UNDERVOLTAGE
     for servo_bit, bit in _MOTOR_ERRORS.items():
@@ -41,7 +43,7 @@ def motor_error(error: HardwareError, voltage: float, voltage_max: float) -> Mot
     return bits
 
 
-def describe(error: HardwareError) -> str:
+def describe(error: int) -> str:
     """The error bits in words."""
     names = [e.name.lower().replace("_", " ") for e in HardwareError if e & error and e.name]
     return " and ".join(names) or "no error"
@@ -83,9 +85,7 @@ class RebootPolicy:
         self._last = now
         self._due = now + self._delay
 
-    def due(
-        self, now: float, error: HardwareError, temperature: float, temperature_limit: float
-    ) -> bool:
+    def due(self, now: float, error: int, temperature: float, temperature_limit: float) -> bool:
         """Whether to reboot now.
 
         :param temperature: present, °C.

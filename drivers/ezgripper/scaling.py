@@ -15,6 +15,7 @@ __all__ = [
     "JOINT_PER_TICK",
     "STROKE",
     "TICKS_PER_PERCENT",
+    "VELOCITY_LIMIT",
     "amperes",
     "current_of_effort",
     "joint_of_ticks",
@@ -34,6 +35,9 @@ JOINT_PER_TICK = _JOINT.stroke / STROKE
 
 CURRENT_LIMIT = 1600
 """Current units that are 100 % effort (facts/mx64 D2); 76 % already stalls the servo at 12 V."""
+
+VELOCITY_LIMIT = 1023
+"""Highest value of Velocity Limit(44): 640 % of the stroke a second, far beyond the motor."""
 
 _TICKS_PER_SECOND = mx64.VELOCITY_UNIT_RPM / 60 * mx64.TICKS_PER_TURN
 """ticks/s of one velocity unit (0.229 rpm): 15.63."""
@@ -60,8 +64,13 @@ def joint_speed(velocity: float) -> float:
 
 
 def profile_velocity(percent_per_second: float) -> int:
-    """Profile Velocity register value for a speed; at least 1, because 0 means no limit."""
-    return max(1, round(percent_per_second * TICKS_PER_PERCENT / _TICKS_PER_SECOND))
+    """Profile Velocity register value for a speed.
+
+    At least 1, because 0 means no limit, and at most Velocity Limit's 1023, because the servo
+    may refuse more (facts/mx64 B5).
+    """
+    units = round(percent_per_second * TICKS_PER_PERCENT / _TICKS_PER_SECOND)
+    return min(max(units, 1), VELOCITY_LIMIT)
 
 
 def current_of_effort(effort: float) -> int:

@@ -79,7 +79,8 @@ class Servo:
         :raises HandLost: the port has gone away.
         """
         started = self._clock.now()
-        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, block.encode(goal))
+        data = block.encode(goal)
+        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, data, with_next=True)
         sample = self._read(started + self._to_measurement)
         self.statistics.exchanges += 1
         if sample.goal_current != goal.current or sample.goal_position != goal.position:
@@ -114,9 +115,9 @@ class Servo:
         self.bus.write_item(self.id, mx64.BUS_WATCHDOG, 0)
         self.bus.write_item(self.id, mx64.BUS_WATCHDOG, period)
 
-    def hardware_error(self) -> mx64.HardwareError:
+    def hardware_error(self) -> int:
         """Hardware Error Status(70), one byte: 71 does not exist."""
-        return mx64.HardwareError(self.bus.read_item(self.id, mx64.HARDWARE_ERROR_STATUS))
+        return self.bus.read_item(self.id, mx64.HARDWARE_ERROR_STATUS)
 
     def temperature(self) -> int:
         """Present Temperature, °C."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from dexkit.drivers.ezgripper import block
 from dexkit.drivers.ezgripper.bus import ServoBus, ServoError
-from dexkit.drivers.ezgripper.scaling import CURRENT_LIMIT
+from dexkit.drivers.ezgripper.scaling import CURRENT_LIMIT, VELOCITY_LIMIT
 from dexkit.errors import HandRefused
 from dexkit.wire import mx64
 from dexkit.wire.mx64 import OperatingMode, StatusReturnLevel
@@ -37,7 +37,7 @@ EEPROM: tuple[tuple[mx64.Item, int], ...] = (
     (mx64.HOMING_OFFSET, 0),
     (mx64.RETURN_DELAY_TIME, 2),  # 4 us (D3)
     (mx64.CURRENT_LIMIT, CURRENT_LIMIT),
-    (mx64.VELOCITY_LIMIT, 1023),
+    (mx64.VELOCITY_LIMIT, VELOCITY_LIMIT),
 )
 """EEPROM items and the values that they must have (facts/mx64 D3)."""
 
