@@ -48,7 +48,7 @@ class Client:
         settings[4] = settings[5] = speed
         termios.tcsetattr(self.fd, termios.TCSANOW, settings)
 
-    def ask(self, data: bytes, timeout: float = 2.0) -> Packet | None:
+    def ask(self, data: bytes, timeout: float = 5.0) -> Packet | None:
         os.write(self.fd, data)
         parser = dxl.PacketParser()
         deadline = time.monotonic() + timeout
@@ -82,9 +82,9 @@ def wait_for(what: object, seconds: float = 5.0) -> None:
         time.sleep(0.005)
 
 
-def ping(path: str, servo_id: int = 1) -> bool:
+def ping(path: str, servo_id: int = 1, timeout: float = 5.0) -> bool:
     with client(path) as opened:
-        return opened.ask(dxl.encode(servo_id, Instruction.PING), 0.3) is not None
+        return opened.ask(dxl.encode(servo_id, Instruction.PING), timeout) is not None
 
 
 def is_cut_off(opened: Client) -> bool:
@@ -140,7 +140,7 @@ def test_two_grippers_on_one_line(tmp_path: Path) -> None:
     with emulated_ezgripper(process=True, extra=["--id=2"]) as gripper:
         assert ping(gripper.path, 1)
         assert ping(gripper.path, 2)
-        assert not ping(gripper.path, 3)
+        assert not ping(gripper.path, 3, 0.2)
 
 
 def test_stale_link_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
@@ -263,7 +263,7 @@ def test_port_survives_clients_that_come_and_go() -> None:
 )
 def test_client_must_have_the_servos_baud_rate(speed: int, answers: bool) -> None:
     with emulated_ezgripper() as gripper, client(gripper.path, speed) as opened:
-        assert (opened.ask(PING, 0.2) is not None) == answers
+        assert (opened.ask(PING, 5.0 if answers else 0.2) is not None) == answers
         assert isinstance(gripper, EmulatedThread)
         assert gripper.bus.counters.garbled == (0 if answers else len(PING))
 

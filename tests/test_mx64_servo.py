@@ -737,7 +737,7 @@ def test_any_history_keeps_the_servo_within_its_table(
     target = servo()
     for item, value in steps:
         if item is None:
-            send(target, Instruction.REBOOT, packet_id=target.id)
+            target.handle(Packet(target.id, Instruction.REBOOT))
             run(target, 0.4)
             continue
         data = (value & (1 << 8 * item.size) - 1).to_bytes(item.size, "little")

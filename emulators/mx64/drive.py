@@ -22,7 +22,13 @@ SLOW = 10
 """Heat and supply are stepped once in so many periods."""
 
 _TICK = mx64.TICK
-_PWM = 1.0 / mx64.PWM_MAX
+# plain integers: an enum's attribute look-up costs more than the sum it guards
+_CURRENT, _VELOCITY = int(OperatingMode.CURRENT), int(OperatingMode.VELOCITY)
+_PWM, _CURRENT_BASED_POSITION = (
+    int(OperatingMode.PWM),
+    int(OperatingMode.CURRENT_BASED_POSITION),
+)
+_DUTY = 1.0 / mx64.PWM_MAX
 _VELOCITY_TICKS = mx64.VELOCITY_UNIT / mx64.TICK  # ticks/s of one velocity unit
 _ACCELERATION_TICKS = mx64.ACCELERATION_UNIT / mx64.TICK  # ticks/s² of one acceleration unit
 
@@ -32,7 +38,7 @@ class Demand:
     """What the registers ask of the drive, refreshed when they change; register units."""
 
     torque: bool = False
-    mode: OperatingMode = OperatingMode.POSITION
+    mode: int = int(OperatingMode.POSITION)
     pwm: int = mx64.PWM_MAX
     current: int = 1941
     velocity: int = 0
@@ -220,7 +226,7 @@ class Drive:
     @property
     def ramped_velocity(self) -> float:
         """Velocity trajectory, ticks/s, of mode 1 or of the position profile."""
-        if self.demand.mode == OperatingMode.VELOCITY:
+        if self.demand.mode == _VELOCITY:
             return self._ramped
         return self.profile.velocity
 
@@ -259,21 +265,21 @@ class Drive:
         """Duty that the active mode asks for."""
         d = self.demand
         mode = d.mode
-        if mode == OperatingMode.CURRENT_BASED_POSITION:
+        if mode == _CURRENT_BASED_POSITION:
             units = self._pid(abs(d.current))
             return self._current_duty(units * mx64.CURRENT_UNIT)
-        if mode == OperatingMode.CURRENT:
+        if mode == _CURRENT:
             return self._current_duty(0.0 if d.stopped else d.current * mx64.CURRENT_UNIT)
-        if mode == OperatingMode.PWM:
-            return 0.0 if d.stopped else d.pwm * _PWM
-        if mode == OperatingMode.VELOCITY:
+        if mode == _PWM:
+            return 0.0 if d.stopped else d.pwm * _DUTY
+        if mode == _VELOCITY:
             error = (self._ramped - self.joint.dq / _TICK) / _VELOCITY_TICKS
             output = d.velocity_p / 128 * error
             integral = self._integral + d.velocity_i / 65536 * error
             if abs(output + integral) <= abs(d.pwm) or integral * error < 0:
                 self._integral = integral
-            return (output + self._integral) * _PWM
-        return self._pid(abs(d.pwm)) * _PWM
+            return (output + self._integral) * _DUTY
+        return self._pid(abs(d.pwm)) * _DUTY
 
     def ramp_velocity(self, acceleration: int) -> None:
         """Move the velocity trajectory of mode 1 by one period."""
@@ -290,11 +296,11 @@ class Drive:
         d = self.demand
         joint = self.joint
         if d.torque:
-            if d.mode == OperatingMode.VELOCITY:
+            if d.mode == _VELOCITY:
                 self.ramp_velocity(profile_acceleration)
             else:
                 self.profile.step(PERIOD)
-            limit = 1.0 if d.mode == OperatingMode.PWM else abs(d.pwm) * _PWM
+            limit = 1.0 if d.mode == _PWM else abs(d.pwm) * _DUTY
             duty = max(-limit, min(limit, self._control()))
             current = (duty * self.voltage - p.kt * joint.dq) / p.resistance
             self.duty = duty

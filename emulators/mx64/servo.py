@@ -44,11 +44,18 @@ _GAINS = (
     mx64.FEEDFORWARD_2ND_GAIN,
 )
 _GOALS = (mx64.GOAL_PWM, mx64.GOAL_CURRENT, mx64.GOAL_VELOCITY, mx64.GOAL_POSITION)
-_POSITION_MODES = (
-    OperatingMode.POSITION,
-    OperatingMode.EXTENDED_POSITION,
-    OperatingMode.CURRENT_BASED_POSITION,
+_POSITION_MODES = frozenset(
+    (
+        int(OperatingMode.POSITION),
+        int(OperatingMode.EXTENDED_POSITION),
+        int(OperatingMode.CURRENT_BASED_POSITION),
+    )
 )
+# plain integers: enum arithmetic is slow, and these are used a thousand times a second
+_REVERSE, _TIMED = int(DriveMode.REVERSE), int(DriveMode.TIME_BASED_PROFILE)
+_DRIVE_MODE, _OPERATING_MODE = mx64.DRIVE_MODE.address, mx64.OPERATING_MODE.address
+_TORQUE_ENABLE = mx64.TORQUE_ENABLE.address
+_HARDWARE_ERROR = mx64.HARDWARE_ERROR_STATUS.address
 # Realtime Tick(120) to Present Temperature(146): the block without a gap that changes by itself
 _PRESENT = struct.Struct("<HBBhhiiiiHB")
 _PRESENT_START = mx64.REALTIME_TICK.address
@@ -98,6 +105,7 @@ class Servo:
         self._shut_down = False
         self._overload_time = 0.0
         self._profile_acceleration = 0
+        self._watchdog = self._least_volts = self._most_volts = self._most_heat = 0
         self._after: Callable[[], None] | None = None
         self._factory_eeprom()
         self._put(mx64.ID, servo_id)
@@ -152,7 +160,7 @@ class Servo:
     @property
     def torque(self) -> bool:
         """Torque Enable(64)."""
-        return bool(self._table[mx64.TORQUE_ENABLE.address])
+        return bool(self._table[_TORQUE_ENABLE])
 
     @property
     def led(self) -> bool:
@@ -194,11 +202,10 @@ class Servo:
         if not self._powered:
             self._powered = True
             self._boot(self.firmware.boot_time)
-        watchdog = self._get(mx64.BUS_WATCHDOG)
         if (
-            watchdog > 0
+            self._watchdog > 0
             and self.torque
-            and self.now - self._last_packet > watchdog * mx64.WATCHDOG_UNIT
+            and self.now - self._last_packet > self._watchdog * mx64.WATCHDOG_UNIT
         ):
             self._put(mx64.BUS_WATCHDOG, mx64.WATCHDOG_TRIPPED)
             drive.reset_control()
@@ -208,16 +215,15 @@ class Servo:
             self._overload_time += dt
         else:
             self._overload_time = max(0.0, self._overload_time - dt)
-        error = HardwareError.NONE
+        error = 0
         if self._overload_time >= self.firmware.overload_delay:
             error |= HardwareError.OVERLOAD
-        if math.floor(drive.temperature) > self._get(mx64.TEMPERATURE_LIMIT):
+        if math.floor(drive.temperature) > self._most_heat:
             error |= HardwareError.OVERHEATING
-        volts = round(drive.voltage / mx64.VOLTAGE_UNIT)
-        if not self._get(mx64.MIN_VOLTAGE_LIMIT) <= volts <= self._get(mx64.MAX_VOLTAGE_LIMIT):
+        if not self._least_volts <= round(drive.voltage / mx64.VOLTAGE_UNIT) <= self._most_volts:
             error |= HardwareError.INPUT_VOLTAGE
         if error:
-            self.raise_error(error)
+            self.raise_error(HardwareError(error))
 
     # --- faults
 
@@ -275,18 +281,21 @@ class Servo:
     # --- registers
 
     def _get(self, item: Item) -> int:
-        return item.decode(self._table, 0)
+        # Item.decode without its checks: this is the inner loop
+        start = item.address
+        raw = self._table[start : start + item.size]
+        return int.from_bytes(raw, "little", signed=item.signed)
 
     def _put(self, item: Item, value: int) -> None:
         self._table[item.address : item.end] = item.encode(value)
 
     @property
     def _reverse(self) -> bool:
-        return bool(self._table[mx64.DRIVE_MODE.address] & DriveMode.REVERSE)
+        return bool(self._table[_DRIVE_MODE] & _REVERSE)
 
     @property
-    def _mode(self) -> OperatingMode:
-        return OperatingMode(self._table[mx64.OPERATING_MODE.address])
+    def _mode(self) -> int:
+        return self._table[_OPERATING_MODE]
 
     @property
     def _homing(self) -> int:
@@ -319,13 +328,17 @@ class Servo:
         demand.feedforward_2 = self._get(mx64.FEEDFORWARD_2ND_GAIN)
         demand.velocity_p = self._get(mx64.VELOCITY_P_GAIN)
         demand.velocity_i = self._get(mx64.VELOCITY_I_GAIN)
-        demand.stopped = self._get(mx64.BUS_WATCHDOG) == mx64.WATCHDOG_TRIPPED
+        self._watchdog = self._get(mx64.BUS_WATCHDOG)
+        demand.stopped = self._watchdog == mx64.WATCHDOG_TRIPPED
         self._profile_acceleration = self._get(mx64.PROFILE_ACCELERATION)
+        self._least_volts = self._get(mx64.MIN_VOLTAGE_LIMIT)
+        self._most_volts = self._get(mx64.MAX_VOLTAGE_LIMIT)
+        self._most_heat = self._get(mx64.TEMPERATURE_LIMIT)
 
     def _start_profile(self) -> None:
         sign = -1 if self._reverse else 1
         goal = sign * (self._get(mx64.GOAL_POSITION) - self._homing)
-        timed = bool(self._table[mx64.DRIVE_MODE.address] & DriveMode.TIME_BASED_PROFILE)
+        timed = bool(self._table[_DRIVE_MODE] & _TIMED)
         self.drive.profile.start(
             float(goal),
             self._get(mx64.PROFILE_VELOCITY),
@@ -348,7 +361,7 @@ class Servo:
         elif self.firmware.current_noise and self._powered:
             current += self._random.gauss(0.0, self.firmware.current_noise)
         moving = profile.running or abs(velocity) > self._get(mx64.MOVING_THRESHOLD)
-        status = MovingStatus.NONE
+        status = 0
         homing = self._homing
         trajectory = sign * round(profile.position) + homing
         if drive.demand.mode in _POSITION_MODES and torque:
@@ -424,7 +437,8 @@ class Servo:
         saved = self.eeprom
         for item, value in values:
             self._apply(item, value)
-        self._update_demand()
+        if len(values) > 1 or values[0][0] is not mx64.GOAL_POSITION:
+            self._update_demand()
         if self.eeprom != saved and self.on_eeprom is not None:
             self.on_eeprom()
         return ErrorNumber.NONE
@@ -490,7 +504,7 @@ class Servo:
             return -most, most
         if item is mx64.GOAL_POSITION and self._mode == OperatingMode.POSITION:
             return self._get(mx64.MIN_POSITION_LIMIT), self._get(mx64.MAX_POSITION_LIMIT)
-        timed = self._table[mx64.DRIVE_MODE.address] & DriveMode.TIME_BASED_PROFILE
+        timed = self._table[_DRIVE_MODE] & _TIMED
         if not timed:
             if item is mx64.PROFILE_ACCELERATION:
                 return low, self._get(mx64.ACCELERATION_LIMIT)
@@ -519,7 +533,6 @@ class Servo:
             self.drive.reset_control()
             self._put(mx64.GOAL_POSITION, self._position())
         elif item is mx64.GOAL_POSITION and self.torque and self._mode in _POSITION_MODES:
-            self._update_demand()
             self._start_profile()
         elif item is mx64.BUS_WATCHDOG and before == mx64.WATCHDOG_TRIPPED:
             self._update_demand()
@@ -554,7 +567,7 @@ class Servo:
 
     def error_byte(self, error: int) -> int:
         """``error`` with the alert bit if Hardware Error Status(70) is not zero."""
-        return error | (dxl.ALERT if self.hardware_error else 0)
+        return error | (dxl.ALERT if self._table[_HARDWARE_ERROR] else 0)
 
     def answers_reads(self, *, sync: bool = False) -> bool:
         """Whether Status Return Level(68) lets it answer a read."""
