@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dexkit.traces import open_trace, sample_path
+from tests.dds_helpers import free_domain
+from tests.trace_helpers import (
+    CMD,
+    CMD_TYPE,
+    STATE,
+    STATE_TYPE,
+    cmd,
+    mcap_bytes,
+    rows,
+    state,
+    write,
+)
+
+RIGHT = "rt/dex1/right/cmd"
+
+
+def run(*args: object, timeout: float = 60) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", "from dexkit.cli import main; main()", *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+
+
+@contextmanager
+def running(*args: object) -> Iterator[subprocess.Popen[str]]:
+    """A command in another process, from its ready line on."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from dexkit.cli import main; main()", *map(str, args)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        while line and not line.startswith("ready:"):
+            line = process.stdout.readline()
+        if not line:
+            pytest.fail(f"{args[0]} did not start: {process.communicate()[1]}")
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def interrupt(process: subprocess.Popen[str], signum: int = signal.SIGINT) -> tuple[str, str]:
+    process.send_signal(signum)
+    return process.communicate(timeout=20)
+
+
+# -- info ------------------------------------------------------------------------------------------
+
+
+def test_info_prints_topics_rates_and_gaps() -> None:
+    done = run("info", sample_path("dex1_hand_dropout"))
+    assert done.returncode == 0
+    (line,) = [x for x in done.stdout.splitlines() if x.startswith("rt/dex1/left/state")]
+    assert line.split()[1:] == (
+        ["8,998", "461.5", "2.00", "2.28", "1502.3", "0.00", "unitree_go", "MotorStates_", "omgidl"]
+    )
+    assert "controller_commit" in done.stdout
+    assert "complete" in done.stdout
+
+
+def test_info_as_json() -> None:
+    done = run("info", "--json", sample_path("dex3_pinch"))
+    data = json.loads(done.stdout)
+    assert data["messages"] == 23165
+    assert data["truncated"] is False
+    assert data["duration_s"] == pytest.approx(19.494, abs=0.001)
+    topics = {row["topic"]: row for row in data["topics"]}
+    assert topics["rt/dex3/left/cmd"]["mean_hz"] == pytest.approx(99.0, abs=0.05)
+    assert topics["rt/dex3/left/cmd"]["type"] == "unitree_hg::msg::dds_::HandCmd_"
+    assert {e["reliability"] for e in data["endpoints"] if e["kind"] == "writer"} == {"reliable"}
+
+
+def test_info_says_when_a_file_is_unfinished(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", mcap_bytes(rows(60))[:-700])
+    done = run("info", path)
+    assert done.returncode == 0
+    assert "unfinished" in done.stdout
+    assert json.loads(run("info", "--json", path).stdout)["truncated"] is True
+
+
+def test_info_refuses_what_is_no_recording(tmp_path: Path) -> None:
+    done = run("info", write(tmp_path / "a.mcap", b"SQLite format 3\0" + bytes(50)))
+    assert done.returncode == 2
+    assert "not an mcap file" in done.stderr
+    assert "convert" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# -- record and replay, between processes ----------------------------------------------------------
+
+
+def test_a_replayed_session_is_recorded_as_it_was(tmp_path: Path) -> None:
+    """Sample -> replay (process 1) -> DDS -> record (process 2): same bytes, same timing.
+
+    Tolerances are for a busy machine: the median gap within 0.5 ms.
+    """
+    domain = free_domain()
+    # 2 s out of the middle, so that the test is short
+    source = open_trace(sample_path("dex1_pick_place"))
+    start = source.first_ns + 3_000_000_000
+    part = [
+        (m.topic, m.log_time_ns, m.publish_time_ns, m.data)
+        for m in source.messages([CMD, RIGHT])
+        if start <= m.log_time_ns < start + 2_000_000_000
+    ]
+    clip = write(tmp_path / "clip.mcap", mcap_bytes(part, types={CMD: CMD_TYPE, RIGHT: CMD_TYPE}))
+    out = tmp_path / "out.mcap"
+    options = ("--domain", domain)
+    with running("record", out, "--topic", "/dex1/left/cmd", "--topic", RIGHT, *options) as rec:
+        done = run("replay", clip, *options)
+        assert done.returncode == 0, done.stderr
+        stdout, stderr = interrupt(rec)
+        assert rec.returncode == 0, stderr
+    assert f"sent {len(part)} messages" in done.stdout
+    assert f"{len(part)} messages" in stdout
+    assert "0 dropped" in stdout
+    trace = open_trace(out)
+    assert (trace.truncated, trace.warnings) == (False, [])
+    original = open_trace(clip).load()
+    for topic, samples in trace.load().items():
+        assert samples.payloads == original[topic].payloads
+        gaps = np.diff(samples.log_time_ns) / 1e6
+        assert np.median(gaps) == pytest.approx(
+            np.median(np.diff(original[topic].log_time_ns)) / 1e6, abs=0.5
+        )
+        lag = samples.log_time_ns - samples.publish_time_ns
+        assert (lag > 0).all()
+        assert np.median(lag) < 50e6
+    for channel in trace.channels:
+        assert channel.schema_encoding == "ros2msg"
+        assert channel.metadata["qos.reliability"] == "reliable"
+        assert channel.metadata["dds.domain"] == str(domain)
+    writers = {e.topic: e for e in trace.endpoints if e.kind == "writer"}
+    assert sorted(writers) == [CMD, RIGHT]
+    assert (writers[CMD].reliability, writers[CMD].history) == ("reliable", "KeepLast(depth=1)")
+    assert writers[CMD].type_name == CMD_TYPE
+
+
+def test_record_finds_topics_that_appear_later_and_ends_on_sigterm(tmp_path: Path) -> None:
+    from dexkit.dds import DdsNode
+
+    domain = free_domain()
+    out = tmp_path / "out.mcap"
+    with running("record", out, "--domain", domain) as rec, DdsNode(domain) as node:
+        for topic, kind, data in ((STATE, STATE_TYPE, state(1.0)), ("rt/any", CMD_TYPE, cmd(2.0))):
+            writer = node.writer(topic, kind)
+            assert writer.wait_matched(20)
+            for _ in range(10):
+                writer.write_raw(data)
+                time.sleep(0.005)
+        _, stderr = interrupt(rec, signal.SIGTERM)
+        assert rec.returncode == 0, stderr
+    trace = open_trace(out)
+    assert trace.topics == ["rt/any", STATE]
+    assert trace.samples("rt/any").payloads[-1] == cmd(2.0)
+    assert len(trace.samples(STATE)) == 10
+
+
+def test_a_recorder_killed_leaves_what_it_had(tmp_path: Path) -> None:
+    from dexkit.dds import DdsNode
+
+    domain = free_domain()
+    out = tmp_path / "out.mcap"
+    with running("record", out, "--domain", domain) as rec, DdsNode(domain) as node:
+        writer = node.writer(STATE, STATE_TYPE)
+        assert writer.wait_matched(20)
+        begin = time.monotonic()
+        while time.monotonic() - begin < 1.2:
+            writer.write_raw(state(time.monotonic() - begin))
+            time.sleep(0.002)
+        rec.kill()
+        rec.wait(10)
+        end = time.time_ns()
+    trace = open_trace(out)
+    assert trace.truncated
+    # half a second by promise, and some for the time between the kill and the clock here
+    assert end - trace.last_ns < 0.7e9
+    assert trace.endpoints[0].type_name == STATE_TYPE
+
+
+def test_record_says_what_it_saw_when_nothing_came(tmp_path: Path) -> None:
+    from dexkit.dds import DdsNode
+
+    domain = free_domain()
+    out = tmp_path / "out.mcap"
+    with DdsNode(domain) as node:
+        node.writer(STATE, STATE_TYPE)
+        done = run("record", out, "--topic", CMD, "--domain", domain, "--duration", "1")
+    assert done.returncode == 1
+    assert f"domain {domain}, lo" in done.stderr
+    assert CMD in done.stderr
+    assert f"{STATE} ({STATE_TYPE})" in done.stderr
+    assert not out.exists()
+
+
+def test_record_keeps_an_existing_file(tmp_path: Path) -> None:
+    out = write(tmp_path / "out.mcap", b"precious")
+    done = run("record", out, "--duration", "1", "--domain", free_domain())
+    assert done.returncode == 2
+    assert "--force" in done.stderr
+    assert out.read_bytes() == b"precious"
+
+
+def test_record_on_no_such_interface(tmp_path: Path) -> None:
+    done = run("record", tmp_path / "o.mcap", "--interface", "nope0", "--domain", free_domain())
+    assert done.returncode == 2
+    assert "nope0" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_replay_names_the_topics_that_nobody_subscribes() -> None:
+    done = run("replay", sample_path("dex1_pick_place"), "--wait", "0.3", "--domain", free_domain())
+    assert done.returncode == 1
+    assert f"nobody subscribes {CMD}, {RIGHT}" in done.stderr
+    assert "dexkit serve" in done.stderr
+
+
+def test_replay_refuses_company_on_its_topics() -> None:
+    from dexkit.dds import DdsNode
+
+    domain = free_domain()
+    sample = sample_path("dex1_pick_place")
+    with DdsNode(domain) as node:
+        node.writer(RIGHT, CMD_TYPE)
+        refused = run("replay", sample, "--no-wait", "--domain", domain)
+        assert refused.returncode == 1
+        assert "somebody else publishes" in refused.stderr
+        assert f"{RIGHT} (" in refused.stderr
+        forced = run("replay", sample, "--no-wait", "--force", "--speed", "40", "--domain", domain)
+    assert forced.returncode == 0, forced.stderr
+    assert "sent 8052 messages" in forced.stdout
+
+
+@pytest.mark.parametrize(("options", "code"), [((), 130), (("--loop",), 0)])
+def test_an_interrupted_replay_ends_cleanly(options: tuple[str, ...], code: int) -> None:
+    with running(
+        "replay", sample_path("dex1_pick_place"), "--no-wait", *options, "--domain", free_domain()
+    ) as process:
+        stdout, stderr = interrupt(process)
+    assert process.returncode == code
+    assert "sent" in stdout
+    assert stderr == ""
+
+
+def test_replay_refuses_a_type_it_does_not_know(tmp_path: Path) -> None:
+    data = mcap_bytes(rows(4), schema_text="uint8 other\n", schema_name="other_msgs/msg/Thing")
+    done = run("replay", write(tmp_path / "a.mcap", data), "--no-wait", "--domain", free_domain())
+    assert done.returncode == 2
+    assert "does not know the type" in done.stderr
