@@ -252,8 +252,10 @@ class _Cyclone:
             # a prototype of our own: the wheel's classes set argtypes on the shared objects
             prototype = ctypes.CFUNCTYPE(ctypes.c_int32, *arguments)
             setattr(self, name, prototype((name, self.lib)))
-        # nothing on stderr; what goes wrong is asked for when it is needed (_trace)
-        self.lib.dds_set_log_mask(ctypes.c_uint32(0))
+        # Nothing on stderr; what goes wrong is asked for when it is needed (_why). The sink has
+        # to be a C function, since it is called by threads that hold CycloneDDS's locks, and one
+        # without effect: abs() of the unused first argument.
+        self.lib.dds_set_log_sink(ctypes.CDLL(None).abs, None)
         self.data_available = int(core.DDSStatus.DataAvailable)
         self.publication_matched = int(core.DDSStatus.PublicationMatched)
         self.subscription_matched = int(core.DDSStatus.SubscriptionMatched)
@@ -752,8 +754,8 @@ class DdsNode:
         self.interface = interface
         self.discovery = Discovery(self)
         self._closed = False
-        self._closing = threading.Lock()
-        # held while callbacks run, so that closing an endpoint waits for them
+        # Held while callbacks run and while endpoints come and go, so that closing waits for
+        # callbacks; re-entrant, so that a callback may close its own reader.
         self._dispatching = threading.RLock()
         self._changed = threading.Condition()
         self._handles: dict[int, _Handle] = {}
@@ -855,30 +857,29 @@ class DdsNode:
 
     def close(self) -> None:
         """Delete everything of this node. No callback runs after this. May be called twice."""
-        with self._closing:
+        with self._dispatching:
             if self._closed:
                 return
             self._closed = True
-            cyclone = _cyclone()
-            cyclone.dds_waitset_set_trigger(self._waitset, True)
-            if threading.current_thread() is not self._thread:
-                self._thread.join()
-            with self._dispatching:
-                handles = list(self._handles.values())
-                self._handles.clear()
-            children = [h._entity for h in handles]
-            for handle in handles:
-                self._mark_closed(handle)
-            for reader in self._builtin:
-                children += [reader, reader._next_condition]
-            children += self._topics.values()
-            for entity in children:
-                cyclone.forget(entity)  # they go with the participant
-            with _domains_lock:
-                cyclone.delete(self._participant)
-                _release_domain(self.domain)
-            self._topics.clear()
-            _nodes.discard(self)
+            handles = list(self._handles.values())
+            self._handles.clear()
+        cyclone = _cyclone()
+        cyclone.dds_waitset_set_trigger(self._waitset, True)
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+        children = [h._entity for h in handles]
+        for handle in handles:
+            self._mark_closed(handle)
+        for reader in self._builtin:
+            children += [reader, reader._next_condition]
+        children += self._topics.values()
+        for entity in children:
+            cyclone.forget(entity)  # they go with the participant
+        with _domains_lock:
+            cyclone.delete(self._participant)
+            _release_domain(self.domain)
+        self._topics.clear()
+        _nodes.discard(self)
         self._notify()
 
     def _topic(self, name: str, kind: MessageType) -> Any:
@@ -891,7 +892,7 @@ class DdsNode:
 
     def _add(self, handle: _Handle, factory: Any, mask: int) -> None:
         cyclone = _cyclone()
-        with self._closing:
+        with self._dispatching:
             if self._closed:
                 raise DdsError(f"{self!r} is closed")
             try:
@@ -902,23 +903,21 @@ class DdsNode:
                     f"cannot make a {type(handle).__name__.lower()} on {handle.topic!r}: {error}"
                 ) from error
             handle._ref = handle._entity._ref
+            handle._token = self._next_token
+            self._next_token += 1
+            self._handles[handle._token] = handle
             cyclone.dds_set_status_mask(handle._ref, mask)
-            with self._dispatching:
-                handle._token = self._next_token
-                self._next_token += 1
-                self._handles[handle._token] = handle
             cyclone.dds_waitset_attach(self._waitset, handle._ref, handle._token)
 
     def _drop(self, handle: _Handle) -> None:
-        with self._closing:
+        with self._dispatching:  # waits for a callback that runs now
             if self._closed or handle.closed:
                 return
             cyclone = _cyclone()
-            with self._dispatching:  # waits for a callback that runs now
-                self._handles.pop(handle._token, None)
-                cyclone.dds_waitset_detach(self._waitset, handle._ref)
-                entity = handle._entity
-                self._mark_closed(handle)
+            del self._handles[handle._token]
+            cyclone.dds_waitset_detach(self._waitset, handle._ref)
+            entity = handle._entity
+            self._mark_closed(handle)
             cyclone.delete(entity)
         self._notify()
 

@@ -7,11 +7,12 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
-from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, interfaces
-from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError
+from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, interfaces, type_hash
+from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError, WireError
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until
@@ -73,6 +74,26 @@ def test_on_data_wakes_once_per_arrival_and_never_after_close(dds_node: DdsNode)
     with pytest.raises(DdsError, match="closed"):
         reader.take()
     assert not arrived.acquire(timeout=0.05)
+
+
+def test_a_callback_may_close_its_reader_and_its_node(dds_domain: int) -> None:
+    done = threading.Event()
+    with DdsNode(dds_domain) as other:
+        node = DdsNode(dds_domain)
+
+        def close() -> None:
+            reader.close()
+            node.close()
+            done.set()
+
+        reader = node.reader("rt/t11", STATES, on_data=close)
+        writer = other.writer("rt/t11", STATES)
+        assert reader.wait_matched(10)
+        assert writer.wait_matched(10)
+        writer.write(MotorStates_([]))
+        assert done.wait(10)
+        assert node.closed
+        node.close()
 
 
 def test_a_failing_callback_is_logged_and_the_node_lives_on(
@@ -214,6 +235,135 @@ def test_bad_use_is_refused(dds_node: DdsNode) -> None:
         dds_node.reader("no spaces allowed", CMDS)
 
 
+def test_bytes_that_are_no_message_travel_and_raise_when_decoded(dds_node: DdsNode) -> None:
+    reader = dds_node.reader("rt/t12", CMDS)
+    writer = dds_node.writer("rt/t12", CMDS)
+    assert writer.wait_matched(10)
+    writer.write_raw(b"\x00\x01\x00\x00\xff\xff\xff\xff")
+    (sample,) = take_until(reader, bool)
+    with pytest.raises(WireError):
+        _ = sample.message
+
+
+def _run(script: str, *, quiet: bool = True) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr if quiet else "") == (0, "")
+    return done.stdout
+
+
+def test_a_domain_that_other_code_configured_is_used_and_kept() -> None:
+    script = f"""
+import logging
+from cyclonedds.domain import Domain, DomainParticipant
+from dexkit.dds import DdsNode, _config
+records = []
+logging.getLogger("dexkit.dds").warning = lambda *args: records.append(args)
+foreign = Domain({free_domain()}, _config("lo"))
+for _ in range(2):
+    with DdsNode(foreign._id) as node, DdsNode(foreign._id) as other:
+        writer = node.writer("rt/x", "{CMDS}")
+        reader = other.reader("rt/x", "{CMDS}")
+        print(writer.wait_matched(10), len(records))
+participant = DomainParticipant(foreign._id)
+print(len(foreign.get_participants()))
+"""
+    assert _run(script, quiet=False) == "True 1\nTrue 2\n1\n"
+
+
+def test_participants_of_other_code_outlive_our_domain() -> None:
+    script = f"""
+from cyclonedds.domain import DomainParticipant
+from dexkit.dds import DdsNode
+number = {free_domain()}
+node = DdsNode(number)
+theirs = DomainParticipant(number)
+node.close()
+print(theirs.domain_id == number)
+with DdsNode(number) as node:
+    print(node.writer("rt/x", "{CMDS}").matched)
+"""
+    assert _run(script) == "True\n0\n"
+
+
+def test_a_peer_with_an_older_layout_is_seen_and_told_apart(dds_node: DdsNode) -> None:
+    """HandState_ of 2024-08 (facts/unitree-dex A.3) has the same name and does not match."""
+    name = "unitree_hg::msg::dds_::HandCmd_"
+    script = f"""
+import sys
+from cyclonedds.idl import make_idl_struct, annotations, types
+from dexkit import dds
+old = make_idl_struct(
+    "HandCmd_", "unitree_hg.msg.dds_.HandCmd_",
+    dict(motor_cmd=types.sequence[dds.cyclone_type("unitree_hg::msg::dds_::MotorCmd_")]),
+)
+annotations.final(old)
+annotations.autoid("sequential")(old)
+dds.cyclone_type = lambda name: old
+with dds.DdsNode({dds_node.domain}) as node:
+    writer = node.writer("rt/t13", "{name}")
+    print("up", flush=True)
+    sys.stdin.read()
+    print(writer.matched)
+"""
+    reader = dds_node.reader("rt/t13", name)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert dds_node.discovery.wait(
+            lambda found: any(e.topic == "rt/t13" and not e.own for e in found), 30
+        )
+        (theirs,) = [e for e in dds_node.endpoints() if e.topic == "rt/t13" and not e.own]
+        assert theirs.type_name == name
+        assert theirs.type_hash not in ("", type_hash(name))
+        assert not reader.wait_matched(0.2)
+    finally:
+        output, _ = process.communicate(timeout=30)
+    assert output == "up\n0\n"
+
+
+def test_without_cyclonedds_the_import_works_and_use_says_what_to_do() -> None:
+    script = """
+import sys
+sys.modules["cyclonedds"] = None
+import dexkit.dds
+from dexkit.errors import DdsUnavailable
+try:
+    dexkit.dds.DdsNode(1)
+except DdsUnavailable as error:
+    print(isinstance(error, ImportError), "3.10" in error.hint)
+"""
+    assert _run(script) == "True True\n"
+    assert _run("import sys, dexkit.dds; print('cyclonedds' in sys.modules)") == "False\n"
+
+
+def test_cyclonedds_11_is_refused() -> None:
+    script = """
+from importlib import metadata
+metadata.version = lambda name: "11.0.1"
+from dexkit.dds import DdsNode
+try:
+    DdsNode(1)
+except ImportError as error:
+    print(error)
+"""
+    assert _run(script) == "CycloneDDS 11.0.1 is installed, dexkit needs 0.10.x\n"
+
+
+def test_the_log_goes_to_a_file_when_asked(tmp_path: Path) -> None:
+    path = tmp_path / "dds.log"
+    script = f"""
+import os
+os.environ["DEXKIT_DDS_LOG"] = {str(path)!r}
+from dexkit.dds import DdsNode
+DdsNode({free_domain()}).close()
+"""
+    assert _run(script) == ""
+    assert "lo" in path.read_text()
+
+
 def test_nothing_reaches_stderr_and_exit_without_close_is_clean() -> None:
     script = (
         "from dexkit.dds import DdsNode\n"
@@ -221,7 +371,4 @@ def test_nothing_reaches_stderr_and_exit_without_close_is_clean() -> None:
         f"r = node.reader('rt/x', '{CMDS}'); w = node.writer('rt/x', '{CMDS}')\n"
         "print(w.wait_matched(10))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
+    assert _run(script) == "True\n"

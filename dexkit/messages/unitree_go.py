@@ -23,6 +23,9 @@ from dexkit.messages.codec import (
 )
 from dexkit.messages.layout import MAX_ELEMENTS
 
+# blank objects, filled by plain assignments: faster than calling the constructor
+new = object.__new__
+
 __all__ = [
     "MotorCmd_",
     "MotorCmds_",
@@ -134,10 +137,17 @@ def decode_MotorCmds_(data: Buffer, big: bool) -> MotorCmds_:
     end = at + 36 * v[0]
     if end > len(data) or v[0] > MAX_ELEMENTS:
         check_count("MotorCmds_.cmds", v[0], end, len(data))
-    cmds = [
-        MotorCmd_(e0[0], e0[1], e0[2], e0[3], e0[4], e0[5], e0[6:9])
-        for e0 in _MotorCmds_cmds[big].iter_unpack(data[at:end])
-    ]
+    cmds = []
+    for x0, x1, x2, x3, x4, x5, x6, x7, x8 in _MotorCmds_cmds[big].iter_unpack(data[at:end]):
+        e0 = new(MotorCmd_)
+        e0.mode = x0
+        e0.q = x1
+        e0.dq = x2
+        e0.tau = x3
+        e0.kp = x4
+        e0.kd = x5
+        e0.reserve = (x6, x7, x8)
+        cmds.append(e0)
     at = end
     if at != len(data):
         check_end("MotorCmds_", data, at)
@@ -191,10 +201,21 @@ def decode_MotorStates_(data: Buffer, big: bool) -> MotorStates_:
     end = at + 48 * v[0]
     if end > len(data) or v[0] > MAX_ELEMENTS:
         check_count("MotorStates_.states", v[0], end, len(data))
-    states = [
-        MotorState_(e0[0], e0[1], e0[2], e0[3], e0[4], e0[5], e0[6], e0[7], e0[8], e0[9], e0[10:12])
-        for e0 in _MotorStates_states[big].iter_unpack(data[at:end])
-    ]
+    states = []
+    for x0, x1, x2, x3, x4, x5, x6, x7, x8, x9, x10, x11 in _MotorStates_states[big].iter_unpack(data[at:end]):
+        e0 = new(MotorState_)
+        e0.mode = x0
+        e0.q = x1
+        e0.dq = x2
+        e0.ddq = x3
+        e0.tau_est = x4
+        e0.q_raw = x5
+        e0.dq_raw = x6
+        e0.ddq_raw = x7
+        e0.temperature = x8
+        e0.lost = x9
+        e0.reserve = (x10, x11)
+        states.append(e0)
     at = end
     if at != len(data):
         check_end("MotorStates_", data, at)

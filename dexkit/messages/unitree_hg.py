@@ -23,6 +23,9 @@ from dexkit.messages.codec import (
 )
 from dexkit.messages.layout import MAX_ELEMENTS
 
+# blank objects, filled by plain assignments: faster than calling the constructor
+new = object.__new__
+
 __all__ = [
     "HandCmd_",
     "HandState_",
@@ -170,10 +173,17 @@ def decode_HandCmd_(data: Buffer, big: bool) -> HandCmd_:
     end = at + 28 * v[0]
     if end > len(data) or v[0] > MAX_ELEMENTS:
         check_count("HandCmd_.motor_cmd", v[0], end, len(data))
-    motor_cmd = [
-        MotorCmd_(e0[0], e0[1], e0[2], e0[3], e0[4], e0[5], e0[6])
-        for e0 in _HandCmd_motor_cmd[big].iter_unpack(data[at:end])
-    ]
+    motor_cmd = []
+    for x0, x1, x2, x3, x4, x5, x6 in _HandCmd_motor_cmd[big].iter_unpack(data[at:end]):
+        e0 = new(MotorCmd_)
+        e0.mode = x0
+        e0.q = x1
+        e0.dq = x2
+        e0.tau = x3
+        e0.kp = x4
+        e0.kd = x5
+        e0.reserve = x6
+        motor_cmd.append(e0)
     at = end
     if len(data) < at + 16:
         raise truncated("HandCmd_", at + 16, len(data))
@@ -286,10 +296,20 @@ def decode_HandState_(data: Buffer, big: bool) -> HandState_:
     end = at + 56 * v[0]
     if end > len(data) or v[0] > MAX_ELEMENTS:
         check_count("HandState_.motor_state", v[0], end, len(data))
-    motor_state = [
-        MotorState_(e0[0], e0[1], e0[2], e0[3], e0[4], e0[5:7], e0[7], e0[8:10], e0[10], e0[11:15])
-        for e0 in _HandState_motor_state[big].iter_unpack(data[at:end])
-    ]
+    motor_state = []
+    for x0, x1, x2, x3, x4, x5, x6, x7, x8, x9, x10, x11, x12, x13, x14 in _HandState_motor_state[big].iter_unpack(data[at:end]):
+        e0 = new(MotorState_)
+        e0.mode = x0
+        e0.q = x1
+        e0.dq = x2
+        e0.ddq = x3
+        e0.tau_est = x4
+        e0.temperature = (x5, x6)
+        e0.vol = x7
+        e0.sensor = (x8, x9)
+        e0.motorstate = x10
+        e0.reserve = (x11, x12, x13, x14)
+        motor_state.append(e0)
     at = end
     if len(data) < at + 4:
         raise truncated("HandState_", at + 4, len(data))
@@ -298,10 +318,14 @@ def decode_HandState_(data: Buffer, big: bool) -> HandState_:
     end = at + 104 * v[0]
     if end > len(data) or v[0] > MAX_ELEMENTS:
         check_count("HandState_.press_sensor_state", v[0], end, len(data))
-    press_sensor_state = [
-        PressSensorState_(e1[0:12], e1[12:24], e1[24], e1[25])
-        for e1 in _HandState_press_sensor_state[big].iter_unpack(data[at:end])
-    ]
+    press_sensor_state = []
+    for x0, x1, x2, x3, x4, x5, x6, x7, x8, x9, x10, x11, x12, x13, x14, x15, x16, x17, x18, x19, x20, x21, x22, x23, x24, x25 in _HandState_press_sensor_state[big].iter_unpack(data[at:end]):
+        e1 = new(PressSensorState_)
+        e1.pressure = (x0, x1, x2, x3, x4, x5, x6, x7, x8, x9, x10, x11)
+        e1.temperature = (x12, x13, x14, x15, x16, x17, x18, x19, x20, x21, x22, x23)
+        e1.lost = x24
+        e1.reserve = x25
+        press_sensor_state.append(e1)
     at = end
     if len(data) < at + 88:
         raise truncated("HandState_", at + 88, len(data))
