@@ -191,42 +191,17 @@ def test_a_bad_schema_is_unsupported(name: str) -> None:
         schemas.parse(encoding, "pkg/msg/T", text)
 
 
+TOKENS = (
+    *("struct", "module", "typedef", "const", "sequence", "long", "unsigned", "uint8", "T", "3"),
+    *("{", "}", ";", "<", ">", "[", "]", "@", "(", ")", "=", ",", "::", "#", '"', "\n"),
+    *("MSG:", "pkg/T", "float32[]"),
+)
+
+
 @given(
     st.sampled_from(schemas.ENCODINGS),
     st.lists(
-        st.sampled_from(
-            [
-                "struct",
-                "module",
-                "T",
-                "{",
-                "}",
-                ";",
-                "<",
-                ">",
-                "sequence",
-                "long",
-                "unsigned",
-                "[",
-                "]",
-                "3",
-                "@",
-                "(",
-                ")",
-                "typedef",
-                "const",
-                "=",
-                "uint8",
-                "MSG:",
-                "pkg/T",
-                ",",
-                "::",
-                "float32[]",
-                "#",
-                '"',
-                "\n",
-            ]
-        ),
+        st.sampled_from(TOKENS),
         max_size=40,
     ).map(" ".join)
     | st.text(max_size=80),

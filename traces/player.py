@@ -22,7 +22,7 @@ from dexkit.traces.reader import Trace, TraceMessage
 __all__ = ["PlayStats", "Player"]
 
 #: Seconds before a deadline at which waiting turns into polling the clock.
-SPIN = 0.0005
+SPIN = 0.0002
 # Seconds of one sleep, so that a stop is noticed within a long gap.
 _NAP = 0.05
 # Errors kept for the percentiles; older ones of a long loop are forgotten.
@@ -114,6 +114,11 @@ class Player:
     def duration(self) -> float:
         """Seconds of one pass at the chosen speed."""
         return self._offsets[-1]
+
+    @property
+    def offsets(self) -> list[float]:
+        """Deadline of each message of a pass, seconds from its start."""
+        return list(self._offsets)
 
     def play(
         self,
