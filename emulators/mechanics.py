@@ -25,7 +25,7 @@ class Wall:
     :param push: +1 if it pushes the joint toward larger q (a lower stop, or an object between
         fingers that close toward smaller q), -1 if toward smaller q.
     :param stiffness: N·m/rad.
-    :param damping: N·m·s/rad, while the joint moves into it.
+    :param damping: N·m·s/rad.
     """
 
     q: float
@@ -85,8 +85,10 @@ class Joint:
         for wall in self.walls:
             depth = (wall.q - q) * wall.push
             if depth > 0.0:
-                contact += wall.push * wall.stiffness * depth
-                if velocity * wall.push < 0.0:
+                force = wall.stiffness * depth
+                contact += wall.push * force
+                # out of the wall, damping takes from its push but never pulls
+                if wall.damping * velocity * wall.push < force:
                     damping += wall.damping
         self.contact = contact
         if self.locked:

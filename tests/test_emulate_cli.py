@@ -157,6 +157,30 @@ def test_stale_link_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
         pass
 
 
+def test_a_link_to_something_that_exists_is_not_taken(tmp_path: Path) -> None:
+    link = tmp_path / "gripper"
+    with emulated_ezgripper(link=link) as gripper:
+        with pytest.raises(EmulatorError) as caught, emulated_ezgripper(link=link):
+            pass
+        assert "another emulator" in caught.value.hint
+        assert ping(gripper.path)
+    link.symlink_to(tmp_path)
+    with pytest.raises(EmulatorError), emulated_ezgripper(link=link):
+        pass
+    assert link.is_symlink()
+
+
+def test_process_ends_with_its_parent(tmp_path: Path) -> None:
+    """Its input ends when the program that started it is killed."""
+    with emulated_ezgripper(process=True, link=tmp_path / "g") as gripper:
+        assert isinstance(gripper, EmulatedProcess)
+        assert gripper.process.stdin is not None
+        gripper.process.stdin.close()
+        assert gripper.process.wait(10) == 0
+        gripper.process.stdin = None
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_somebody_elses_link_is_left_alone(tmp_path: Path) -> None:
     link = tmp_path / "gripper"
     with emulated_ezgripper(link=link):
@@ -325,6 +349,9 @@ def test_faults_can_be_injected(process: bool) -> None:
         wait_for(alerts)
         with pytest.raises(UsageError):
             gripper.inject("fire")
+    if isinstance(gripper, EmulatedProcess):
+        assert (gripper.process.returncode, gripper.errors) == (0, "")
+        assert gripper.output.startswith("stopped: ")
 
 
 def test_protocol_1_firmware(tmp_path: Path) -> None:

@@ -122,6 +122,20 @@ def test_more_current_squeezes_harder() -> None:
     assert openings[0] > openings[1] > openings[2]
 
 
+def test_squeezed_object_pushes_back_when_torque_goes() -> None:
+    target = servo(object_pct=40.0, start=80.0)
+    ready(target, EZ)
+    write(target, mx64.GOAL_CURRENT, 640)
+    write(target, mx64.GOAL_POSITION, 1510)
+    run(target, 1.5)
+    squeezed = target.drive.opening
+    write(target, mx64.TORQUE_ENABLE, 0)
+    run(target, 5.0)
+    # until friction holds what is left
+    assert squeezed + 2 < target.drive.opening < 42
+    assert target.drive.resting
+
+
 def test_springs_do_not_back_drive_the_gears() -> None:
     target = servo(start=10.0)
     run(target, 5.0)

@@ -181,6 +181,14 @@ def test_profile_velocity_above_the_limit_can_be_allowed() -> None:
     assert write(target, mx64.PROFILE_VELOCITY, 500) == 0
 
 
+def test_profile_times_have_their_own_limit() -> None:
+    target = servo()
+    write(target, mx64.DRIVE_MODE, mx64.DriveMode.TIME_BASED_PROFILE)
+    for item in (mx64.PROFILE_VELOCITY, mx64.PROFILE_ACCELERATION):
+        assert write(target, item, mx64.PROFILE_TIME_MAX) == 0
+        assert write(target, item, mx64.PROFILE_TIME_MAX + 1) == ErrorNumber.DATA_LIMIT
+
+
 def test_one_write_can_span_items() -> None:
     target = servo()
     ready(target, OperatingMode.CURRENT_BASED_POSITION)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.common import stop_on_signals
+from dexkit.cli.common import StopRequest, stop_on_signals
 from dexkit.clock import RealClock
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.wire import mx64
@@ -75,7 +75,11 @@ def command() -> None:
     metavar="SPEC",
     help="Have a fault, e.g. overload@3s, drop:p=0.05, unplug@5s:for=2s; may be repeated.",
 )
-@click.option("--faults-from-stdin", is_flag=True, help="Also take faults as lines of input.")
+@click.option(
+    "--faults-from-stdin",
+    is_flag=True,
+    help="Also take faults as lines of input, and stop at its end.",
+)
 @click.option("--seed", type=int, default=0, help="Of the faults' chance and of noise.")
 @click.option(
     "--eeprom",
@@ -152,7 +156,7 @@ def emulate_mx64(
             if faults_from_stdin:
                 threading.Thread(
                     target=_read_faults,
-                    args=(lambda spec: port.inject(parse_fault(spec)),),
+                    args=(lambda spec: port.inject(parse_fault(spec)), request),
                     daemon=True,
                 ).start()
             port.start()
@@ -171,13 +175,19 @@ def emulate_mx64(
         click.echo(f"stopped: {summary}")
 
 
-def _read_faults(inject: Callable[[str], None]) -> None:
-    for line in sys.stdin:
-        if line.strip():
+def _read_faults(inject: Callable[[str], None], request: StopRequest) -> None:
+    # not sys.stdin: a daemon thread inside a buffered reader can crash the interpreter's exit
+    pending = b""
+    while data := os.read(0, 4096):
+        *lines, pending = (pending + data).split(b"\n")
+        for line in lines:
+            if not line.strip():
+                continue
             try:
-                inject(line)
+                inject(line.decode(errors="replace"))
             except DexkitError as error:
                 click.echo(f"error: {error.message}", err=True)
+    request.set()
 
 
 class _EepromFile:

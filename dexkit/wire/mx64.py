@@ -42,6 +42,9 @@ WATCHDOG_TRIPPED = -1
 POSITION_SPAN = 1_048_575
 """Goal and present position reach this many ticks either way in modes 4 and 5 (256 turns)."""
 
+PROFILE_TIME_MAX = 32737
+"""Largest Profile Velocity and Acceleration in ms, with Drive Mode's time-based profile."""
+
 BAUD_RATES: dict[int, int] = {
     0: 9_600,
     1: 57_600,

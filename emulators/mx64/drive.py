@@ -157,7 +157,7 @@ class Drive:
             Wall(stroke, -1, body.open_stiffness, 1.0),
         ]
         if body.object_pct is not None:
-            walls.append(Wall(stroke * body.object_pct / 100, +1, body.object_stiffness, 0.5))
+            walls.append(Wall(stroke * body.object_pct / 100, +1, body.object_stiffness, 1.0))
         self.joint = Joint(
             inertia=physics.inertia + body.inertia,
             coulomb=physics.coulomb + body.coulomb,
@@ -180,6 +180,7 @@ class Drive:
         self._ramped = 0.0  # velocity trajectory of mode 1, ticks/s
         self._heat = 0.0  # J since the last slow step
         self._phase = 0
+        self._settled = False
         self.counter = 0
         self.fold()
 
@@ -233,7 +234,7 @@ class Drive:
     @property
     def resting(self) -> bool:
         """Nothing would change but the temperature."""
-        return not self.demand.torque and self.joint.dq == 0.0 and self.current == 0.0
+        return self._settled and not self.demand.torque
 
     def _pid(self, limit: float) -> float:
         """Output of the position controller, clamped to ``limit``, with anti-windup."""
@@ -296,6 +297,7 @@ class Drive:
         d = self.demand
         joint = self.joint
         if d.torque:
+            self._settled = False
             if d.mode == _VELOCITY:
                 self.ramp_velocity(profile_acceleration)
             else:
@@ -310,7 +312,9 @@ class Drive:
             self._heat += current * current * p.resistance * PERIOD
         else:
             self.duty = self.current = 0.0
-            joint.step(0.0, PERIOD)
+            joint.step(0.0, PERIOD, self.physics.gear_loss * abs(joint.contact))
+            # friction holds it, whatever it leans on
+            self._settled = joint.dq == 0.0 and not joint.locked
         self._phase += 1
         if self._phase >= SLOW:
             self._slow(self._phase * PERIOD)

@@ -90,7 +90,7 @@ class EmulatedProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
-        self.output = ""
+        self.output = self.errors = ""
         try:
             self.ready_line = self._await_ready(timeout)
         except BaseException:
@@ -127,15 +127,16 @@ class EmulatedProcess:
         stdin.flush()
 
     def close(self) -> None:
-        """Stop it; ``output`` then holds what it printed behind the ready line."""
+        """Stop it; ``output`` and ``errors`` then hold what it printed behind the ready line."""
         if self.process.returncode is None:
             self.process.terminate()
             try:
-                stdout, _ = self.process.communicate(timeout=10.0)
+                stdout, stderr = self.process.communicate(timeout=10.0)
             except subprocess.TimeoutExpired:
                 self.process.kill()
-                stdout, _ = self.process.communicate()
+                stdout, stderr = self.process.communicate()
             self.output = stdout.decode(errors="replace")
+            self.errors = stderr.decode(errors="replace")
         if self._directory is not None:
             self._directory.cleanup()
             self._directory = None

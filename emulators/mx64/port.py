@@ -1,7 +1,7 @@
 """The bus on a pseudo-terminal: the thin, impure end of the emulator.
 
 A symbolic link names the terminal, because ``/dev/pts`` numbers change. The link is replaced
-atomically, never over something that is not a link, and removed at the end. While unplugged,
+atomically, never over anything but a dangling link, and removed at the end. While unplugged,
 link and terminal are gone, and a client sees what it sees of a pulled USB cable.
 """
 
@@ -53,8 +53,8 @@ class Port:
     :param link: where to put the symbolic link; None for a name in a temporary directory.
     :param clock: the bus' clock.
     :param check_baudrate: a client at another baud rate than a servo's is not understood.
-    :raises EmulatorError: ``link`` is something else than a symbolic link, or its directory is
-        missing or not writable, or there are no pseudo-terminals.
+    :raises EmulatorError: ``link`` is something else than a dangling symbolic link, or its
+        directory is missing or not writable, or there are no pseudo-terminals.
 
     ``run`` serves until ``stop``; ``start`` does so in a thread. Also a context manager.
 
@@ -118,6 +118,11 @@ class Port:
         if os.path.lexists(path) and not path.is_symlink():
             raise EmulatorError(
                 f"{path} exists and is not a link", hint="choose another path, or remove it"
+            )
+        if path.exists():
+            raise EmulatorError(
+                f"{path} is a link to {os.readlink(path)}, which exists",
+                hint="another emulator may serve it; choose another path, or remove it",
             )
         temporary = f"{self.path}.{os.getpid()}.{threading.get_ident()}"
         try:

@@ -504,8 +504,10 @@ class Servo:
             return -most, most
         if item is mx64.GOAL_POSITION and self._mode == OperatingMode.POSITION:
             return self._get(mx64.MIN_POSITION_LIMIT), self._get(mx64.MAX_POSITION_LIMIT)
-        timed = self._table[_DRIVE_MODE] & _TIMED
-        if not timed:
+        if self._table[_DRIVE_MODE] & _TIMED:
+            if item is mx64.PROFILE_ACCELERATION or item is mx64.PROFILE_VELOCITY:
+                return low, mx64.PROFILE_TIME_MAX
+        else:
             if item is mx64.PROFILE_ACCELERATION:
                 return low, self._get(mx64.ACCELERATION_LIMIT)
             if item is mx64.PROFILE_VELOCITY and self.firmware.profile_velocity_limited:
