@@ -168,7 +168,7 @@ def run() -> list[Result]:
         ("5 Hz feedback, predicted between", 5.0, Estimation.PREDICT),
         ("30 Hz feedback, predicted between", 30.0, Estimation.PREDICT),
     ]
-    results = []
+    results: list[Result] = []
     for name, rate, estimation in rows:
         seconds = teleop_time(rate, estimation, speed)
         results.append(

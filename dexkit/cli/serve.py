@@ -131,10 +131,10 @@ def command(
             )
             for group in groups
         ]
+        prepare_process()
         with ExitStack() as running:
             for service in services:
                 running.enter_context(service)
-            prepare_process()
             _on_sigusr1(running, services)
             for service, group in zip(services, groups, strict=True):
                 names = " and ".join(str(hand.spec.side) for hand in group)
