@@ -1,1 +1,179 @@
-"""Options of the conformance suite, registered with pytest."""
+"""Pytest options of the conformance suite, and what a run of it prints.
+
+Registered through the entry point ``pytest11``, so that the suite also runs outside a checkout:
+``pytest --pyargs dexkit.conformance --backend ezgripper``. It is loaded in every pytest run of
+the environment, so it imports nothing heavy and does nothing unless the suite is collected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from dexkit.conformance.results import RunResult
+    from dexkit.conformance.session import SuiteOptions
+
+__all__ = ["OPTIONS_KEY", "RESULT_KEY"]
+
+OPTIONS_KEY: pytest.StashKey[SuiteOptions | None] = pytest.StashKey()
+RESULT_KEY: pytest.StashKey[RunResult] = pytest.StashKey()
+
+_MARK = "conformance"
+_TRACE = "--dexkit-trace"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Declare the suite's options."""
+    group = parser.getgroup("dexkit conformance", "judge a hand on Unitree's topics")
+    add = group.addoption
+    add(
+        "--backend",
+        metavar="NAME",
+        help="hand to judge: a name from 'dexkit backends', package.module:Class, or 'external' "
+        "for a service that already runs",
+    )
+    add(
+        "--device",
+        action="append",
+        default=[],
+        metavar="PATH",
+        help="device of the hand, or left=PATH and right=PATH; without it the device is emulated "
+        "where dexkit can",
+    )
+    add(
+        "--side",
+        choices=["left", "right", "both"],
+        help="hands to judge; default both, or left with one --device",
+    )
+    add(
+        "--dialect",
+        choices=["unitree_go", "unitree_hg", "unitree_actuator"],
+        default="unitree_go",
+        help="how the hand speaks (default: unitree_go)",
+    )
+    add(
+        "--domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device"
+    )
+    add("--interface", default="lo", help="network interface (default: lo)")
+    add(
+        "--object",
+        action="append",
+        default=[],
+        metavar="PCT",
+        help="something to squeeze, felt at so many percent of opening; left=PCT or right=PCT. "
+        "Default: 37 in the right hand where the kit starts it; 'none' for none",
+    )
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the backend")
+    add(
+        _TRACE,
+        metavar="FILE",
+        help="recorded session to replay; also '--trace FILE' (a file that ends in .mcap)",
+    )
+    add(
+        "--require",
+        action="append",
+        default=[],
+        metavar="PREFIX",
+        help="only requirements whose id begins so (DEX1-RATE)",
+    )
+    add(
+        "--level",
+        choices=["must", "should", "info"],
+        help="only requirements at least this binding",
+    )
+    add("--json", metavar="FILE", dest="dexkit_json", help="write the result file")
+    add("--report", metavar="FILE.html", dest="dexkit_report", help="write the report page")
+    add("--recording", metavar="FILE.mcap", dest="dexkit_recording", help="keep the recording")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_load_initial_conftests(args: list[str]) -> None:
+    """Let ``--trace FILE.mcap`` name the session: pytest's own ``--trace`` takes no value."""
+    for i, (option, value) in enumerate(pairwise(args)):
+        if option == "--trace" and value.endswith(".mcap"):
+            args[i : i + 2] = [_TRACE, value]
+            return
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Check the options, before anything is started."""
+    config.addinivalue_line("markers", f"{_MARK}: a requirement of the conformance suite")
+    config.stash[OPTIONS_KEY] = None
+    given = [o for o in ("device", "side", "object", "set", "domain") if config.getoption(o)]
+    given += [
+        o for o in ("dexkit_json", "dexkit_report", "dexkit_recording") if config.getoption(o)
+    ]
+    if config.getoption("dexkit_trace"):
+        given.append("trace")
+    if not config.getoption("backend"):
+        if given:
+            names = ", ".join(f"--{o.removeprefix('dexkit_')}" for o in given)
+            raise pytest.UsageError(f"{names} without --backend: which hand is to be judged?")
+        return
+    from dexkit.conformance.session import SuiteOptions
+    from dexkit.errors import DexkitError
+
+    try:
+        config.stash[OPTIONS_KEY] = SuiteOptions.from_pytest(config)
+    except DexkitError as error:
+        hint = f"\n  {error.hint}" if error.hint else ""
+        raise pytest.UsageError(f"{error.message}{hint}") from error
+
+
+def _items(session: pytest.Session) -> list[pytest.Item]:
+    return [i for i in session.items if i.get_closest_marker(_MARK)] if session.items else []
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """Nothing judged is never a success."""
+    config = session.config
+    if config.option.collectonly or not _items(session):
+        return
+    result = config.stash.get(RESULT_KEY, None)
+    if (result is None or result.judged == 0) and exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.NO_TESTS_COLLECTED
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> Iterator[None]:
+    """The table that a person reads."""
+    session = terminalreporter._session
+    yield
+    if session is None or config.option.collectonly or not _items(session):
+        return
+    result = config.stash.get(RESULT_KEY, None)
+    terminalreporter.section("conformance")
+    if result is None:
+        terminalreporter.write_line(
+            "Nothing was judged, which is not a pass. Name the hand: --backend ezgripper "
+            "(emulated), --backend sim-dex1, or --backend external for a service that runs.",
+            yellow=True,
+        )
+        return
+    from rich.console import Console
+
+    from dexkit.conformance.report.terminal import print_result
+
+    width = max(terminalreporter._tw.fullwidth, 80)
+    console = Console(
+        file=terminalreporter._tw._file,
+        width=width,
+        force_terminal=terminalreporter._tw.hasmarkup,
+    )
+    print_result(result, console)
+    for option, name in (
+        ("dexkit_json", "result"),
+        ("dexkit_report", "report"),
+        ("dexkit_recording", "recording"),
+    ):
+        path = config.getoption(option)
+        if path:
+            terminalreporter.write_line(f"{name}: {Path(path)}")

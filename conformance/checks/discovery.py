@@ -63,7 +63,7 @@ def command_qos(ctx: Context) -> Outcome:
             f"the reader asks for {bad[0].durability}; official clients offer VOLATILE",
         )
     shown = next(r for r in readers if r not in bad)
-    return ctx.passed(_qos(shown), f"the reader asks for {_qos(shown)}")
+    return ctx.passed(shown.durability.lower(), f"the reader asks for {_qos(shown)}")
 
 
 @check("DEX1-QOS-02")
@@ -75,7 +75,7 @@ def state_qos(ctx: Context) -> Outcome:
     bad = [w for w in writers if w.reliability.lower() != "reliable"]
     if bad:
         return ctx.failed(bad[0].reliability, f"the writer offers {_qos(bad[0])}")
-    return ctx.passed(_qos(writers[0]), f"the writer offers {_qos(writers[0])}")
+    return ctx.passed(writers[0].reliability, f"the writer offers {_qos(writers[0])}")
 
 
 def _qos(endpoint: TraceEndpoint) -> str:

@@ -27,7 +27,7 @@ def print_result(result: RunResult, console: Console, *, verbose: bool = False) 
     :param verbose: also list what could not be judged here, and why.
     """
     sides = list(dict.fromkeys(r.side for r in result.results))
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
     table.add_column("requirement", no_wrap=True)
     table.add_column("level", style="dim")
     table.add_column("what")

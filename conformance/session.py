@@ -1,0 +1,247 @@
+"""One run for the whole suite: options, run, verdicts, files."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from dexkit.conformance.judge import judge
+from dexkit.conformance.processes import EMULATED, EXTERNAL, RigOptions
+from dexkit.conformance.requirements import Requirement, catalogue, select
+from dexkit.conformance.results import RunResult
+from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.view import Recording, sides_of
+from dexkit.errors import ConformanceError, UsageError
+from dexkit.hand import Side
+from dexkit.models import Dialect, dialect
+
+if TYPE_CHECKING:
+    import pytest
+
+__all__ = ["DEFAULT_OBJECT", "SuiteOptions", "judge_recording", "run_suite"]
+
+DEFAULT_OBJECT = {Side.RIGHT: 37.0}
+"""Percent of opening at which the right hand of a started pair feels an object: 2.0 rad, where
+the shipped session closes on one."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SuiteOptions:
+    """What a run of the suite was asked for.
+
+    :param domain: None for a free one.
+    """
+
+    backend: str
+    sides: tuple[Side, ...]
+    dialect: Dialect
+    domain: int | None
+    interface: str
+    devices: Mapping[Side, str]
+    objects: Mapping[Side, float]
+    settings: tuple[str, ...]
+    trace: Path | None
+    requirements: tuple[Requirement, ...]
+    json: Path | None = None
+    report: Path | None = None
+    recording: Path | None = None
+
+    @classmethod
+    def from_pytest(cls, config: pytest.Config) -> SuiteOptions:
+        """From the command line of pytest.
+
+        :raises UsageError: options that make no sense together.
+        :raises BackendError: no such backend.
+        """
+        get = config.getoption
+
+        def path(name: str) -> Path | None:
+            value = get(name)
+            return Path(value) if value else None
+
+        return cls.make(
+            backend=get("backend"),
+            side=get("side"),
+            dialect_name=get("dialect"),
+            domain=get("domain"),
+            interface=get("interface"),
+            devices=get("device"),
+            objects=get("object"),
+            settings=get("set"),
+            trace=path("dexkit_trace"),
+            require=get("require"),
+            level=get("level"),
+            json=path("dexkit_json"),
+            report=path("dexkit_report"),
+            recording=path("dexkit_recording"),
+        )
+
+    @classmethod
+    def make(
+        cls,
+        *,
+        backend: str,
+        side: str | None = None,
+        dialect_name: str = "unitree_go",
+        domain: int | None = None,
+        interface: str = "lo",
+        devices: Sequence[str] = (),
+        objects: Sequence[str] = (),
+        settings: Sequence[str] = (),
+        trace: Path | None = None,
+        require: Sequence[str] = (),
+        level: str | None = None,
+        json: Path | None = None,
+        report: Path | None = None,
+        recording: Path | None = None,
+    ) -> SuiteOptions:
+        """Check and complete what a user gave.
+
+        :raises UsageError: options that make no sense together.
+        :raises BackendError: no such backend.
+        """
+        one_device = len(devices) == 1 and "=" not in devices[0]
+        sides = sides_of(side or ("left" if one_device else "both"))
+        if one_device and len(sides) > 1:
+            raise UsageError(
+                "one --device for two hands", hint="--device left=PATH --device right=PATH"
+            )
+        if backend != EXTERNAL:
+            _check_backend(backend, needs_device=not devices and backend not in EMULATED)
+        touch = [o for o in objects if o != "none"]
+        by_side = _by_side(touch, sides, float, "--object")
+        for pct in by_side.values():
+            if not 5 <= pct <= 60:
+                raise UsageError(
+                    f"an object at {pct:g} % of opening", hint="5 to 60 % leaves room to move"
+                )
+        started = backend in EMULATED or backend == "sim-dex1"
+        chosen = dialect(dialect_name)
+        shared = len({chosen.topics(s) for s in Side}) == 1
+        if not objects and started and not devices and not (shared and backend not in EMULATED):
+            by_side = {s: pct for s, pct in DEFAULT_OBJECT.items() if s in sides}
+        if domain is None and (backend == EXTERNAL or devices):
+            domain = 0
+        if domain is not None and not 0 <= domain <= 230:
+            raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
+        if trace is not None and not trace.exists():
+            raise UsageError(f"no such file: {trace}")
+        requirements = select(catalogue(), prefixes=require, level=level)
+        if not requirements:
+            raise UsageError("no requirement is left by --require and --level together")
+        options = cls(
+            backend=backend,
+            sides=sides,
+            dialect=chosen,
+            domain=domain,
+            interface=interface,
+            devices=_by_side(devices, sides, str, "--device"),
+            objects=by_side,
+            settings=tuple(settings),
+            trace=trace,
+            requirements=requirements,
+            json=json,
+            report=report,
+            recording=recording,
+        )
+        options.rig(0).check()
+        return options
+
+    def rig(self, domain: int) -> RigOptions:
+        """What is to be brought up, on that domain."""
+        return RigOptions(
+            backend=self.backend,
+            sides=self.sides,
+            dialect=self.dialect,
+            domain=domain,
+            interface=self.interface,
+            devices=self.devices,
+            objects=self.objects,
+            settings=self.settings,
+        )
+
+    @property
+    def subject(self) -> dict[str, str]:
+        """What a report says of what was judged."""
+        emulated = self.backend in EMULATED and not self.devices
+        about = {"backend": self.backend}
+        if self.devices:
+            about["device"] = ", ".join(f"{s} {d}" for s, d in self.devices.items())
+        elif emulated:
+            about["device"] = "emulated"
+        if self.objects:
+            about["object"] = ", ".join(f"{s} at {p:g} %" for s, p in self.objects.items())
+        return about
+
+
+def _check_backend(name: str, *, needs_device: bool) -> None:
+    from dexkit.backends import backend
+
+    found = backend(name)
+    if found.needs_device and needs_device:
+        raise UsageError(f"the backend {name} needs a device", hint=f"--device: {found.needs}")
+
+
+def _by_side(
+    values: Sequence[str], sides: Sequence[Side], kind: Callable[[str], T], option: str
+) -> dict[Side, T]:
+    """``left=X`` and ``right=X``, or one value for the only side (or for each of them)."""
+    found: dict[Side, T] = {}
+    for value in values:
+        name, equals, rest = value.partition("=")
+        named = [s for s in Side if equals and s.value == name]
+        try:
+            for side in named or sides:
+                found[side] = kind(rest if named else value)
+        except ValueError:
+            raise UsageError(f"{option} {value}: not a number") from None
+    return found
+
+
+def run_suite(
+    options: SuiteOptions, say: Callable[[str], None] = lambda text: None
+) -> tuple[RunResult, Recording]:
+    """Do the live run, judge it, write the files that were asked for.
+
+    :raises ConformanceError: the hand cannot be started or died; nothing is said of it.
+    :raises TopicConflict: somebody else commands it.
+    :raises DdsError: DDS cannot be used here.
+    """
+    from dexkit.conformance.live import LiveOptions, free_domain, record_run
+    from dexkit.traces import open_trace
+
+    phases = phases_for(options.requirements)
+    session = None
+    if "replay" in phases:
+        session = Session.load(options.trace) if options.trace else Session.default()
+    domain = options.domain if options.domain is not None else free_domain(options.interface)
+    with tempfile.TemporaryDirectory(prefix="dexkit-") as folder:
+        path = options.recording or Path(folder) / "run.mcap"
+        live = LiveOptions(options.rig(domain), phases, session)
+        if not record_run(live, path, say=say):
+            raise ConformanceError("the run was interrupted; nothing is judged")
+        view = Recording.of(
+            open_trace(path), dialect_name=options.dialect.name, sides=options.sides
+        )
+    return judge_recording(options, view), view
+
+
+def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
+    """Judge the run's recording and write the files that were asked for."""
+    subject = dict(options.subject)
+    if options.recording:
+        subject["recording"] = options.recording.name
+    result = judge(view, requirements=options.requirements, subject=subject)
+    if options.json:
+        result.write_json(options.json)
+    if options.report:
+        from dexkit.conformance.report.html import write_html
+
+        write_html(result, view, options.report)
+    return result

@@ -1,0 +1,94 @@
+"""``dexkit check``: judge a recording."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from dexkit.errors import ConformanceError
+from dexkit.models import DIALECTS
+
+
+@click.command("check")
+@click.argument("recording", type=click.Path(exists=True, path_type=Path), metavar="IN.mcap")
+@click.option(
+    "--side",
+    type=click.Choice(["left", "right", "both"]),
+    help="Hands to judge. Default: those that are in the recording.",
+)
+@click.option(
+    "--dialect",
+    type=click.Choice(["auto", *DIALECTS]),
+    default="auto",
+    show_default=True,
+    help="How the hand speaks; auto takes it from topics and types.",
+)
+@click.option(
+    "--require",
+    multiple=True,
+    metavar="PREFIX",
+    help="Only requirements whose id begins so (DEX1-RATE). May be given several times.",
+)
+@click.option(
+    "--level",
+    type=click.Choice(["must", "should", "info"], case_sensitive=False),
+    help="Only requirements at least this binding.",
+)
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the result file.")
+@click.option("--junit", "junit_path", type=click.Path(path_type=Path), help="Write JUnit XML.")
+@click.option("--html", "html_path", type=click.Path(path_type=Path), help="Write a report page.")
+@click.option("-v", "--verbose", is_flag=True, help="Also say what could not be judged, and why.")
+def command(
+    recording: Path,
+    side: str | None,
+    dialect: str,
+    require: tuple[str, ...],
+    level: str | None,
+    json_path: Path | None,
+    junit_path: Path | None,
+    html_path: Path | None,
+    verbose: bool,
+) -> None:
+    """Judge a recording against the requirements of its hand.
+
+    Judges what the recording holds: any session recorded with 'dexkit record', a ROS 2 bag, or
+    the recording of a conformance run with all its stimuli.
+
+    Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
+    usable or nothing in it could be judged.
+    """
+    from dexkit.conformance.judge import judge
+    from dexkit.conformance.report.html import write_html
+    from dexkit.conformance.report.junit import write_junit
+    from dexkit.conformance.report.terminal import print_result
+    from dexkit.conformance.requirements import catalogue, select
+    from dexkit.conformance.view import Recording, sides_of
+    from dexkit.traces import open_trace
+
+    requirements = select(catalogue(), prefixes=require, level=level)
+    if not requirements:
+        raise ConformanceError("no requirement is left by --require and --level together")
+    view = Recording.of(
+        open_trace(recording),
+        dialect_name=None if dialect == "auto" else dialect,
+        sides=sides_of(side) if side else (),
+    )
+    result = judge(view, requirements=requirements, subject={"recording": recording.name})
+    console = Console()
+    print_result(result, console, verbose=verbose)
+    if json_path:
+        result.write_json(json_path)
+    if junit_path:
+        write_junit(result, junit_path)
+    if html_path:
+        write_html(result, view, html_path)
+        console.print(f"report: {html_path}", highlight=False)
+    if result.judged == 0:
+        raise ConformanceError(
+            "nothing was judged, which is not a pass",
+            hint="dexkit check -v says what each requirement needs",
+        )
+    sys.exit(result.overall.exit_code)
