@@ -165,7 +165,7 @@ def _read() -> list[Result]:
 
 
 def _replay(path: Path, messages: list[TraceMessage]) -> Result:
-    """Two seconds at the recorded speed, in turns with the peer so that both meet the same noise."""
+    """Two seconds at the recorded speed, in turns with the peer: both meet the same noise."""
     commands = [m for m in messages if m.topic.endswith("/cmd")]
     end = commands[0].log_time_ns + 2_000_000_000
     with Recorder(path, overwrite=True) as recorder:
