@@ -96,7 +96,10 @@ class SdkClient:
 
     def _receive(self) -> dict[str, Any]:
         assert self._process.stdout is not None
+        watchdog = threading.Timer(90, self._process.kill)  # never hang a test run
+        watchdog.start()
         line = self._process.stdout.readline()
+        watchdog.cancel()
         if not line:
             raise SdkError(f"the SDK process has gone (exit code {self._process.wait(10)})")
         answer: dict[str, Any] = json.loads(line)
