@@ -21,6 +21,7 @@ PERIOD = 1e-3
 SLOW = 10
 """Heat and supply are stepped once in so many periods."""
 
+_STILL = 1e-6  # rad/s
 _TICK = mx64.TICK
 # plain integers: an enum's attribute look-up costs more than the sum it guards
 _CURRENT, _VELOCITY = int(OperatingMode.CURRENT), int(OperatingMode.VELOCITY)
@@ -180,7 +181,7 @@ class Drive:
         self._ramped = 0.0  # velocity trajectory of mode 1, ticks/s
         self._heat = 0.0  # J since the last slow step
         self._phase = 0
-        self._settled = False
+        self._still = 0  # periods
         self.counter = 0
         self.fold()
 
@@ -234,7 +235,8 @@ class Drive:
     @property
     def resting(self) -> bool:
         """Nothing would change but the temperature."""
-        return self._settled and not self.demand.torque
+        # one period without motion may be the turning point of a rebound
+        return self._still >= SLOW and not self.demand.torque
 
     def _pid(self, limit: float) -> float:
         """Output of the position controller, clamped to ``limit``, with anti-windup."""
@@ -297,7 +299,7 @@ class Drive:
         d = self.demand
         joint = self.joint
         if d.torque:
-            self._settled = False
+            self._still = 0
             if d.mode == _VELOCITY:
                 self.ramp_velocity(profile_acceleration)
             else:
@@ -313,8 +315,8 @@ class Drive:
         else:
             self.duty = self.current = 0.0
             joint.step(0.0, PERIOD, self.physics.gear_loss * abs(joint.contact))
-            # friction holds it, whatever it leans on
-            self._settled = joint.dq == 0.0 and not joint.locked
+            still = abs(joint.dq) < _STILL and not joint.locked
+            self._still = self._still + 1 if still else 0
         self._phase += 1
         if self._phase >= SLOW:
             self._slow(self._phase * PERIOD)
