@@ -718,7 +718,10 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
         # and it serves from then on, without moving at the start
         with gripper_on(gripper.path, configured(tmp_path, zero=None, config=path)) as hand:
             assert hand.record.zero == zero
-            assert hand.speed == pytest.approx(min(speeds.values()) * 0.054)
+            assert hand.joint_speeds is not None
+            ((opening, closing),) = hand.joint_speeds
+            assert opening == pytest.approx(min(speeds["opening"], 150) * 0.054)
+            assert closing == pytest.approx(min(speeds["closing"], 150) * 0.054)
             assert float(hand.exchange(BRAKE).q[0]) >= -0.05
 
 

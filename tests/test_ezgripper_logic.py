@@ -24,6 +24,7 @@ from dexkit.wire import mx64
 from dexkit.wire.mx64 import HardwareError
 
 fast = settings(max_examples=100, deadline=None)
+fewer = settings(max_examples=40, deadline=None)
 
 # --- scaling
 
@@ -203,7 +204,7 @@ def _run(
     return None
 
 
-@fast
+@fewer
 @given(
     speed=st.floats(MIN_FREE_SPEED, 220.0),
     closing=st.booleans(),
@@ -228,7 +229,7 @@ def test_free_motion_is_never_contact(
     assert found is None
 
 
-@fast
+@fewer
 @given(
     speed=st.floats(5.0, 220.0),
     stop=st.integers(100, 2300),

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 __all__ = ["MIN_FREE_SPEED", "Contact", "ContactDetector"]
 
-MIN_FREE_SPEED = 2.0
-"""Percent of stroke a second. Free motion at least this fast is never taken for contact."""
+MIN_FREE_SPEED = 3.0
+"""Percent of stroke a second. Free motion at least this fast, begun within 30 ms, is never
+taken for contact."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class ContactDetector:
     fingers move on towards the goal by more than ``release`` ticks.
 
     The defaults: 2 ticks in 0.1 s are 0.8 %/s, below any speed the driver allows
-    (:data:`MIN_FREE_SPEED`) with a tick of noise either way; 25 ticks are 1 % of the stroke,
-    beyond what the servo's position loop leaves as its own error, and below the 83 ticks
-    (0.18 rad) by which xr_teleoperate leads (facts/mx64 D7).
+    (:data:`MIN_FREE_SPEED`), a tick of noise either way and the start included; 25 ticks are
+    1 % of the stroke, beyond what the servo's position loop leaves as its own error, and below
+    the 83 ticks (0.18 rad) by which xr_teleoperate leads (facts/mx64 D7).
     """
 
     window: float = 0.1

@@ -189,10 +189,17 @@ class EZGripper:
         return self._servo.statistics if self._servo is not None else ServoStatistics()
 
     @property
-    def speed(self) -> float | None:
-        """Slower one of the calibrated speeds, rad/s of the joint, or None if not measured."""
-        known = [s for s in (self.record.opening, self.record.closing) if s is not None]
-        return min(known) / 100 * self._spec.joints[0].stroke if known else None
+    def joint_speeds(self) -> tuple[tuple[float, float]] | None:
+        """Calibrated speeds of the joint opening and closing, rad/s; None if not measured.
+
+        What the service's estimator expects; no faster than the speed limit that is set.
+        """
+        opening, closing = self.record.opening, self.record.closing
+        if opening is None or closing is None:
+            return None
+        limit = self.configuration.control.speed
+        per_percent = self._spec.joints[0].stroke / 100
+        return ((min(opening, limit) * per_percent, min(closing, limit) * per_percent),)
 
     # --- opening and closing
 

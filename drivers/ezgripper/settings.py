@@ -91,8 +91,8 @@ def _hold_here(bus: ServoBus, servo_id: int) -> None:
 def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
     """Bring the registers of a servo to what the driver needs. Nothing moves.
 
-    Torque is switched off only if EEPROM has to change; a servo that holds something goes on
-    holding it, at the position where it is.
+    Torque is switched off only if EEPROM or the mapping has to change; a servo that holds
+    something goes on holding it, at the position where it is.
 
     :returns: the limits that the servo watches itself.
     :raises HandRefused: a register does not take its value.
@@ -106,9 +106,11 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
     )
     if bus.read_item(servo_id, mx64.BUS_WATCHDOG) != 0:
         bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
-    differing = [(item, value) for item, value in EEPROM if bus.read_item(servo_id, item) != value]
+    differing = [(item, wanted) for item, _, wanted in differences(bus, servo_id)]
+    mapped = _mapping(bus, servo_id) == block.mapping()
     if bus.read_item(servo_id, mx64.TORQUE_ENABLE):
-        if differing:
+        # ROBOTIS' examples map indirect addresses with torque off only
+        if differing or not mapped:
             bus.write_item(servo_id, mx64.TORQUE_ENABLE, 0)
         else:
             _hold_here(bus, servo_id)
@@ -125,7 +127,8 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
     for item, value in RAM:
         bus.write_item(servo_id, item, value)
         _verify(bus, servo_id, item, value)
-    _map_block(bus, servo_id)
+    if not mapped:
+        _map_block(bus, servo_id)
     bus.write_item(servo_id, mx64.BUS_WATCHDOG, WATCHDOG_UNITS)
     _verify(bus, servo_id, mx64.BUS_WATCHDOG, WATCHDOG_UNITS)
     return ServoLimits(
@@ -135,15 +138,13 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
     )
 
 
+def _mapping(bus: ServoBus, servo_id: int) -> bytes:
+    return bus.read(servo_id, mx64.INDIRECT_BLOCKS[0].address, len(block.mapping()))[0]
+
+
 def _map_block(bus: ServoBus, servo_id: int) -> None:
-    first = mx64.INDIRECT_BLOCKS[0].address
-    wanted = block.mapping()
-    found, _ = bus.read(servo_id, first, len(wanted))
-    if found == wanted:
-        return
-    bus.write(servo_id, first, wanted)
-    found, _ = bus.read(servo_id, first, len(wanted))
-    if found != wanted:
+    bus.write(servo_id, mx64.INDIRECT_BLOCKS[0].address, block.mapping())
+    if _mapping(bus, servo_id) != block.mapping():
         raise HandRefused(
             f"servo {servo_id}: the indirect addresses do not take the driver's mapping",
             hint="update the servo's firmware with DYNAMIXEL Wizard 2",
