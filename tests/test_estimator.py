@@ -192,6 +192,19 @@ def test_an_object_stops_the_prediction_at_the_object() -> None:
     assert e.predict(now + 0.1) < contact - 0.02 * STROKE
 
 
+@pytest.mark.parametrize("goal", [3.0, 1.0])
+def test_a_hand_that_overshoots_does_not_take_the_prediction_along(goal: float) -> None:
+    e = JointEstimator(JOINT, (5.0, 5.0))
+    e.measure(2.0, 0.0)
+    e.follow(goal, 0.0)
+    way = math.copysign(1.0, goal - 2.0)
+    for i in range(1, 100):
+        now = 0.01 * i
+        e.measure(e.q + way * 0.05 * STROKE, now)
+        assert (e.predict(now + 0.009) - goal) * way <= EPS
+    assert e.q == goal
+
+
 def test_turning_round_ends_a_stall() -> None:
     e = JointEstimator(JOINT, (5.0, 5.0))
     e.measure(2.0, 0.0)

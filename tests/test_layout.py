@@ -85,9 +85,7 @@ def test_nothing_imports_a_room_by_its_bare_name(folder: str) -> None:
 def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))
-        # the codec benchmark compares with CycloneDDS's own serialisation
-        allowed = {ROOT / "dexkit" / "dds.py", ROOT / "benchmarks" / "bench_codec.py"}
-        assert not touches or path in allowed, path.relative_to(ROOT)
+        assert not touches or path == ROOT / "dexkit" / "dds.py", path.relative_to(ROOT)
 
 
 def test_help_imports_no_room_and_no_dds() -> None:

@@ -13,7 +13,7 @@ from dexkit.errors import DdsError, HandLost, HandTimeout, TopicConflict, UsageE
 from dexkit.hand import HandState, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go, unitree_hg
 from dexkit.models import dialect
-from dexkit.service import HandService, diagnose
+from dexkit.service import Backoff, HandService, diagnose
 from tests.service_helpers import FakeEndpoint, FakeNode, FakeWriter, ScriptedHand, wait_until
 
 CMD, STATE = dialect("unitree_go").topics(Side.LEFT)
@@ -136,6 +136,32 @@ class TestLink:
             assert (counters.losses, counters.reconnects) == (1, 1)
         assert hand.closes == 2
 
+    def test_each_loss_begins_with_the_shortest_delay(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        delays: list[float] = []
+
+        class Recorded(Backoff):
+            def next(self) -> float:
+                delays.append(super().next())
+                return delays[-1]
+
+        monkeypatch.setattr("dexkit.service.service.Backoff", Recorded)
+        hand, node = ScriptedHand(), FakeNode()
+        with serve(hand, node) as service:
+            counters = service.cores[Side.LEFT].counters
+            hand.plugged = False
+            wait_until(lambda: len(delays) == 3)
+            hand.plugged = True
+            wait_until(lambda: counters.reconnects == 1)
+            done = counters.exchanges
+            wait_until(lambda: counters.exchanges > done + 5)
+            assert delays == [0.1, 0.2, 0.4]
+            delays.clear()
+            hand.plugged = False
+            wait_until(lambda: delays)
+            assert delays[0] == 0.1
+
     def test_lost_in_the_middle_of_a_stop(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         service = serve(hand, node)
@@ -207,6 +233,15 @@ class TestStop:
         assert (newest(node).q, newest(node).mode) == (2.0, 0)
         assert node.open_entities == 0
         assert not node.closed  # it was lent
+
+    def test_the_last_state_is_from_after_the_brake(self) -> None:
+        hand, node = ScriptedHand(), FakeNode()
+        service = serve(hand, node, state_rate=5.0)
+        service.start()
+        node.deliver(CMD, cmd(2.0))
+        wait_until(lambda: newest(node).mode == 1)
+        service.stop()
+        assert newest(node).mode == 0
 
     def test_a_service_starts_once(self) -> None:
         hand, node = ScriptedHand(), FakeNode()

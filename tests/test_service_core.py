@@ -177,6 +177,19 @@ class TestFailedExchanges:
         assert bench.exchange().q[0] == 3.0  # it goes on
         assert bench.core.counters.exchange_errors == 1
 
+    def test_missed_counts_from_the_last_good_one(self) -> None:
+        bench = Bench()
+        for expected in (1, 2):
+            bench.core.failed(HandTimeout("no answer"))
+            view = bench.core.view()
+            assert view is not None
+            assert view.missed == expected
+        bench.exchange()
+        bench.core.failed(HandTimeout("no answer"))
+        view = bench.core.view()
+        assert view is not None
+        assert view.missed == 1
+
     def test_half_a_second_of_timeouts_is_a_loss(self) -> None:
         bench = Bench()
         for _ in range(5):

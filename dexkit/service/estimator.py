@@ -13,7 +13,8 @@ calibrated speed, each measurement moves it by 10 % of the difference, and a dif
 model, and these hold of it, between two resynchronisations, for one standing command:
 
 V  it never moves faster than the calibrated speed of the direction in which it moves;
-O  travelling, it never passes the command;
+O  it never passes the command in the direction in which it came to it, not even when the hand
+   does (seed 003: "never overshoots");
 R  travelling, it never moves away from the command: it waits until the model has caught up.
 
 A resynchronisation (difference above the threshold) is the one jump, onto what was measured:
@@ -22,8 +23,8 @@ nothing is predicted in that direction until the hand is seen to move or the com
 round, so a gripper that holds an object is not reported to creep through it.
 
 Travelling ends when the model arrives. From then on the velocity model has nothing to add, and
-the prediction follows the measurements alone (seed 003 would return to the command after each
-correction and so report an arrival that never happened).
+the prediction follows the measurements alone, up to the command (seed 003 would return to the
+command after each correction and so report an arrival that never happened).
 """
 
 from __future__ import annotations

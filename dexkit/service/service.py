@@ -317,7 +317,10 @@ class HandService:
     def _open(self, unit: _Unit) -> None:
         """Open the hand and do one exchange, so that there is a state from the first sample on."""
         unit.hand.open()
-        unit.core.opened(unit.hand.spec, getattr(unit.hand, "joint_speeds", None))
+        speeds = getattr(unit.hand, "joint_speeds", None)
+        unit.core.opened(unit.hand.spec, speeds)
+        if unit.core.predicting and speeds is None:
+            log.warning("%s: the speed of the hand is not known; predictions will jump", unit.side)
         try:
             unit.core.measured(unit.hand.exchange(unit.core.next_command()))
         except Exception as error:
@@ -391,8 +394,11 @@ class HandService:
     def _publish_loop(self) -> None:
         precise_timers()
         rate = Rate(self.state_rate, self._clock, spin=min(_SPIN, 0.2 / self.state_rate))
-        while not self._stop.is_set():
-            self.counters.publish_misses += rate.wait()
+        while True:
+            missed = rate.wait()
+            if self._stop.is_set():
+                return  # the last state is written when the hands have been released
+            self.counters.publish_misses += missed
             self._write(self._compose())
 
     def _compose(self) -> bytes | None:
