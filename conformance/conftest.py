@@ -22,7 +22,7 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
             print(f"\n  ... {text}", end="", file=sys.stderr, flush=True)
 
     try:
-        result, _ = run_suite(options, say)
+        result = run_suite(options, say)
     except DexkitError as error:
         hint = f"\n{error.hint}" if error.hint else ""
         pytest.exit(f"the kit cannot judge: {error.message}{hint}", returncode=2)

@@ -106,7 +106,9 @@ def record_run(
         recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
         if rig_options.backend != EXTERNAL:
             say(f"starting {rig_options.backend} on domain {rig_options.domain}")
-        rig = stack.enter_context(Rig(rig_options))
+        rig = stack.enter_context(Rig(rig_options, stop))
+        if stop.is_set():
+            return False
         _refuse_company(recorder_node, options)
         plan = options.plan()
         script = Script(plan, say)

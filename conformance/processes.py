@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -48,6 +49,17 @@ EMULATED: dict[str, Emulation] = {
 }
 """Backends whose device the kit can start itself."""
 
+# a kit that is killed takes its processes with it: SIGTERM when the parent dies (Linux)
+_ENTRY = """
+import ctypes, signal
+try:
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+except (OSError, AttributeError):
+    pass
+from dexkit.cli import main
+main()
+"""
+
 _OBJECT_SETTING = {"sim-dex1": "object"}  # backends that are told of an object by a setting
 
 
@@ -64,7 +76,7 @@ class Tool:
         self.ready = threading.Event()
         self._tail: deque[str] = deque(maxlen=12)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", "from dexkit.cli import main; main()", *arguments],
+            [sys.executable, "-c", _ENTRY, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -98,9 +110,12 @@ class Tool:
         """The last lines that it printed."""
         return "\n".join(self._tail)
 
-    def wait_ready(self, timeout: float = READY_TIMEOUT) -> None:
-        """Wait until it says that it is ready."""
-        came = self.ready.wait(timeout)
+    def wait_ready(self, stop: threading.Event, timeout: float = READY_TIMEOUT) -> None:
+        """Wait until it says that it is ready, or ``stop`` is set."""
+        end = time.monotonic() + timeout
+        while not (came := self.ready.wait(0.05)) and time.monotonic() < end:
+            if stop.is_set():
+                return
         if not came or not any(line.startswith("ready:") for line in self._tail):
             what = "is not ready" if came is False else "ended before it was ready"
             raise ConformanceError(f"{self!r} {what}", hint=self.last_words)
@@ -175,11 +190,15 @@ class RigOptions:
 
 
 class Rig:
-    """Everything that runs during a live run, except the kit itself; a context manager."""
+    """Everything that runs during a live run, except the kit itself; a context manager.
 
-    def __init__(self, options: RigOptions) -> None:
+    :param stop: ends the wait for a process that is starting.
+    """
+
+    def __init__(self, options: RigOptions, stop: threading.Event) -> None:
         options.check()
         self.options = options
+        self._stop = stop
         self._stack = contextlib.ExitStack()
         self.tools: list[Tool] = []
 
@@ -216,12 +235,14 @@ class Rig:
                 for s in options.sides
             ]
             for tool in emulators:
-                tool.wait_ready()
+                tool.wait_ready(self._stop)
+            if self._stop.is_set():
+                return
             given = {s.partition("=")[0] for s in settings}
             settings += [f"{k}={v}" for k, v in emulation.settings.items() if k not in given]
         services = [self._serve(group, devices, settings) for group in self._groups()]
         for tool in services:
-            tool.wait_ready()
+            tool.wait_ready(self._stop)
 
     def _groups(self) -> list[tuple[Side, ...]]:
         """The sides that one service serves: one each, unless they share their topics."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,9 @@ from dexkit.models import Dialect, dialect
 if TYPE_CHECKING:
     import pytest
 
-__all__ = ["DEFAULT_OBJECT", "SuiteOptions", "judge_recording", "run_suite"]
+    from dexkit.conformance.live import LiveOptions
+
+__all__ = ["DEFAULT_OBJECT", "SuiteOptions", "judge_recording", "live_options", "run_suite"]
 
 DEFAULT_OBJECT = {Side.RIGHT: 37.0}
 """Percent of opening at which the right hand of a started pair feels an object: 2.0 rad, where
@@ -204,32 +207,46 @@ def _by_side(
     return found
 
 
-def run_suite(
-    options: SuiteOptions, say: Callable[[str], None] = lambda text: None
-) -> tuple[RunResult, Recording]:
-    """Do the live run, judge it, write the files that were asked for.
+def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
+    """The live run that the options ask for, on that domain.
 
-    :raises ConformanceError: the hand cannot be started or died; nothing is said of it.
-    :raises TopicConflict: somebody else commands it.
-    :raises DdsError: DDS cannot be used here.
+    :raises TraceError: the session to be replayed cannot be read.
     """
-    from dexkit.conformance.live import LiveOptions, free_domain, record_run
-    from dexkit.traces import open_trace
+    from dexkit.conformance.live import LiveOptions
 
     phases = phases_for(options.requirements)
     session = None
     if "replay" in phases:
         session = Session.load(options.trace) if options.trace else Session.default()
+    return LiveOptions(options.rig(domain), phases, session)
+
+
+def run_suite(
+    options: SuiteOptions,
+    say: Callable[[str], None] = lambda text: None,
+    stop: threading.Event | None = None,
+) -> RunResult:
+    """Do the live run, judge it, write the files that were asked for.
+
+    :raises ConformanceError: the hand cannot be started or died, or the run was stopped;
+        nothing is said of it.
+    :raises TopicConflict: somebody else commands it.
+    :raises DdsError: DDS cannot be used here.
+    """
+    from dexkit.conformance.live import free_domain, record_run
+    from dexkit.traces import open_trace
+
     domain = options.domain if options.domain is not None else free_domain(options.interface)
+    live = live_options(options, domain)
     with tempfile.TemporaryDirectory(prefix="dexkit-") as folder:
         path = options.recording or Path(folder) / "run.mcap"
-        live = LiveOptions(options.rig(domain), phases, session)
-        if not record_run(live, path, say=say):
-            raise ConformanceError("the run was interrupted; nothing is judged")
+        if not record_run(live, path, say=say, stop=stop):
+            raise ConformanceError("the run was stopped; nothing is judged")
+        say("judging the recording")
         view = Recording.of(
             open_trace(path), dialect_name=options.dialect.name, sides=options.sides
         )
-    return judge_recording(options, view), view
+    return judge_recording(options, view)
 
 
 def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:

@@ -24,7 +24,7 @@ from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 
 __all__ = ["MemoryTrace", "ReferenceHand", "ReferenceService", "Sample", "run_virtual"]
 
-TICK = 0.002
+TICK = 0.003  # seconds: the slowest rate of the vendor's service, 333 Hz (facts/unitree-dex B.2)
 EPOCH_NS = 1_700_000_000_000_000_000
 
 

@@ -77,9 +77,9 @@ class SlowPublisher(ReferenceService):
 
 
 class HalfRate(ReferenceService):
-    """Publishes at 250 Hz: enough, but not what the vendor does."""
+    """Publishes at 222 Hz: enough, but not what the vendor does."""
 
-    period = 0.004
+    period = 0.0045
 
 
 class Hiccup(ReferenceService):
@@ -90,7 +90,7 @@ class Hiccup(ReferenceService):
 
 
 class Bursts(ReferenceService):
-    """Publishes ten states at once, every 20 ms."""
+    """Publishes ten states at once."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ from dexkit.conformance.report.plots import Band, Line, histogram, time_plot
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
+from dexkit.models import MODELS
 
 __all__ = ["render", "write_html"]
 
@@ -32,8 +33,8 @@ _HEADS = {
     ),
 }
 _PHASES = {
-    "listen": "listening",
-    "approach": "to the middle",
+    "listen": "listen",
+    "approach": "to mid",
     "step": "steps",
     "nan": "NaN",
     "out-of-range": "out of range",
@@ -62,7 +63,7 @@ def render(result: RunResult, view: Recording) -> str:
     head, css, sentence = _HEADS[result.overall]
     about = result.subject.get("backend") or result.subject.get("recording", "recording")
     body = [
-        f"<h1>Is this a drop-in for a Unitree {escape(result.subject.get('model', ''))}?</h1>",
+        f"<h1>Is this a drop-in for Unitree's {escape(_title(result))}?</h1>",
         f'<div class="verdict {css}"><b>{head}</b><p>{escape(sentence)}</p></div>',
         _chips(result),
         _facts(result),
@@ -77,9 +78,14 @@ def render(result: RunResult, view: Recording) -> str:
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f"<title>{head}: {escape(about)} as {escape(result.subject.get('model', ''))}</title>"
+        f"<title>{head}: {escape(about)} as {escape(_title(result))}</title>"
         f"<style>{_STYLE.read_text(encoding='utf-8')}</style></head><body><main>{''.join(body)}</main></body></html>\n"
     )
+
+
+def _title(result: RunResult) -> str:
+    known = MODELS.get(result.subject.get("model", ""))
+    return known.title if known else "hand"
 
 
 def _chips(result: RunResult) -> str:
@@ -260,7 +266,14 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
             _plot(
                 time_plot(
                     f"{hand.side} hand, intervals over time",
-                    [Line("interval", "state", states.clock[1:], intervals)],
+                    [
+                        Line(
+                            "interval",
+                            "state",
+                            states.clock[1:],
+                            np.where(intervals > 0, intervals, np.nan),
+                        )
+                    ],
                     unit="ms",
                     span=span,
                     height=130,

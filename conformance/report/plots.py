@@ -24,14 +24,12 @@ class Line:
     """One curve.
 
     :param css: class that colours it.
-    :param dots: draw points instead of a line.
     """
 
     label: str
     css: str
     x: Floats
     y: Floats
-    dots: bool = False
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,17 @@ def thin(x: Floats, y: Floats, points: int = _MAX_POINTS) -> tuple[Floats, Float
             low, high = a + int(np.argmin(y[a:b])), a + int(np.argmax(y[a:b]))
             keep += sorted({low, high})
     return x[keep], y[keep]
+
+
+def pieces(x: Floats, y: Floats) -> list[tuple[Floats, Floats]]:
+    """The curve cut where samples are missing: a line across a gap would be invented."""
+    good = np.isfinite(x) & np.isfinite(y)
+    x, y = x[good], y[good]
+    if len(x) < 3:
+        return [(x, y)] if len(x) else []
+    steps = np.diff(x)
+    cuts = np.flatnonzero(steps > max(0.05, 8 * float(np.median(steps)))) + 1
+    return list(zip(np.split(x, cuts), np.split(y, cuts), strict=True))
 
 
 def nice_ticks(low: float, high: float, count: int = 6) -> list[float]:
@@ -136,9 +145,10 @@ def time_plot(
     values: list[float] = [*include, *(v for v, _ in limits)]
     for line in lines:
         inside = (line.x >= span[0]) & (line.x <= span[1])
-        x, y = thin(line.x[inside], line.y[inside])
-        curves.append((line, x, y))
-        if len(y):
+        for piece in pieces(line.x[inside], line.y[inside]):
+            share = len(piece[0]) / max(int(inside.sum()), 1)
+            x, y = thin(*piece, points=max(20, round(_MAX_POINTS * share)))
+            curves.append((line, x, y))
             values += [float(y.min()), float(y.max())]
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     pad = 0.06 * (high - low) or 0.5
@@ -163,15 +173,6 @@ def time_plot(
             f"{escape(label)}</text>"
         )
     for line, x, y in curves:
-        if line.dots:
-            frame.parts.append(
-                "".join(
-                    f'<circle class="{line.css}" cx="{frame.x(float(a)):.1f}" '
-                    f'cy="{frame.y(float(b)):.1f}" r="1.6"/>'
-                    for a, b in zip(x, y, strict=True)
-                )
-            )
-            continue
         points = " ".join(
             f"{frame.x(float(a)):.1f},{frame.y(float(b)):.1f}" for a, b in zip(x, y, strict=True)
         )
@@ -187,8 +188,8 @@ def _band_labels(frame: _Frame, bands: Sequence[Band], span: tuple[float, float]
         if b <= a:
             continue
         width = 6.3 * len(band.label)
-        at = frame.x(a)
-        if at < free_from or at + width > WIDTH - RIGHT:
+        at = max(frame.x(a), free_from)
+        if at > frame.x(b) or at + width > WIDTH - RIGHT:
             continue
         frame.parts.append(
             f'<text class="phase" x="{at:.1f}" y="{TOP - 6}">{escape(band.label)}</text>'

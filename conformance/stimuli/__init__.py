@@ -53,6 +53,11 @@ __all__ = [
 PERIOD_NS = round(1e9 / DEX1_1.command_rate)
 LEAD = 0.18 / 5.4  # of the stroke: how far xr_teleoperate commands ahead (facts/unitree-dex B.3)
 _SETTLED = 0.02  # of the stroke
+_BAD = {
+    "nan": "broken commands (NaN and infinity): nothing may move",
+    "out-of-range": "commands far out of range: no harm may be done",
+    "empty": "empty commands: nothing may move",
+}
 _Payloads = list[tuple[str, bytes]]
 
 
@@ -174,7 +179,7 @@ class Script:
         if self.plan.phases & {"squeeze", "silence", "resume"}:
             yield from self._squeeze_and_silence()
         if "restart" in self.plan.phases:
-            self._say("the client is restarted")
+            self._say("the commanding program is restarted: the new one must be obeyed")
             yield Restart()
             yield from self._everyone("restart", self._other_place())
         yield from self._hold(0.2)
@@ -288,7 +293,7 @@ class Script:
     # -- phases -----------------------------------------------------------------------------
 
     def _listen(self) -> Steps:
-        self._say("listening: state must flow before any command")
+        self._say("listening: the hand must report its state before anybody commands it")
         phase = self._begin("listen", self.plan.sides)
         while self._elapsed(phase) < 1.2:
             yield from self._wait(0.05)
@@ -311,14 +316,14 @@ class Script:
         yield from self._until_settled(phase, self.plan.sides, least=0.3, most=2.0)
 
     def _steps(self, side: Side) -> Steps:
-        self._say(f"steps of the {side} hand")
+        self._say(f"large steps of the {side} hand; the other one must not move")
         for target in (self._high(), self._low(side), self._middle(side)):
             self._goal[side] = target
             phase = self._begin("step", (side,), targets={side: target})
             yield from self._until_settled(phase, (side,), least=0.6, most=2.5)
 
     def _bad(self, name: str) -> Steps:
-        self._say(f"bad commands: {name}")
+        self._say(_BAD[name])
         sides = self.plan.sides
         yield from self._hold(0.2)
         bursts: list[_Payloads] = []
@@ -357,7 +362,7 @@ class Script:
         return bad
 
     def _limp(self) -> Steps:
-        self._say("zero gains")
+        self._say("commands without force (zero gains): the hand must not be pulled")
         sides = self.plan.sides
         yield from self._everyone("center", dict.fromkeys(sides, 0.8 * self._stroke))
         targets = {s: self._low(s) for s in sides}
@@ -375,7 +380,7 @@ class Script:
         self._goal.update({s: session.first(s, self._stroke).q for s in sides})
         reachable = [s for s in sides if self._goal[s] > self.plan.objects.get(s, -math.inf)]
         yield from self._until_settled(None, reachable, least=0.6, most=2.0)
-        self._say(f"replaying {session.duration:.0f} s of {session.name}")
+        self._say(f"replaying {session.duration:.0f} s of the recorded session {session.name}")
         phase = self._begin("replay", sides, session=session.name)
         newest = {s: Motor(q=q) for s, q in self._goal.items()}
         start = self._obs.now_ns
@@ -390,7 +395,7 @@ class Script:
         yield from self._everyone("center", {s: self._middle(s) for s in self.plan.sides})
 
     def _late_joiner(self) -> Steps:
-        self._say("a late subscriber joins")
+        self._say("a second listener joins late: it must hear the hand at once")
         phase = self._begin("late-joiner", self.plan.sides)
         yield Join()
         while self._elapsed(phase) < 3.0:
@@ -419,7 +424,7 @@ class Script:
             return
         if free and self._gains_used:
             yield from self._drive(free, squeeze)
-        self._say("silence: the hand must brake after a second")
+        self._say("... silence: after a second the hand must brake")
         phase = self._begin("silence", sides)
         while self._elapsed(phase) < 2 * DEX1_1.command_timeout + 0.1:
             yield from self._wait(0.05)
@@ -428,7 +433,7 @@ class Script:
 
     def _drive(self, sides: Sequence[Side], others: Mapping[Side, Motor]) -> Steps:
         """Open at a steady low speed by velocity feedback alone, whatever the friction."""
-        self._say("opening slowly by velocity, then ...")
+        self._say("slow motion, and then ...")
         phase = self._begin("drive", sides)
         slow = 0.16 * self._stroke  # rad/s: far from the stop even after a whole time-out
         wanted = dict.fromkeys(sides, slow)
