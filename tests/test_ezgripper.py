@@ -550,10 +550,11 @@ def test_low_voltage_is_reported_while_work_goes_on(tmp_path: Path) -> None:
         gripper_on(gripper.path, configured(tmp_path)) as hand,
     ):
         drive(hand, HALF, at(2.7))
-        gripper.inject("brown-out:volts=8")
+        gripper.inject("brown-out:volts=8,for=300ms")
         low = drive(hand, HALF, lambda s: bool(s.fault[0]))
         assert low.fault[0] == MotorError.UNDERVOLTAGE
         assert float(low.voltage[0]) < 9.5
+        drive(hand, HALF, lambda s: not s.fault[0])
         drive(hand, HandCommand.position(3.5), at(3.5))
 
 
@@ -757,7 +758,8 @@ def test_calibration_is_interrupted_and_lets_go(tmp_path: Path) -> None:
         hand.close()
 
 
-def test_the_force_table_is_measured(tmp_path: Path) -> None:
+def test_the_force_table_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dexkit.cli.calibrate._FORCE_EFFORTS", (10.0, 30.0))
     path = tmp_path / "ezgripper.json"
     with emulated(start=80.0, object_pct=50.0) as gripper:
         key = os.path.abspath(gripper.path)
@@ -765,13 +767,13 @@ def test_the_force_table_is_measured(tmp_path: Path) -> None:
         result = CliRunner().invoke(
             calibrate_command,
             ["--device", gripper.path, "--config", str(path), "--force", "--yes"],
-            input="2\n3\n4\n6\n8\n",
+            input="2\n6\n",
         )
         assert result.exit_code == 0, (result.output, result.exception)
         table = json.loads(path.read_text())["force_lookup"][key]
         currents = [float(k) for k in table]
-        assert sorted(table.values()) == [0, 2, 3, 4, 6, 8]
-        for current, effort in zip(sorted(currents)[1:], (10, 15, 20, 30, 40), strict=True):
+        assert sorted(table.values()) == [0, 2, 6]
+        for current, effort in zip(sorted(currents)[1:], (10, 30), strict=True):
             assert current == pytest.approx(effort * 16, rel=0.1)
 
 

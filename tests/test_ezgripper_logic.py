@@ -516,13 +516,17 @@ def test_senseless_settings_are_refused(wrong: dict[str, float]) -> None:
 
 def test_errors_in_words_and_in_the_common_vocabulary() -> None:
     assert describe(HardwareError(0x24)) == "overheating and overload"
-    assert motor_error(HardwareError.OVERLOAD, 12.0, 16.0) == MotorError.OVERCURRENT
-    assert motor_error(HardwareError.INPUT_VOLTAGE, 9.0, 16.0) == MotorError.UNDERVOLTAGE
-    assert motor_error(HardwareError.INPUT_VOLTAGE, 17.0, 16.0) == MotorError.OVERVOLTAGE
-    both = motor_error(HardwareError(0x0C), 12.0, 16.0)
-    assert both == MotorError.WINDING_OVERTEMPERATURE | MotorError.OUTPUT_ENCODER
+
+    def bits(error: int, voltage: float = 12.0) -> MotorError:
+        return motor_error(error, voltage, 9.5, 16.0)
+
+    assert bits(HardwareError.OVERLOAD) == MotorError.OVERCURRENT
+    assert bits(HardwareError.INPUT_VOLTAGE, 9.0) == MotorError.UNDERVOLTAGE
+    assert bits(HardwareError.INPUT_VOLTAGE, 17.0) == MotorError.OVERVOLTAGE
+    assert bits(HardwareError.INPUT_VOLTAGE, 12.0) == 0, "over, though the servo remembers it"
+    assert bits(0x0C) == MotorError.WINDING_OVERTEMPERATURE | MotorError.OUTPUT_ENCODER
     for bit in HardwareError:
-        assert (motor_error(bit, 9.0, 16.0) != 0) == (bit != 0)
+        assert (bits(bit, 9.0) != 0) == (bit != 0)
 
 
 def test_reboots_back_off_and_forget() -> None:

@@ -152,7 +152,8 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
     def clearPort(self) -> None:  # noqa: N802
         """Forget what has been received: the SDK calls this before each instruction."""
         self._received.clear()
-        self.ser.reset_input_buffer()
+        if not self.hold_next:  # what is held is sent with the next one, which clears
+            self.ser.reset_input_buffer()
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         """At most ``length`` bytes; fewer only when the deadline has come."""

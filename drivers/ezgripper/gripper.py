@@ -303,6 +303,13 @@ class EZGripper:
             log.warning("could not switch the motor off: %s", error)
         finally:
             servo.bus.close()
+            log.info(
+                "EZGripper on %s closed: %s, %s, %s",
+                servo.bus.path,
+                self.statistics,
+                servo.statistics,
+                servo.bus.statistics,
+            )
 
     def __enter__(self) -> EZGripper:
         self.open()
@@ -381,9 +388,9 @@ class EZGripper:
         self._was_warm = sample.temperature >= control.settings.warm
 
     def _motor_error(self, sample: Sample) -> MotorError:
-        return motor_error(
-            sample.error, sample.voltage * mx64.VOLTAGE_UNIT, self._limits.voltage_max
-        )
+        limits = self._limits
+        voltage = sample.voltage * mx64.VOLTAGE_UNIT
+        return motor_error(sample.error, voltage, limits.voltage_min, limits.voltage_max)
 
     def _state(self, control: Control, sample: Sample) -> HandState:
         contact = control.contact
@@ -486,7 +493,7 @@ class EZGripper:
             if not self._policy.due(self._clock.now(), error, temperature, limit):
                 raise HandFault(
                     f"the servo is in shutdown: {describe(error)} ({temperature} degC)",
-                    bits=(motor_error(error, 0.0, 0.0),),
+                    bits=(motor_error(error, 0.0, 0.0, 0.0),),
                     hint="let it cool down, free the fingers, and try again",
                 )
         self._clock.sleep_until(self._clock.now() + min(self._policy.delay, 2.0))
@@ -499,7 +506,7 @@ class EZGripper:
         if _is_shutdown(error):
             raise HandFault(
                 f"the servo is in shutdown and a restart does not help: {describe(error)}",
-                bits=(motor_error(error, 0.0, 0.0),),
+                bits=(motor_error(error, 0.0, 0.0, 0.0),),
             )
 
 

@@ -26,17 +26,24 @@ _MOTOR_ERRORS = {
 }
 
 
-def motor_error(error: int, voltage: float, voltage_max: float) -> MotorError:
+def motor_error(error: int, voltage: float, voltage_min: float, voltage_max: float) -> MotorError:
     """The servo's error bits in the vocabulary of all hands (facts/unitree-dex B.6).
 
-    :param voltage: present supply, V; tells which limit an input voltage error broke.
-    :param voltage_max: upper limit, V.
+    The servo keeps an input voltage error until it is rebooted; it is reported while the
+    voltage is outside the limits.
+
+    :param voltage: present supply, V.
+    :param voltage_min: the servo's limits, V.
+    :param voltage_max: see ``voltage_min``.
     """
     bits = MotorError.NONE
     if not error:
         return bits
     if error & HardwareError.INPUT_VOLTAGE:
-        bits |= MotorError.OVERVOLTAGE if voltage > voltage_max else MotorError.UNDERVOLTAGE
+        if voltage > voltage_max:
+            bits |= MotorError.OVERVOLTAGE
+        elif voltage < voltage_min:
+            bits |= MotorError.UNDERVOLTAGE
     for servo_bit, bit in _MOTOR_ERRORS.items():
         if error & servo_bit:
             bits |= bit
