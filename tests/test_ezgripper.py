@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -585,6 +587,38 @@ def test_unplugged_in_motion_and_plugged_in_again(tmp_path: Path) -> None:
         assert travel(gripper) == pytest.approx(stopped, abs=20)
         drive(hand, HALF, at(2.7))
         hand.close()
+
+
+_DRIVER = """
+import sys
+from dexkit.drivers.ezgripper import EZGripper, GripperSettings
+from dexkit.drivers.ezgripper.control import ControlSettings
+from dexkit.hand import HandCommand
+settings = GripperSettings(zero=int(sys.argv[2]), control=ControlSettings(startup_speed=20))
+with EZGripper(sys.argv[1], configuration=settings) as hand:
+    while True:
+        hand.exchange(HandCommand.position(0.0))
+"""
+
+
+def test_a_killed_driver_leaves_nothing_moving(tmp_path: Path) -> None:
+    with emulated(start=100.0) as gripper:
+        driver = subprocess.Popen([sys.executable, "-c", _DRIVER, gripper.path, str(ZERO)])
+        try:
+            deadline = time.monotonic() + LONG
+            while gripper.servo.get(mx64.PRESENT_VELOCITY) > -10:
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+        finally:
+            driver.kill()
+            driver.wait()
+        while gripper.servo.get(mx64.BUS_WATCHDOG) != mx64.WATCHDOG_TRIPPED:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        while gripper.servo.get(mx64.PRESENT_VELOCITY) != 0:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert travel(gripper) > 1000, "far from where it was told to go"
 
 
 def test_a_pause_trips_the_watchdog_and_work_goes_on(tmp_path: Path) -> None:
