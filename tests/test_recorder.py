@@ -185,6 +185,15 @@ def test_a_full_disk_ends_the_recording_with_an_error(tmp_path: Path) -> None:
         recorder.close()
 
 
+@pytest.mark.parametrize("times", [(-1, 0), (0, -1), (2**64, 0)])
+def test_a_time_that_is_none_is_refused_at_once(tmp_path: Path, times: tuple[int, int]) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        with pytest.raises(UsageError, match="not times"):
+            recorder.put(CMD, CMD_TYPE, cmd(0.0), *times)
+        assert recorder.put(CMD, CMD_TYPE, cmd(0.0), T0)
+    assert recorder.written == 1
+
+
 def test_closing_twice_and_putting_after_is_harmless(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mcap")
     recorder.open()

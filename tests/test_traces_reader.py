@@ -189,7 +189,8 @@ def test_reads_what_the_mcap_library_reads(
     ]
     path = write(tmp_path / "a.mcap", data)
     ours = as_rows(path)
-    assert ours == sorted(written, key=lambda row: row[1])
+    # of equal times, chunks that overlap may give the later one first
+    assert [r[1] for r in ours] == sorted(r[1] for r in written)
     assert Counter(ours) == Counter(theirs)
     trace = open_trace(path)
     for topic, samples in trace.load().items():

@@ -135,8 +135,9 @@ def test_an_old_layout_is_named_and_not_decoded(tmp_path: Path, encoding: str) -
     assert "another layout" in channel.problem
     assert "lacks system_v, device_v, error" in channel.problem
     assert any("another layout" in w for w in trace.warnings)
-    with pytest.raises(TraceUnsupported, match="another layout"):
-        trace.message_type(topic)
+    for decode in (trace.message_type, lambda t: trace.samples(t).columns()):
+        with pytest.raises(TraceUnsupported, match="another layout"):
+            decode(topic)
 
 
 @pytest.mark.parametrize(

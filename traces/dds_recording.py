@@ -190,9 +190,9 @@ class DdsRecording:
                 self._known_channels.add(key)
                 self.recorder.add_channel(topic, type_name, self._channel_metadata(key))
             for sample in samples:
-                self.recorder.put(
-                    topic, type_name, sample.data, sample.reception_ns, sample.source_timestamp_ns
-                )
+                # a writer may send no timestamp, which DDS gives as a negative number
+                source = max(sample.source_timestamp_ns, 0)
+                self.recorder.put(topic, type_name, sample.data, sample.reception_ns, source)
 
     def _channel_metadata(self, key: tuple[str, str]) -> dict[str, str]:
         metadata = {

@@ -134,6 +134,7 @@ class SampleArray:
     :param log_time_ns: reception, ns since the epoch, shape (n,), int64.
     :param publish_time_ns: DDS source timestamp, likewise; 0 where it is unknown.
     :param payloads: n payloads as recorded.
+    :param problem: why they cannot be decoded, or empty.
     """
 
     topic: str
@@ -141,6 +142,7 @@ class SampleArray:
     log_time_ns: Times
     publish_time_ns: Times
     payloads: list[bytes]
+    problem: str = ""
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
@@ -148,8 +150,10 @@ class SampleArray:
     def columns(self) -> Columns:
         """The fields of the payloads as numpy columns.
 
-        :raises UsageError: dexkit does not know the type.
+        :raises TraceUnsupported: their type, layout or encoding cannot be decoded.
         """
+        if self.problem:
+            raise TraceUnsupported(f"{self.topic}: {self.problem}")
         return message_type(self.type_name).columns(self.payloads)
 
 
@@ -299,28 +303,24 @@ class Trace:
         :param payloads: False for the times alone.
         :raises UsageError: a topic is not in the recording.
         """
-        chosen: dict[str, str] = {}
+        chosen: dict[str, ChannelInfo] = {}
         wanted = self._wanted(topics)
         for info in sorted(
             (self._info[i] for i in wanted), key=lambda c: (not c.supported, -c.message_count)
         ):
-            chosen.setdefault(info.topic, info.type_name)
+            chosen.setdefault(info.topic, info)
         sinks = {
             i: _Sink(payloads=[] if payloads else None)
             for i in wanted
-            if chosen[self._info[i].topic] == self._info[i].type_name
+            if chosen[self._info[i].topic].type_name == self._info[i].type_name
         }
         with self.path.open("rb") as file:
             for segment in self._segments:
                 if segment.counts is None or not sinks.keys().isdisjoint(segment.counts):
                     self._parse(self._unpack(file, segment), segment, sinks)
         return {
-            topic: _columns(
-                topic,
-                type_name,
-                [s for i, s in sinks.items() if self._info[i].topic == topic],
-            )
-            for topic, type_name in sorted(chosen.items())
+            topic: _columns(info, [s for i, s in sinks.items() if self._info[i].topic == topic])
+            for topic, info in sorted(chosen.items())
         }
 
     def samples(self, topic: str) -> SampleArray:
@@ -714,7 +714,7 @@ def _unzstd(packed: bytes, size: int, cut: bool) -> bytes:
         return reader.read(size)
 
 
-def _columns(topic: str, type_name: str, sinks: list[_Sink]) -> SampleArray:
+def _columns(info: ChannelInfo, sinks: list[_Sink]) -> SampleArray:
     log = _times([t for s in sinks for t in s.log])
     publish = _times([t for s in sinks for t in s.publish])
     payloads = [p for s in sinks if s.payloads is not None for p in s.payloads]
@@ -723,7 +723,7 @@ def _columns(topic: str, type_name: str, sinks: list[_Sink]) -> SampleArray:
         log, publish = log[order], publish[order]
         if payloads:
             payloads = [payloads[i] for i in order]
-    return SampleArray(topic, type_name, log, publish, payloads)
+    return SampleArray(info.topic, info.type_name, log, publish, payloads, info.problem)
 
 
 def _times(values: list[int]) -> Times:

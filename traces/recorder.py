@@ -4,8 +4,8 @@ Whoever receives samples calls :meth:`Recorder.put`, which only appends to a que
 is slower than the samples, the queue fills up to its bound and further samples are dropped and
 counted, so recording never slows down what is recorded. Every :data:`FLUSH_INTERVAL` what has
 been received is written as a complete chunk and handed to the operating system: killing the
-process (SIGKILL included) costs the last moments, not the file. A power cut may cost more, since
-nothing is forced onto the disk.
+process (SIGKILL included) costs the last moments, not the file, as long as the writer keeps up
+with the queue. A power cut may cost more, since nothing is forced onto the disk.
 
 Schemas are ``ros2msg`` and the profile is ``ros2``, because that is what PlotJuggler, Foxglove
 and the readers of ROS 2 bags open; topics keep their DDS names (``rt/...``).
@@ -34,6 +34,10 @@ FLUSH_INTERVAL = 0.2
 # Seconds that the writer sleeps when nothing wakes it, and queued messages that do.
 _POLL = 0.05
 _WAKE_AT = 512
+# Messages written between two looks at the clock.
+_SLICE = 4096
+# mcap times are unsigned 64-bit numbers
+_TIMES = 2**64
 
 _COMPRESSION = {
     "zstd": CompressionType.ZSTD,
@@ -112,7 +116,7 @@ class Recorder:
         self._closing = False
         self._thread: threading.Thread | None = None
         self._file: BinaryIO | None = None
-        self._error: OSError | None = None
+        self._error: Exception | None = None
         self._written = 0
         self._bytes = 0
 
@@ -144,7 +148,7 @@ class Recorder:
         return dict(counts)
 
     @property
-    def error(self) -> OSError | None:
+    def error(self) -> Exception | None:
         """Why writing has stopped, or None."""
         return self._error
 
@@ -183,11 +187,13 @@ class Recorder:
             self._closing = True
         self._wake.set()
         thread.join()
-        if self._error is not None:
+        error = self._error
+        if error is not None:
+            reason = error.strerror if isinstance(error, OSError) else f"{error!r}"
             raise TraceError(
-                f"recording to {self.path} stopped: {self._error.strerror or self._error}",
+                f"recording to {self.path} stopped: {reason or error}",
                 hint=f"{self._written} messages were written and can be read",
-            )
+            ) from error
 
     def __enter__(self) -> Recorder:
         self.open()
@@ -231,8 +237,10 @@ class Recorder:
         :param log_time_ns: reception, ns since the epoch.
         :param publish_time_ns: DDS source timestamp, ns since the epoch; 0 if unknown.
         :returns: False when it was dropped.
-        :raises UsageError: dexkit does not know the type.
+        :raises UsageError: dexkit does not know the type, or a time is not one.
         """
+        if not (0 <= log_time_ns < _TIMES and 0 <= publish_time_ns < _TIMES):
+            raise UsageError(f"not times in ns since the epoch: {log_time_ns}, {publish_time_ns}")
         channel = self._channels.get((topic, type_name))
         if channel is None:
             self.add_channel(topic, type_name)
@@ -270,7 +278,7 @@ class Recorder:
         try:
             with self._file:
                 self._write_all()
-        except OSError as error:  # a full disk, a vanished mount
+        except Exception as error:  # a full disk, a vanished mount; close() raises it
             with self._lock:
                 self._error = error
 
@@ -286,33 +294,12 @@ class Recorder:
             with self._lock:
                 closing = self._closing
                 batch, self._queue = self._queue, []
-            messages = size = 0
-            for item in batch:
-                if isinstance(item, _Metadata):
-                    writer.add_metadata(item.name, item.values)
-                    continue
-                if not item.channel.id:
-                    self._register(item.channel)
-                writer.add_message(
-                    item.channel.id,
-                    item.log_time_ns,
-                    item.data,
-                    item.publish_time_ns,
-                    item.sequence,
-                )
-                messages += 1
-                size += len(item.data)
-            with self._lock:
-                self._queued -= messages
-                self._queued_bytes -= size
-            self._written += messages
-            self._bytes += size
+            for start in range(0, len(batch), _SLICE):
+                self._write(batch[start : start + _SLICE])
+                flushed = self._flush_after(flushed)
             if closing:
                 break
-            now = time.monotonic()
-            if now - flushed >= FLUSH_INTERVAL:
-                writer.flush()  # type: ignore[no-untyped-call]
-                flushed = now
+            flushed = self._flush_after(flushed)
         with self._lock:
             silent = [c for c in self._channels.values() if not c.id]
             dropped: Counter[str] = Counter()
@@ -329,6 +316,34 @@ class Recorder:
             },
         )
         writer.finish()  # type: ignore[no-untyped-call]
+
+    def _write(self, items: list[_Item | _Metadata]) -> None:
+        writer = self._writer
+        messages = size = 0
+        for item in items:
+            if isinstance(item, _Metadata):
+                writer.add_metadata(item.name, item.values)
+                continue
+            if not item.channel.id:
+                self._register(item.channel)
+            writer.add_message(
+                item.channel.id, item.log_time_ns, item.data, item.publish_time_ns, item.sequence
+            )
+            messages += 1
+            size += len(item.data)
+        with self._lock:
+            self._queued -= messages
+            self._queued_bytes -= size
+        self._written += messages
+        self._bytes += size
+
+    def _flush_after(self, flushed: float) -> float:
+        """Complete the chunk if it is time; returns when that was last done."""
+        now = time.monotonic()
+        if now - flushed < FLUSH_INTERVAL:
+            return flushed
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        return now
 
     def _register(self, channel: _Channel) -> None:
         kind = channel.kind

@@ -57,8 +57,8 @@ def command(
     """Record DDS topics to OUT, an mcap file, until Ctrl-C.
 
     Payloads are written as they were on the wire, with the time of reception and the source
-    timestamp. PlotJuggler, Foxglove and readers of ROS 2 bags open the file. Killing the
-    recorder costs at most half a second.
+    timestamp, and with ros2msg schemas, as PlotJuggler, Foxglove and readers of ROS 2 bags want
+    them. Killing the recorder costs at most half a second.
 
     Exit code 1 when nothing was received.
     """
