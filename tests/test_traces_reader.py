@@ -250,7 +250,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Sh
 def test_a_cut_costs_no_more_than_the_record_it_falls_in(tmp_path: Path) -> None:
     expected = rows(8)
     data = mcap_bytes(expected, Shape(chunked=False))
-    for cut in range(header_end(data), len(data)):
+    for cut in range(header_end(data), len(data), 3):
         got = check_cut(tmp_path, data, cut, expected)
         whole = 0
         at = header_end(data)
