@@ -234,6 +234,7 @@ def packets(draw: st.DrawFn) -> Packet:
 
 
 @given(nasty)
+@settings(deadline=None)
 def test_stuffing_is_undone_and_hides_every_header(body: bytes) -> None:
     stuffed = dxl.stuff(body)
     assert dxl.unstuff(stuffed) == body
@@ -241,11 +242,13 @@ def test_stuffing_is_undone_and_hides_every_header(body: bytes) -> None:
 
 
 @given(packets())
+@settings(deadline=None)
 def test_decode_inverts_encode(packet: Packet) -> None:
     assert dxl.decode(dxl.encode(packet.id, packet.instruction, packet.params)) == packet
 
 
 @given(packets(), st.data())
+@settings(deadline=None)
 def test_any_flipped_bit_is_noticed(packet: Packet, data: st.DataObject) -> None:
     wire = bytearray(dxl.encode(packet.id, packet.instruction, packet.params))
     bit = data.draw(st.integers(0, 8 * len(wire) - 1))
@@ -255,7 +258,7 @@ def test_any_flipped_bit_is_noticed(packet: Packet, data: st.DataObject) -> None
 
 
 @given(st.lists(packets(), max_size=5), st.data())
-@settings(max_examples=150)
+@settings(max_examples=150, deadline=None)
 def test_parser_does_not_care_how_bytes_are_cut(sent: list[Packet], data: st.DataObject) -> None:
     stream = b"".join(dxl.encode(p.id, p.instruction, p.params) for p in sent)
     parser = PacketParser()
@@ -269,6 +272,7 @@ def test_parser_does_not_care_how_bytes_are_cut(sent: list[Packet], data: st.Dat
 
 
 @given(st.binary(max_size=2000))
+@settings(deadline=None)
 def test_parser_survives_anything_within_bounds(noise: bytes) -> None:
     parser = PacketParser()
     parser.feed(noise)
@@ -276,6 +280,7 @@ def test_parser_survives_anything_within_bounds(noise: bytes) -> None:
 
 
 @given(nasty, packets())
+@settings(deadline=None)
 def test_good_packet_is_found_behind_garbage(noise: bytes, packet: Packet) -> None:
     """A false header can hide a packet only until the bytes that it claims have come."""
     parser = PacketParser()

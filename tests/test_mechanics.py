@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.emulators.mechanics import Joint, Wall
@@ -85,6 +85,7 @@ def test_locked_joint_does_not_move() -> None:
     st.floats(0.0, 0.2),
     st.sampled_from([2e-4, 5e-4, 1e-3]),
 )
+@settings(deadline=None)
 def test_any_torque_keeps_it_between_its_stops(
     torques: list[float], coulomb: float, viscous: float, dt: float
 ) -> None:
@@ -111,6 +112,7 @@ def test_any_torque_keeps_it_between_its_stops(
 
 
 @given(st.floats(0.05, 3.0), st.floats(-3.0, 3.0))
+@settings(deadline=None)
 def test_friction_never_adds_energy(coulomb: float, speed: float) -> None:
     joint = Joint(inertia=0.01, coulomb=coulomb, dq=speed)
     before = abs(speed)

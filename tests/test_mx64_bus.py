@@ -573,6 +573,7 @@ def test_protocol_1_servo_answers_its_own_protocol_only() -> None:
 
 
 @given(st.binary(max_size=200))
+@settings(deadline=None)
 def test_protocol_1_survives_anything(noise: bytes) -> None:
     old = Protocol1Servo(1)
     old.feed(noise)

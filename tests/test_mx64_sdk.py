@@ -119,22 +119,16 @@ def test_errors_are_understood(port: sdk.PortHandler) -> None:
     assert PACKETS.write1ByteTxRx(port, 1, mx64.ID.address, 1) == (sdk.COMM_SUCCESS, 7)
 
 
-def test_sdk_sends_stuffed_goals_wrong_and_the_emulator_keeps_to_the_manual(
-    port: sdk.PortHandler,
-) -> None:
-    """The SDK forgets to stuff (facts/mx64 A3): the packet on the wire holds FF FF FD 00.
-
-    Its CRC is right, so a servo takes it as what it is: the same value.
-    """
-    PACKETS.write1ByteTxRx(port, 1, mx64.OPERATING_MODE.address, 5)
-    goal = 0x0000_FFFD - 0x1_0000  # FD FF FF FF: harmless
-    assert PACKETS.write4ByteTxRx(port, 1, 116, goal & 0xFFFFFFFF) == OK
-    harmful = -131073  # FF FF FD FF
-    result, error = PACKETS.write4ByteTxRx(port, 1, 116, harmful & 0xFFFFFFFF)
-    assert (result, error) == OK
-    # the answer is stuffed by the manual, and the SDK unstuffs it
-    assert PACKETS.read4ByteTxRx(port, 1, 116) == (harmful & 0xFFFFFFFF, *OK)
-    PACKETS.write1ByteTxRx(port, 1, mx64.OPERATING_MODE.address, 3)
+def test_goals_that_the_sdk_forgets_to_stuff_are_still_understood(port: sdk.PortHandler) -> None:
+    """The SDK does not stuff what it sends (facts/mx64 A3), but its length and CRC agree."""
+    goal = mx64.GOAL_POSITION.address
+    assert PACKETS.write1ByteTxRx(port, 1, mx64.OPERATING_MODE.address, 5) == OK
+    # FF FF FD 00, a whole header inside the packet: understood, and out of range
+    assert PACKETS.write4ByteTxRx(port, 1, goal, 0x00FDFFFF) == (sdk.COMM_SUCCESS, 4)
+    # FF FF FD FF: in range; the answer is stuffed by the manual, and the SDK unstuffs it
+    assert PACKETS.write4ByteTxRx(port, 1, goal, -131073 & 0xFFFFFFFF) == OK
+    assert PACKETS.read4ByteTxRx(port, 1, goal) == (-131073 & 0xFFFFFFFF, *OK)
+    assert PACKETS.write1ByteTxRx(port, 1, mx64.OPERATING_MODE.address, 3) == OK
 
 
 def test_group_sync_read_and_write(port: sdk.PortHandler) -> None:

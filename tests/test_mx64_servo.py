@@ -49,7 +49,7 @@ def test_every_item_reads_with_its_initial_value(item: Item) -> None:
 
 
 @given(st.integers(0, 700), st.integers(0, 700))
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 def test_reads_answer_everything_or_an_access_error(address: int, length: int) -> None:
     error, data = servo().read_block(address, length)
     covered = {a for i in mx64.TABLE.values() for a in range(i.address, i.end)}
@@ -79,7 +79,7 @@ def test_part_of_an_item_can_be_read_but_not_written() -> None:
 
 
 @given(st.integers(0, 700), st.binary(max_size=30), st.booleans())
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 def test_a_write_changes_all_of_what_it_says_or_nothing(
     address: int, data: bytes, torque: bool
 ) -> None:
