@@ -132,7 +132,7 @@ def _stage(recording: Recording, side: Side) -> str:
             return "moving"
         return "samples flowing"
     if any(c.topic == topic for c in recording.channels) or any(
-        e.topic == topic for e in recording.endpoints
+        e.topic == topic and e.kind == "writer" for e in recording.endpoints
     ):
         return "topic seen, no sample of the right type"
     return "nothing seen"

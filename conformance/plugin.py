@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -28,17 +27,29 @@ _TRACE = "--dexkit-trace"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Declare the suite's options."""
+    """Declare the suite's options.
+
+    Each also has a long name, ``--dexkit-NAME``. Should another plug-in of the environment own
+    the short one, that is the only one: this plug-in must not break anybody's pytest.
+    """
     group = parser.getgroup("dexkit conformance", "judge a hand on Unitree's topics")
-    add = group.addoption
+
+    def add(name: str, **attributes: Any) -> None:
+        long = f"--dexkit-{name}"
+        dest = long.removeprefix("--").replace("-", "_")
+        try:
+            group.addoption(f"--{name}", long, dest=dest, **attributes)
+        except ValueError:
+            group.addoption(long, dest=dest, **attributes)
+
     add(
-        "--backend",
+        "backend",
         metavar="NAME",
         help="hand to judge: a name from 'dexkit backends', package.module:Class, or 'external' "
         "for a service that already runs",
     )
     add(
-        "--device",
+        "device",
         action="append",
         default=[],
         metavar="PATH",
@@ -46,49 +57,43 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "where dexkit can",
     )
     add(
-        "--side",
+        "side",
         choices=["left", "right", "both"],
         help="hands to judge; default both, or left with one --device",
     )
     add(
-        "--dialect",
+        "dialect",
         choices=["unitree_go", "unitree_hg", "unitree_actuator"],
         default="unitree_go",
         help="how the hand speaks (default: unitree_go)",
     )
+    add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")
+    add("interface", default="lo", help="network interface (default: lo)")
     add(
-        "--domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device"
-    )
-    add("--interface", default="lo", help="network interface (default: lo)")
-    add(
-        "--object",
+        "object",
         action="append",
         default=[],
         metavar="PCT",
         help="something to squeeze, felt at so many percent of opening; left=PCT or right=PCT. "
         "Default: 37 in the right hand where the kit starts it; 'none' for none",
     )
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the backend")
-    add(
+    add("set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the backend")
+    group.addoption(
         _TRACE,
         metavar="FILE",
         help="recorded session to replay; also '--trace FILE' (a file that ends in .mcap)",
     )
     add(
-        "--require",
+        "require",
         action="append",
         default=[],
         metavar="PREFIX",
         help="only requirements whose id begins so (DEX1-RATE)",
     )
-    add(
-        "--level",
-        choices=["must", "should", "info"],
-        help="only requirements at least this binding",
-    )
-    add("--json", metavar="FILE", dest="dexkit_json", help="write the result file")
-    add("--report", metavar="FILE.html", dest="dexkit_report", help="write the report page")
-    add("--recording", metavar="FILE.mcap", dest="dexkit_recording", help="keep the recording")
+    add("level", choices=["must", "should", "info"], help="only requirements at least this binding")
+    add("json", metavar="FILE", help="write the result file")
+    add("report", metavar="FILE.html", help="write the report page")
+    add("recording", metavar="FILE.mcap", help="keep the recording")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -104,16 +109,12 @@ def pytest_configure(config: pytest.Config) -> None:
     """Check the options, before anything is started."""
     config.addinivalue_line("markers", f"{_MARK}: a requirement of the conformance suite")
     config.stash[OPTIONS_KEY] = None
-    given = [o for o in ("device", "side", "object", "set", "domain") if config.getoption(o)]
-    given += [
-        o for o in ("dexkit_json", "dexkit_report", "dexkit_recording") if config.getoption(o)
-    ]
-    if config.getoption("dexkit_trace"):
-        given.append("trace")
-    if not config.getoption("backend"):
+    names = ("device", "side", "object", "set", "domain", "trace", "json", "report", "recording")
+    if not config.getoption("dexkit_backend"):
+        given = [f"--{name}" for name in names if config.getoption(f"dexkit_{name}")]
         if given:
-            names = ", ".join(f"--{o.removeprefix('dexkit_')}" for o in given)
-            raise pytest.UsageError(f"{names} without --backend: which hand is to be judged?")
+            text = f"{', '.join(given)} without --backend: which hand is to be judged?"
+            raise pytest.UsageError(text)
         return
     from dexkit.conformance.session import SuiteOptions
     from dexkit.errors import DexkitError
@@ -169,11 +170,7 @@ def pytest_terminal_summary(
         force_terminal=terminalreporter._tw.hasmarkup,
     )
     print_result(result, console)
-    for option, name in (
-        ("dexkit_json", "result"),
-        ("dexkit_report", "report"),
-        ("dexkit_recording", "recording"),
-    ):
-        path = config.getoption(option)
+    for option, name in (("json", "result"), ("report", "report"), ("recording", "recording")):
+        path = config.getoption(f"dexkit_{option}")
         if path:
-            terminalreporter.write_line(f"{name}: {Path(path)}")
+            terminalreporter.write_line(f"{name}: {path}")

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.processes import EMULATED, EXTERNAL, RigOptions
@@ -62,7 +62,9 @@ class SuiteOptions:
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
         """
-        get = config.getoption
+
+        def get(name: str) -> Any:
+            return config.getoption(f"dexkit_{name}")
 
         def path(name: str) -> Path | None:
             value = get(name)
@@ -77,12 +79,12 @@ class SuiteOptions:
             devices=get("device"),
             objects=get("object"),
             settings=get("set"),
-            trace=path("dexkit_trace"),
+            trace=path("trace"),
             require=get("require"),
             level=get("level"),
-            json=path("dexkit_json"),
-            report=path("dexkit_report"),
-            recording=path("dexkit_recording"),
+            json=path("json"),
+            report=path("report"),
+            recording=path("recording"),
         )
 
     @classmethod

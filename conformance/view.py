@@ -163,15 +163,16 @@ class Recording:
         origin = min([int(t[0]) for t in times] + marks, default=0)
         end = max([int(t[-1]) for t in times] + marks, default=0)
         wire = Wire(chosen)
-        views = {
-            s: SideView(
-                s,
-                _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
-                _commands(wire, s, samples.get(chosen.topics(s)[0]), origin),
-            )
-            for s in sorted(Side, key=lambda s: s is not Side.LEFT)
-            if s in judged or any(topic in present for topic in chosen.topics(s))
-        }
+        with np.errstate(invalid="ignore"):  # any NaN is a finding, not a surprise
+            views = {
+                s: SideView(
+                    s,
+                    _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
+                    _commands(wire, s, samples.get(chosen.topics(s)[0]), origin),
+                )
+                for s in sorted(Side, key=lambda s: s is not Side.LEFT)
+                if s in judged or any(topic in present for topic in chosen.topics(s))
+            }
         notes = list(trace.warnings)
         if trace.truncated:
             notes.append("the recording is unfinished; it is judged as far as it goes")

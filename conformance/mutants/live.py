@@ -1,0 +1,70 @@
+"""A mutant (or the reference) on real DDS: to try the live suite on hands that are known."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from dexkit.clock import Rate
+from dexkit.conformance.virtual import TICK, ReferenceService
+from dexkit.dds import DdsNode, Qos, Reader, Writer
+
+__all__ = ["LiveMutant"]
+
+
+class LiveMutant:
+    """Serves a virtual service in real time, from a thread; a context manager.
+
+    The hand does what it does on the virtual clock, except what only the virtual wire can do:
+    :attr:`~ReferenceService.serves_late_readers`. Clients are told apart by their writers.
+    """
+
+    def __init__(self, service: ReferenceService, domain: int, interface: str = "lo") -> None:
+        self.service = service
+        self._node = DdsNode(domain=domain, interface=interface)
+        self._stop = threading.Event()
+        self._clients: dict[int, int] = {}
+        self._readers: dict[str, Reader] = {}
+        self._writers: dict[tuple[str, str], Writer] = {}
+        durability = "volatile" if service.reader_durability == "Volatile" else "transient_local"
+        for endpoint in service.endpoints():
+            if endpoint.kind == "reader":
+                self._readers[endpoint.topic] = self._node.reader(
+                    endpoint.topic,
+                    endpoint.type_name,
+                    qos=Qos(endpoint.reliability, durability),
+                    depth=16,
+                )
+        self._thread = threading.Thread(target=self._run, name="mutant", daemon=True)
+
+    def __enter__(self) -> LiveMutant:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._node.close()
+
+    def _run(self) -> None:
+        rate = Rate(1.0 / TICK)
+        last = time.monotonic()
+        while not self._stop.is_set():
+            for topic, reader in self._readers.items():
+                for sample in reader.take():
+                    client = self._clients.setdefault(sample.writer, len(self._clients))
+                    self.service.receive(topic, sample.data, client)
+            # late ticks are lived through, so that the hand does not slow down with the machine
+            now = time.monotonic()
+            while last + TICK <= now:
+                last += TICK
+                for state in self.service.advance(TICK):
+                    self._writer(state.topic, state.type_name).write_raw(state.payload)
+            rate.wait()
+
+    def _writer(self, topic: str, type_name: str) -> Writer:
+        key = (topic, type_name)
+        if key not in self._writers:
+            qos = Qos(self.service.writer_reliability)
+            self._writers[key] = self._node.writer(topic, type_name, qos=qos)
+        return self._writers[key]

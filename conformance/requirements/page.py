@@ -1,0 +1,63 @@
+"""The catalogue as a page: ``python -m dexkit.conformance.requirements.page`` brings it up to date
+in docs/conformance.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dexkit.conformance.requirements import Requirement, catalogue
+
+__all__ = ["BEGIN", "END", "catalogue_page"]
+
+BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
+END = "<!-- end of catalogue -->"
+
+
+def catalogue_page() -> str:
+    """Markdown of all requirements, by area."""
+    from dexkit.conformance.mutants import MUTANTS
+
+    lines: list[str] = []
+    area = ""
+    for requirement in catalogue():
+        if requirement.area != area:
+            area = requirement.area
+            lines += ["", f"### {area}", ""]
+        killers = [f"`{m.name}`" for m in MUTANTS if m.kills == requirement.id]
+        lines += [
+            f"**{requirement.id}** ({requirement.level}) {requirement.sentence}  ",
+            f"{requirement.rationale}  ",
+            f"*Source:* {requirement.source} ({requirement.confidence}). "
+            f"*Judged from:* {_needs(requirement)}. *Proven by:* {', '.join(killers)}.",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _needs(requirement: Requirement) -> str:
+    where = {
+        "nothing": "any recording",
+        "endpoints": "what discovery saw",
+        "state": "any state",
+        "commands": "any commanded session",
+        "motion": "any motion",
+    }.get(requirement.needs)
+    if where is None:
+        kind, _, name = requirement.needs.partition(":")
+        other = " of the other hand" if kind.startswith("other") else ""
+        where = f"stimulus `{name}`{other}"
+    only = "" if len(requirement.dialects) == 3 else f", in {' and '.join(requirement.dialects)}"
+    return where + only
+
+
+def main() -> None:
+    """Write it into the documentation."""
+    path = Path(__file__).resolve().parents[2] / "docs" / "conformance.md"
+    text = path.read_text(encoding="utf-8")
+    head, tail = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    path.write_text(f"{head}\n{catalogue_page()}\n{tail}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

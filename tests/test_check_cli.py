@@ -1,0 +1,82 @@
+"""``dexkit check``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from dexkit.cli import main
+from dexkit.traces import sample_path
+
+
+def check(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(["check", *map(str, arguments)])
+    assert isinstance(end.value.code, int)
+    return end.value.code
+
+
+@pytest.mark.parametrize("name", ["dex1_pick_place", "dex1_idle_then_startle", "dex1_legacy_v1_1"])
+def test_good_recordings_pass(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path(name)) == 0
+    assert "PASS: every MUST that could be judged is met" in capsys.readouterr().out
+
+
+def test_the_dropout_fails_and_is_explained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / name for name in ("r.json", "r.xml", "r.html")]
+    code = check(
+        sample_path("dex1_hand_dropout"),
+        *("--json", files[0], "--junit", files[1], "--html", files[2]),
+    )
+    assert code == 1
+    out = capsys.readouterr().out
+    assert "DEX1-RATE-03 (MUST) left: fail" in out
+    assert "rt/dex1/left/state at 9.49" in out
+    assert json.loads(files[0].read_text())["overall"] == "fail"
+    suite = ElementTree.parse(files[1]).getroot()
+    failures = suite.findall("./testcase/failure")
+    assert (suite.get("failures"), len(failures)) == ("1", 1)
+    assert "never silent for more than 0.1 s" in (failures[0].text or "")
+    assert "Fail" in files[2].read_text()
+
+
+def test_one_side_can_be_judged_alone() -> None:
+    assert check(sample_path("dex1_hand_dropout"), "--side", "right") == 0
+
+
+def test_what_is_no_dex1_is_not_usable(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path("dex3_pinch")) == 2
+    assert "rt/dex3/left/state" in capsys.readouterr().err
+
+
+def test_what_is_no_recording_is_not_usable(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"not a recording")
+    assert check(path) == 2
+    assert check(tmp_path / "missing.mcap") == 2
+
+
+def test_nothing_judged_is_not_a_pass(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-MOVE") == 2
+    assert "nothing was judged, which is not a pass" in capsys.readouterr().err
+
+
+def test_selection(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--level", "must") == 0
+    out = capsys.readouterr().out
+    assert "DEX1-RATE-01" in out
+    assert "DEX1-RATE-02" not in out
+    assert "(2 requirements: 2 pass)" in out
+    assert check(sample_path("dex1_pick_place"), "--require", "DEX7") == 2
+    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-QOS-02", "--level", "must") == 2
+
+
+def test_verbose_says_what_was_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path("dex1_pick_place"), "-v") == 0
+    out = capsys.readouterr().out
+    assert "DEX1-WDOG-01 left: needs the stimulus 'silence'" in out.replace("\n", " ")

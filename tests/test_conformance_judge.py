@@ -1,0 +1,278 @@
+"""Verdicts on recordings: the genuine ones, damaged ones, and those that hold too little."""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dexkit.conformance.judge import judge
+from dexkit.conformance.phases import RECORD, Stall, Stimulus
+from dexkit.conformance.requirements import catalogue, select
+from dexkit.conformance.results import Overall, RunResult, Verdict, read_json, worst
+from dexkit.conformance.view import Recording, detect_dialect, sides_of
+from dexkit.conformance.virtual import MemoryTrace
+from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
+from dexkit.hand import Side
+from dexkit.models import dialect
+from dexkit.traces import open_trace, sample_labels, sample_path
+from tests.conformance_helpers import copy_of, failed, of, short_run
+
+STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+CMD = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
+
+
+def judged(trace: MemoryTrace) -> RunResult:
+    return judge(Recording.of(trace))
+
+
+# ------------------------------------------------------------------------- genuine recordings
+
+
+@pytest.mark.parametrize("name", ["dex1_pick_place", "dex1_idle_then_startle"])
+def test_genuine_recordings_pass(name: str) -> None:
+    result = judge(Recording.of(open_trace(sample_path(name))))
+    assert result.overall is Overall.PASS
+    assert {v for v, n in result.counts().items() if n} == {Verdict.PASS, Verdict.NOT_APPLICABLE}
+    for requirement in ("DEX1-START-01", "DEX1-RATE-03", "DEX1-FIELD-03", "DEX1-TRACK-01"):
+        for side in Side:
+            assert of(result, requirement, side).verdict is Verdict.PASS
+
+
+def test_the_dropout_is_found_where_it_was_made() -> None:
+    result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
+    assert result.overall is Overall.FAIL
+    assert failed(result) == {("DEX1-RATE-03", "left")}
+    gap = of(result, "DEX1-RATE-03").evidence[0]
+    stops, resumes = (
+        e.seconds_from_first_message for e in sample_labels("dex1_hand_dropout").events
+    )
+    assert gap.topic == "rt/dex1/left/state"
+    assert gap.time_s == pytest.approx(stops, abs=0.01)
+    assert gap.end_s == pytest.approx(resumes, abs=0.01)
+
+
+def test_the_legacy_recording_is_judged_in_its_own_dialect() -> None:
+    trace = open_trace(sample_path("dex1_legacy_v1_1"))
+    assert detect_dialect(trace).name == "unitree_actuator"
+    recording = Recording.of(trace)
+    result = judge(recording)
+    assert result.overall is Overall.PASS
+    assert recording.judged == (Side.LEFT, Side.RIGHT)
+    # index 0 is the right hand, which holds the object at 2.4 rad (traces/samples/README.md)
+    assert recording.sides[Side.RIGHT].states.tau.min() < -0.8
+    assert of(result, "DEX1-FIELD-01", "right").figure == "2"
+
+
+def test_a_dex3_recording_is_no_dex1() -> None:
+    with pytest.raises(ConformanceError, match="no Dex1-1 gripper"):
+        Recording.of(open_trace(sample_path("dex3_pinch")))
+
+
+def test_the_wrong_dialect_fails_by_its_topics() -> None:
+    trace = open_trace(sample_path("dex1_pick_place"))
+    result = judge(Recording.of(trace, dialect_name="unitree_hg"))
+    assert failed(result) == {("DEX1-TOPIC-01", "left"), ("DEX1-TOPIC-01", "right")}
+    assert of(result, "DEX1-RATE-01").verdict is Verdict.BLOCKED
+    assert result.stage["left"] == "topic seen, no sample of the right type"
+    with pytest.raises(ConformanceError, match="unitree_actuator"):
+        Recording.of(trace, dialect_name="unitree_actuator")
+
+
+@pytest.mark.realtime
+def test_judging_is_much_faster_than_the_session() -> None:
+    best = 0.0
+    for _ in range(3):  # the machine may be busy; the code is not slower than its best
+        begin = time.perf_counter()
+        result = judge(Recording.of(open_trace(sample_path("dex1_pick_place"))))
+        best = max(best, result.duration_s / (time.perf_counter() - begin))
+    assert best > 30  # 130 times real time measured, two cores, others busy
+
+
+# ----------------------------------------------------------------------------- too little
+
+
+def test_a_side_that_is_asked_for_and_absent_fails() -> None:
+    trace = copy_of(short_run())
+    result = judge(Recording.of(trace, sides=(Side.LEFT, Side.RIGHT)))
+    assert failed(result) == {("DEX1-TOPIC-01", "right"), ("DEX1-TOPIC-02", "right")}
+    assert result.stage == {"left": "moving", "right": "nothing seen"}
+
+
+def test_without_discovery_the_endpoints_are_not_judged() -> None:
+    trace = copy_of(short_run())
+    trace.endpoints.clear()
+    result = judged(trace)
+    for requirement in ("DEX1-TOPIC-02", "DEX1-QOS-01", "DEX1-QOS-02"):
+        assert of(result, requirement).verdict is Verdict.NOT_APPLICABLE
+    assert result.overall is Overall.PASS
+
+
+def test_states_alone_are_judged_as_far_as_they_go() -> None:
+    trace = copy_of(short_run())
+    trace.metadata.clear()
+    del trace.rows[CMD]
+    result = judged(trace)
+    assert result.overall is Overall.PASS
+    assert of(result, "DEX1-START-01").reason == "no commands to this hand in the recording"
+    assert of(result, "DEX1-MOVE-01").reason.startswith("needs the stimulus 'step'")
+
+
+def test_an_empty_topic_is_no_pass() -> None:
+    trace = copy_of(short_run())
+    trace.metadata.clear()
+    trace.rows.clear()
+    result = judged(trace)
+    assert failed(result) == {("DEX1-TOPIC-01", "left")}
+
+
+def test_nothing_judged_is_inconclusive() -> None:
+    recording = Recording.of(copy_of(short_run()))
+    only = select(catalogue(), prefixes=["DEX1-LIFE-01"])
+    result = judge(recording, requirements=only)
+    assert result.judged == 0
+    assert result.overall is Overall.INCONCLUSIVE
+    assert result.overall.exit_code == 2
+    assert "nothing can be said" in result.sentence()
+
+
+def test_a_recording_that_begins_in_mid_session_says_nothing_about_the_start() -> None:
+    trace = copy_of(short_run())
+    trace.metadata.clear()
+    first_command = trace.rows[CMD][0][0]
+    trace.rows[STATE] = [r for r in trace.rows[STATE] if r[0] > first_command]
+    assert of(judged(trace), "DEX1-START-01").verdict is Verdict.NOT_APPLICABLE
+
+
+def test_without_source_timestamps_reception_is_judged() -> None:
+    trace = copy_of(short_run())
+    trace.rows[STATE] = [(log, 0, data) for log, _, data in trace.rows[STATE]]
+    result = judged(trace)
+    assert of(result, "DEX1-ORDER-01").verdict is Verdict.NOT_APPLICABLE
+    assert of(result, "DEX1-RATE-01").verdict is Verdict.PASS
+
+
+# ------------------------------------------------------------------------ whose fault is it
+
+
+def with_gap(seconds: float, at: float = 2.5) -> MemoryTrace:
+    trace = copy_of(short_run())
+    first = trace.rows[STATE][0][0]
+    begin, end = first + round(at * 1e9), first + round((at + seconds) * 1e9)
+    trace.rows[STATE] = [r for r in trace.rows[STATE] if not begin <= r[0] < end]
+    return trace
+
+
+def test_a_gap_is_blamed_on_the_hand() -> None:
+    assert ("DEX1-RATE-03", "left") in failed(judged(with_gap(0.2)))
+    assert of(judged(with_gap(0.05)), "DEX1-RATE-03").verdict is Verdict.PASS
+
+
+def test_a_gap_in_which_the_kit_stood_still_is_not() -> None:
+    trace = with_gap(0.2)
+    stimulus = Stimulus.from_metadata(trace.metadata[RECORD])
+    first = trace.rows[STATE][0][0]
+    stimulus.stalls.append(Stall(first + round(2.52e9), first + round(2.68e9)))
+    trace.metadata[RECORD] = stimulus.to_metadata()
+    result = judged(trace)
+    assert of(result, "DEX1-RATE-03").verdict is Verdict.BLOCKED
+    assert "machine stood still" in of(result, "DEX1-RATE-03").reason
+    assert result.overall is Overall.INCONCLUSIVE
+
+
+def test_a_state_that_stops_for_good_is_a_gap() -> None:
+    trace = copy_of(short_run())
+    trace.metadata.clear()  # no silence that has its own requirement
+    rows = trace.rows[STATE]
+    trace.rows[STATE] = rows[: len(rows) // 2]
+    assert ("DEX1-RATE-03", "left") in failed(judged(trace))
+
+
+def test_a_check_that_breaks_is_the_kits_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(context: object) -> None:
+        raise ZeroDivisionError("1/0")
+
+    checks = {**judge.__globals__["all_checks"](), "DEX1-RATE-01": broken}
+    monkeypatch.setitem(judge.__globals__, "all_checks", lambda: checks)
+    result = judged(short_run())
+    assert of(result, "DEX1-RATE-01").verdict is Verdict.ERROR
+    assert "ZeroDivisionError: 1/0" in of(result, "DEX1-RATE-01").reason
+    assert of(result, "DEX1-RATE-02").reason == "blocked by DEX1-RATE-01"
+    assert result.overall is Overall.INCONCLUSIVE
+
+
+# --------------------------------------------------------------------------------- hostile
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), share=st.sampled_from([0.001, 0.05, 1.0]))
+def test_damaged_samples_never_break_a_check(seed: int, share: float) -> None:
+    """Whatever the bytes are, there is a verdict, and never the kit's own error."""
+    random_ = random.Random(seed)
+    trace = copy_of(short_run())
+    for key, rows in trace.rows.items():
+        trace.rows[key] = [
+            (log, sent, damage(random_, data) if random_.random() < share else data)
+            for log, sent, data in rows[:: random_.choice([3, 7, 50, 400])]
+        ]
+    result = judged(trace)
+    assert Verdict.ERROR not in {r.verdict for r in result.results}
+
+
+def damage(random_: random.Random, data: bytes) -> bytes:
+    kind = random_.randrange(4)
+    if kind == 0:
+        return data[: random_.randrange(len(data))]
+    if kind == 1:
+        return data + random_.randbytes(random_.randrange(1, 40))
+    changed = bytearray(data)
+    for _ in range(random_.randrange(1, 8)):
+        changed[random_.randrange(len(changed))] = random_.randrange(256)
+    return bytes(changed) if kind == 2 else random_.randbytes(len(data))
+
+
+# ------------------------------------------------------------------------- result and record
+
+
+def test_a_result_file_reads_back(tmp_path: Path) -> None:
+    result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
+    path = tmp_path / "r.json"
+    result.write_json(path)
+    again = read_json(path)
+    assert again.as_dict() == result.as_dict()
+    data = json.loads(path.read_text())
+    assert (data["overall"], data["counts"]["fail"]) == ("fail", 1)
+    path.write_text(json.dumps({**data, "version": 99}))
+    with pytest.raises(UsageError, match="version 99"):
+        read_json(path)
+    path.write_text("[]")
+    with pytest.raises(UsageError, match="not a result file"):
+        read_json(path)
+
+
+def test_the_stimulus_record_reads_back_and_refuses_what_it_does_not_know() -> None:
+    record = short_run().metadata[RECORD]
+    assert Stimulus.from_metadata(record).to_metadata() == record
+    with pytest.raises(TraceUnsupported, match="version"):
+        Stimulus.from_metadata({**record, "version": "2"})
+    with pytest.raises(TraceUnsupported, match="damaged"):
+        Stimulus.from_metadata({**record, "phases": "[{}]"})
+
+
+def test_the_worst_verdict_counts_and_an_unjudged_side_does_not() -> None:
+    assert worst([Verdict.PASS, Verdict.FAIL]) is Verdict.FAIL
+    assert worst([Verdict.NOT_APPLICABLE, Verdict.PASS]) is Verdict.PASS
+    assert worst([]) is Verdict.NOT_APPLICABLE
+
+
+def test_sides() -> None:
+    assert sides_of("both") == (Side.LEFT, Side.RIGHT)
+    assert sides_of("right") == (Side.RIGHT,)
+    with pytest.raises(UsageError, match="no side"):
+        sides_of("middle")
+    assert dialect("unitree_go").q_open == 5.4

@@ -1,0 +1,105 @@
+"""The catalogue: well formed, complete, documented."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dexkit.conformance.checks import all_checks
+from dexkit.conformance.mutants import MUTANTS
+from dexkit.conformance.requirements import Level, catalogue, parse, select
+from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
+from dexkit.conformance.stimuli import phases_for
+from dexkit.errors import UsageError
+
+DOCS = Path(__file__).parent.parent / "docs" / "conformance.md"
+
+GOOD = """
+model = "dex1-1"
+[[requirement]]
+id = "DEX1-X-01"
+area = "A"
+level = "MUST"
+title = "t"
+sentence = "At most {limit:g}."
+rationale = "r"
+source = "s"
+confidence = "measured"
+needs = "state"
+advice = "a"
+tolerances = { limit = "model:command_timeout" }
+"""
+
+
+def test_tolerances_come_from_the_model_and_fill_the_sentence() -> None:
+    (requirement,) = parse(GOOD)
+    assert requirement.tolerance("limit") == 1.0
+    assert requirement.sentence == "At most 1."
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('id = "DEX1-X-01"', 'id = "x"', "an id is like"),
+        ('level = "MUST"', 'level = "must"', "level is one of"),
+        ('confidence = "measured"', 'confidence = "sure"', "confidence is one of"),
+        ('needs = "state"', 'needs = "luck"', "needs is one of"),
+        ('advice = "a"', 'advise = "a"', "unknown keys ['advise'], missing ['advice']"),
+        ('"model:command_timeout"', '"model:nothing"', "has no figure"),
+        ('"model:command_timeout"', '"1 s"', "a tolerance is a number"),
+        ('needs = "state"', 'needs = "state"\nafter = ["DEX1-Y-01"]', "does not come before"),
+        ('needs = "state"', 'needs = "state"\ndialects = ["latin"]', "no dialect"),
+    ],
+)
+def test_what_is_wrong_in_a_requirement_is_said(old: str, new: str, says: str) -> None:
+    with pytest.raises(UsageError, match=says.replace("[", r"\[").replace("]", r"\]")):
+        parse(GOOD.replace(old, new))
+
+
+def test_an_id_occurs_once() -> None:
+    table = GOOD[GOOD.index("[[") :]
+    with pytest.raises(UsageError, match="occurs once"):
+        parse(GOOD + table)
+
+
+def test_every_requirement_has_one_check_and_every_check_a_requirement() -> None:
+    assert set(all_checks()) == {r.id for r in catalogue()}
+
+
+def test_every_requirement_has_a_hand_that_breaks_it() -> None:
+    assert {m.kills for m in MUTANTS} == {r.id for r in catalogue()}
+
+
+def test_every_stimulus_that_is_needed_exists() -> None:
+    known = {
+        *("step", "nan", "out-of-range", "empty", "limp", "replay", "late-joiner"),
+        *("squeeze", "silence", "resume", "restart"),
+    }
+    assert phases_for(catalogue()) == known
+
+
+def test_dependencies_bring_their_stimuli() -> None:
+    (only,) = select(catalogue(), prefixes=["DEX1-LIFE-02"])
+    assert {"restart", "resume", "step"} <= phases_for([only])
+
+
+def test_select() -> None:
+    rates = select(catalogue(), prefixes=["dex1-rate"])
+    assert {r.id for r in rates} == {f"DEX1-RATE-0{i}" for i in range(1, 5)}
+    musts = select(catalogue(), level="must")
+    assert musts
+    assert {r.level for r in musts} == {Level.MUST}
+    assert len(select(catalogue(), level="should")) > len(musts)
+    with pytest.raises(UsageError, match="no requirement begins with 'DEX9'"):
+        select(catalogue(), prefixes=["DEX9"])
+    with pytest.raises(UsageError, match="no level"):
+        select(catalogue(), level="may")
+
+
+def test_the_documented_catalogue_is_the_data() -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    page = text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip()
+    assert page == catalogue_page().strip(), (
+        "docs/conformance.md is out of date: python -m dexkit.conformance.requirements.page"
+    )

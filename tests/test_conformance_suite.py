@@ -1,0 +1,204 @@
+"""The suite as a user runs it: pytest options, and live runs on DDS."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from dexkit.conformance.judge import judge
+from dexkit.conformance.live import LiveOptions, record_run
+from dexkit.conformance.mutants import zoo
+from dexkit.conformance.mutants.live import LiveMutant
+from dexkit.conformance.processes import EXTERNAL, RigOptions
+from dexkit.conformance.requirements import catalogue as requirements
+from dexkit.conformance.requirements import select
+from dexkit.conformance.results import RunResult
+from dexkit.conformance.session import SuiteOptions
+from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.view import Recording
+from dexkit.conformance.virtual import ReferenceService
+from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
+from dexkit.hand import Side
+from dexkit.models import dialect
+from dexkit.traces import open_trace, sample_path
+from tests.conformance_helpers import failed
+from tests.dds_helpers import DdsNode, free_domain
+
+ROOT = Path(__file__).parent.parent
+
+
+def suite(*arguments: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+
+
+# --------------------------------------------------------------------------------- options
+
+
+def test_without_a_backend_it_skips_says_how_and_is_no_success() -> None:
+    run = suite("conformance/", "-rs")
+    assert run.returncode == 5
+    assert "Nothing was judged, which is not a pass" in run.stdout
+    assert "--backend ezgripper" in run.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--side", "left"), "--side without --backend"),
+        (("--backend", "sim-dex1", "--trace", "missing.mcap"), "no such file: missing.mcap"),
+    ],
+)
+def test_what_makes_no_sense_is_a_usage_error(arguments: tuple[str, ...], says: str) -> None:
+    run = suite("conformance/", *arguments)
+    assert run.returncode == 4
+    assert says in run.stderr
+
+
+def test_requirements_are_the_test_ids() -> None:
+    run = suite(
+        "conformance/", "--backend", "sim-dex1", "--side", "left", "--require", "DEX1-RATE",
+        "--collect-only",
+    )  # fmt: skip
+    ids = [line.partition("::")[2] for line in run.stdout.splitlines() if "::" in line]
+    assert ids == [f"test_requirement[DEX1-RATE-0{i}-left]" for i in range(1, 5)]
+
+
+def test_defaults() -> None:
+    options = SuiteOptions.make(backend="ezgripper")
+    assert options.sides == (Side.LEFT, Side.RIGHT)
+    assert options.domain is None
+    assert options.objects == {Side.RIGHT: 37.0}
+    assert options.subject["device"] == "emulated"
+    real = SuiteOptions.make(backend="ezgripper", devices=["/dev/ttyUSB0"])
+    assert (real.sides, real.domain, real.objects) == ((Side.LEFT,), 0, {})
+    outside = SuiteOptions.make(backend="external", side="right", objects=["right=25"])
+    assert (outside.domain, outside.objects) == (0, {Side.RIGHT: 25.0})
+    assert SuiteOptions.make(backend="sim-dex1", objects=["none"]).objects == {}
+
+
+def test_options_that_contradict_each_other() -> None:
+    with pytest.raises(UsageError, match="one --device for two hands"):
+        SuiteOptions.make(backend="ezgripper", side="both", devices=["/dev/ttyUSB0"])
+    with pytest.raises(UsageError, match="a device is needed for each side"):
+        SuiteOptions.make(backend="ezgripper", side="both", devices=["left=/dev/ttyUSB0"])
+    with pytest.raises(UsageError, match="not under test"):
+        SuiteOptions.make(backend="external", side="left", objects=["right=30"])
+    with pytest.raises(UsageError, match="at 80 % of opening"):
+        SuiteOptions.make(backend="external", objects=["80"])
+    with pytest.raises(UsageError, match="not a number"):
+        SuiteOptions.make(backend="external", objects=["soft"])
+    with pytest.raises(UsageError, match="external starts nothing"):
+        SuiteOptions.make(backend="external", settings=["a=b"])
+    with pytest.raises(UsageError, match="no requirement begins with 'DEX9'"):
+        SuiteOptions.make(backend="external", require=["DEX9"])
+    with pytest.raises(UnknownBackend):
+        SuiteOptions.make(backend="nobody")
+
+
+# ------------------------------------------------------------------------------- live runs
+
+
+def run_live(
+    service: type[ReferenceService], prefix: str, tmp_path: Path, *, sides: tuple[Side, ...]
+) -> RunResult:
+    """A hand of the zoo, on DDS, judged by the live suite."""
+    domain, chosen = free_domain(), dialect("unitree_go")
+    wanted = select(requirements(), prefixes=[prefix])
+    path = tmp_path / "run.mcap"
+    rig = RigOptions(EXTERNAL, sides, chosen, domain)
+    with LiveMutant(service(chosen, sides, {}), domain):
+        assert record_run(LiveOptions(rig, phases_for(wanted)), path)
+    return judge(Recording.of(open_trace(path), sides=sides), requirements=wanted)
+
+
+def test_a_good_hand_passes_on_dds(tmp_path: Path) -> None:
+    result = run_live(ReferenceService, "DEX1-LIFE-01", tmp_path, sides=(Side.LEFT,))
+    assert str(result.overall) == "pass"
+
+
+def test_a_hand_that_waits_for_a_command_is_caught_on_dds(tmp_path: Path) -> None:
+    result = run_live(zoo.SilentUntilCommanded, "DEX1-START", tmp_path, sides=(Side.LEFT,))
+    assert failed(result) == {("DEX1-START-01", "left")}
+
+
+def test_a_hand_that_asks_for_history_is_caught_on_dds(tmp_path: Path) -> None:
+    result = run_live(zoo.DemandsHistory, "DEX1-QOS", tmp_path, sides=(Side.LEFT,))
+    assert failed(result) == {("DEX1-QOS-01", "left")}
+
+
+def test_nobody_there_is_a_failure_not_a_success(tmp_path: Path) -> None:
+    rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
+    path = tmp_path / "run.mcap"
+    assert record_run(LiveOptions(rig, frozenset({"step"})), path)
+    result = judge(Recording.of(open_trace(path), dialect_name="unitree_go", sides=rig.sides))
+    assert str(result.overall) == "fail"
+    assert failed(result) == {("DEX1-TOPIC-01", "left"), ("DEX1-TOPIC-02", "left")}
+    assert result.stage == {"left": "nothing seen"}
+
+
+def test_it_refuses_to_start_beside_another_client(tmp_path: Path) -> None:
+    domain, chosen = free_domain(), dialect("unitree_go")
+    rig = RigOptions(EXTERNAL, (Side.LEFT,), chosen, domain)
+    with DdsNode(domain, "lo") as other:
+        other.writer("rt/dex1/left/cmd", chosen.cmd_type)
+        with pytest.raises(TopicConflict, match="somebody else publishes rt/dex1/left/cmd"):
+            record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap")
+
+
+def test_a_service_that_does_not_start_is_the_kits_error(tmp_path: Path) -> None:
+    rig = RigOptions(
+        "sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain(), settings=("colour=red",)
+    )
+    with pytest.raises(ConformanceError, match="ended before it was ready") as caught:
+        record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap")
+    assert "colour" in caught.value.hint
+
+
+def test_a_run_can_be_stopped_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    rig = RigOptions("sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain())
+    stop = threading.Event()
+
+    def say(text: str) -> None:
+        if text.startswith("listening"):
+            stop.set()
+
+    assert not record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap", say=say, stop=stop)
+    left = subprocess.run(
+        ["pgrep", "-f", f"--domain {rig.domain} "], capture_output=True, text=True
+    )
+    assert left.stdout == ""
+
+
+def test_the_emulated_ezgripper_passes_as_a_user_runs_it(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("r.json", "r.html", "r.mcap", "junit.xml")]
+    run = suite(
+        "conformance/", "--backend", "ezgripper", "--side", "right", "--require", "DEX1-FORCE",
+        "--trace", sample_path("dex1_pick_place"), "--json", files[0], "--report", files[1],
+        "--recording", files[2], "--junitxml", files[3],
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert "PASS: every MUST that could be judged is met" in run.stdout
+    result = json.loads(files[0].read_text())
+    assert {r["id"]: r["verdict"] for r in result["results"]} == {
+        "DEX1-FORCE-01": "pass",
+        "DEX1-FORCE-02": "pass",
+        "DEX1-FORCE-03": "pass",
+    }
+    assert files[1].read_text().startswith("<!doctype html>")
+    assert "DEX1-FORCE-01-right" in files[3].read_text()
+    # the recording alone gives the same verdicts
+    again = judge(Recording.of(open_trace(files[2])))
+    assert not failed(again)

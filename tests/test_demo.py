@@ -1,0 +1,76 @@
+"""``dexkit demo``: from the first line to the last process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", "from dexkit.cli import main; main()", "demo", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1"},
+    )
+
+
+def children_of(pid: int) -> set[int]:
+    found = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout
+    return {int(p) for p in found.split()}
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_ending_it_leaves_no_process(how: signal.Signals, tmp_path: Path) -> None:
+    demo = start("--out", tmp_path)
+    assert demo.stdout is not None
+    seen = ""
+    while "listening" not in seen:
+        line = demo.stdout.readline()
+        assert line, seen
+        seen += line
+    processes = children_of(demo.pid)
+    assert len(processes) == 4, seen  # two emulated devices, two services
+    demo.send_signal(how)
+    rest = demo.stdout.read() if how is signal.SIGINT else ""
+    code = demo.wait(20)
+    if how is signal.SIGINT:
+        assert code == 130
+        assert "stopped; nothing is left running" in rest
+    demo.stdout.close()
+    end = time.monotonic() + 10
+    while any(alive(p) for p in processes) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not [p for p in processes if alive(p)]
+
+
+@pytest.mark.soak
+def test_the_whole_story(tmp_path: Path) -> None:
+    begin = time.monotonic()
+    demo = start("--out", tmp_path)
+    out, _ = demo.communicate(timeout=120)
+    assert demo.returncode == 0, out
+    assert time.monotonic() - begin < 60
+    assert "PASS: every MUST that could be judged is met (35 requirements: 35 pass)" in out
+    result = json.loads((tmp_path / "results.json").read_text())
+    assert result["overall"] == "pass"
+    assert (tmp_path / "report.html").stat().st_size > 50_000
+    assert (tmp_path / "recording.mcap").exists()
