@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from dexkit.backends import list_backends
@@ -17,11 +18,11 @@ def command() -> None:
         table.add_column(heading, overflow="fold")
     for row in list_backends():
         if row.backend is None:
-            table.add_row(row.name, "?", row.origin, "", f"[red]unusable: {row.error}[/red]")
+            table.add_row(row.name, "?", row.origin, "", f"[red]unusable: {escape(row.error)}[/red]")
             continue
         b = row.backend
         table.add_row(row.name, b.model, row.origin, b.needs or "nothing", b.summary)
         for key, text in b.settings.items():
-            table.add_row("", "", "", f"[dim]--set {key}=...[/dim]", f"[dim]{text}[/dim]")
+            table.add_row("", "", "", f"[dim]--set {key}=...[/dim]", f"[dim]{escape(text)}[/dim]")
     Console().print(table)
     click.echo("\nYour own: dexkit serve package.module:Object (docs/backends.md).")
