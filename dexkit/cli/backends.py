@@ -18,7 +18,8 @@ def command() -> None:
         table.add_column(heading, overflow="fold")
     for row in list_backends():
         if row.backend is None:
-            table.add_row(row.name, "?", row.origin, "", f"[red]unusable: {escape(row.error)}[/red]")
+            problem = f"[red]unusable: {escape(row.error)}[/red]"
+            table.add_row(row.name, "?", row.origin, "", problem)
             continue
         b = row.backend
         table.add_row(row.name, b.model, row.origin, b.needs or "nothing", b.summary)
