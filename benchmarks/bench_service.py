@@ -1,9 +1,10 @@
 """Publish jitter at 500 Hz and the way of a command to the wire.
 
 Two emulated EZGrippers, each in its own process, served by two more processes through the real
-driver. Delays are taken by a subscriber, from the source timestamps of the samples: how long
-after its deadline each was written. The peer, a loop that does nothing but keep the same
-deadlines, runs at the same time, so that both see the same machine.
+driver. The emulators stand in for hardware with processors of its own, so they run at a lower
+priority than the services. Delays are taken by a subscriber, from the source timestamps of the
+samples: how long after its deadline each was written. The peer, a loop that does nothing but
+keep the same deadlines, runs at the same time, so that both see the same machine.
 
 For latency a tap sits between a service and its gripper and notes when the bytes of each goal
 arrive. The peer is one exchange: a command that comes while one is under way waits for it.
@@ -33,7 +34,7 @@ from benchmarks import Result
 from dexkit.clock import Rate
 from dexkit.dds import DdsNode, Qos
 from dexkit.drivers.ezgripper.servo import exchange_time
-from dexkit.emulators.mx64 import emulated_ezgripper
+from dexkit.emulators.mx64 import EmulatedProcess, emulated_ezgripper
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
@@ -236,10 +237,19 @@ def latency(domain: int, device: str) -> list[Result]:
     ]
 
 
+@contextlib.contextmanager
+def gripper() -> Iterator[str]:
+    """Path of an emulated gripper in a process that gives way to those measured."""
+    with emulated_ezgripper(process=True, check_baudrate=False) as emulated:
+        assert isinstance(emulated, EmulatedProcess)
+        for thread in Path(f"/proc/{emulated.process.pid}/task").iterdir():
+            os.setpriority(os.PRIO_PROCESS, int(thread.name), 10)
+        yield emulated.path
+
+
 def run() -> list[Result]:
     domain = random.randrange(201, 230)
-    options = {"process": True, "check_baudrate": False}
-    with emulated_ezgripper(**options) as left, emulated_ezgripper(**options) as right:  # type: ignore[arg-type]
-        results = jitter(domain, {Side.LEFT: left.path, Side.RIGHT: right.path})
-    with emulated_ezgripper(**options) as left:  # type: ignore[arg-type]
-        return results + latency(domain, left.path)
+    with gripper() as left, gripper() as right:
+        results = jitter(domain, {Side.LEFT: left, Side.RIGHT: right})
+    with gripper() as left:
+        return results + latency(domain, left)

@@ -143,8 +143,7 @@ class HandService:
         self._threads: list[threading.Thread] = []
         self._reader: _Reader | None = None
         self._writer: _Writer | None = None
-        self._views: tuple[StateView | None, ...] = ()
-        self._payload: bytes | None = None
+        self._encoded: tuple[tuple[StateView | None, ...], bytes | None] = ((), None)
         self._started = False
         self.failure: Exception | None = None  #: what ended a thread of the service, if anything
 
@@ -359,6 +358,8 @@ class HandService:
         if unit.problem:
             log.info("%s: the hand answers again", unit.side)
             unit.problem = ""
+        if not core.predicting:
+            self._compose()
         return True
 
     def _reconnect(self, unit: _Unit, backoff: Backoff) -> bool:
@@ -402,20 +403,26 @@ class HandService:
             self._write(self._compose())
 
     def _compose(self) -> bytes | None:
-        """The sample for now, encoded again only if something changed; None without a state."""
+        """The sample for now; None without a state.
+
+        It is encoded again only if something changed. The exchange thread calls this too, so
+        that the publishing thread mostly finds the work done; should both do it at once, both
+        get it right.
+        """
         views = tuple(unit.core.view() for unit in self._units)
-        if len(views) == len(self._views) and all(
-            a is b for a, b in zip(views, self._views, strict=True)
+        encoded_views, payload = self._encoded
+        if len(views) == len(encoded_views) and all(
+            a is b for a, b in zip(views, encoded_views, strict=True)
         ):
-            return self._payload
+            return payload
         known = {u.side: v for u, v in zip(self._units, views, strict=True) if v is not None}
-        self._views = views
         try:
-            self._payload = self._state_type.encode(self._map.state(known)) if known else None
+            payload = self._state_type.encode(self._map.state(known)) if known else None
         except WireError as error:  # a value that the wire cannot hold
             self._count_publish_error(error)
-            self._payload = None
-        return self._payload
+            payload = None
+        self._encoded = (views, payload)
+        return payload
 
     def _write(self, payload: bytes | None) -> None:
         if payload is None:
