@@ -243,7 +243,7 @@ def gripper() -> Iterator[str]:
     with emulated_ezgripper(process=True, check_baudrate=False) as emulated:
         assert isinstance(emulated, EmulatedProcess)
         for thread in Path(f"/proc/{emulated.process.pid}/task").iterdir():
-            os.setpriority(os.PRIO_PROCESS, int(thread.name), 10)
+            os.setpriority(os.PRIO_PROCESS, int(thread.name), 5)
         yield emulated.path
 
 
