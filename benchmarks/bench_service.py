@@ -62,13 +62,13 @@ def serving(side: Side, device: str, domain: int) -> Iterator[None]:
             *("--side", side, "--device", device, "--set", _ZERO, "--domain", str(domain)),
         ],
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
     )
     try:
         assert process.stdout is not None
         if not process.stdout.readline().startswith("ready: "):
-            raise DexkitError("the service did not start")
+            raise DexkitError(f"the service did not start: {process.communicate()[1].strip()}")
         yield
     finally:
         process.send_signal(signal.SIGTERM)
