@@ -398,4 +398,8 @@ def test_hg_messages_on_an_hg_service() -> None:
         node.deliver(CMD, encode(unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=math.pi)])))
         wait_until(lambda: hand.q == pytest.approx(2.7))
         mt = message_type(d.state_type)
-        wait_until(lambda: mt.decode(node.sent[-1][1]).motor_state[0].q == pytest.approx(math.pi))
+        wait_until(
+            lambda: (
+                node.sent and mt.decode(node.sent[-1][1]).motor_state[0].q == pytest.approx(math.pi)
+            )
+        )
