@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
 
 from dexkit.conformance.checks import Check, Context, Outcome, all_checks
 from dexkit.conformance.requirements import Level, Requirement, catalogue
-from dexkit.conformance.results import Result, RunResult, Verdict
+from dexkit.conformance.results import TOO_BUSY, Result, RunResult, Verdict
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
 __all__ = ["judge"]
 
+STARVED = 0.5
+"""Part of a failure's time that must be starved for it not to be blamed on the hand."""
 _OPEN = (Verdict.FAIL, Verdict.BLOCKED, Verdict.ERROR)
 
 
@@ -53,6 +56,7 @@ def judge(
         stage={str(s): _stage(recording, s) for s in recording.judged},
         duration_s=recording.duration,
         notes=list(recording.notes),
+        starved=recording.starved(0.0, recording.duration),
         recorded_at=when.isoformat(timespec="seconds"),
     )
 
@@ -98,10 +102,26 @@ def _judge_one(
         text = f"the check itself failed: {type(error).__name__}: {error}"
         return result(Verdict.ERROR, Outcome(None, reason=text))
     if outcome.met is None:
-        return result(Verdict.BLOCKED if outcome.harness else Verdict.NOT_APPLICABLE, outcome)
+        return result(Verdict.NOT_APPLICABLE, outcome)
     if outcome.met:
         return result(Verdict.PASS, outcome)
+    excuse = _excuse(recording, requirement, outcome)
+    if excuse:
+        return result(Verdict.BLOCKED, replace(outcome, reason=excuse))
     return result(Verdict.FAIL if requirement.level is Level.MUST else Verdict.WARN, outcome)
+
+
+def _excuse(recording: Recording, requirement: Requirement, outcome: Outcome) -> str:
+    """Why a failure is not blamed on the hand: every place of it, or the run, was starved."""
+    if not requirement.realtime:
+        return ""
+    spans = [(e.time_s, e.end_s) for e in outcome.evidence if e.end_s is not None]
+    shares = [recording.starved(a, b) for a, b in spans] or [
+        recording.starved(0.0, recording.duration)
+    ]
+    if min(shares) < STARVED:
+        return ""
+    return f"{TOO_BUSY} to tell: it lacked processor time for {min(shares):.0%} of it; run again"
 
 
 def _missing(context: Context) -> str:

@@ -36,9 +36,15 @@ from dexkit.traces.recorder import Recorder
 
 __all__ = ["LiveOptions", "free_domain", "record_run"]
 
+TOOLS = "dexkit.tools"
+"""Metadata record with the last lines that each process of the run printed."""
 DISCOVERY_TIMEOUT = 5.0
-_BEAT = 0.005  # seconds between heartbeats
-_LATE = 0.03  # seconds late that count as a stall of the kit's own machine
+_BEAT = 0.01  # seconds between heartbeats
+_LATE = 0.03  # seconds late that show that the machine is too busy
+_PRESSURE = (
+    0.9  # part of the time in which some task waits for a processor; a run alone on two: 0.7
+)
+_PSI = Path("/proc/pressure/cpu")
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,10 @@ def record_run(
         _meet(recorder_node, plan)
         finished = driver.go_through(script, stop, rig)
         recording.stop()
+        driver.close()
+        rig.stop()
+        # what the services and emulated devices had to say, counters included
+        recorder.add_metadata(TOOLS, {repr(tool): tool.last_words for tool in rig.tools})
         stimulus = Stimulus(
             phases=[p for p in script.phases if p.end_ns],
             objects={s: plan.objects.get(s) for s in plan.sides},
@@ -161,7 +171,12 @@ def _meet(node: DdsNode, plan: Plan) -> None:
 
 
 class _Heartbeat:
-    """Notes when this process did not get to run: then the machine is late, not the hand."""
+    """Notes when the machine lacked processor time: then it is late, not the hand.
+
+    Shown by this thread being woken late, and by Linux' pressure stall information: the time for
+    which some task could have run but had no processor. Without the latter (no Linux, or a
+    kernel without it) only the former is known.
+    """
 
     def __init__(self) -> None:
         self.stalls: list[Stall] = []
@@ -170,11 +185,19 @@ class _Heartbeat:
 
     def _beat(self) -> None:
         clock = RealClock()
+        waited = _waited()
         while not self._stop.is_set():
-            wall, due = time.time_ns(), clock.now() + _BEAT
+            begin, due = time.time_ns(), clock.now() + _BEAT
             clock.sleep_until(due)
-            if clock.now() - due > _LATE:
-                self.stalls.append(Stall(wall, time.time_ns()))
+            late = clock.now() - due
+            before, waited = waited, _waited()
+            end = time.time_ns()
+            short = (waited - before) * 1e9 > _PRESSURE * (end - begin)
+            if late <= _LATE and not short:
+                continue
+            if self.stalls and begin - self.stalls[-1].end_ns < _BEAT * 1e9:
+                begin = self.stalls.pop().begin_ns
+            self.stalls.append(Stall(begin, end))
 
     def __enter__(self) -> _Heartbeat:
         self._thread.start()
@@ -183,6 +206,15 @@ class _Heartbeat:
     def __exit__(self, *exc: object) -> None:
         self._stop.set()
         self._thread.join()
+
+
+def _waited() -> float:
+    """Seconds, ever, for which some task waited for a processor; 0 where that is not told."""
+    try:
+        text = _PSI.read_text()
+        return float(text.partition("total=")[2].split()[0]) / 1e6
+    except (OSError, IndexError, ValueError):
+        return 0.0
 
 
 @dataclass
@@ -204,6 +236,10 @@ class _Driver:
         return self
 
     def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the domain. May be called twice."""
         for part in (self._client, self._monitor):
             if part is not None:
                 part.close()

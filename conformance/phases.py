@@ -42,7 +42,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Stall:
-    """A stretch in which the kit's own machine did not run on time."""
+    """A stretch in which the kit's own machine lacked processor time."""
 
     begin_ns: int
     end_ns: int
@@ -54,7 +54,7 @@ class Stimulus:
 
     :param phases: in order of time.
     :param objects: where each side touches its object, rad, or None where there is none.
-    :param stalls: when the kit itself was late, so that the hand is not blamed for it.
+    :param stalls: when the machine lacked processor time, so that the hand is not blamed for it.
     """
 
     phases: list[Phase] = field(default_factory=list)

@@ -74,7 +74,7 @@ class Tool:
     def __init__(self, *arguments: str) -> None:
         self.arguments = arguments
         self.ready = threading.Event()
-        self._tail: deque[str] = deque(maxlen=12)
+        self._tail: deque[str] = deque(maxlen=40)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _ENTRY, *arguments],
             stdin=subprocess.DEVNULL,
@@ -216,6 +216,10 @@ class Rig:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End all processes. May be called twice."""
         self._stack.close()
 
     def _start(self) -> None:

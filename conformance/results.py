@@ -7,7 +7,7 @@ pass           judged, and met
 fail           a MUST that is not met
 warn           a SHOULD that is not met; does not fail the hand
 not applicable cannot be judged here, with the reason; never counts as a pass
-blocked        another requirement failed first, or the kit's own machine stalled
+blocked        another requirement failed first, or the kit's own machine was too busy
 error          the kit's own fault
 ============== ============================================================================
 """
@@ -28,6 +28,7 @@ from dexkit.errors import UsageError
 
 __all__ = [
     "FORMAT",
+    "TOO_BUSY",
     "Evidence",
     "Overall",
     "Result",
@@ -37,6 +38,7 @@ __all__ = [
     "worst",
 ]
 
+TOO_BUSY = "the machine was too busy"
 FORMAT = "dexkit-conformance-result"
 VERSION = 1
 
@@ -160,6 +162,7 @@ class RunResult:
     :param stage: per side how far it got: nothing, discovered, flowing, moving.
     :param duration_s: seconds of the recording.
     :param notes: remarks on the recording.
+    :param starved: part of the run, 0 to 1, in which the kit's own machine lacked processor time.
     """
 
     subject: dict[str, str]
@@ -169,6 +172,7 @@ class RunResult:
     notes: list[str] = field(default_factory=list)
     environment: dict[str, str] = field(default_factory=environment)
     recorded_at: str = ""
+    starved: float = 0.0
 
     def counts(self) -> dict[Verdict, int]:
         """Requirements by verdict, sides taken together."""
@@ -186,6 +190,13 @@ class RunResult:
     def judged(self) -> int:
         """How many results came to a finding about the hand."""
         return sum(r.verdict.judged for r in self.results)
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether a MUST is open only because the kit's own machine was too busy."""
+        return self.overall is Overall.INCONCLUSIVE and any(
+            r.verdict is Verdict.BLOCKED and r.reason.startswith(TOO_BUSY) for r in self.results
+        )
 
     @property
     def overall(self) -> Overall:
@@ -225,6 +236,7 @@ class RunResult:
             "recorded_at": self.recorded_at,
             "duration_s": round(self.duration_s, 3),
             "counts": {str(v): n for v, n in self.counts().items()},
+            "starved": round(self.starved, 4),
             "environment": dict(self.environment),
             "notes": list(self.notes),
             "results": [_result_dict(r) for r in self.results],
@@ -266,6 +278,7 @@ def read_json(path: Path) -> RunResult:
             duration_s=data["duration_s"],
             notes=data["notes"],
             environment=data["environment"],
+            starved=data["starved"],
             recorded_at=data["recorded_at"],
             results=[_result_of(entry) for entry in data["results"]],
         )

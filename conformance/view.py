@@ -204,14 +204,15 @@ class Recording:
             p for p in self.stimulus.phases if p.name == name and (side is None or side in p.sides)
         ]
 
-    def stalled(self, begin: float, end: float) -> float:
-        """Seconds in [begin, end] for which the kit's own machine stood still."""
-        if self.stimulus is None:
+    def starved(self, begin: float, end: float) -> float:
+        """Part of [begin, end], 0 to 1, in which the kit's own machine lacked processor time."""
+        if self.stimulus is None or end <= begin:
             return 0.0
-        return sum(
+        seconds = sum(
             max(0.0, min(end, self.seconds(s.end_ns)) - max(begin, self.seconds(s.begin_ns)))
             for s in self.stimulus.stalls
         )
+        return seconds / (end - begin)
 
 
 def detect_dialect(trace: TraceLike) -> Dialect:

@@ -38,7 +38,6 @@ class Outcome:
     """What a check found.
 
     :param met: whether the requirement is met; None when it could not be judged.
-    :param harness: it could not be judged because of the kit's own machine.
     """
 
     met: bool | None
@@ -47,7 +46,6 @@ class Outcome:
     reason: str = ""
     evidence: tuple[Evidence, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
-    harness: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,10 +116,6 @@ class Context:
     def skipped(self, reason: str) -> Outcome:
         """It cannot be judged here."""
         return Outcome(None, reason=reason)
-
-    def disturbed(self, reason: str) -> Outcome:
-        """It cannot be judged because of the kit's own machine."""
-        return Outcome(None, reason=reason, harness=True)
 
 
 def _plain(values: Mapping[str, float]) -> dict[str, float]:

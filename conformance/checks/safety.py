@@ -6,7 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.motion import Step, step_of
-from dexkit.conformance.checks.timing import blame, gaps
+from dexkit.conformance.checks.timing import gaps
 from dexkit.conformance.phases import Phase
 
 
@@ -24,16 +24,13 @@ def _unharmed(ctx: Context, what: str) -> Outcome:
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         found = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end + 0.2)
-        guilty = blame(ctx, found)
-        if guilty:
-            a, b = guilty[0]
+        if found:
+            a, b = found[0]
             return ctx.failed(
                 "state stops",
                 f"state stopped at {a:.3f} s, during {what}",
                 ctx.at(topic, a, b),
             )
-        if found:
-            return ctx.disturbed("the kit's own machine stood still during this stimulus")
         step = _recovery(ctx, phase)
         if step is None:
             return ctx.failed(
@@ -78,7 +75,7 @@ def _stays(ctx: Context, what: str) -> Outcome:
                 motion_rad=most,
             )
     outcome = _unharmed(ctx, what)
-    if outcome.met is False or outcome.harness:
+    if outcome.met is False:
         return outcome
     return ctx.passed(
         f"{most:.3f} rad", f"moved by {most:.3f} rad during {what}, then obeyed", motion_rad=most
@@ -112,7 +109,7 @@ def out_of_range(ctx: Context) -> Outcome:
             )
         low, high = min(low, float(q.min())), max(high, float(q.max()))
     outcome = _unharmed(ctx, "commands far out of range")
-    if outcome.met is False or outcome.harness:
+    if outcome.met is False:
         return outcome
     return ctx.passed(
         f"{low:.2f} .. {high:.2f} rad",
@@ -207,17 +204,14 @@ def state_in_silence(ctx: Context) -> Outcome:
     longest = 0.0
     for begin, end in spans:
         found = gaps(ctx, limit, begin, end)
-        guilty = blame(ctx, found)
-        if guilty:
-            a, b = guilty[0]
+        if found:
+            a, b = found[0]
             return ctx.failed(
                 f"{b - a:.2f} s",
                 f"no state from {a:.3f} s to {b:.3f} s, in the silence that began at {begin:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 max_gap_s=b - a,
             )
-        if found:
-            return ctx.disturbed("the kit's own machine stood still during the silence")
         clock = ctx.states.clock
         inside = clock[(clock >= begin) & (clock <= end)]
         longest = max(longest, float(np.diff(inside).max()) if len(inside) > 1 else 0.0)

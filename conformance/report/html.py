@@ -103,6 +103,7 @@ def _facts(result: RunResult) -> str:
         **result.subject,
         "recorded": f"{result.recorded_at}, {result.duration_s:.1f} s",
         **{f"{side} hand": stage for side, stage in result.stage.items()},
+        "machine": f"short of processor time for {result.starved:.0%} of the run",
     }
     return (
         '<dl class="facts">'
@@ -200,6 +201,8 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
         Line("command", "cmd", commands.t, goal),
         Line("state", "state", states.t, states.q),
     ]
+    touch = view.stimulus.objects.get(hand.side) if view.stimulus else None
+    felt = [(touch, "object")] if touch is not None else []
     parts = [f"<h3>{str(hand.side).capitalize()} hand: opening (0 closed, {stroke:.2f} open)</h3>"]
     parts.append(
         _plot(
@@ -210,6 +213,7 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
                 span=span,
                 bands=bands,
                 include=(0.0, stroke),
+                limits=felt,
             )
         )
     )
@@ -226,11 +230,11 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
                     unit="rad",
                     span=(a, b),
                     include=(0.0, stroke),
+                    limits=felt,
                 )
             )
         )
-    touch = view.stimulus.objects.get(hand.side) if view.stimulus else None
-    held = f" There is something between its fingers, felt at {touch:.2f} rad." if touch else ""
+    held = f" There is something between its fingers, felt at {touch:.2f} rad." if felt else ""
     parts.append(f"<p>Force (tau_est): negative is closing.{held}</p>")
     parts.append(
         _plot(

@@ -68,6 +68,12 @@ def print_result(result: RunResult, console: Console, *, verbose: bool = False) 
                 f"[dim]  {entry.requirement.id} {entry.side}: {escape(entry.reason)}[/dim]",
                 highlight=False,
             )
+    if result.starved > 0.05:
+        console.print(
+            f"[dim]note: the machine was short of processor time for {result.starved:.0%} of the "
+            "run.[/dim]",
+            highlight=False,
+        )
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()

@@ -45,8 +45,9 @@ _KEYS = {
     "dialects",
     "tolerances",
     "advice",
+    "realtime",
 }
-_OPTIONAL = {"after", "dialects", "tolerances"}
+_OPTIONAL = {"after", "dialects", "tolerances", "realtime"}
 
 
 class Level(str, Enum):
@@ -75,6 +76,8 @@ class Requirement:
     :param after: requirements that must not have failed, or this one is blocked.
     :param dialects: the dialects that it applies to.
     :param tolerances: the figures that the check compares with.
+    :param realtime: a machine that is short of processor time can make a good hand fail it; a
+        failure is then not blamed on the hand.
     :param advice: likely cause and what to try, printed with a failure.
     """
 
@@ -92,6 +95,7 @@ class Requirement:
     after: tuple[str, ...] = ()
     dialects: tuple[str, ...] = ()
     tolerances: Mapping[str, float] = field(default_factory=dict)
+    realtime: bool = False
 
     @property
     def phase(self) -> str | None:
@@ -169,6 +173,7 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
             after=tuple(entry.get("after", ())),
             dialects=tuple(entry.get("dialects", dialect_names)),
             tolerances=tolerances,
+            realtime=bool(entry.get("realtime", False)),
         )
     return tuple(found.values())
 
