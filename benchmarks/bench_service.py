@@ -2,9 +2,11 @@
 
 Two emulated EZGrippers, each in its own process, served by two more processes through the real
 driver. The emulators stand in for hardware with processors of its own, so they run at a lower
-priority than the services. Delays are taken by a subscriber, from the source timestamps of the
-samples: how long after its deadline each was written. The peer, a loop that does nothing but
-keep the same deadlines, runs at the same time, so that both see the same machine.
+priority than the services. It is measured with real-time priority where this user may have it,
+as the service asks for by default, and without. Delays are taken by a subscriber, from the
+source timestamps of the samples: how long after its deadline each was written. The peer, a loop
+that does nothing but keep the same deadlines, runs at the same time with the same priority, so
+that both see the same machine.
 
 For latency a tap sits between a service and its gripper and notes when the bytes of each goal
 arrive. The peer is one exchange: a command that comes while one is under way waits for it.
@@ -24,6 +26,7 @@ import tempfile
 import time
 import tty
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -39,7 +42,7 @@ from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
 from dexkit.models import DEX1_1, dialect
-from dexkit.service.realtime import precise_timers
+from dexkit.service.realtime import ask_for_real_time, precise_timers
 from dexkit.wire.dynamixel import Instruction, PacketParser
 
 _GO = dialect("unitree_go")
@@ -55,11 +58,12 @@ _spawn = multiprocessing.get_context("spawn")
 
 
 @contextlib.contextmanager
-def serving(side: Side, device: str, domain: int) -> Iterator[None]:
+def serving(side: Side, device: str, domain: int, *, real_time: bool) -> Iterator[None]:
     process = subprocess.Popen(
         [
             *(sys.executable, "-m", "dexkit", "serve", "ezgripper", "--quiet"),
             *("--side", side, "--device", device, "--set", _ZERO, "--domain", str(domain)),
+            "--real-time" if real_time else "--no-real-time",
         ],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -75,8 +79,10 @@ def serving(side: Side, device: str, domain: int) -> Iterator[None]:
         process.wait(15)
 
 
-def bare_loop(seconds: float, out: Connection) -> None:
+def bare_loop(seconds: float, real_time: bool, out: Connection) -> None:
     """Deadlines and nothing else; sends its wall-clock times."""
+    if real_time:
+        ask_for_real_time()
     precise_timers()
     rate = Rate(1 / _PERIOD, spin=150e-6)
     times = []
@@ -102,10 +108,10 @@ def delays(times: list[int], slope: float) -> tuple[NDArray[np.float64], int]:
     return t - k * period - 0.02 * period, int(k[-1] - k[0] + 1 - len(np.unique(k)))
 
 
-def jitter(domain: int, devices: dict[Side, str]) -> list[Result]:
+def jitter(domain: int, devices: dict[Side, str], *, real_time: bool) -> list[Result]:
     with contextlib.ExitStack() as stack:
         for side, device in devices.items():
-            stack.enter_context(serving(side, device, domain))
+            stack.enter_context(serving(side, device, domain, real_time=real_time))
         node = stack.enter_context(DdsNode(domain))
         keep = Qos("best_effort", depth=10_000)
         readers = [node.reader(_GO.topics(s)[1], _GO.state_type, qos=keep) for s in devices]
@@ -113,7 +119,7 @@ def jitter(domain: int, devices: dict[Side, str]) -> list[Result]:
         for reader in readers:
             reader.take()
         ours, theirs = _spawn.Pipe(duplex=False)
-        bare = _spawn.Process(target=bare_loop, args=(_SECONDS, theirs))
+        bare = _spawn.Process(target=bare_loop, args=(_SECONDS, real_time, theirs))
         began = time.time(), time.monotonic()
         bare.start()
         bare_times = ours.recv()
@@ -122,6 +128,7 @@ def jitter(domain: int, devices: dict[Side, str]) -> list[Result]:
         times = [[s.source_timestamp_ns for s in r.take()][-len(bare_times) :] for r in readers]
     bare_late, bare_missed = delays(bare_times, slope)
     late, missed = zip(*(delays(t, slope) for t in times), strict=True)
+    priority = "real-time" if real_time else "ordinary priority"
     results = []
     for q in (50.0, 99.0, 99.9):
         value = max(float(np.percentile(x, q)) for x in late)
@@ -129,7 +136,7 @@ def jitter(domain: int, devices: dict[Side, str]) -> list[Result]:
         is_target = q == 99.0
         results.append(
             Result(
-                name=f"publish delay p{q:g}, the worse of two grippers",
+                name=f"publish delay p{q:g}, the worse of two grippers, {priority}",
                 value=value,
                 unit="ms",
                 peer="bare deadline loop beside it",
@@ -144,7 +151,7 @@ def jitter(domain: int, devices: dict[Side, str]) -> list[Result]:
     bare_rate = 1e3 * bare_missed / len(bare_times)
     results.append(
         Result(
-            name="periods without a sample, the worse of two grippers",
+            name=f"periods without a sample, the worse of two grippers, {priority}",
             value=max(per_thousand),
             unit="per 1000",
             peer="bare deadline loop beside it",
@@ -200,7 +207,7 @@ def latency(domain: int, device: str) -> list[Result]:
         tapping = _spawn.Process(target=tap, args=(device, link, theirs), daemon=True)
         tapping.start()
         ours.recv()
-        with serving(Side.LEFT, link, domain), DdsNode(domain) as node:
+        with serving(Side.LEFT, link, domain, real_time=True), DdsNode(domain) as node:
             writer = node.writer(cmd_topic, _GO.cmd_type)
             states = node.reader(state_topic, _GO.state_type)
             writer.wait_matched(5)
@@ -247,9 +254,19 @@ def gripper() -> Iterator[str]:
         yield emulated.path
 
 
+def permitted() -> bool:
+    """Whether this user may have real-time priority."""
+    with ThreadPoolExecutor(1) as other:  # of a thread that ends with the question
+        return other.submit(ask_for_real_time).result()
+
+
 def run() -> list[Result]:
     domain = random.randrange(201, 230)
     with gripper() as left, gripper() as right:
-        results = jitter(domain, {Side.LEFT: left, Side.RIGHT: right})
+        devices = {Side.LEFT: left, Side.RIGHT: right}
+        results = []
+        if permitted():
+            results = jitter(domain, devices, real_time=True)
+        results += jitter(domain, devices, real_time=False)
     with gripper() as left:
         return results + latency(domain, left)

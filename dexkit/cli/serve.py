@@ -18,7 +18,14 @@ from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Hand, Side
 from dexkit.models import DIALECTS
 from dexkit.models import dialect as dialect_by_name
-from dexkit.service import Estimation, Fill, HandService, diagnose, prepare_process
+from dexkit.service import (
+    Estimation,
+    Fill,
+    HandService,
+    ask_for_real_time,
+    diagnose,
+    prepare_process,
+)
 
 __all__ = ["command"]
 
@@ -81,6 +88,12 @@ _LONELY = 10.0  # seconds without a client before a hint
 )
 @click.option("--wait-for-device", is_flag=True, help="Do not fail if it is not there yet.")
 @click.option("--force", is_flag=True, help="Even if another process publishes the state topic.")
+@click.option(
+    "--real-time/--no-real-time",
+    default=True,
+    show_default=True,
+    help="Run before ordinary processes where the system permits it (docs/service.md).",
+)
 @click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
 def command(
     backend_name: str,
@@ -95,6 +108,7 @@ def command(
     fill: str,
     wait_for_device: bool,
     force: bool,
+    real_time: bool,
     quiet: bool,
 ) -> int:
     """Put a hand on Unitree's topics until Ctrl-C or SIGTERM.
@@ -116,6 +130,9 @@ def command(
 
     from dexkit.dds import DdsNode
 
+    # before any thread is started: they inherit it
+    if real_time and not ask_for_real_time():
+        log.info("no real-time priority: this user has no rtprio limit (docs/service.md)")
     with stop_on_signals() as stop, DdsNode(domain=chosen, interface=interface) as node:
         services = [
             HandService(
@@ -133,9 +150,9 @@ def command(
         ]
         prepare_process()
         with ExitStack() as running:
+            _on_sigusr1(running, services)
             for service in services:
                 running.enter_context(service)
-            _on_sigusr1(running, services)
             for service, group in zip(services, groups, strict=True):
                 names = " and ".join(str(hand.spec.side) for hand in group)
                 click.echo(
