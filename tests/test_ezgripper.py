@@ -23,7 +23,7 @@ from dexkit.backends import BackendOptions
 from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
 from dexkit.drivers.ezgripper import Calibrate, EZGripper, GripperSettings, calibration, settings
-from dexkit.drivers.ezgripper.bus import PacketHandler, ServoBus, ServoError
+from dexkit.drivers.ezgripper.bus import DevicePort, PacketHandler, ServoBus, ServoError
 from dexkit.drivers.ezgripper.calibration import CalibrationFailed
 from dexkit.drivers.ezgripper.control import ControlSettings, Phase
 from dexkit.drivers.ezgripper.discovery import (
@@ -356,6 +356,25 @@ def test_it_follows_measures_and_switches_off(tmp_path: Path) -> None:
         hand.close()
 
 
+@pytest.mark.parametrize("where", ["writePort", "readPort"])
+def test_ctrl_c_in_an_exchange_switches_the_motor_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def interrupt(*args: object) -> bytes:
+        patched.undo()
+        raise KeyboardInterrupt
+
+    with emulated(start=100.0) as gripper:
+        with gripper_on(gripper.path, configured(tmp_path)) as hand:
+            drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
+            with monkeypatch.context() as patched:
+                patched.setattr(DevicePort, where, interrupt)
+                with pytest.raises(KeyboardInterrupt):
+                    hand.exchange(CLOSE)
+            assert gripper.servo.torque
+        assert not gripper.servo.torque
+
+
 def test_zero_gains_leave_it_alone_and_brake_holds(tmp_path: Path) -> None:
     with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
         before = travel(gripper)
@@ -515,6 +534,25 @@ def test_a_servo_found_in_shutdown_is_restarted(tmp_path: Path) -> None:
             time.sleep(0.005)
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
             assert hand.statistics.reboots == 1
+            assert hand.exchange(BRAKE).fault[0] == 0
+
+
+def test_a_servo_that_has_cooled_down_is_restarted_by_whoever_comes_next(tmp_path: Path) -> None:
+    with emulated() as gripper:
+        gripper.inject("overheat:c=85")
+        deadline = time.monotonic() + LONG
+        while not gripper.servo.hardware_error:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        hot = EZGripper(gripper.path, configuration=configured(tmp_path))
+        with pytest.raises(HandFault, match="overheating"):
+            hot.open()
+        assert gripper.servo.hardware_error, "left to cool"
+        gripper.inject("overheat:c=30")
+        while gripper.servo.get(mx64.PRESENT_TEMPERATURE) > 30:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        with gripper_on(gripper.path, configured(tmp_path)) as hand:
             assert hand.exchange(BRAKE).fault[0] == 0
 
 

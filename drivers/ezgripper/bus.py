@@ -200,6 +200,12 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
                     break
         return sent - held
 
+    def abandon(self) -> None:
+        """Forget a transaction that was cut short: the SDK would call the port busy for ever."""
+        self.is_using = False
+        self.hold_next = False
+        self._held = b""
+
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         """Start the clock for a reply of ``packet_length`` bytes."""
         # what was written may still be leaving: allow the longest instruction as well
@@ -326,6 +332,16 @@ class ServoBus:
                 hint="known: " + ", ".join(str(b) for b in mx64.BAUD_RATES.values()),
             )
 
+    @contextmanager
+    def _line(self) -> Iterator[None]:
+        """A transaction; whatever cuts it short (Ctrl-C, too), the next one can be made."""
+        try:
+            with _port_errors(self.path):
+                yield
+        except BaseException:
+            self._port.abandon()
+            raise
+
     def drain(self) -> None:
         """Wait until what was written has left the adapter, whatever it buffers.
 
@@ -354,13 +370,13 @@ class ServoBus:
 
     def ping_all(self) -> list[Ping]:
         """Every servo that answers a broadcast; takes about a second (facts/mx64 C3)."""
-        with _port_errors(self.path):
+        with self._line():
             found, _ = self._packets.broadcastPing(self._port)
         return [Ping(i, model, firmware) for i, (model, firmware) in sorted(found.items())]
 
     def ping_protocol_1(self, servo_id: int) -> int | None:
         """Model number of a servo that still speaks Protocol 1.0, or None."""
-        with _port_errors(self.path):
+        with self._line():
             model, result, _ = Protocol1PacketHandler().ping(self._port, servo_id)
         return int(model) if result == COMM_SUCCESS else None
 
@@ -397,7 +413,7 @@ class ServoBus:
         :raises HandLost: the port has gone away or takes no more bytes.
         """
         self._port.hold_next = with_next
-        with _port_errors(self.path):
+        with self._line():
             result = self._packets.syncWriteTxOnly(
                 self._port, address, len(data), [servo_id, *data], 1 + len(data)
             )
@@ -429,7 +445,7 @@ class ServoBus:
         for attempt in range(attempts):
             statistics.transactions += 1
             statistics.retries += attempt > 0
-            with _port_errors(self.path):
+            with self._line():
                 # the SDK changes the list that it is given
                 reply, result, error = self._packets.txRxPacket(self._port, list(packet))
             if result == COMM_RX_TIMEOUT:

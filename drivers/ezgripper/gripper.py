@@ -104,6 +104,10 @@ class GripperStatistics:
     resets: int = 0
 
 
+_LONGEST_PAUSE = 2.0
+"""Seconds that opening waits for a restart to be due; a later one is left to a later opening."""
+
+
 def _is_shutdown(error: int) -> bool:
     # an input voltage error does not cut the torque by default (facts/mx64 B6)
     return error > HardwareError.INPUT_VOLTAGE
@@ -487,16 +491,16 @@ class EZGripper:
             self._policy.fault(self._clock.now())
         self._error = error
         self._trouble = _Trouble.FAULT
-        if error & HardwareError.OVERHEATING or self._policy.delay > 2.0:
-            temperature = servo.temperature()
-            limit = servo.bus.read_item(servo.id, mx64.TEMPERATURE_LIMIT)
-            if not self._policy.due(self._clock.now(), error, temperature, limit):
-                raise HandFault(
-                    f"the servo is in shutdown: {describe(error)} ({temperature} degC)",
-                    bits=(motor_error(error, 0.0, 0.0, 0.0),),
-                    hint="let it cool down, free the fingers, and try again",
-                )
-        self._clock.sleep_until(self._clock.now() + min(self._policy.delay, 2.0))
+        if self._policy.delay <= _LONGEST_PAUSE:
+            self._clock.sleep_until(self._clock.now() + self._policy.delay)
+        temperature = servo.temperature()
+        limit = servo.bus.read_item(servo.id, mx64.TEMPERATURE_LIMIT)
+        if not self._policy.due(self._clock.now(), error, temperature, limit):
+            raise HandFault(
+                f"the servo is in shutdown: {describe(error)} ({temperature} degC)",
+                bits=(motor_error(error, 0.0, 0.0, 0.0),),
+                hint="let it cool down, free the fingers, and try again",
+            )
         self._reboot(servo, self._clock.now())
         deadline = self._clock.now() + BOOT_TIME
         while not servo.answers():
