@@ -808,6 +808,41 @@ def test_calibration_does_not_believe_an_object(tmp_path: Path) -> None:
         assert not gripper.servo.torque
 
 
+def test_a_lost_link_does_not_calibrate_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    original = calibration.find_zero
+
+    def counted(*args: object, **kwargs: object) -> int:
+        calls.append(1)
+        return original(*args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(calibration, "find_zero", counted)
+    with emulated(start=20.0) as gripper:
+        configuration = configured(tmp_path, zero=None, calibrate=Calibrate.YES)
+        with gripper_on(gripper.path, configuration) as hand:
+            before = hand.exchange(BRAKE)
+            hand.close()  # as the service does with a link that it has lost
+            hand.open()
+            again = hand.exchange(BRAKE)
+            assert float(again.q[0]) == pytest.approx(float(before.q[0]), abs=0.05)
+        assert len(calls) == 1
+
+    # nor does it try again where an object was in the way
+    with emulated(start=90.0, object_pct=50.0) as gripper:
+        hand = EZGripper(gripper.path, configuration=configuration)
+        with pytest.raises(CalibrationFailed):
+            hand.open()
+        left = travel(gripper)
+        with pytest.raises(HandRefused, match="not repeated"):
+            hand.open()
+        # what was squeezed at the end of the attempt gives a little
+        assert travel(gripper) == pytest.approx(left, abs=40)
+        assert not gripper.servo.torque
+    assert len(calls) == 2
+
+
 def test_calibration_without_fingers_on_the_tendon(tmp_path: Path) -> None:
     # nothing stops a servo that nothing is attached to: closed lies beyond the search
     body = replace(Physics().gripper, closed_stiffness=1e-6)

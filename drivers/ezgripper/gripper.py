@@ -58,7 +58,8 @@ class GripperSettings:
     :param baudrate: bits a second, or None to try those known.
     :param control: the behaviour.
     :param calibrate: NO needs a stored zero, and opening never moves; AUTO closes and opens the
-        gripper if there is none; YES does so at every opening.
+        gripper if there is none; YES does so in any case. Either only at the first opening:
+        a gripper that is opened again, after a lost link for example, never moves for it.
     :param zero: zero in ticks, instead of the stored one.
     :param config: file of the stored calibration; None is the user's.
     :param force_table: instead of the stored one.
@@ -153,6 +154,8 @@ class EZGripper:
         self._force = DEFAULT_FORCE_TABLE
         self._limits = settings.ServoLimits(80, 9.5, 16.0)
         self._policy = RebootPolicy()
+        self._moved_for: str | None = None
+        self._found: int | None = None
         self._trouble = _Trouble.NONE
         self._error = 0
         self._fault = MotorError.NONE
@@ -279,6 +282,14 @@ class EZGripper:
         configuration = self.configuration
         if configuration.zero is not None:
             return configuration.zero
+        if self._moved_for == self.key and self._found is not None:
+            return self._found
+        if self._moved_for is not None:
+            # a link that comes back must not set the gripper in motion by itself
+            raise HandRefused(
+                f"the gripper {self.key} has no zero: calibration is not repeated by itself",
+                hint="see that it is empty and start again",
+            )
         if configuration.calibrate is not Calibrate.YES and self.record.zero is not None:
             return self.record.zero
         if configuration.calibrate is Calibrate.NO:
@@ -287,7 +298,8 @@ class EZGripper:
                 hint=f"empty it and run: dexkit calibrate ezgripper --device {self.device_name}"
                 " (or calibrate at every start with --set calibrate=yes)",
             )
-        zero = calibration.find_zero(servo, progress=log.info)
+        self._moved_for = self.key
+        zero = self._found = calibration.find_zero(servo, progress=log.info)
         self.record = replace(self.record, zero=zero)
         if self.device is not None and self.device.serial_number:
             Store(configuration.config).write(self.key, GripperRecord(zero=zero))
@@ -547,7 +559,8 @@ _SETTINGS: dict[str, tuple[Callable[[str], object], str]] = {
     "baudrate": (_or_auto, "bits a second, or auto to try those known (default 1000000)"),
     "calibrate": (
         Calibrate,
-        "no: needs a stored zero; auto: moves to find one if needed; yes: always (default no)",
+        "no: needs a stored zero; auto: moves at the start to find one if needed; "
+        "yes: always (default no)",
     ),
     "zero": (int, "zero in servo ticks, instead of the stored one"),
     "config": (Path, "calibration file (default the user's)"),
