@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants.zoo import ZOO
@@ -49,15 +50,19 @@ MUTANTS: tuple[Mutant, ...] = tuple(
 )
 
 
+@cache
+def _session() -> Session:
+    return Session.default().first_seconds(SESSION_SECONDS)
+
+
 def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(Side)) -> Plan:
     """Every stimulus, with an object in the right hand."""
     chosen = dialect(dialect_name)
-    sample = Session.default()
     return Plan(
         dialect=chosen,
         sides=tuple(sides),
         objects={Side.RIGHT: 0.37 * chosen.q_open} if Side.RIGHT in sides else {},
-        session=sample.first_seconds(SESSION_SECONDS),
+        session=_session(),
         phases=phases_for(catalogue()),
     )
 
