@@ -32,7 +32,14 @@ from dexkit.drivers.ezgripper.discovery import (
     latency_timer,
     latency_warning,
 )
-from dexkit.emulators.mx64 import Bus, EmulatedThread, Port, Servo, emulated_ezgripper
+from dexkit.emulators.mx64 import (
+    Bus,
+    EmulatedThread,
+    Firmware,
+    Port,
+    Servo,
+    emulated_ezgripper,
+)
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 from dexkit.emulators.mx64.settings import Physics
 from dexkit.errors import (
@@ -671,6 +678,30 @@ def test_a_pause_trips_the_watchdog_and_work_goes_on(tmp_path: Path) -> None:
             time.sleep(0.01)
         drive(hand, HALF, at(2.7))
         assert hand.servo_statistics.watchdog_trips == 1
+
+
+def test_a_servo_that_its_watchdog_stopped_is_taken_over_at_rest(tmp_path: Path) -> None:
+    # the least kind reading of the manual: once cleared, it goes on to its old goal
+    firmware = Firmware(watchdog_resumes=True)
+    with emulated(start=100.0, latency_timer=16e-3, firmware=firmware) as gripper:
+        hand = EZGripper(gripper.path, configuration=configured(tmp_path))
+        hand.open()
+        drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
+        assert hand._servo is not None
+        hand._servo.bus.close()  # killed, or unplugged
+        deadline = time.monotonic() + LONG
+        while (
+            gripper.servo.get(mx64.BUS_WATCHDOG) != mx64.WATCHDOG_TRIPPED
+            or gripper.servo.get(mx64.PRESENT_VELOCITY) != 0
+        ):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        stopped = travel(gripper)
+        assert gripper.servo.torque
+        with gripper_on(gripper.path, configured(tmp_path)) as after:
+            drive_for(after, BRAKE, 0.3)
+            # one answer's time at the speed it had just begun to take up
+            assert travel(gripper) == pytest.approx(stopped, abs=100)
 
 
 def test_damaged_and_lost_answers_are_retried_and_counted(tmp_path: Path) -> None:

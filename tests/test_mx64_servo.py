@@ -562,6 +562,22 @@ def test_bus_watchdog_stops_and_locks_the_goals() -> None:
     assert write(target, mx64.GOAL_POSITION, at) == 0
 
 
+@pytest.mark.parametrize("resumes", [False, True])
+def test_a_cleared_watchdog_leaves_it_standing_or_lets_it_go_on(resumes: bool) -> None:
+    target = servo(firmware=dataclasses.replace(QUIET, watchdog_resumes=resumes))
+    ready(target, OperatingMode.CURRENT_BASED_POSITION)
+    write(target, mx64.PROFILE_VELOCITY, 50)
+    write(target, mx64.BUS_WATCHDOG, 5)
+    goal = read(target, mx64.PRESENT_POSITION) + 1000
+    write(target, mx64.GOAL_POSITION, goal)
+    run(target, 0.5)
+    at = read(target, mx64.PRESENT_POSITION)
+    write(target, mx64.BUS_WATCHDOG, 0)
+    run(target, 3.0)
+    expected = goal if resumes else at
+    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(expected, abs=20)
+
+
 @pytest.mark.parametrize("mode", [OperatingMode.CURRENT, OperatingMode.VELOCITY, OperatingMode.PWM])
 def test_bus_watchdog_stops_every_mode(mode: OperatingMode) -> None:
     target = servo()

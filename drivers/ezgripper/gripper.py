@@ -398,7 +398,7 @@ class EZGripper:
             )
         if sample.watchdog == mx64.WATCHDOG_TRIPPED:
             log.warning("nothing was sent to the servo for too long; it stopped, going on")
-            servo.rearm_watchdog(settings.WATCHDOG_UNITS)
+            servo.rearm_watchdog()
         if sample.temperature >= control.settings.warm and not self._was_warm:
             log.warning("the servo is at %d degC: effort is reduced", sample.temperature)
         self._was_warm = sample.temperature >= control.settings.warm

@@ -8,7 +8,12 @@ from dexkit.clock import Clock, RealClock
 from dexkit.drivers.ezgripper import block
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import ServoBus
-from dexkit.drivers.ezgripper.settings import ServoLimits, apply_settings
+from dexkit.drivers.ezgripper.settings import (
+    WATCHDOG_UNITS,
+    ServoLimits,
+    apply_settings,
+    hold_here,
+)
 from dexkit.errors import HandTimeout
 from dexkit.wire import mx64
 
@@ -109,11 +114,10 @@ class Servo:
         self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, block.encode(goal))
         self.set_torque(True)
 
-    def rearm_watchdog(self, period: int) -> None:
-        """Make a servo that stopped by its watchdog take goals again."""
+    def rearm_watchdog(self) -> None:
+        """Make a servo that stopped by its watchdog take goals again; it stays where it is."""
         self.statistics.watchdog_trips += 1
-        self.bus.write_item(self.id, mx64.BUS_WATCHDOG, 0)
-        self.bus.write_item(self.id, mx64.BUS_WATCHDOG, period)
+        hold_here(self.bus, self.id, WATCHDOG_UNITS)
 
     def hardware_error(self) -> int:
         """Hardware Error Status(70), one byte: 71 does not exist."""

@@ -26,6 +26,7 @@ __all__ = [
     "ServoLimits",
     "apply_settings",
     "differences",
+    "hold_here",
 ]
 
 log = logging.getLogger(__name__)
@@ -83,9 +84,17 @@ def _verify(bus: ServoBus, servo_id: int, item: mx64.Item, value: int) -> None:
         )
 
 
-def _hold_here(bus: ServoBus, servo_id: int) -> None:
+def hold_here(bus: ServoBus, servo_id: int, watchdog: int = 0) -> None:
+    """Set the bus watchdog, and the goal to where the servo is, with nothing in between.
+
+    A servo stopped by its watchdog refuses goals until that is cleared; whether it then goes on
+    to its old goal is not documented.
+    """
     present = bus.read_item(servo_id, mx64.PRESENT_POSITION)
+    bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
     bus.write_item(servo_id, mx64.GOAL_POSITION, present)
+    if watchdog:
+        bus.write_item(servo_id, mx64.BUS_WATCHDOG, watchdog)
 
 
 def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
@@ -104,8 +113,6 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
         mx64.STATUS_RETURN_LEVEL.address,
         mx64.STATUS_RETURN_LEVEL.encode(StatusReturnLevel.ALL),
     )
-    if bus.read_item(servo_id, mx64.BUS_WATCHDOG) != 0:
-        bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
     differing = [(item, wanted) for item, _, wanted in differences(bus, servo_id)]
     mapped = _mapping(bus, servo_id) == block.mapping()
     if bus.read_item(servo_id, mx64.TORQUE_ENABLE):
@@ -113,7 +120,9 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
         if differing or not mapped:
             bus.write_item(servo_id, mx64.TORQUE_ENABLE, 0)
         else:
-            _hold_here(bus, servo_id)
+            hold_here(bus, servo_id)
+    # only now: a servo stopped by its watchdog may move again
+    bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
     for item, value in differing:
         log.info("servo %d: setting %s(%d) to %d", servo_id, item.name, item.address, value)
         try:

@@ -539,6 +539,8 @@ class Servo:
         elif item is mx64.BUS_WATCHDOG and before == mx64.WATCHDOG_TRIPPED:
             self._update_demand()
             self.drive.reset_control()
+            if self.firmware.watchdog_resumes and self.torque and self._mode in _POSITION_MODES:
+                self._start_profile()
 
     def _set_torque(self, on: bool) -> None:
         if on == self.torque or (on and self._shut_down):

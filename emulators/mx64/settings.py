@@ -43,6 +43,8 @@ class Firmware:
     :param level_0_answers_sync: at Status Return Level 0, Sync and Bulk Read are answered.
     :param profile_velocity_limited: a Profile Velocity above Velocity Limit(44) is refused.
     :param goal_starts_at_present: Goal Position becomes the present one at Torque Enable = 1.
+    :param watchdog_resumes: when the bus watchdog is cleared the servo heads for its goal again;
+        otherwise it stays where it was stopped.
     :param fast_reads: Fast Sync and Fast Bulk Read, which no MX is listed to have.
     :param backup: Control Table Backup, which no MX is listed to have.
     :param byte_gap: seconds between bytes after which a packet begun is dropped.
@@ -67,6 +69,7 @@ class Firmware:
     level_0_answers_sync: bool = False
     profile_velocity_limited: bool = True
     goal_starts_at_present: bool = True
+    watchdog_resumes: bool = False
     fast_reads: bool = False
     backup: bool = False
     byte_gap: float = 1.5e-3
