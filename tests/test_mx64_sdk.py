@@ -6,7 +6,6 @@ so.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from importlib import resources
@@ -247,20 +246,22 @@ def test_easy_sdk(pair: EmulatedProcess) -> None:
 
 @pytest.mark.realtime
 def test_at_least_200_exchanges_a_second(port: sdk.PortHandler) -> None:
-    """A write and a read at 1 Mbaud with a 1 ms latency timer; the model allows 500."""
-    for servo_id in (1,):
-        PACKETS.write1ByteTxRx(port, servo_id, mx64.RETURN_DELAY_TIME.address, 2)
+    """A write and a read at 1 Mbaud with a 1 ms latency timer; the model allows 500.
+
+    The rate is that of the fastest ten in a row, a twentieth of a second at most: what this
+    claims is that neither the emulator nor the line is slower, and on a busy machine both still
+    get so much time together now and then. Sustained rates are a matter of the benchmark.
+    """
+    PACKETS.write1ByteTxRx(port, 1, mx64.RETURN_DELAY_TIME.address, 2)
+    run = 10
+    ends = [time.monotonic()]
+    deadline = ends[0] + 20.0
     best = 0.0
-    for _ in range(40):  # short runs: on a busy machine one of them is left alone
-        begin = time.monotonic()
-        for _ in range(20):
-            assert PACKETS.write4ByteTxRx(port, 1, mx64.GOAL_POSITION.address, 2000) == OK
-            assert PACKETS.readTxRx(port, 1, 126, 21)[1:] == OK
-        best = max(best, 20 / (time.monotonic() - begin))
-        if best > 250:
-            break
-    cores = os.cpu_count() or 1
-    if best <= 200 and os.getloadavg()[0] > 1.5 * cores:
-        # the same figure holds in virtual time: test_mx64_bus
-        pytest.skip(f"{best:.0f}/s, but the machine has more to do than it can")
-    assert 200 < best < 550
+    while len(ends) <= 200 or (best <= 200 and ends[-1] < deadline):
+        assert PACKETS.write4ByteTxRx(port, 1, mx64.GOAL_POSITION.address, 2000) == OK
+        assert PACKETS.readTxRx(port, 1, 126, 21)[1:] == OK
+        ends.append(time.monotonic())
+        if len(ends) > run:
+            best = max(best, run / (ends[-1] - ends[-1 - run]))
+    # two waits for the timer each, of which the first of the ten may be shorter
+    assert 200 < best < 600
