@@ -83,9 +83,3 @@ def test_indirect_items() -> None:
     for number in (0, 57):
         with pytest.raises(EncodeError):
             mx64.indirect_data(number)
-
-
-def test_names() -> None:
-    assert mx64.item_named("Goal Position") is mx64.GOAL_POSITION
-    with pytest.raises(EncodeError):
-        mx64.item_named("goal")

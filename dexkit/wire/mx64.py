@@ -316,14 +316,3 @@ def _build_table() -> dict[int, Item]:
 
 TABLE: dict[int, Item] = _build_table()
 """Every item by its address, in order."""
-
-
-def item_named(name: str) -> Item:
-    """The item called ``name`` (``"Goal Position"``, case and spaces as in the manual).
-
-    :raises EncodeError: there is none.
-    """
-    for item in TABLE.values():
-        if item.name == name:
-            return item
-    raise EncodeError(f"no item {name!r} in the MX-64's control table")
