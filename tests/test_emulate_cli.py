@@ -257,6 +257,14 @@ def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["eeprom.json"]
 
 
+def test_eeprom_file_without_a_directory_is_an_error_at_once(tmp_path: Path) -> None:
+    process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(tmp_path / "no" / "e.json"))
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert b"directory" in errors
+    assert not os.path.lexists(tmp_path / "g")
+
+
 @pytest.mark.parametrize("text", ["", "{}", '{"device": "mx64", "eeprom": ["00"]}', "[1]"])
 def test_broken_eeprom_file_is_an_error(tmp_path: Path, text: str) -> None:
     file = tmp_path / "eeprom.json"

@@ -196,6 +196,11 @@ class _EepromFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._contents: list[bytes] = []
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise EmulatorError(
+                f"cannot keep the EEPROM in {path}",
+                hint="its directory must exist and be writable",
+            )
         if path.exists():
             try:
                 data = json.loads(path.read_text())
