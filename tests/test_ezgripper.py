@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -827,6 +828,37 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
             assert opening == pytest.approx(min(speeds["opening"], 150) * 0.054)
             assert closing == pytest.approx(min(speeds["closing"], 150) * 0.054)
             assert float(hand.exchange(BRAKE).q[0]) >= -0.05
+
+
+def test_a_gripper_is_known_by_its_usb_serial_number_in_any_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def plug_in(path: str) -> None:
+        ports = [
+            SimpleNamespace(device="/dev/ttyS0", serial_number=None),
+            SimpleNamespace(device=path, serial_number="DA1Z9T40"),
+        ]
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
+
+    configuration = configured(tmp_path, zero=None, calibrate=Calibrate.AUTO)
+    with emulated(start=20.0) as gripper:
+        plug_in(gripper.path)
+        with gripper_on("DA1Z9T40", configuration) as hand:
+            assert hand.key == "DA1Z9T40"
+            zero = hand.record.zero
+    content = json.loads((tmp_path / "ezgripper.json").read_text())
+    assert content == {"calibration": {"DA1Z9T40": zero}}
+    # another port, opened by its path, and nothing moves
+    with emulated(start=70.0) as gripper:
+        plug_in(gripper.path)
+        before = travel(gripper)
+        configuration = replace(configuration, calibrate=Calibrate.NO)
+        with gripper_on(gripper.path, configuration) as hand:
+            assert hand.record.zero == zero
+            assert travel(gripper) == before
+    with pytest.raises(HandNotFound, match="DA1Z9T41") as missing:
+        find_device("DA1Z9T41")
+    assert "DA1Z9T40" in missing.value.hint
 
 
 def test_calibration_does_not_believe_an_object(tmp_path: Path) -> None:

@@ -328,8 +328,8 @@ class ServoBus:
             raise _open_failed(self.path, error) from error
         if not known:
             raise UsageError(
-                f"baud rate {baudrate} is not supported",
-                hint="known: " + ", ".join(str(b) for b in mx64.BAUD_RATES.values()),
+                f"baud rate {baudrate} is not supported by dynamixel-sdk",
+                hint="use " + ", ".join(str(b) for b in mx64.BAUD_RATES.values() if b != baudrate),
             )
 
     @contextmanager
