@@ -54,6 +54,7 @@ from dexkit.errors import (
     UsageError,
 )
 from dexkit.hand import HandCommand, HandState, MotorError, Side
+from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
 
 ZERO = 1510
@@ -823,11 +824,16 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
         # and it serves from then on, without moving at the start
         with gripper_on(gripper.path, configured(tmp_path, zero=None, config=path)) as hand:
             assert hand.record.zero == zero
-            assert hand.joint_speeds is not None
             ((opening, closing),) = hand.joint_speeds
             assert opening == pytest.approx(min(speeds["opening"], 150) * 0.054)
             assert closing == pytest.approx(min(speeds["closing"], 150) * 0.054)
             assert float(hand.exchange(BRAKE).q[0]) >= -0.05
+
+
+def test_without_a_measured_speed_the_estimator_gets_the_limit_that_the_servo_keeps() -> None:
+    hand = EZGripper("/dev/nothing", Side.LEFT, GripperSettings())
+    limit = 1.5 * DEX1_1.joints[Side.LEFT][0].stroke  # 150 % of the stroke a second
+    assert hand.joint_speeds == ((pytest.approx(limit), pytest.approx(limit)),)
 
 
 def test_a_gripper_is_known_by_its_usb_serial_number_in_any_port(

@@ -196,17 +196,19 @@ class EZGripper:
         return self._servo.statistics if self._servo is not None else ServoStatistics()
 
     @property
-    def joint_speeds(self) -> tuple[tuple[float, float]] | None:
-        """Calibrated speeds of the joint opening and closing, rad/s; None if not measured.
+    def joint_speeds(self) -> tuple[tuple[float, float]]:
+        """Speeds of the joint opening and closing, rad/s: what the service's estimator expects.
 
-        What the service's estimator expects; no faster than the speed limit that is set.
+        As calibrated, but no faster than the speed limit that is set, which the servo's profile
+        keeps; where none was measured, that limit.
         """
-        opening, closing = self.record.opening, self.record.closing
-        if opening is None or closing is None:
-            return None
         limit = self.configuration.control.speed
         per_percent = self._spec.joints[0].stroke / 100
-        return ((min(opening, limit) * per_percent, min(closing, limit) * per_percent),)
+        opening, closing = (
+            limit if measured is None else min(measured, limit)
+            for measured in (self.record.opening, self.record.closing)
+        )
+        return ((opening * per_percent, closing * per_percent),)
 
     # --- opening and closing
 
