@@ -227,6 +227,7 @@ def check_cut(tmp_path: Path, data: bytes, cut: int, expected: list[Row]) -> int
     trace = open_trace(path)
     assert trace.truncated
     assert any("unfinished" in w for w in trace.warnings)
+    assert ("it holds no messages" in trace.warnings) == (trace.message_count == 0)
     got = [(m.topic, m.log_time_ns, m.publish_time_ns, m.data) for m in trace.messages()]
     assert got == expected[: len(got)], "what is left must be a prefix of what was"
     assert trace.message_count == len(got)

@@ -371,9 +371,9 @@ class Trace:
                 self._complete(file)
         except OSError as error:
             raise TraceUnreadable(f"cannot read {self.path}: {error.strerror}") from error
-        if self.truncated and not self._info:
-            self._warn("it holds no messages")
         self._describe()
+        if self.truncated and not self.message_count:
+            self._warn("it holds no messages")
 
     def _read_start(self, file: BinaryIO) -> None:
         magic = file.read(len(MCAP0_MAGIC))
