@@ -1,9 +1,9 @@
 """From DDS into a recorder: which topics, which types, and what discovery saw meanwhile.
 
 A plain DDS reader must know the type. Types come from discovery (any endpoint of a known type
-on a wanted topic, reader or writer) and, for topics asked for by name, from the hand models, so
-that the reader is there before the writer: a controller that forks never learns of readers that
-appear later (facts/unitree-dex B.7).
+on a wanted topic, reader or writer) and, for topics asked for by name on which there is nobody
+yet, from the hand models, so that the reader is there before the writer: a controller that forks
+never learns of readers that appear later (facts/unitree-dex B.7).
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ __all__ = ["DdsRecording", "record_topics"]
 DEPTH = 1000
 # Seconds between metadata records with the endpoints, at most; they change when a run starts.
 _ENDPOINTS_EVERY = 0.25
+# Seconds in which discovery may tell the type of a topic asked for by name; on one machine it takes
+# a few tens of milliseconds.
+_LOOK = 0.5
 # Seconds after which the thread looks around although nothing woke it.
 _IDLE = 0.1
 
@@ -81,12 +84,20 @@ class DdsRecording:
         return dict(self._unknown)
 
     def start(self) -> None:
-        """Subscribe and begin."""
-        for topic in self._patterns or ():
-            for type_name in _model_types(topic):
-                self._subscribe(topic, type_name)
+        """Subscribe and begin; waits up to half a second for the types of topics in use."""
         for topic, type_name in self._types.items():
             self._subscribe(topic, type_name)
+        guesses = {t: _model_types(t) for t in self._patterns or () if t not in self._types}
+        guesses = {topic: types for topic, types in guesses.items() if types}
+
+        # readers of types that nobody uses look like peers of another dialect to a service
+        def unused(endpoints: list[Endpoint]) -> set[str]:
+            return guesses.keys() - {e.topic for e in endpoints if not e.own}
+
+        self.node.discovery.wait(lambda endpoints: not unused(endpoints), timeout=_LOOK)
+        for topic in sorted(unused(self.node.endpoints())):
+            for type_name in guesses[topic]:
+                self._subscribe(topic, type_name)
         self._unsubscribe = self.node.discovery.subscribe(
             lambda event: self._note(event.endpoint) if event.appeared else None
         )

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from dexkit.models import DIALECTS
+from dexkit.traces import Recorder
+from dexkit.traces.dds_recording import DdsRecording
+from tests.dds_helpers import DdsNode, free_domain
+from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE
+
+
+def types_read(node: DdsNode) -> set[tuple[str, str]]:
+    """What the other participants of the domain subscribe."""
+    return {(e.topic, e.type_name) for e in node.endpoints() if e.kind == "reader" and not e.own}
+
+
+def test_a_topic_in_use_is_read_as_the_type_that_it_has(tmp_path: Path) -> None:
+    """A reader of another dialect's type would look to the service like a peer that errs."""
+    domain = free_domain()
+    with DdsNode(domain) as hand, DdsNode(domain) as node, Recorder(tmp_path / "a.mcap") as out:
+        hand.writer(STATE, STATE_TYPE)
+        hand.reader(CMD, CMD_TYPE)
+        with DdsRecording(node, out, [STATE, "/dex1/left/cmd"]) as recording:
+            expected = {(STATE, STATE_TYPE), (CMD, CMD_TYPE)}
+            assert hand.discovery.wait(lambda _: types_read(hand) >= expected, timeout=10)
+            assert types_read(hand) == expected
+            assert recording.subscribed == [CMD, STATE]
+
+
+def test_a_topic_of_a_model_is_read_before_anybody_is_there(tmp_path: Path) -> None:
+    domain = free_domain()
+    expected = {(CMD, DIALECTS[name].cmd_type) for name in ("unitree_go", "unitree_hg")}
+    with (
+        DdsNode(domain) as other,
+        DdsNode(domain) as node,
+        Recorder(tmp_path / "a.mcap") as out,
+        DdsRecording(node, out, [CMD, "/unknown/topic"]) as recording,
+    ):
+        assert recording.subscribed == [CMD]
+        assert other.discovery.wait(lambda _: types_read(other) == expected, timeout=10)
+
+
+def test_a_type_that_is_told_is_not_guessed(tmp_path: Path) -> None:
+    domain = free_domain()
+    with (
+        DdsNode(domain) as other,
+        DdsNode(domain) as node,
+        Recorder(tmp_path / "a.mcap") as out,
+        DdsRecording(node, out, [CMD], types={CMD: CMD_TYPE}),
+    ):
+        assert other.discovery.wait(lambda _: types_read(other), timeout=10)
+        assert types_read(other) == {(CMD, CMD_TYPE)}
