@@ -24,6 +24,9 @@ __all__ = ["command"]
 #: Seconds in which other publishers on the topics are looked for; discovery on one machine takes
 #: a few tens of milliseconds.
 LOOK = 1.0
+# Seconds from a match seen here to the first message, for the other side to see it too: what comes
+# before is lost to it. Unitree's SDK sleeps as long after making a writer (facts/unitree-dex A.6).
+_SETTLE = 0.2
 # Seconds for the other side's readers after the last message, before the writers vanish.
 _LINGER = 0.1
 
@@ -101,6 +104,7 @@ def command(
         writers = {topic: node.writer(topic, name) for topic, name in player.topics.items()}
         if not no_wait:
             _wait_for_readers(node, writers, wait, stop)
+            stop.wait(_SETTLE)
         if stop:
             return 130
         click.echo(f"ready: playing on domain {domain}, {interface}")
