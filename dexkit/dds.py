@@ -71,6 +71,7 @@ _PRECONDITION_NOT_MET = -4
 _ALIVE = 16  # DDS_ALIVE_INSTANCE_STATE
 _MAX_PARTICIPANT_INDEX = 60  # processes on one machine and domain; each is probed at start-up
 _TAKE_CHUNK = 64
+_EXIT_PATIENCE = 3.0  # seconds for closing at the end of the process; it takes some 20 ms
 _BUILTIN = "org::eclipse::cyclonedds::builtin::"  # types of a node's own discovery readers
 
 
@@ -207,8 +208,11 @@ class _Cyclone:
             from cyclonedds import topic as topic_module
             from cyclonedds.idl import annotations, types
         except Exception as error:  # its loader raises its own classes, too
+            missing = isinstance(error, metadata.PackageNotFoundError)
             raise DdsUnavailable(
-                f"CycloneDDS cannot be loaded: {error}",
+                "CycloneDDS is not installed"
+                if missing
+                else f"CycloneDDS cannot be loaded: {error}",
                 hint="DDS needs CPython 3.10 on x86-64 Linux (the only one with cyclonedds 0.10 "
                 "wheels): 'uv python install 3.10', or 'pip install \"cyclonedds<0.11\"' there. "
                 "Recordings, emulated devices and offline checks work without it.",
@@ -1058,6 +1062,17 @@ def _qos_of(policies: Any) -> Qos:
 @atexit.register
 def _close_all() -> None:
     # a dispatcher that is inside CycloneDDS while the interpreter goes away may crash it
-    for node in list(_nodes):
-        with contextlib.suppress(Exception):
-            node.close()
+    def close() -> None:
+        for node in list(_nodes):
+            with contextlib.suppress(Exception):
+                node.close()
+
+    if not _nodes:
+        return
+    # in a thread, so that a callback that never returns cannot keep the process from ending
+    closer = threading.Thread(target=close, name="dds-exit", daemon=True)
+    closer.start()
+    closer.join(_EXIT_PATIENCE)
+    if closer.is_alive():
+        _log.warning("DDS was not closed within %g s; leaving it behind", _EXIT_PATIENCE)
+        _cyclone().core.Entity._entities.clear()  # nor may finalisers wait for it

@@ -372,3 +372,35 @@ def test_nothing_reaches_stderr_and_exit_without_close_is_clean() -> None:
         "print(w.wait_matched(10))\n"
     )
     assert _run(script) == "True\n"
+
+
+STUCK = """
+import logging
+import sys
+import threading
+from dexkit import dds
+
+logging.basicConfig()
+dds._EXIT_PATIENCE = 0.2
+node, other = dds.DdsNode(int(sys.argv[1])), dds.DdsNode(int(sys.argv[1]))
+inside = threading.Event()
+
+def callback(event):
+    inside.set()
+    threading.Event().wait()
+
+node.discovery.subscribe(lambda event: event.endpoint.own or callback(event))
+other.writer("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
+assert inside.wait(10)
+"""
+
+
+def test_a_callback_that_never_returns_does_not_keep_the_process() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STUCK, str(free_domain())],
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "was not closed within 0.2 s" in done.stderr
