@@ -24,7 +24,7 @@ def test_a_topic_in_use_is_read_as_the_type_that_it_has(tmp_path: Path) -> None:
             expected = {(STATE, STATE_TYPE), (CMD, CMD_TYPE)}
             assert hand.discovery.wait(lambda _: types_read(hand) >= expected, timeout=10)
             assert types_read(hand) == expected
-            assert recording.subscribed == [CMD, STATE]
+        assert recording.subscribed == [CMD, STATE]
 
 
 def test_a_topic_of_a_model_is_read_before_anybody_is_there(tmp_path: Path) -> None:
