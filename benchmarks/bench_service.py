@@ -26,7 +26,6 @@ import tempfile
 import time
 import tty
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -42,7 +41,8 @@ from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
 from dexkit.models import DEX1_1, dialect
-from dexkit.service.realtime import ask_for_real_time, precise_timers
+from dexkit.service.realtime import precise_timers
+from dexkit.service.realtime import real_time as real_time_priority
 from dexkit.wire.dynamixel import Instruction, PacketParser
 
 _GO = dialect("unitree_go")
@@ -81,14 +81,13 @@ def serving(side: Side, device: str, domain: int, *, real_time: bool) -> Iterato
 
 def bare_loop(seconds: float, real_time: bool, out: Connection) -> None:
     """Deadlines and nothing else; sends its wall-clock times."""
-    if real_time:
-        ask_for_real_time()
     precise_timers()
-    rate = Rate(1 / _PERIOD, spin=150e-6)
     times = []
-    for _ in range(round(seconds / _PERIOD)):
-        rate.wait()
-        times.append(time.time_ns())
+    with real_time_priority() if real_time else contextlib.nullcontext():
+        rate = Rate(1 / _PERIOD, spin=150e-6)
+        for _ in range(round(seconds / _PERIOD)):
+            rate.wait()
+            times.append(time.time_ns())
     out.send(times)
 
 
@@ -254,18 +253,14 @@ def gripper() -> Iterator[str]:
         yield emulated.path
 
 
-def permitted() -> bool:
-    """Whether this user may have real-time priority."""
-    with ThreadPoolExecutor(1) as other:  # of a thread that ends with the question
-        return other.submit(ask_for_real_time).result()
-
-
 def run() -> list[Result]:
     domain = random.randrange(201, 230)
     with gripper() as left, gripper() as right:
         devices = {Side.LEFT: left, Side.RIGHT: right}
         results = []
-        if permitted():
+        with real_time_priority() as permitted:
+            pass
+        if permitted:
             results = jitter(domain, devices, real_time=True)
         results += jitter(domain, devices, real_time=False)
     with gripper() as left:

@@ -1,4 +1,4 @@
-"""Asking for real-time priority never fails, and says truly what came of it."""
+"""Asking for real-time priority never fails, says truly what came of it, and leaves no trace."""
 
 from __future__ import annotations
 
@@ -7,32 +7,27 @@ import threading
 
 import pytest
 
-from dexkit.service import ask_for_real_time
+from dexkit.service import real_time
 
 
-def in_new_thread() -> tuple[bool, int, list[int]]:
-    """(what was answered, the thread's policy, the policy of a thread it started)."""
-    inherited: list[int] = []
+def policy() -> int:
+    return os.sched_getscheduler(0)
 
-    def ask() -> tuple[bool, int]:
-        granted = ask_for_real_time()
-        child = threading.Thread(target=lambda: inherited.append(os.sched_getscheduler(0)))
-        child.start()
-        child.join()
-        return granted, os.sched_getscheduler(0)
 
-    answers: list[tuple[bool, int]] = []
-    thread = threading.Thread(target=lambda: answers.append(ask()))
+def policy_of_new_thread() -> int:
+    seen: list[int] = []
+    thread = threading.Thread(target=lambda: seen.append(policy()))
     thread.start()
     thread.join()
-    return (*answers[0], inherited)
+    return seen[0]
 
 
 def test_the_answer_is_the_policy_of_this_thread_and_those_it_starts() -> None:
-    granted, policy, inherited = in_new_thread()
-    assert (policy == os.SCHED_RR) == granted
-    assert inherited == [policy]
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER  # nobody else is touched
+    before = policy()
+    with real_time() as granted:
+        assert (policy() == os.SCHED_RR) == granted
+        assert policy_of_new_thread() == policy()
+    assert policy() == before
 
 
 def test_where_it_is_not_permitted_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,5 +35,7 @@ def test_where_it_is_not_permitted_nothing_changes(monkeypatch: pytest.MonkeyPat
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    granted, policy, _ = in_new_thread()
-    assert (granted, policy) == (False, os.SCHED_OTHER)
+    before = policy()
+    with real_time() as granted:
+        assert not granted
+        assert policy() == before

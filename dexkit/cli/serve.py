@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from types import FrameType
 
 import click
@@ -22,10 +22,10 @@ from dexkit.service import (
     Estimation,
     Fill,
     HandService,
-    ask_for_real_time,
     diagnose,
     prepare_process,
 )
+from dexkit.service import real_time as real_time_priority
 
 __all__ = ["command"]
 
@@ -130,10 +130,14 @@ def command(
 
     from dexkit.dds import DdsNode
 
-    # before any thread is started: they inherit it
-    if real_time and not ask_for_real_time():
-        log.info("no real-time priority: this user has no rtprio limit (docs/service.md)")
-    with stop_on_signals() as stop, DdsNode(domain=chosen, interface=interface) as node:
+    with (
+        # before any thread is started: they inherit it
+        real_time_priority() if real_time else nullcontext(True) as granted,
+        stop_on_signals() as stop,
+        DdsNode(domain=chosen, interface=interface) as node,
+    ):
+        if not granted:
+            log.info("no real-time priority: this user has no rtprio limit (docs/service.md)")
         services = [
             HandService(
                 group,

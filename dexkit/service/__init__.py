@@ -13,7 +13,7 @@ from dexkit.service.counters import HandCounters, TopicCounters
 from dexkit.service.diagnose import diagnose
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.estimator import JointEstimator, StateEstimator
-from dexkit.service.realtime import ask_for_real_time, prepare_process
+from dexkit.service.realtime import prepare_process, real_time
 from dexkit.service.service import HandService
 
 __all__ = [
@@ -28,8 +28,8 @@ __all__ = [
     "StateEstimator",
     "StateView",
     "TopicCounters",
-    "ask_for_real_time",
     "diagnose",
     "dialect_map",
     "prepare_process",
+    "real_time",
 ]

@@ -6,29 +6,37 @@ import ctypes
 import gc
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-__all__ = ["ask_for_real_time", "precise_timers", "prepare_process"]
+__all__ = ["precise_timers", "prepare_process", "real_time"]
 
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _SWITCH_INTERVAL = 200e-6  # seconds; Python's default of 5 ms is two and a half state periods
 _RR_PRIORITY = 1  # the lowest: ahead of ordinary processes, behind everything that is real-time
 
 
-def ask_for_real_time() -> bool:
-    """Ask the kernel to run this thread, and those it starts, before ordinary processes.
+@contextmanager
+def real_time() -> Iterator[bool]:
+    """Run this thread, and those it starts meanwhile, before ordinary processes.
 
-    :returns: whether that was permitted: to root, and to users with an rtprio limit. Elsewhere
-        nothing changes.
-
-    The service sleeps most of the time, and the kernel keeps 5 % for others in any case.
+    Yields whether the kernel permits it: to root, and to users with an rtprio limit. Elsewhere
+    nothing changes. The service sleeps most of the time, and the kernel keeps 5 % for others in
+    any case.
     """
     if sys.platform != "linux":
-        return False
+        yield False
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_RR_PRIORITY))
     except OSError:
-        return False
-    return True
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        os.sched_setscheduler(0, *before)
 
 
 def precise_timers() -> None:
