@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from dexkit.service import real_time
+from dexkit.service.realtime import go_first
 
 
 def policy() -> int:
@@ -39,3 +40,12 @@ def test_where_it_is_not_permitted_nothing_changes(monkeypatch: pytest.MonkeyPat
     with real_time() as granted:
         assert not granted
         assert policy() == before
+
+
+def test_the_thread_with_deadlines_goes_first_only_among_its_like() -> None:
+    go_first()
+    assert policy() == os.SCHED_OTHER
+    with real_time() as granted:
+        before = os.sched_getparam(0).sched_priority
+        go_first()
+        assert os.sched_getparam(0).sched_priority == before + granted

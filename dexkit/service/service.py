@@ -28,7 +28,7 @@ from dexkit.models import dialect as dialect_by_name
 from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
-from dexkit.service.realtime import precise_timers
+from dexkit.service.realtime import go_first, precise_timers
 
 __all__ = ["HandService", "Node"]
 
@@ -394,6 +394,7 @@ class HandService:
 
     def _publish_loop(self) -> None:
         precise_timers()
+        go_first()
         rate = Rate(self.state_rate, self._clock, spin=min(_SPIN, 0.2 / self.state_rate))
         while True:
             missed = rate.wait()
