@@ -13,7 +13,8 @@ __all__ = ["go_first", "precise_timers", "prepare_process", "real_time"]
 
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _SWITCH_INTERVAL = 200e-6  # seconds; Python's default of 5 ms is two and a half state periods
-_RR_PRIORITY = 1  # the lowest, and one above it for deadlines: ahead of ordinary processes, behind everything that is real-time
+# the lowest (and one above it for deadlines): ahead of ordinary processes, behind all else
+_RR_PRIORITY = 1
 
 
 @contextmanager
