@@ -8,18 +8,27 @@ its name::
     my-gripper = "my_package.hand:backend"
 
 ``package.module:Class`` also takes a plain callable ``(options) -> Hand`` or a Hand class whose
-constructor takes the side.
+constructor takes the side. The module is installed, or lies in the working directory.
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import os
+import sys
+import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib import metadata
 
-from dexkit.errors import BackendBroken, BackendConflict, UnknownBackend, UsageError
+from dexkit.errors import (
+    BackendBroken,
+    BackendConflict,
+    DexkitError,
+    UnknownBackend,
+    UsageError,
+)
 from dexkit.hand import Hand, Side
 
 __all__ = ["GROUP", "Backend", "BackendInfo", "BackendOptions", "backend", "list_backends"]
@@ -79,11 +88,20 @@ class Backend:
         """Make the hand; nothing is opened yet.
 
         :raises UsageError: a device is needed and missing, or a setting is unknown.
+        :raises BackendBroken: the backend's own code failed.
         """
         if self.needs_device and not options.device:
             raise UsageError("this backend needs a device", hint=f"give {self.needs}")
         options.refuse_unknown(self.settings)
-        return self.make(options)
+        try:
+            return self.make(options)
+        except DexkitError:
+            raise
+        except Exception as error:  # a plug-in may raise anything
+            raise BackendBroken(
+                f"the backend failed to make its hand: {type(error).__name__}: {error}",
+                hint=_where(error),
+            ) from error
 
 
 @dataclass(frozen=True)
@@ -173,17 +191,37 @@ def _checked(target: str, hand: object) -> Hand:
     return hand
 
 
+def _where(error: BaseException) -> str:
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"at {frame.filename}:{frame.lineno}"
+
+
+def _load_hint(error: Exception, module_name: str) -> str:
+    if isinstance(error, ModuleNotFoundError):
+        missing = error.name or ""
+        if module_name == missing or module_name.startswith(f"{missing}."):
+            return "is it installed in this environment, or in the working directory?"
+        return f"{module_name} needs it: is it installed in this environment?"
+    return _where(error)
+
+
 def _load(target: str) -> Backend:
     module_name, _, attribute = target.partition(":")
     try:
         value: object = importlib.import_module(module_name)
-        for part in attribute.split("."):
-            value = getattr(value, part)
     except Exception as error:  # a plug-in may raise anything while it is imported
         raise BackendBroken(
             f"cannot load {target}: {type(error).__name__}: {error}",
-            hint="is the package installed in this environment?",
+            hint=_load_hint(error, module_name),
         ) from error
+    for part in attribute.split("."):
+        if not hasattr(value, part):
+            raise BackendBroken(
+                f"cannot load {target}: there is no {part!r} in {module_name}",
+                hint="package.module:Object names a Backend, a Hand class, or a function that "
+                "makes a Hand",
+            )
+        value = getattr(value, part)
     return _coerce(target, value)
 
 
@@ -195,6 +233,11 @@ def backend(name: str) -> Backend:
     :raises BackendBroken: it cannot be loaded.
     """
     if ":" in name:
+        # As `python -m` does: a hand that is being written need not be installed. Last, so that
+        # nothing that lies here replaces what is installed.
+        here = os.getcwd()
+        if here not in sys.path and "" not in sys.path:
+            sys.path.append(here)
         return _load(name)
     entry = _select(name)
     if entry is None:
