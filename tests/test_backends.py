@@ -99,7 +99,7 @@ class TestByName:
         [
             ("raise RuntimeError('boom')", "RuntimeError: boom"),
             ("import no_such_module_at_all", "ModuleNotFoundError"),
-            ("x = 1", "AttributeError"),
+            ("x = 1", "there is no 'backend' in broken_mod"),
             ("backend = 42", "is a int, not a backend"),
             ("import sys; sys.modules[__name__] = None; this is no python", "SyntaxError"),
         ],
@@ -149,6 +149,10 @@ def make_hand(options: BackendOptions) -> Hand:
     return ScriptedHand(options.side)
 
 
+def make_failure(options: BackendOptions) -> Hand:
+    raise ValueError("no port")
+
+
 def make_nothing(options: BackendOptions) -> object:
     return None
 
@@ -175,6 +179,31 @@ class TestByPath:
     def test_a_path_to_nothing(self, path: str) -> None:
         with pytest.raises(BackendBroken, match="cannot load"):
             backend(path)
+
+    def test_the_hint_tells_a_missing_module_from_a_misspelt_name(self) -> None:
+        with pytest.raises(BackendBroken) as missing:
+            backend("no_such_package.hand:Hand")
+        assert "installed" in (missing.value.hint or "")
+        with pytest.raises(BackendBroken, match=r"no .nope. in tests\.service_helpers") as misspelt:
+            backend("tests.service_helpers:nope")
+        assert "installed" not in (misspelt.value.hint or "")
+
+    def test_a_module_in_the_working_directory(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "hand_being_written.py").write_text(
+            "from tests.service_helpers import ScriptedHand\n"
+        )
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+        kind = backend("hand_being_written:ScriptedHand")
+        assert kind.create(LEFT).spec.side is Side.LEFT
+        assert sys.path[-1] == str(tmp_path)
+
+    def test_a_hand_that_fails_to_be_made_says_where(self) -> None:
+        with pytest.raises(BackendBroken, match="ValueError: no port") as raised:
+            backend(f"{__name__}:make_failure").create(LEFT)
+        assert raised.value.hint == f"at {__file__}:{make_failure.__code__.co_firstlineno + 1}"
 
     def test_something_else(self) -> None:
         with pytest.raises(BackendBroken, match="is a tuple"):
