@@ -153,11 +153,13 @@ def pytest_terminal_summary(
     result = config.stash.get(RESULT_KEY, None)
     terminalreporter.section("conformance")
     if result is None:
-        terminalreporter.write_line(
-            "Nothing was judged, which is not a pass. Name the hand: --backend ezgripper "
-            "(emulated), --backend sim-dex1, or --backend external for a service that runs.",
-            yellow=True,
-        )
+        text = "Nothing was judged, which is not a pass."
+        if config.stash[OPTIONS_KEY] is None:
+            text += (
+                " Name the hand: --backend ezgripper (emulated), --backend sim-dex1, "
+                "or --backend external for a service that runs."
+            )
+        terminalreporter.write_line(text, yellow=True)
         return
     from rich.console import Console
 

@@ -137,6 +137,9 @@ class SuiteOptions:
             raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
         if trace is not None and not trace.exists():
             raise UsageError(f"no such file: {trace}")
+        for file in (json, report, recording):
+            if file is not None and not file.absolute().parent.is_dir():
+                raise UsageError(f"cannot write {file}: there is no such directory")
         requirements = select(catalogue(), prefixes=require, level=level)
         if not requirements:
             raise UsageError("no requirement is left by --require and --level together")

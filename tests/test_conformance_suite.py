@@ -59,6 +59,7 @@ def test_without_a_backend_it_skips_says_how_and_is_no_success() -> None:
     [
         (("--side", "left"), "--side without --backend"),
         (("--backend", "sim-dex1", "--trace", "missing.mcap"), "no such file: missing.mcap"),
+        (("--backend", "sim-dex1", "--json", "/no/such/r.json"), "cannot write /no/such/r.json"),
     ],
 )
 def test_what_makes_no_sense_is_a_usage_error(arguments: tuple[str, ...], says: str) -> None:

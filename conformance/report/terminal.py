@@ -21,10 +21,13 @@ MARKS = {
 _STYLE = {Overall.PASS: "green", Overall.FAIL: "red", Overall.INCONCLUSIVE: "magenta"}
 
 
-def print_result(result: RunResult, console: Console, *, verbose: bool = False) -> None:
+def print_result(
+    result: RunResult, console: Console, *, verbose: bool = False, more: str = ""
+) -> None:
     """Print the table, then what is wrong and what to try.
 
     :param verbose: also list what could not be judged here, and why.
+    :param more: where else the reader finds why.
     """
     sides = list(dict.fromkeys(r.side for r in result.results))
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
@@ -52,7 +55,8 @@ def print_result(result: RunResult, console: Console, *, verbose: bool = False) 
     console.print(table)
     if hidden:
         console.print(
-            f"[dim]{hidden} requirement(s) could not be judged here and are not shown.[/dim]"
+            f"[dim]{hidden} requirement(s) could not be judged here and are not shown"
+            f"{f' ({more})' if more else ''}.[/dim]"
         )
     troubles = [r for r in result.results if r.verdict in (Verdict.FAIL, Verdict.ERROR)]
     warned = [r for r in result.results if r.verdict is Verdict.WARN]

@@ -78,7 +78,7 @@ def command(
     )
     result = judge(view, requirements=requirements, subject={"recording": recording.name})
     console = Console()
-    print_result(result, console, verbose=verbose)
+    print_result(result, console, verbose=verbose, more="-v says why")
     if json_path:
         result.write_json(json_path)
     if junit_path:
