@@ -81,7 +81,7 @@ def command(out: Path, backend: str, domain: int | None) -> None:
     seconds = time.monotonic() - begin
     console.print(f"\n{seconds:.0f} s. Look at it: [bold]{out / 'report.html'}[/bold]")
     console.print(
-        f"[dim]{options.recording} opens in Foxglove and PlotJuggler; "
+        f"[dim]{options.recording} has the ros2msg schemas that Foxglove and PlotJuggler read; "
         f"'dexkit check {options.recording}' judges it again.[/dim]"
     )
     if result.judged == 0:
