@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum, IntFlag
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -95,6 +95,8 @@ class JointSpec:
     """One joint: its name and its limits, SI units.
 
     :param closing: sign of dq that closes the hand (+1 or -1), or 0 where neither does.
+    :param urdf: name of the joint in Unitree's URDF, or empty.
+    :param gear_ratio: turns of the rotor for one of the joint.
     """
 
     name: str
@@ -103,6 +105,8 @@ class JointSpec:
     dq_max: float
     tau_max: float
     closing: int = 0
+    urdf: str = ""
+    gear_ratio: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.q_min < self.q_max:
@@ -113,6 +117,8 @@ class JointSpec:
             raise UsageError(f"joint {self.name}: dq_max and tau_max must be positive")
         if self.closing not in (-1, 0, 1):
             raise UsageError(f"joint {self.name}: closing must be -1, 0 or 1")
+        if self.gear_ratio <= 0:
+            raise UsageError(f"joint {self.name}: gear_ratio must be positive")
 
     @property
     def stroke(self) -> float:
@@ -175,6 +181,10 @@ class HandCommand:
     """One command: per joint ``mode, q, dq, tau, kp, kd``, arrays of shape (n_joints,).
 
     The motors follow ``tau_motor = kp (q - q_now) + kd (dq - dq_now) + tau`` in mode FOC.
+
+    :param timeout: which joints the client wants braked when its commands stop (bit 7 of
+        RIS_Mode, facts/unitree-dex B.4), shape (n_joints,); None where the dialect has no such
+        bit, and the service's own time-out holds for all.
     """
 
     q: Floats
@@ -183,6 +193,7 @@ class HandCommand:
     kp: Floats
     kd: Floats
     mode: NDArray[np.uint8]
+    timeout: NDArray[np.bool_] | None = None
 
     @classmethod
     def position(
@@ -227,7 +238,7 @@ class HandCommand:
         """Whether all fields are equal."""
         return all(
             np.array_equal(getattr(self, name), getattr(other, name))
-            for name in ("q", "dq", "tau", "kp", "kd", "mode")
+            for name in ("q", "dq", "tau", "kp", "kd", "mode", "timeout")
         )
 
 
@@ -257,8 +268,14 @@ class HandState:
     """One state. What a backend does not know stays NaN (or None): nothing is invented.
 
     :param q: joint position, rad, shape (n_joints,).
+    :param temperature: of the motor's case, °C, shape (n_joints,).
+    :param winding_temperature: likewise of its winding, or None where it is not measured apart.
     :param fault: :class:`MotorError` bits per joint.
-    :param pressure: shape (n_sensors, 12), or None without sensors.
+    :param pressure: Pa, shape (n_sensors, 12), NaN where there is no sensor element; or None
+        without sensors.
+    :param sensor_temperature: °C, shape (n_sensors, 12), or None.
+    :param sensor_lost: packets that each sensor has missed, shape (n_sensors,), or None.
+    :param error: the hand's own error word, apart from its motors'.
     :param stamp: monotonic time of *measurement*, seconds.
     :param measured: False when an estimator predicted ``q``.
     """
@@ -276,6 +293,10 @@ class HandState:
     pressure: Floats | None = None
     imu: ImuState | None = None
     supply: SupplyState | None = None
+    winding_temperature: Floats | None = None
+    sensor_temperature: Floats | None = None
+    sensor_lost: NDArray[np.uint32] | None = None
+    error: int = 0
 
     @classmethod
     def of(
@@ -294,6 +315,10 @@ class HandState:
         pressure: Floats | None = None,
         imu: ImuState | None = None,
         supply: SupplyState | None = None,
+        winding_temperature: Floats | None = None,
+        sensor_temperature: Floats | None = None,
+        sensor_lost: NDArray[np.uint32] | None = None,
+        error: int = 0,
     ) -> HandState:
         """Build a state from scalars or sequences; scalars are repeated for each joint."""
         position = _vector(q)
@@ -312,6 +337,10 @@ class HandState:
             pressure=pressure,
             imu=imu,
             supply=supply,
+            winding_temperature=winding_temperature,
+            sensor_temperature=sensor_temperature,
+            sensor_lost=sensor_lost,
+            error=error,
         )
 
 
@@ -401,7 +430,7 @@ class CommandGate:
         if not changed.any():
             return command
         self.clamped += 1
-        return HandCommand(q=q, dq=dq, tau=tau, kp=kp, kd=kd, mode=command.mode)
+        return replace(command, q=q, dq=dq, tau=tau, kp=kp, kd=kd)
 
 
 def _joint_values(spec: HandSpec, values: Iterable[float]) -> str:

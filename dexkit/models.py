@@ -7,12 +7,22 @@ Every other module takes these facts from here. Sources are sections of the fact
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dexkit.errors import UsageError
 from dexkit.hand import HandSpec, JointSpec, Side
 
-__all__ = ["DEX1_1", "DIALECTS", "MODELS", "Dialect", "HandModel", "dialect", "model"]
+__all__ = [
+    "DEX1_1",
+    "DEX3_1",
+    "DIALECTS",
+    "MODELS",
+    "Dialect",
+    "HandModel",
+    "PressureSensor",
+    "dialect",
+    "model",
+]
 
 
 @dataclass(frozen=True)
@@ -21,9 +31,11 @@ class Dialect:
 
     :param cmd_topic: command topic; ``{side}`` is replaced by ``left`` or ``right``.
     :param cmd_type: DDS type name of the command.
-    :param index: position of a side's motor in the sequence (all 0 unless both share a topic).
-    :param length: motors in the sequence, for a one-joint hand.
-    :param q_open: q of a fully open gripper, rad; 0 is closed.
+    :param index: position of a side's first motor in the sequence (0 unless both share a topic).
+    :param length: motors in the sequence.
+    :param q_open: q of a fully open gripper, rad, where 0 is closed; NaN for hands whose joints
+        have no such scale.
+    :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
     """
 
     name: str
@@ -36,10 +48,23 @@ class Dialect:
     length: int
     q_open: float
     summary: str
+    low_rate_topic: str = ""
 
     def topics(self, side: Side) -> tuple[str, str]:
         """(command topic, state topic) of a side."""
         return self.cmd_topic.format(side=side), self.state_topic.format(side=side)
+
+
+@dataclass(frozen=True)
+class PressureSensor:
+    """One sensor packet of a hand.
+
+    :param place: where it is.
+    :param slots: which of the packet's 12 values are sensor elements; the others hold "no value".
+    """
+
+    place: str
+    slots: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -50,7 +75,12 @@ class HandModel:
     :param min_state_rate: Hz below which clients suffer.
     :param command_rate: Hz at which xr_teleoperate sends commands.
     :param command_timeout: seconds without a command after which the vendor's service brakes.
-    :param vendor_ids: motor ids on the vendor's bus.
+    :param vendor_ids: id on the vendor's bus, for a hand of one motor.
+    :param client_gains: kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends.
+    :param rest_q: where a simulated hand rests at first, per side, rad; never all zero, because
+        clients wait for a position that is not.
+    :param sensors: pressure sensor packets of a state, in order.
+    :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
     """
 
     name: str
@@ -61,7 +91,11 @@ class HandModel:
     min_state_rate: float
     command_rate: float
     command_timeout: float
-    vendor_ids: dict[Side, int]
+    client_gains: tuple[float, float]
+    rest_q: dict[Side, tuple[float, ...]]
+    vendor_ids: dict[Side, int] = field(default_factory=dict)
+    sensors: tuple[PressureSensor, ...] = ()
+    low_rate: float = 0.0
 
     def spec(
         self,
@@ -78,6 +112,7 @@ class HandModel:
             joints=self.joints[side],
             io_rate=io_rate,
             exchange_timeout=exchange_timeout,
+            n_sensors=len(self.sensors),
             simulated=simulated,
         )
 
@@ -129,6 +164,20 @@ DIALECTS: dict[str, Dialect] = {
             q_open=5.4,
             summary="xr_teleoperate v1.1: both grippers in one message, 0 right, 1 left",
         ),
+        Dialect(
+            name="dex3",
+            model="dex3-1",
+            cmd_topic="rt/dex3/{side}/cmd",
+            state_topic="rt/dex3/{side}/state",
+            cmd_type="unitree_hg::msg::dds_::HandCmd_",
+            state_type="unitree_hg::msg::dds_::HandState_",
+            index={Side.LEFT: 0, Side.RIGHT: 0},
+            length=7,
+            q_open=math.nan,
+            summary="Dex3-1 of G1: 7 motors in the order of the IDL, RIS_Mode in the mode byte",
+            # F A.1: the only state topic to which the vendor's C++ example subscribes
+            low_rate_topic="rt/lf/dex3/{side}/state",
+        ),
     )
 }
 
@@ -141,10 +190,84 @@ DEX1_1 = HandModel(
     min_state_rate=200.0,  # F D conflict 7; seed 000 "200+ Hz"
     command_rate=200.0,  # F B.1
     command_timeout=1.0,  # F B.2: timeout_ms_ = 1000
+    client_gains=(5.0, 0.05),  # F B.1
+    rest_q=dict.fromkeys(Side, (0.2 * _DEX1_JOINT.stroke,)),
     vendor_ids={Side.LEFT: 1, Side.RIGHT: 0},  # F B.2
 )
 
-MODELS: dict[str, HandModel] = {DEX1_1.name: DEX1_1}
+
+def _dex3_joints(side: Side) -> tuple[JointSpec, ...]:
+    """The seven joints in the order of the IDL, on both sides: thumb, middle, index.
+
+    Names and order: seed 002 "Message Structure Sorting"; xr_teleoperate's enum names 3 to 6
+    index-then-middle for the right hand, without effect (F D 13). Limits: Unitree's URDF, which
+    for thumb_1 is the manual's and narrower than xr_teleoperate's (F B.4, D 17). The sides are
+    mirrored: every flexing sign of the left hand turns round on the right; thumb_0 swings both
+    ways. dq_max: xr_teleoperate's URDF (F D 27); tau_max: both URDFs (F B.4). Ratios: seed 002
+    "Miniature Brushless Force Control Joint"; that thumb_0 is the one with 214 follows from its
+    torque and speed, and is uncertain (F B.4).
+    """
+    mirror = 1 if side is Side.LEFT else -1
+
+    def joint(
+        name: str, low: float, high: float, flexing: int, *, ratio: float = 108.0
+    ) -> JointSpec:
+        geared = ratio != 108.0
+        q_min, q_max = sorted((mirror * low, mirror * high))
+        return JointSpec(
+            name,
+            q_min=q_min + 0.0,  # no -0.0
+            q_max=q_max + 0.0,
+            dq_max=6.857 if geared else 12.0,
+            tau_max=2.45 if geared else 1.4,
+            closing=mirror * flexing,
+            urdf=f"{side}_hand_{name}_joint",
+            gear_ratio=ratio,
+        )
+
+    finger = [("0", -1.5708), ("1", -1.7453)]
+    return (
+        joint("thumb_0", -1.0472, 1.0472, 0, ratio=214.0),
+        joint("thumb_1", -0.6109, 1.0472, 1),
+        joint("thumb_2", 0.0, 1.7453, 1),
+        *(joint(f"middle_{i}", low, 0.0, -1) for i, low in finger),
+        *(joint(f"index_{i}", low, 0.0, -1) for i, low in finger),
+    )
+
+
+_DEX3_REST = (0.05, 0.2, 0.3, -0.3, -0.4, -0.3, -0.4)  # left; half relaxed, clear of all stops
+
+# F B.4, seed 002 "Number of Pressure Sensors": 9 packets, 33 elements: three areas of 2 x 2 on
+# the palm, 2 x 2 on each finger pad, 3 x 1 on each finger tip. Which packet is which, and which
+# of the 12 values are elements, is in a figure that the sources lost: this order is assumed.
+_DEX3_SENSORS = (
+    *(
+        PressureSensor(f"{finger} {part}", slots)
+        for finger in ("thumb", "middle", "index")
+        for part, slots in (("tip", (0, 1, 2)), ("pad", (0, 1, 2, 3)))
+    ),
+    *(PressureSensor(f"palm {i}", (0, 1, 2, 3)) for i in range(3)),
+)
+
+DEX3_1 = HandModel(
+    name="dex3-1",
+    title="Dex3-1 hand",
+    joints={side: _dex3_joints(side) for side in Side},
+    dialects=tuple(d for d in DIALECTS.values() if d.model == "dex3-1"),
+    state_rate=1000.0,  # seed 002 "Communication rate"
+    min_state_rate=200.0,  # inferred: twice the client's command rate, as for the Dex1-1
+    command_rate=100.0,  # F B.1
+    command_timeout=1.0,  # seed 002 RIS_Mode_t: "default 1s timeout"
+    client_gains=(1.5, 0.2),  # F B.1
+    rest_q={
+        Side.LEFT: _DEX3_REST,
+        Side.RIGHT: tuple(q if i == 0 else -q for i, q in enumerate(_DEX3_REST)),
+    },
+    sensors=_DEX3_SENSORS,
+    low_rate=20.0,  # inferred: the sources give a topic and no rate (F A.1)
+)
+
+MODELS: dict[str, HandModel] = {m.name: m for m in (DEX1_1, DEX3_1)}
 
 
 def model(name: str) -> HandModel:
