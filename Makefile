@@ -33,8 +33,8 @@ setup: $(STAMP) ## create the environment
 demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
 	@$(RUN) dexkit demo --out demo-out
 
-test: $(STAMP) ## the tests (ARGS="-k name" is passed on)
-	$(RUN) pytest -m "not soak" $(ARGS)
+test: $(STAMP) ## the tests, on all cores (ARGS="-k name" is passed on)
+	$(RUN) pytest -n auto -m "not soak" $(ARGS)
 
 soak: $(STAMP) ## the long tests
 	$(RUN) pytest -m soak $(ARGS)
