@@ -10,7 +10,10 @@ A fault is written ``KIND[@TIME][:KEY=VALUE[,KEY=VALUE...]]``::
     brown-out@4s:volts=8,for=1s
 
 Times count from the moment the emulator is ready. ``for`` limits a fault that can end by
-itself; ``id`` picks one servo of several. Chance is seeded, so a run can be repeated.
+itself; ``id`` picks one servo of several, or one motor of a hand, and ``side`` one hand of two.
+Chance is seeded, so a run can be repeated.
+
+Each family of devices has its kinds: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`.
 """
 
 from __future__ import annotations
@@ -20,8 +23,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from dexkit.errors import UsageError
+from dexkit.hand import Side
 
-__all__ = ["FAULT_KINDS", "Fault", "FaultKind", "FaultSchedule", "parse_fault"]
+__all__ = [
+    "DEX3_FAULTS",
+    "FAULT_KINDS",
+    "MX64_FAULTS",
+    "Fault",
+    "FaultFamily",
+    "FaultKind",
+    "FaultSchedule",
+    "grammar",
+    "parse_fault",
+]
 
 
 @dataclass(frozen=True)
@@ -41,35 +55,89 @@ class FaultKind:
     targets_device: bool = False
 
 
-FAULT_KINDS: dict[str, FaultKind] = {
-    k.name: k
-    for k in (
-        FaultKind("drop", "answers are lost with probability p", {"p": 1.0}, lasting=True),
-        FaultKind("corrupt", "a bit of answers flips with probability p", {"p": 1.0}, lasting=True),
-        FaultKind("delay", "answers come ms late", {"ms": 20.0, "p": 1.0}, lasting=True),
-        FaultKind("unplug", "the port vanishes", lasting=True),
+@dataclass(frozen=True)
+class FaultFamily:
+    """The faults that one family of emulated devices can have.
+
+    :param kinds: in the order of the help text.
+    :param max_id: largest ``id`` of what a fault can pick.
+    :param sided: ``side`` picks one of two devices, for every kind.
+    """
+
+    name: str
+    kinds: tuple[FaultKind, ...]
+    max_id: int
+    sided: bool = False
+
+    def kind(self, name: str) -> FaultKind | None:
+        """The kind called ``name``, or None."""
+        return next((kind for kind in self.kinds if kind.name == name), None)
+
+
+_DROP = FaultKind("drop", "answers are lost with probability p", {"p": 1.0}, lasting=True)
+_CORRUPT = FaultKind("corrupt", "a bit of answers flips with probability p", {"p": 1.0}, True)
+_DELAY = FaultKind("delay", "answers come ms late", {"ms": 20.0, "p": 1.0}, lasting=True)
+_UNPLUG = FaultKind("unplug", "the port vanishes", lasting=True)
+_STUCK = FaultKind("stuck", "the mechanism jams", lasting=True, targets_device=True)
+
+MX64_FAULTS = FaultFamily(
+    "mx64",
+    (
+        _DROP,
+        _CORRUPT,
+        _DELAY,
+        _UNPLUG,
         FaultKind("overload", "overload error", targets_device=True),
         FaultKind("overheat", "the servo is at c degrees Celsius", {"c": 85.0}, False, True),
         FaultKind("encoder", "motor encoder error", targets_device=True),
         FaultKind("shock", "electrical shock error", targets_device=True),
-        FaultKind("stuck", "the mechanism jams", lasting=True, targets_device=True),
+        _STUCK,
         FaultKind("brown-out", "the supply falls to volts", {"volts": 8.0}, True, True),
-    )
-}
+    ),
+    max_id=252,
+)
+"""Faults of an emulated MX-64; ``id`` is that of a servo on the line."""
+
+DEX3_FAULTS = FaultFamily(
+    "dex3",
+    (
+        _DROP,
+        _CORRUPT,
+        _DELAY,
+        FaultKind("stall", "the bulk IN endpoint halts until the host clears it"),
+        FaultKind("stall-out", "the bulk OUT endpoint halts until the host clears it"),
+        _UNPLUG,
+        FaultKind("silent", "a motor is off its bus: no state, no commands", {}, True, True),
+        FaultKind(
+            "overheat", "a motor's winding is at c degrees Celsius", {"c": 140.0}, True, True
+        ),
+        FaultKind("overcurrent", "a motor reports overcurrent", {}, True, True),
+        _STUCK,
+    ),
+    max_id=6,
+    sided=True,
+)
+"""Faults of an emulated Dex3-1; ``id`` is a motor's index in the IDL, 0 thumb_0 to 6 index_1."""
+
+FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kinds}
+"""The kinds of the MX-64 by name."""
 
 _SPEC = re.compile(r"(?P<kind>[a-z-]+)(?:@(?P<time>[^:]+))?(?::(?P<args>.*))?", re.DOTALL)
 _DURATION = re.compile(r"(\d+(?:\.\d*)?|\.\d+)(ms|s)?")
 
 
-def grammar() -> str:
-    """The grammar and the kinds, as help text."""
+def grammar(family: FaultFamily = MX64_FAULTS) -> str:
+    """The grammar and the kinds of a family, as help text."""
     kinds = []
-    for kind in FAULT_KINDS.values():
+    for kind in family.kinds:
         keys = [f"{key}={value:g}" for key, value in kind.keys.items()]
         keys += ["for=TIME"] if kind.lasting else []
         keys += ["id=N"] if kind.targets_device else []
         kinds.append(kind.name + (f" ({', '.join(keys)})" if keys else ""))
-    return "KIND[@TIME][:KEY=VALUE,...] with TIME like 3s or 500ms; kinds: " + "; ".join(kinds)
+    sides = "; each also side=left|right" if family.sided else ""
+    return (
+        "KIND[@TIME][:KEY=VALUE,...] with TIME like 3s or 500ms; kinds: " + "; ".join(kinds) + sides
+    )
 
 
 @dataclass(frozen=True)
@@ -80,6 +148,8 @@ class Fault:
     :param duration: seconds, or None for ever.
     :param params: the kind's own keys.
     :param device: id of the device it strikes, or None for all.
+    :param lasting: it goes on until ``duration`` has passed (:class:`FaultKind`).
+    :param side: which of two hands it strikes, or None for both.
     """
 
     kind: str
@@ -87,59 +157,75 @@ class Fault:
     duration: float | None = None
     params: dict[str, float] = field(default_factory=dict)
     device: int | None = None
+    lasting: bool = False
+    side: Side | None = None
 
     def __getitem__(self, key: str) -> float:
         return self.params[key]
 
 
-def _fail(text: str, why: str) -> UsageError:
-    return UsageError(f"fault {text!r}: {why}", hint=grammar())
-
-
-def _duration(text: str, value: str) -> float:
+def _duration(value: str) -> float:
     match = _DURATION.fullmatch(value.strip())
     if match is None:
-        raise _fail(text, f"{value!r} is not a time")
+        raise _Bad(f"{value!r} is not a time")
     return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)
 
 
-def parse_fault(text: str) -> Fault:
+def parse_fault(text: str, family: FaultFamily = MX64_FAULTS) -> Fault:
     """The fault that ``text`` describes.
 
+    :param family: of the device that shall have it.
     :raises UsageError: it does not follow the grammar, which the hint states.
     """
+    try:
+        return _parse(text, family)
+    except _Bad as error:
+        raise UsageError(f"fault {text!r}: {error}", hint=grammar(family)) from None
+
+
+class _Bad(Exception):
+    """Why a specification cannot be read."""
+
+
+def _parse(text: str, family: FaultFamily) -> Fault:
     match = _SPEC.fullmatch(text.strip())
     if match is None:
-        raise _fail(text, "cannot be read")
-    kind = FAULT_KINDS.get(match["kind"])
+        raise _Bad("cannot be read")
+    kind = family.kind(match["kind"])
     if kind is None:
-        raise _fail(text, f"there is no kind {match['kind']!r}")
-    at = _duration(text, match["time"]) if match["time"] is not None else 0.0
+        raise _Bad(f"there is no kind {match['kind']!r}")
+    at = _duration(match["time"]) if match["time"] is not None else 0.0
     params = dict(kind.keys)
     duration: float | None = None
     device: int | None = None
+    side: Side | None = None
     for part in match["args"].split(",") if match["args"] is not None else ():
         key, equals, value = (s.strip() for s in part.partition("="))
         if not equals:
-            raise _fail(text, f"{part.strip()!r} is not KEY=VALUE")
+            raise _Bad(f"{part.strip()!r} is not KEY=VALUE")
         if key == "for" and kind.lasting:
-            duration = _duration(text, value)
+            duration = _duration(value)
         elif key == "id" and kind.targets_device:
-            if not value.isdecimal() or int(value) > 252:
-                raise _fail(text, f"{value!r} is not an id")
+            if not value.isdecimal() or int(value) > family.max_id:
+                raise _Bad(f"{value!r} is not an id (0 to {family.max_id})")
             device = int(value)
+        elif key == "side" and family.sided:
+            try:
+                side = Side(value)
+            except ValueError:
+                raise _Bad(f"{value!r} is not a side") from None
         elif key in params:
             try:
                 params[key] = float(value)
             except ValueError:
-                raise _fail(text, f"{key}={value} is not a number") from None
+                raise _Bad(f"{key}={value} is not a number") from None
         else:
-            raise _fail(text, f"{kind.name} has no key {key!r}")
+            raise _Bad(f"{kind.name} has no key {key!r}")
     if not 0.0 <= params.get("p", 0.0) <= 1.0:
-        raise _fail(text, f"p={params['p']:g} is not a probability")
+        raise _Bad(f"p={params['p']:g} is not a probability")
     if not all(0.0 <= v < 1e6 for v in params.values()):
-        raise _fail(text, "a value is out of range")
-    return Fault(kind.name, at, duration, params, device)
+        raise _Bad("a value is out of range")
+    return Fault(kind.name, at, duration, params, device, kind.lasting, side)
 
 
 class FaultSchedule:
@@ -183,7 +269,7 @@ class FaultSchedule:
                 continue
             time, fault = self._begins.pop(0)
             events.append((fault, True))
-            if FAULT_KINDS[fault.kind].lasting:
+            if fault.lasting:
                 self.active.append(fault)
                 if fault.duration is not None:
                     self._ends.append((time + fault.duration, fault))
