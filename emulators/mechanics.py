@@ -2,7 +2,8 @@
 
 A joint is an inertia with Coulomb and viscous friction, an optional spring, and walls: end
 stops and objects, each a stiff spring with damping that can push but not pull. It is driven by
-a torque and stepped in fixed steps, so the same torques always give the same motion.
+a torque (:meth:`Joint.step`) or by a motor with a feedback law (:meth:`Joint.drive`), in fixed
+steps (:class:`FixedSteps`), so the same commands always give the same motion.
 
 Not modelled: backlash, tendon stretch as a separate state, link dynamics of under-actuated
 fingers, gravity.
@@ -14,7 +15,35 @@ from dataclasses import dataclass, field
 
 from dexkit.errors import UsageError
 
-__all__ = ["Joint", "Wall"]
+__all__ = ["FixedSteps", "Joint", "Wall"]
+
+
+class FixedSteps:
+    """How many fixed steps a body must live to catch up with a clock.
+
+    :param step: seconds.
+    :param most: longest pause that is lived through, seconds; what was before it is skipped.
+    """
+
+    def __init__(self, step: float, *, most: float = 0.5) -> None:
+        self.step = step
+        self.done = 0
+        self._most = int(most / step)
+        self._origin = 0.0
+
+    def restart(self, now: float) -> None:
+        """Count from ``now``."""
+        self._origin = now
+        self.done = 0
+
+    def due(self, now: float) -> int:
+        """Steps to live up to ``now``; they count as lived from here on."""
+        total = int((now - self._origin) / self.step + 1e-6)
+        steps = min(total - self.done, self._most)
+        if steps <= 0:
+            return 0
+        self.done = total
+        return steps
 
 
 @dataclass(frozen=True)
@@ -107,3 +136,73 @@ class Joint:
         velocity /= 1.0 + gain * damping
         self.dq = velocity
         self.q = q + dt * velocity
+
+    def drive(
+        self,
+        torque: float,
+        damping: float,
+        most: float,
+        most_along: float,
+        dt: float,
+        *,
+        driving_loss: float = 0.0,
+        holding_loss: float = 0.0,
+    ) -> float:
+        """Advance by ``dt`` seconds under a motor whose torque falls with speed.
+
+        The motor gives ``torque - damping * dq`` with dq at the end of the step: however stiff
+        its gains are, they stay stable, and blocked it gives exactly ``torque``. Walls are taken
+        in the same way.
+
+        :param torque: what it gives at standstill, N·m.
+        :param damping: N·m·s/rad; for a position gain kp, kp * dt belongs to it.
+        :param most: its largest torque, N·m.
+        :param most_along: its largest torque in the direction in which it already turns.
+        :param driving_loss: part of its torque that gearing takes while it drives the joint.
+        :param holding_loss: part of its torque that gearing adds while the joint turns against
+            it. At rest the joint is held for loads between the two.
+        :returns: torque of the motor at the end of the step, before the gearing's losses.
+        """
+        q = self.q
+        velocity = self.dq
+        high = most_along if velocity > 0.0 else most
+        low = -most_along if velocity < 0.0 else -most
+        if self.locked:
+            self.dq = 0.0
+            return min(max(torque, low), high)
+        resist = self.viscous
+        contact = 0.0
+        for wall in self.walls:
+            depth = (wall.q - q) * wall.push
+            if depth > 0.0:
+                force = wall.stiffness * depth
+                contact += wall.push * force
+                resist += wall.stiffness * dt
+                if wall.damping * velocity * wall.push < force:
+                    resist += wall.damping
+        self.contact = contact
+        rate = dt / self.inertia
+        load = contact - self.spring * (q - self.spring_rest)
+        now = torque - damping * velocity
+        now = low if now < low else high if now > high else now
+        free = velocity + rate * (torque + load)
+        slow = 1.0 + rate * (resist + damping)
+        end = torque - damping * free / slow
+        if not low <= end <= high:
+            # as much as it can, whatever the speed: nothing of its damping is left
+            torque = low if end < low else high
+            damping = 0.0
+            free = velocity + rate * (torque + load)
+            slow = 1.0 + rate * resist
+        along = now * (velocity if velocity != 0.0 else free) > 0.0
+        stick = rate * (self.coulomb + (driving_loss if along else holding_loss) * abs(now))
+        if free > stick:
+            velocity = (free - stick) / slow
+        elif free < -stick:
+            velocity = (free + stick) / slow
+        else:
+            velocity = 0.0
+        self.dq = velocity
+        self.q = q + dt * velocity
+        end = torque - damping * velocity
+        return low if end < low else high if end > high else end

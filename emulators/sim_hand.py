@@ -16,7 +16,7 @@ import math
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
-from dexkit.emulators.mechanics import Joint, Wall
+from dexkit.emulators.mechanics import FixedSteps, Joint, Wall
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, Side
 from dexkit.models import DEX1_1
@@ -80,8 +80,7 @@ class SimHand:
         self._open = False
         self._torque = 0.0
         self._use(HandCommand.brake(1))
-        self._origin = 0.0
-        self._steps = 0
+        self._steps = FixedSteps(STEP, most=_MOST_CATCH_UP)
 
     @property
     def spec(self) -> HandSpec:
@@ -91,8 +90,7 @@ class SimHand:
     def open(self) -> None:
         """Start to live; brakes until the first command."""
         self._use(HandCommand.brake(1))
-        self._origin = self._clock.now()
-        self._steps = 0
+        self._steps.restart(self._clock.now())
         self._open = True
 
     def close(self) -> None:
@@ -129,12 +127,7 @@ class SimHand:
             self._kp, self._kd = float(command.kp[0]), float(command.kd[0])
 
     def _live(self, now: float) -> None:
-        due = int((now - self._origin) / STEP + 1e-6)
-        most = int(_MOST_CATCH_UP / STEP)
-        if due - self._steps > most:
-            self._steps = due - most
-        while self._steps < due:
-            self._steps += 1
+        for _ in range(self._steps.due(now)):
             self._torque = self._motor()
             self.joint.step(self._torque, STEP)
 

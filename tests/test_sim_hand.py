@@ -180,7 +180,7 @@ def test_a_long_pause_is_not_lived_through() -> None:
     clock.advance(3600.0)
     state = hand.exchange(HandCommand.brake(1))
     assert np.isfinite(state.q[0])
-    assert hand._steps == int(3600 / 0.5e-3)
+    assert hand._steps.done == int(3600 / 0.5e-3)
 
 
 def test_only_an_open_hand_exchanges() -> None:
