@@ -106,7 +106,7 @@ def test_bad_commands_do_no_harm_and_are_counted() -> None:
         wait_until(lambda: service.counters.received == len(bad))
         wait_until(lambda: newest(node).q == pytest.approx(5.4))
         count, core = service.counters, service.cores[Side.LEFT].counters
-    assert (count.empty, count.overlong, count.undecodable) == (1, 1, 2)
+    assert (count.short, count.overlong, count.undecodable) == (1, 1, 2)
     assert (core.accepted, core.rejected, core.clamped) == (2, 3, 1)
 
 

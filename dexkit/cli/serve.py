@@ -12,12 +12,13 @@ from types import FrameType
 
 import click
 
-from dexkit.backends import Backend, BackendOptions, backend
+from dexkit.backends import BackendOptions, backend
 from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Hand, Side
-from dexkit.models import DIALECTS
+from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
+from dexkit.models import model as model_by_name
 from dexkit.service import (
     Estimation,
     Fill,
@@ -56,21 +57,28 @@ _LONELY = 10.0  # seconds without a client before a hint
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
-    help="A setting of the backend; 'dexkit backends' lists them.",
+    help="A setting of the backend; 'dexkit backends' lists them. left.KEY=VALUE and "
+    "right.KEY=VALUE are for one hand.",
+)
+@click.option(
+    "--usb",
+    metavar="URL",
+    help="USB hands on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
 )
 @click.option(
     "--dialect",
     type=click.Choice(list(DIALECTS)),
-    default="unitree_go",
-    show_default=True,
-    help="Topics, types and units.",
+    help="Topics, types and units.  [default: the model's first: unitree_go for a Dex1-1, "
+    "dex3 for a Dex3-1]",
 )
 @dds_options(default_domain=None)
 @click.option(
     "--state-rate",
     type=click.FloatRange(1, 1000),
     metavar="HZ",
-    help="States published a second.  [default: the model's, 500]",
+    help="States published a second.  [default: the model's, "
+    + ", ".join(f"{m.state_rate:g} for a {m.name}" for m in MODELS.values())
+    + "]",
 )
 @click.option(
     "--estimator",
@@ -100,7 +108,8 @@ def command(
     side_name: str,
     devices: tuple[str, ...],
     settings: tuple[str, ...],
-    dialect: str,
+    usb: str | None,
+    dialect: str | None,
     domain: int | None,
     interface: str,
     state_rate: float | None,
@@ -116,17 +125,22 @@ def command(
     BACKEND is a name from 'dexkit backends' or package.module:Class. Prints "ready: ..." when
     the topics are up. SIGUSR1 logs the counters.
 
-    Without --domain, a named device is served on domain 0 (the robot's) and everything else on
+    Without --domain, a device is served on domain 0 (the robot's) and everything else on
     domain 1 (that of xr_teleoperate's simulation mode).
     """
+    if usb is not None:
+        settings = (*settings, f"usb={usb}")
     status = sys.stderr.isatty() and not quiet
     _log_to_stderr(logging.WARNING if quiet else logging.INFO, status)
     kind = backend(backend_name)
     sides = list(Side) if side_name == "both" else [Side(side_name)]
     by_side = _devices(devices, sides)
-    hands = [_make(kind, side, by_side.get(side), settings) for side in sides]
-    chosen = domain if domain is not None else (0 if by_side else 1)
-    groups = _groups(hands, dialect)
+    values = _settings(settings, sides)
+    hands = [kind.create(BackendOptions(side, by_side.get(side), values[side])) for side in sides]
+    # a backend that needs something is a device, even where it finds it by itself
+    chosen = domain if domain is not None else (0 if by_side or kind.needs else 1)
+    language = _dialect(hands, dialect)
+    groups = _groups(hands, language)
 
     from dexkit.dds import DdsNode
 
@@ -143,7 +157,7 @@ def command(
                 group,
                 node=node,
                 domain=chosen,
-                dialect=dialect,
+                dialect=language,
                 state_rate=state_rate,
                 estimation=Estimation(estimator),
                 fill=Fill(fill),
@@ -161,7 +175,7 @@ def command(
                 names = " and ".join(str(hand.spec.side) for hand in group)
                 click.echo(
                     f"ready: {backend_name} {names} on {service.cmd_topic} and "
-                    f"{service.state_topic} ({dialect}), {service.state_rate:g} Hz, "
+                    f"{service.state_topic} ({language.name}), {service.state_rate:g} Hz, "
                     f"domain {chosen}, {interface}"
                 )
             sys.stdout.flush()
@@ -194,21 +208,43 @@ def _devices(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:
     return by_side
 
 
-def _make(kind: Backend, side: Side, device: str | None, settings: Sequence[str]) -> Hand:
-    values: dict[str, str] = {}
-    for text in settings:
+def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[str, str]]:
+    """The settings of each hand."""
+    values: dict[Side, dict[str, str]] = {side: {} for side in sides}
+    for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise UsageError(f"--set {text} is not KEY=VALUE")
-        values[key] = value
-    return kind.create(BackendOptions(side, device, values))
+        prefix, dot, rest = key.partition(".")
+        if dot and prefix in [str(s) for s in Side]:
+            if Side(prefix) not in values:
+                raise UsageError(f"--set {text}, but only the {sides[0]} hand is served")
+            values[Side(prefix)][rest] = value
+        else:
+            for one in values.values():
+                one[key] = value
+    return values
 
 
-def _groups(hands: list[Hand], dialect: str) -> list[list[Hand]]:
+def _dialect(hands: Sequence[Hand], name: str | None) -> Dialect:
+    """The dialect called ``name``, or the first that the hands speak."""
+    model = model_by_name(hands[0].spec.model)
+    if name is None:
+        return model.dialects[0]
+    chosen = dialect_by_name(name)
+    if chosen.model != model.name:
+        raise UsageError(
+            f"a {model.name} does not speak {name}",
+            hint=f"it speaks {', '.join(d.name for d in model.dialects)}",
+        )
+    return chosen
+
+
+def _groups(hands: list[Hand], dialect: Dialect) -> list[list[Hand]]:
     """The hands by topic pair."""
     groups: dict[tuple[str, str], list[Hand]] = {}
     for hand in hands:
-        groups.setdefault(dialect_by_name(dialect).topics(hand.spec.side), []).append(hand)
+        groups.setdefault(dialect.topics(hand.spec.side), []).append(hand)
     return list(groups.values())
 
 
@@ -277,11 +313,17 @@ class _Rate:
 def _line(service: HandService, rate: float) -> str:
     hands = []
     for side, core in service.cores.items():
-        view = core.view()
-        q = "q ?" if view is None else f"q {float(view.state.q[0]):.2f}"
-        what = "lost" if not core.connected else "driven" if core.driving else "brake"
+        q = ""
+        if core.spec.n_joints == 1:  # seven would not fit
+            view = core.view()
+            q = "q ? " if view is None else f"q {float(view.state.q[0]):.2f} "
+        what = "driven" if core.driving else "brake"
+        if core.holding:
+            what = "held"
+        elif not core.connected:
+            what = "lost"
         if core.connected and core.predicting:
             what += ", predicted"
-        hands.append(f"{side} {q} {what} {core.measured_rate:.0f}/s")
+        hands.append(f"{side} {q}{what} {core.measured_rate:.0f}/s")
     clients = f"{service.clients} client{'' if service.clients == 1 else 's'}"
     return f"{', '.join(hands)}; state {rate:.0f} Hz, {clients}"

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import HandCounters, TopicCounters
 from dexkit.service.diagnose import diagnose
-from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.service.dialects import DialectMap, Fill, Remark, StateView, dialect_map
 from dexkit.service.estimator import JointEstimator, StateEstimator
 from dexkit.service.realtime import prepare_process, real_time
 from dexkit.service.service import HandService
@@ -25,6 +25,7 @@ __all__ = [
     "HandCounters",
     "HandService",
     "JointEstimator",
+    "Remark",
     "StateEstimator",
     "StateView",
     "TopicCounters",

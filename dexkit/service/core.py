@@ -16,10 +16,19 @@ from dataclasses import replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.clock import Clock
 from dexkit.errors import CommandRejected, HandError, HandFault, HandTimeout
-from dexkit.hand import CommandGate, Floats, HandCommand, HandSpec, HandState, MotorError
+from dexkit.hand import (
+    CommandGate,
+    Floats,
+    HandCommand,
+    HandSpec,
+    HandState,
+    JointMode,
+    MotorError,
+)
 from dexkit.models import HandModel
 from dexkit.service.counters import HandCounters
 from dexkit.service.dialects import StateView
@@ -88,15 +97,19 @@ class HandCore:
         self._estimation = estimation
         self._gate = CommandGate(spec)
         self._brake = HandCommand.brake(spec.n_joints)
-        self._lock = threading.Lock()  # guards the estimator, which all three threads touch
+        # guards the estimator, which all three threads touch, and the time-outs, which two do
+        self._lock = threading.Lock()
         self._estimator = StateEstimator(spec)
         self._soft_start = not spec.simulated if soft_start is None else soft_start
         self._starting = self._soft_start
         self._start_q: Floats | None = None
         self._start_time = 0.0
         self._command: tuple[HandCommand, float] | None = None
+        self._held: tuple[HandCommand, HandCommand] | None = None  # newest command, what is left
+        self._tripped = np.zeros(spec.n_joints, dtype=np.bool_)
         self._not_before = clock.now()
         self._driving = False
+        self._holding = False
         self._connected = False
         self._faulted: tuple[int, ...] | None = None
         self._answered = clock.now()  # when the device last showed that it is there
@@ -120,9 +133,13 @@ class HandCore:
         self.counters.accepted += 1
         self.counters.clamped = self._gate.clamped
         now = self._clock.now()
-        self._command = (admitted, now)
-        if self._connected and not self._starting and self._faulted is None:
-            with self._lock:
+        with self._lock:
+            self._time_out(now)  # before this one hides how long there was none
+            if admitted.timeout is not None:
+                self._tripped &= admitted.timeout  # a command without the bit clears it
+                admitted = _braked(admitted, self._tripped)
+            self._command = (admitted, now)
+            if self._connected and not self._starting and self._faulted is None:
                 self._estimator.follow(admitted, now)
         return True
 
@@ -166,7 +183,8 @@ class HandCore:
         self.counters.exchanges += 1
         with self._lock:
             self._estimator.measure(state, now)
-        self._view = StateView(state, tuple(int(bits) for bits in state.fault))
+            tripped = tuple(self._tripped.tolist()) if self._tripped.any() else ()
+        self._view = StateView(state, tuple(state.fault.tolist()), tripped=tripped)
 
     def failed(self, error: Exception) -> bool:
         """An exchange raised ``error``. True when the link should be given up and reopened.
@@ -189,7 +207,7 @@ class HandCore:
             )
             if isinstance(error, HandFault):
                 self._faulted = fault
-            self._view = StateView(self._view.state, fault, self._missed)
+            self._view = replace(self._view, fault=fault, missed=self._missed)
         elif isinstance(error, HandFault):
             self._faulted = bits
         patient = isinstance(error, (HandTimeout, HandFault, CommandRejected))
@@ -198,7 +216,7 @@ class HandCore:
     def closed(self) -> None:
         """The link was given up."""
         self._connected = False
-        self._driving = False
+        self._driving = self._holding = False
         self.counters.losses += 1
         with self._lock:
             self._estimator.follow(self._brake, self._clock.now())
@@ -207,7 +225,7 @@ class HandCore:
         """An attempt to open the link again failed."""
         self._missed += 1
         if self._view is not None:
-            self._view = StateView(self._view.state, self._view.fault, self._missed)
+            self._view = replace(self._view, missed=self._missed)
 
     # -- what follows -----------------------------------------------------------------------
 
@@ -233,33 +251,36 @@ class HandCore:
         """Times that the prediction was more than 10 % of the stroke off."""
         return self._estimator.resyncs
 
+    @property
+    def holding(self) -> bool:
+        """Whether the hand is driven without fresh commands, its protection being off."""
+        return self._holding
+
     def next_command(self) -> HandCommand:
         """What the next exchange sends: the newest command, or the brake.
 
-        The brake before the first command, when the last one is older than the model's command
-        time-out, during a fault, and after a (re)connection or a fault until a command comes
-        that is newer.
+        The brake before the first command, during a fault, and after a (re)connection or a
+        fault until a command comes that is newer.
+
+        When the newest command is older than the model's command time-out: the brake, where the
+        dialect has no time-out bit. Where it has one (seed 002, RIS_Mode), a joint whose bit
+        was set *trips*: it brakes until a command comes with the bit clear. A joint whose bit
+        was clear is unprotected and keeps its position command, without the feed-forward
+        velocity and torque, which would move it on.
         """
         now = self._clock.now()
-        held = self._command
-        if (
-            held is None
-            or held[1] < self._not_before
-            or now - held[1] >= self._timeout
-            or self._faulted is not None
-        ):
-            if self._driving:
+        with self._lock:
+            command = self._in_force(now)
+            if command.is_brake:
+                if self._driving and command is self._brake:
+                    self.counters.brakes += 1
                 self._driving = False
-                self.counters.brakes += 1
-            self._start_q = None
-            with self._lock:
+                self._start_q = None
                 self._estimator.follow(self._brake, now)
-            return self._brake
-        self._driving = True
-        command = held[0]
-        if self._starting:
-            command = self._slew(command, now)
-            with self._lock:
+                return command
+            self._driving = True
+            if self._starting:
+                command = self._slew(command, now)
                 self._estimator.follow(command, now)
         return command
 
@@ -283,11 +304,41 @@ class HandCore:
 
     # -- details ----------------------------------------------------------------------------
 
+    def _in_force(self, now: float) -> HandCommand:
+        late = self._time_out(now)
+        newest = self._command
+        if newest is None or newest[1] < self._not_before or self._faulted is not None:
+            self._holding = False
+            return self._brake
+        if not late:
+            self._holding = False
+            return newest[0]
+        if newest[0].timeout is None:
+            return self._brake
+        if self._held is None or self._held[0] is not newest[0]:
+            self._held = (newest[0], _at_rest(_braked(newest[0], self._tripped)))
+            self._estimator.follow(self._held[1], now)
+        if not self._holding and not self._held[1].is_brake:
+            self._holding = True
+            self.counters.holds += 1
+        return self._held[1]
+
+    def _time_out(self, now: float) -> bool:
+        """Whether the newest command is too old; trips the joints that it asks to protect."""
+        newest = self._command
+        if newest is None or now - newest[1] < self._timeout:
+            return False
+        if newest[0].timeout is not None:
+            if self._driving and (newest[0].timeout & ~self._tripped & (newest[0].mode > 0)).any():
+                self.counters.brakes += 1
+            self._tripped |= newest[0].timeout
+        return True
+
     def _stale(self, view: StateView) -> StateView:
         link = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
         if all(bits & link for bits in view.fault):
             return view
-        stale = StateView(view.state, tuple(b | link for b in view.fault), max(view.missed, 1))
+        stale = replace(view, fault=tuple(b | link for b in view.fault), missed=max(view.missed, 1))
         if self._view is view:
             self._view = stale
         return stale
@@ -323,6 +374,17 @@ class HandCore:
             self._starting = False
             return command
         return replace(command, q=self._start_q)
+
+
+def _braked(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
+    if not joints.any():
+        return command
+    return replace(command, mode=np.where(joints, JointMode.BRAKE, command.mode).astype(np.uint8))
+
+
+def _at_rest(command: HandCommand) -> HandCommand:
+    nothing = np.zeros_like(command.q)
+    return replace(command, dq=nothing, tau=nothing)
 
 
 def _at(bits: Sequence[int], joint: int) -> int:

@@ -13,7 +13,7 @@ class TopicCounters:
 
     :ivar received: command samples taken.
     :ivar undecodable: of those, samples that are not the message they claim to be.
-    :ivar empty: samples with no motor for a hand that is served here.
+    :ivar short: samples with too few motors for a hand that is served here; ignored.
     :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
     :ivar published: state samples written.
     :ivar publish_misses: publish deadlines missed by a whole period.
@@ -22,7 +22,7 @@ class TopicCounters:
 
     received: int = 0
     undecodable: int = 0
-    empty: int = 0
+    short: int = 0
     overlong: int = 0
     published: int = 0
     publish_misses: int = 0
@@ -40,7 +40,11 @@ class HandCounters:
     :ivar accepted: commands that are in force or were.
     :ivar rejected: commands with NaN or infinity.
     :ivar clamped: accepted commands that had to be brought within the limits.
+    :ivar wrong_ids: accepted commands with a mode byte whose id is not the motor's index.
+    :ivar unknown_status: accepted commands with a mode byte whose status is neither lock nor FOC.
     :ivar brakes: times that driving stopped because no fresh command was there.
+    :ivar holds: times that a position was held for want of a fresh command, the client having
+        switched the time-out protection off.
     :ivar exchanges: exchanges done.
     :ivar exchange_errors: exchanges that failed.
     :ivar faults: of those, hardware errors that the device reported.
@@ -51,7 +55,10 @@ class HandCounters:
     accepted: int = 0
     rejected: int = 0
     clamped: int = 0
+    wrong_ids: int = 0
+    unknown_status: int = 0
     brakes: int = 0
+    holds: int = 0
     exchanges: int = 0
     exchange_errors: int = 0
     faults: int = 0

@@ -9,6 +9,8 @@ unitree_actuator   the same, two motors in one message: 0 right, 1 left (A.1).
 unitree_hg         seed 000: q runs to 2 pi; a command at or below 0.1 closes, at or above 6.0
                    opens; dq, tau, kp and kd of a command are unused (clients send 0), the gains
                    are those of xr_teleoperate; tau_est of the state is grip strength, not signed.
+dex3               seven motors in the order of the IDL, all values as they are; the mode byte is
+                   RIS_Mode (seed 002): id, status (0 lock, 1 FOC) and the time-out bit.
 =================  ================================================================================
 
 **What a state holds.** ``Fill.VENDOR`` fills what the reference fills and leaves the rest 0:
@@ -31,6 +33,8 @@ the last good one
 q is predicted          reserve[1] = 1               reserve[0] = 1
 ======================  ===========================  ==============================================
 
+The state of dex3 is described in docs/dex3.md; :mod:`dexkit.service.dex3_state` encodes it.
+
 ``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more (A.7).
 What a backend does not know (NaN) is sent as 0.
 """
@@ -39,8 +43,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -54,18 +58,21 @@ from dexkit.hand import (
     HandState,
     ImuState,
     JointMode,
+    JointSpec,
     Side,
     SupplyState,
 )
-from dexkit.messages import unitree_go, unitree_hg
+from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect
+from dexkit.service.dex3_state import Dex3StateEncoder
 
-__all__ = ["DialectMap", "Fill", "StateView", "dialect_map"]
+__all__ = ["DialectMap", "Fill", "Remark", "StateView", "dialect_map"]
 
 # what xr_teleoperate sends to a Dex1 (facts/unitree-dex B.1)
 _KP, _KD = 5.0, 0.05
 _HG_CLOSED, _HG_OPEN = 0.1, 6.0  # seed 000, "Position Conversion"
 _HG_TEMPERATURE, _HG_VOL = 25, 12.0  # seed 000, "MotorState_"
+_ROUNDING = 1e-6  # rad; more than float32 loses of a limit
 _U32 = 0xFFFFFFFF
 _FLOAT_MAX = float(np.finfo(np.float32).max)
 
@@ -83,11 +90,26 @@ class StateView:
 
     :param fault: :class:`~dexkit.hand.MotorError` bits per joint, the link's included.
     :param missed: exchanges missed since the last good one.
+    :param tripped: per joint, whether the time-out that the client asked for has stopped it;
+        empty where none has.
     """
 
     state: HandState
     fault: tuple[int, ...]
     missed: int = 0
+    tripped: tuple[bool, ...] = ()
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something odd about a command that is obeyed nevertheless.
+
+    :param counter: which of :class:`~dexkit.service.counters.HandCounters` counts it.
+    :param text: what is odd, and what to send instead.
+    """
+
+    counter: str
+    text: str
 
 
 class DialectMap(ABC):
@@ -106,6 +128,7 @@ class DialectMap(ABC):
         self.dialect = dialect
         self.fill = fill
         self._specs = dict(specs)
+        self._state_type = message_type(dialect.state_type)
         # one joint: its motor is one element of the sequence; more: they are the sequence
         self._first = {
             side: dialect.index[side] if spec.n_joints == 1 else 0 for side, spec in specs.items()
@@ -130,9 +153,7 @@ class DialectMap(ABC):
         if len(motors) < spec.n_joints:
             return None
         return HandCommand(
-            q=np.array(
-                [self._q_in(m.q, j.q_max) for m, j in zip(motors, spec.joints, strict=True)]
-            ),
+            q=np.array([self._q_in(m.q, j) for m, j in zip(motors, spec.joints, strict=True)]),
             dq=self._feed_forward([m.dq for m in motors]),
             tau=self._feed_forward([m.tau for m in motors]),
             kp=self._gains([m.kp for m in motors], _KP),
@@ -140,17 +161,30 @@ class DialectMap(ABC):
             mode=np.full(len(motors), JointMode.FOC, dtype=np.uint8),
         )
 
+    def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
+        """What is odd about a command that :meth:`command` understands."""
+        return ()
+
     @abstractmethod
     def state(self, views: Mapping[Side, StateView]) -> Any:
         """The state message; a hand of the topic pair that is not in ``views`` is all 0."""
+
+    def encode(self, views: Mapping[Side, StateView]) -> bytes:
+        """The state message as a DDS sample.
+
+        :raises WireError: a value that the message cannot hold.
+        """
+        return self._state_type.encode(self.state(views))
 
     @abstractmethod
     def _motor_commands(self, message: Any) -> list[Any]:
         """The motors of a command message."""
 
-    def _q_in(self, q: float, q_max: float) -> float:
+    def _q_in(self, q: float, joint: JointSpec) -> float:
         # 5.4 as float32 is 1e-7 above 5.4: not a command beyond the limit
-        return q_max if 0 < q - q_max < 1e-6 else q
+        if 0 < q - joint.q_max < _ROUNDING:
+            return joint.q_max
+        return joint.q_min if 0 < joint.q_min - q < _ROUNDING else q
 
     def _feed_forward(self, values: list[float]) -> Floats:
         return np.array(values)
@@ -236,14 +270,14 @@ class _HgMap(DialectMap):
         motors: list[Any] = message.motor_cmd
         return motors
 
-    def _q_in(self, q: float, q_max: float) -> float:
+    def _q_in(self, q: float, joint: JointSpec) -> float:
         if not math.isfinite(q):
             return q  # for the gate to reject: minus infinity is not "closed"
         if q <= _HG_CLOSED:
             return 0.0
         if q >= _HG_OPEN:
-            return q_max
-        return q / self._scale(q_max)
+            return joint.q_max
+        return q / self._scale(joint.q_max)
 
     def _feed_forward(self, values: list[float]) -> Floats:
         return _zero_where_finite(values)
@@ -252,10 +286,63 @@ class _HgMap(DialectMap):
         return _zero_where_finite(values) + default
 
 
+class _Dex3Map(DialectMap):
+    """Mode bytes are RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (seed 002)."""
+
+    def __init__(
+        self, dialect: Dialect, specs: Mapping[Side, HandSpec], fill: Fill = Fill.KNOWN
+    ) -> None:
+        super().__init__(dialect, specs, fill)
+        ((_, spec),) = specs.items()
+        self._encoder = Dex3StateEncoder(spec, known=fill is Fill.KNOWN)
+
+    def command(self, message: Any, side: Side) -> HandCommand | None:
+        command = super().command(message, side)
+        if command is None:
+            return None
+        modes = [m.mode for m in self._motor_commands(message)[: len(command.q)]]
+        foc = [(mode >> 4) & 7 == JointMode.FOC for mode in modes]
+        # a status that is neither lock nor FOC brakes: nothing moves that was not understood
+        return replace(
+            command,
+            mode=np.where(foc, JointMode.FOC, JointMode.BRAKE).astype(np.uint8),
+            timeout=np.array([mode & 0x80 != 0 for mode in modes]),
+        )
+
+    def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
+        found: dict[str, Remark] = {}
+        for i, motor in enumerate(self._motor_commands(message)[: self._specs[side].n_joints]):
+            if motor.mode & 0x6F == i:  # its own id, and status 0 or 1
+                continue
+            mode, status = motor.mode, (motor.mode >> 4) & 7
+            says = f"mode byte {mode:#04x} of motor {i} says id {mode & 15}, status {status}"
+            right = f"send {0x10 | i:#04x} (0x10 | index) to drive motor {i}, {i:#04x} to lock it"
+            if mode & 15 != i:
+                does = "; status 0 locks it" if status == JointMode.BRAKE else ""
+                text = f"{says}: the id is not its index{does}. Motors go by index; {right}"
+                found.setdefault("wrong_ids", Remark("wrong_ids", text))
+            if status not in (JointMode.BRAKE, JointMode.FOC):
+                text = f"{says}: neither 0 (lock) nor 1 (FOC), so it is locked; {right}"
+                found.setdefault("unknown_status", Remark("unknown_status", text))
+        return tuple(found.values())
+
+    def state(self, views: Mapping[Side, StateView]) -> Any:
+        return self._state_type.decode(self.encode(views))
+
+    def encode(self, views: Mapping[Side, StateView]) -> bytes:
+        (view,) = views.values()
+        return self._encoder.encode(view.state, view.fault, view.missed, view.tripped)
+
+    def _motor_commands(self, message: Any) -> list[Any]:
+        motors: list[Any] = message.motor_cmd
+        return motors
+
+
 _MAPS: dict[str, type[DialectMap]] = {
     "unitree_go": _GoMap,
     "unitree_actuator": _GoMap,
     "unitree_hg": _HgMap,
+    "dex3": _Dex3Map,
 }
 
 

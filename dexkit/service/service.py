@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from dexkit.clock import Clock, Rate, RealClock
 from dexkit.errors import DexkitError, HandError, TopicConflict, UsageError, WireError
-from dexkit.hand import Hand, HandCommand, Side
+from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model
 from dexkit.models import dialect as dialect_by_name
@@ -79,6 +80,7 @@ class HandService:
 
     :param hands: a hand, or one of each side for a dialect whose message holds both.
     :param node: DDS node to use; it stays open at stop. Without it one is made and closed.
+    :param dialect: by default the first of the hand model's.
     :param state_rate: Hz; by default that of the model.
     :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
@@ -96,7 +98,7 @@ class HandService:
         node: Node | None = None,
         domain: int = 1,
         interface: str = "lo",
-        dialect: str | Dialect = "unitree_go",
+        dialect: str | Dialect | None = None,
         state_rate: float | None = None,
         estimation: Estimation = Estimation.AUTO,
         fill: Fill = Fill.KNOWN,
@@ -106,8 +108,10 @@ class HandService:
         clock: Clock | None = None,
     ) -> None:
         group = list(hands) if isinstance(hands, Sequence) else [hands]
-        self.dialect = dialect_by_name(dialect) if isinstance(dialect, str) else dialect
         self.model: HandModel = _one_model(group)
+        if dialect is None:
+            dialect = self.model.dialects[0]
+        self.dialect = dialect_by_name(dialect) if isinstance(dialect, str) else dialect
         sides = [hand.spec.side for hand in group]
         topics = {self.dialect.topics(side) for side in sides}
         if len(set(sides)) != len(sides) or len(topics) != 1:
@@ -116,6 +120,7 @@ class HandService:
                 hint="serve each side by its own HandService",
             )
         ((self.cmd_topic, self.state_topic),) = topics
+        self.low_rate_topic = self.dialect.low_rate_topic.format(side=sides[0])
         self.state_rate = state_rate if state_rate is not None else self.model.state_rate
         self.counters = TopicCounters()
         self.domain, self.interface = domain, interface
@@ -137,12 +142,13 @@ class HandService:
         ]
         self._map = dialect_map(self.dialect, {u.side: u.core.spec for u in self._units}, fill)
         self._cmd_type = message_type(self.dialect.cmd_type)
-        self._state_type = message_type(self.dialect.state_type)
         self._stop = threading.Event()
         self._wake = threading.Event()
         self._threads: list[threading.Thread] = []
         self._reader: _Reader | None = None
         self._writer: _Writer | None = None
+        self._low_rate_writer: _Writer | None = None
+        self._said: set[str] = set()  # remarks logged, each kind only once
         self._encoded: tuple[tuple[StateView | None, ...], bytes | None] = ((), None)
         self._started = False
         self.failure: Exception | None = None  #: what ended a thread of the service, if anything
@@ -182,6 +188,8 @@ class HandService:
         for unit in self._units:
             self._open_first(unit)
         self._writer = node.writer(self.state_topic, self.dialect.state_type)
+        if self.low_rate_topic:
+            self._low_rate_writer = node.writer(self.low_rate_topic, self.dialect.state_type)
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
         for unit in self._units:
             unit.thread = self._thread(f"exchange-{unit.side}", self._exchange_loop, unit)
@@ -214,8 +222,8 @@ class HandService:
             if thread.ident is not None:
                 thread.join()
         if self._writer is not None and self._threads:
-            self._write(self._compose())
-        for entity in (self._reader, self._writer):
+            self._publish(self._compose(), low_rate=True)
+        for entity in (self._reader, self._writer, self._low_rate_writer):
             if entity is not None:
                 entity.close()
         if self._own_node and self._node is not None:
@@ -241,8 +249,9 @@ class HandService:
 
     @property
     def clients(self) -> int:
-        """Readers of the state topic."""
-        return self._writer.matched if self._writer is not None else 0
+        """Readers of the state topic and of its low-rate copy."""
+        writers = (self._writer, self._low_rate_writer)
+        return sum(writer.matched for writer in writers if writer is not None)
 
     @property
     def cores(self) -> dict[Side, HandCore]:
@@ -292,15 +301,36 @@ class HandService:
         motors = self._map.motors(message)
         if motors > self._map.length:
             count.overlong += 1
-        empty = False
+            self._say("overlong", f"{motors} motors, the first {self._map.length} are taken")
+        short = False
         for unit in self._units:
             command = self._map.command(message, unit.side)
             if command is None:
-                empty = True
-            elif not unit.core.submit(command) and unit.core.counters.rejected == 1:
-                log.warning("%s: rejected a command that is not finite", self.cmd_topic)
-        if empty:
-            count.empty += 1
+                short = True
+            else:
+                self._obey(unit, command, message)
+        if short:
+            count.short += 1
+            self._say("short", f"ignored, {motors} motor(s) where {self._map.length} are needed")
+
+    def _obey(self, unit: _Unit, command: HandCommand, message: Any) -> None:
+        counters = unit.core.counters
+        clamped = counters.clamped
+        if not unit.core.submit(command):
+            self._say("rejected", "rejected, it is not finite")
+            return
+        if counters.clamped != clamped:
+            for name, text in _beyond(unit.core.spec, command):
+                self._say(name, f"{text}; brought within the limits")
+        for remark in self._map.remarks(message, unit.side):
+            setattr(counters, remark.counter, getattr(counters, remark.counter) + 1)
+            self._say(remark.counter, remark.text)
+
+    def _say(self, kind: str, text: str) -> None:
+        """Log what is odd about a command, each kind only once."""
+        if kind not in self._said:
+            self._said.add(kind)
+            log.warning("%s: a command was odd (counted, said once): %s", self.cmd_topic, text)
 
     # -- exchange ---------------------------------------------------------------------------
 
@@ -396,12 +426,13 @@ class HandService:
         precise_timers()
         go_first()
         rate = Rate(self.state_rate, self._clock, spin=min(_SPIN, 0.2 / self.state_rate))
+        every = max(1, round(self.state_rate / self.model.low_rate)) if self.low_rate_topic else 0
         while True:
             missed = rate.wait()
             if self._stop.is_set():
                 return  # the last state is written when the hands have been released
             self.counters.publish_misses += missed
-            self._write(self._compose())
+            self._publish(self._compose(), low_rate=bool(every) and rate.loops % every == 0)
 
     def _compose(self) -> bytes | None:
         """The sample for now; None without a state.
@@ -418,26 +449,31 @@ class HandService:
             return payload
         known = {u.side: v for u, v in zip(self._units, views, strict=True) if v is not None}
         try:
-            payload = self._state_type.encode(self._map.state(known)) if known else None
+            payload = self._map.encode(known) if known else None
         except WireError as error:  # a value that the wire cannot hold
             self._count_publish_error(error)
             payload = None
         self._encoded = (views, payload)
         return payload
 
-    def _write(self, payload: bytes | None) -> None:
+    def _publish(self, payload: bytes | None, *, low_rate: bool) -> None:
         if payload is None:
             return
         assert self._writer is not None
+        if self._write(self._writer, payload):
+            self.counters.published += 1
+        if low_rate and self._low_rate_writer is not None:
+            self._write(self._low_rate_writer, payload)
+
+    def _write(self, writer: _Writer, payload: bytes) -> bool:
         try:
-            written = self._writer.write_raw(payload)
+            written = writer.write_raw(payload)
         except DexkitError as error:
             self._count_publish_error(error)
-            return
-        if written:
-            self.counters.published += 1
-        else:
+            return False
+        if not written:
             self._count_publish_error(TimeoutError("a reliable reader does not keep up"))
+        return written
 
     def _count_publish_error(self, error: Exception) -> None:
         self.counters.publish_errors += 1
@@ -454,7 +490,9 @@ class HandService:
             return [
                 e
                 for e in node.endpoints()
-                if e.topic == self.state_topic and e.kind == "writer" and not e.own
+                if e.topic in (self.state_topic, self.low_rate_topic)
+                and e.kind == "writer"
+                and not e.own
             ]
 
         discovery = getattr(node, "discovery", None)
@@ -466,6 +504,25 @@ class HandService:
                 f"{who} already publishes {self.state_topic} on domain {self.domain}",
                 hint="stop the other service, choose another --domain, or add --force",
             )
+
+
+def _beyond(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:
+    """(joint and field, sentence) of each value of ``command`` that is beyond the limits."""
+    for i, joint in enumerate(spec.joints):
+        ranges = {
+            "q": (joint.q_min, joint.q_max, "rad"),
+            "dq": (-joint.dq_max, joint.dq_max, "rad/s"),
+            "tau": (-joint.tau_max, joint.tau_max, "N m"),
+            "kp": (0.0, math.inf, "N m/rad"),
+            "kd": (0.0, math.inf, "N m s/rad"),
+        }
+        for name, (low, high, unit) in ranges.items():
+            value = float(getattr(command, name)[i])
+            if not low <= value <= high:
+                yield (
+                    f"{spec.side} {joint.name} {name}",
+                    f"{name} of {joint.name} = {value:.4g} {unit} is outside {low:g} .. {high:g}",
+                )
 
 
 def _one_model(hands: Sequence[Hand]) -> HandModel:
