@@ -1,0 +1,41 @@
+"""The CRC of Unitree's motors, hands and robots: CRC-32/MPEG-2 over words, not bytes.
+
+Polynomial 0x04C11DB7, initial value 0xFFFFFFFF, not reflected, no final xor. The vendor's function
+takes the data as 32-bit little-endian words and feeds each of them most significant byte first,
+which is CRC-32/MPEG-2 over the data with the bytes of every word turned round (facts/unitree-dex
+C.8, A.7; seed 002 "CRC32 Function Calculation Method").
+"""
+
+from __future__ import annotations
+
+from array import array
+
+import fastcrc
+
+from dexkit.errors import EncodeError
+
+__all__ = ["crc32_swapped", "crc32_words"]
+
+_WORD = next(code for code in "IL" if array(code).itemsize == 4)
+
+
+def crc32_words(data: bytes | bytearray | memoryview) -> int:
+    """CRC of ``data``, as the manual's ``crc32(ptr, len)`` gives it for ``len(data) / 4`` words.
+
+    :raises EncodeError: the length is not a multiple of 4.
+    """
+    if len(data) % 4:
+        raise EncodeError(f"the CRC is over whole 32-bit words; {len(data)} bytes are not")
+    words = array(_WORD)
+    words.frombytes(data)
+    words.byteswap()
+    return crc32_swapped(words.tobytes())
+
+
+def crc32_swapped(data: bytes | bytearray | memoryview) -> int:
+    """The same CRC of data whose words have been turned round already.
+
+    For callers that turn a whole frame round at once and then want the CRC of its parts.
+    """
+    value: int = fastcrc.crc32.mpeg_2(data)
+    return value

@@ -1,0 +1,90 @@
+"""The Dex3-1's USB protocol, sans-IO (seed 002; facts/unitree-dex C; docs/dex3-protocol.md).
+
+- :mod:`.layout`: every structure as data, and the identity of the device;
+- :mod:`.packets`: packets, bus buffers and frames as raw integers;
+- :mod:`.units`: between those integers and SI units;
+- :mod:`.codec`: :class:`HandCodec`, both at once for a whole hand, fast.
+"""
+
+from dexkit.wire.dex3_usb.codec import DEFAULT_BUS_MAP, BusMap, DecodedCommand, HandCodec
+from dexkit.wire.dex3_usb.layout import (
+    BROADCAST_ID,
+    COMMAND_734,
+    COMMAND_1234,
+    COMMAND_HEAD,
+    COMMAND_LAYOUTS,
+    MANUFACTURER,
+    MOTOR_CMD,
+    MOTOR_STATE,
+    N_BUSES,
+    PRODUCT,
+    PRODUCT_ID,
+    RIS_MODE,
+    SENSOR_STATE,
+    STATE,
+    STATE_BUS_SIZE,
+    STATE_HEAD,
+    VENDOR_ID,
+    CommandLayout,
+    ris_mode,
+)
+from dexkit.wire.dex3_usb.packets import (
+    FROM_HAND,
+    TO_HAND,
+    CommandFrame,
+    MotorCmd,
+    MotorState,
+    Problem,
+    SensorState,
+    StateFrame,
+    pack_command,
+    pack_state,
+    parse_bus,
+    parse_command,
+    parse_state,
+    scan_bus,
+)
+from dexkit.wire.dex3_usb.units import NO_VALUE, SCALES, Scale
+
+__all__ = [
+    "BROADCAST_ID",
+    "COMMAND_734",
+    "COMMAND_1234",
+    "COMMAND_HEAD",
+    "COMMAND_LAYOUTS",
+    "DEFAULT_BUS_MAP",
+    "FROM_HAND",
+    "MANUFACTURER",
+    "MOTOR_CMD",
+    "MOTOR_STATE",
+    "NO_VALUE",
+    "N_BUSES",
+    "PRODUCT",
+    "PRODUCT_ID",
+    "RIS_MODE",
+    "SCALES",
+    "SENSOR_STATE",
+    "STATE",
+    "STATE_BUS_SIZE",
+    "STATE_HEAD",
+    "TO_HAND",
+    "VENDOR_ID",
+    "BusMap",
+    "CommandFrame",
+    "CommandLayout",
+    "DecodedCommand",
+    "HandCodec",
+    "MotorCmd",
+    "MotorState",
+    "Problem",
+    "Scale",
+    "SensorState",
+    "StateFrame",
+    "pack_command",
+    "pack_state",
+    "parse_bus",
+    "parse_command",
+    "parse_state",
+    "ris_mode",
+    "scan_bus",
+]
