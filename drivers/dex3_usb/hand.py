@@ -1,0 +1,309 @@
+"""The Dex3-1 behind the common interface: opening, exchanging, and what is done about faults."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.backends import Backend, BackendOptions
+from dexkit.clock import Clock, RealClock
+from dexkit.drivers.dex3_usb.discovery import find_hand
+from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
+from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options
+from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, WireError
+from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
+from dexkit.models import DEX3_1
+from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, CommandLayout, HandCodec, parse_state
+
+__all__ = ["Dex3Statistics", "Dex3Usb", "backend"]
+
+log = logging.getLogger(__name__)
+
+_IO_RATE = 1000.0  # seed 002 "Communication rate"
+_SLACK = 0.05  # seconds of an exchange beyond its two time-outs: waiting for a late answer
+_MISSED = 10
+"""Exchanges in a row without a motor's packet until it is reported as lost: a hundredth of a
+second, which no flipped bit lasts."""
+_GREETINGS = 5
+"""Exchanges that opening does at most to hear of every motor."""
+
+
+@dataclass
+class Dex3Statistics:
+    """Counters since the hand was made.
+
+    :ivar damaged_frames: answers that were not intact frames.
+    :ivar damaged_packets: motor and sensor packets lost inside intact frames.
+    :ivar trips: times that motors were found stopped by their own time-out protection.
+    :ivar link: those of the link since it was opened.
+    """
+
+    damaged_frames: int = 0
+    damaged_packets: int = 0
+    trips: int = 0
+    link: LinkStatistics = field(default_factory=LinkStatistics)
+
+
+class Dex3Usb:
+    """A Dex3-1 on USB, or behind a USB/IP server.
+
+    :param side: which hand.
+    :param configuration: how to reach it and how to talk to it.
+
+    ``open`` finds the hand and brakes it. The motors obey for a second at most without the next
+    command (unless ``protect`` is off), so a process that dies leaves none of them driven;
+    those that stopped by themselves are braked and take the command after that one.
+    """
+
+    reconnect_interval = 0.5
+    """Seconds at most between attempts of the service to open a lost hand again: looking for a
+    USB device costs nothing."""
+
+    def __init__(
+        self,
+        side: Side,
+        configuration: Dex3Settings | None = None,
+        *,
+        clock: Clock | None = None,
+    ) -> None:
+        self.configuration = configuration if configuration is not None else Dex3Settings()
+        self.statistics = Dex3Statistics()
+        self._clock: Clock = clock if clock is not None else RealClock()
+        self._link: UsbLink | None = None
+        self._spec = DEX3_1.spec(
+            side,
+            io_rate=_IO_RATE,
+            exchange_timeout=self.configuration.send_timeout + self.configuration.timeout + _SLACK,
+        )
+        n = self._spec.n_joints
+        self._brake = HandCommand.brake(n)
+        self._protect: NDArray[np.bool_] = np.full(n, self.configuration.protect)
+        self._reset()
+
+    def _reset(self) -> None:
+        configuration = self.configuration
+        self._codec = HandCodec(
+            self._spec.joints,
+            configuration.bus_map,
+            configuration.layout,
+            head=configuration.head,
+        )
+        self._last: HandState | None = None
+        self._tripped: NDArray[np.bool_] | None = None
+        self._missed = np.zeros(self._spec.n_joints, np.intp)
+        self._some_missed = False
+
+    @property
+    def spec(self) -> HandSpec:
+        """What this hand is."""
+        return self._spec
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the open hand; empty if it has none or is not open."""
+        return self._link.serial if self._link is not None else ""
+
+    # --- opening and closing
+
+    def open(self) -> None:
+        """Find the hand, claim it, brake it and hear of every motor. Nothing moves.
+
+        :raises HandNotFound: there is none, or more than one; says what there is.
+        :raises HandRefused: no permission, another program has it, it is the other side's, or a
+            motor is not where the bus map says.
+        :raises HandTimeout: it does not answer, or not with whole state frames.
+        :raises HandLost: it goes away meanwhile.
+        """
+        if self._link is not None:
+            return
+        configuration = self.configuration
+        candidate = find_hand(
+            self._spec.side,
+            serial=configuration.serial,
+            server=configuration.server,
+            local=configuration.local,
+        )
+        self._reset()
+        self._link = UsbLink(
+            candidate.backend,
+            candidate.device,
+            str(candidate),
+            out_endpoint=configuration.out_endpoint,
+            in_endpoint=configuration.in_endpoint,
+        )
+        self.statistics.link = self._link.statistics
+        try:
+            state = self._greet(self._link)
+        except BaseException:
+            self.close()
+            raise
+        log.info(
+            "%s: serial number %s, endpoints %#04x and %#04x, supply %.1f V",
+            self._link.name,
+            self._link.serial or "none",
+            self._link.endpoints.out,
+            self._link.endpoints.into,
+            state.supply.power_v if state.supply else np.nan,
+        )
+
+    def _greet(self, link: UsbLink) -> HandState:
+        # bit 7 = 0: whatever tripped while nobody drove the hand is cleared (seed 002 RIS_Mode_t)
+        frame = self._codec.encode(self._brake, False)
+        problem: HandError | None = None
+        answer = b""
+        for _ in range(_GREETINGS):
+            try:
+                answer, state = self._transfer(link, frame)
+            except HandTimeout as error:
+                problem = error
+                if link.statistics.timeouts >= 2:  # once may be a leftover of whoever had it
+                    break
+                continue
+            self._fill_in(state)
+            if not np.isnan(state.q).any():
+                self._last = state
+                return state
+        if not answer:
+            assert problem is not None
+            raise HandTimeout(
+                problem.message,
+                hint="is its power on? The manual has two sizes of the command frame: "
+                f"try --set frame={_other(self.configuration.layout)}",
+            ) from problem
+        raise self._incomplete(answer)
+
+    def _incomplete(self, answer: bytes) -> HandRefused:
+        motors = self.configuration.bus_map.motors
+        silent = ", ".join(
+            f"{self._spec.joints[i].name} (bus {motors[i][0]} id {motors[i][1]})"
+            for i in self._codec.missing_motors
+        )
+        heard = ", ".join(f"{bus}.{motor.id}" for bus, motor in parse_state(answer).motors)
+        return HandRefused(
+            f"no state of the motor(s) {silent}",
+            hint=f"motors that answer (bus.id): {heard or 'none'}; if their places are others, "
+            "say so with --set motors=...",
+        )
+
+    def close(self) -> None:
+        """Brake the motors and release the hand, as far as it is still there."""
+        link, self._link = self._link, None
+        if link is None:
+            return
+        configuration = self.configuration
+        try:
+            if self._last is not None:
+                # bit 7 = 0: a brake needs no protection, and trips would only be left behind
+                frame = self._codec.encode(self._brake, False)
+                link.exchange(frame, configuration.send_timeout, configuration.timeout)
+        except HandError as error:
+            rest = "; its motors stop by themselves within a second"
+            log.warning("could not brake: %s%s", error, rest if configuration.protect else "")
+        finally:
+            link.close()
+            log.info("%s closed: %s", link.name, self.statistics)
+
+    def __enter__(self) -> Dex3Usb:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    # --- exchanging
+
+    def exchange(self, command: HandCommand) -> HandState:
+        """Send one command frame, return what the state frame says.
+
+        A motor whose packet is missing or damaged keeps its last state; after ten exchanges it
+        shows ``MotorError.HOST_SAW_MOTOR_TIMEOUT``.
+
+        :raises HandLost: the hand has gone, or is not open.
+        :raises HandTimeout: no answer in time, none that is intact, or a stalled endpoint.
+        """
+        link = self._link
+        if link is None:
+            raise HandLost("the hand is not open", hint="call open() first")
+        protect, tripped = self._protect, self._tripped
+        if tripped is not None:
+            # one lock frame with bit 7 = 0 clears a motor that stopped by itself
+            command, protect = _locked(command, tripped), protect & ~tripped
+        _, state = self._transfer(link, self._codec.encode(command, protect))
+        if self._codec.missing_motors or self._some_missed:
+            self._fill_in(state)
+        self._look_for_trips(state)
+        self._last = state
+        return state
+
+    def _transfer(self, link: UsbLink, frame: bytes) -> tuple[bytes, HandState]:
+        configuration = self.configuration
+        answer = link.exchange(frame, configuration.send_timeout, configuration.timeout)
+        try:
+            state = self._codec.decode(answer, self._clock.now())
+        except WireError as error:
+            self.statistics.damaged_frames += 1
+            link.resynchronise()
+            raise HandTimeout(f"{link.name} gave no intact answer: {error}") from error
+        if self._codec.problems:
+            self.statistics.damaged_packets += len(self._codec.problems)
+            log.debug("damaged packets: %s", "; ".join(map(str, self._codec.problems)))
+        return answer, state
+
+    def _fill_in(self, state: HandState) -> None:
+        """What was not heard of in this frame stays as it was, but not for long unremarked."""
+        gone = list(self._codec.missing_motors)
+        self._missed[gone] += 1
+        self._missed[[i for i in range(len(self._missed)) if i not in gone]] = 0
+        self._some_missed = bool(gone)
+        if self._last is not None:
+            for name in ("q", "dq", "tau_est", "temperature", "voltage", "mode", "fault"):
+                getattr(state, name)[gone] = getattr(self._last, name)[gone]
+            if state.winding_temperature is not None and (
+                self._last.winding_temperature is not None
+            ):
+                state.winding_temperature[gone] = self._last.winding_temperature[gone]
+        state.fault[self._missed >= _MISSED] |= np.uint32(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+    def _look_for_trips(self, state: HandState) -> None:
+        bits = state.fault & _TRIPPED
+        if not bits.any():
+            self._tripped = None
+            return
+        before, self._tripped = self._tripped, bits != 0
+        if before is None:
+            self.statistics.trips += 1
+            joints = [self._spec.joints[i].name for i in np.flatnonzero(bits)]
+            log.warning("%s heard nothing for a second and stopped; going on", ", ".join(joints))
+
+
+_TRIPPED = np.uint32(MotorError.MOTOR_SAW_HOST_TIMEOUT)
+
+
+def _other(layout: CommandLayout) -> str:
+    return next(other.name for other in COMMAND_LAYOUTS if other is not layout)
+
+
+def _locked(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
+    """``command`` with some joints braked."""
+    keep = ~joints
+    return replace(
+        command,
+        **{name: getattr(command, name) * keep for name in ("dq", "tau", "kp", "kd")},
+        mode=command.mode * keep.astype(np.uint8),
+    )
+
+
+def _make(options: BackendOptions) -> Dex3Usb:
+    return Dex3Usb(options.side, from_options(options))
+
+
+backend = Backend(
+    summary="Dex3-1 on USB, or behind a USB/IP server (dexkit emulate dex3-usb)",
+    model=DEX3_1.name,
+    make=_make,
+    needs="--device serial number or usbip://HOST:PORT, if there is more than one hand",
+    settings=SETTINGS,
+)

@@ -1,0 +1,364 @@
+"""The bulk pipes of one hand: one buffer out, one buffer back.
+
+It works on PyUSB's backend interface (:class:`usb.backend.IBackend`), below
+:class:`usb.core.Device`: the calls are the same, without the bookkeeping that each
+``Device.write`` and ``Device.read`` repeats (about a fifth of the processor time of an
+exchange). What libusb or the USB/IP client raise becomes a :class:`~dexkit.errors.HandError`
+here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import logging
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
+
+__all__ = ["Backend", "Endpoints", "LinkStatistics", "UsbLink", "hand_error", "read_serial"]
+
+log = logging.getLogger(__name__)
+
+Backend: TypeAlias = Any
+"""A :class:`usb.backend.IBackend`; PyUSB has no types."""
+
+_INTERFACE = 0
+_BULK, _TYPE_MASK, _DIRECTION_IN = 0x02, 0x03, 0x80
+_ANSWER_ROOM = 2048
+"""Bytes asked for: more than an answer has (1270), and whole packets of 512, so that an answer
+that is too long arrives and is seen to be too long instead of as an overflow."""
+_STRING_TIMEOUT = 500  # ms
+_DRAIN_TIMEOUT = 1  # ms: as short as libusb can wait (0 is for ever)
+_QUIET = 0.02
+"""Seconds that a late answer is waited for after a time-out, before the next command is sent."""
+_WATCH = 0.5
+"""Seconds after that for which each answer is checked for another one behind it."""
+
+UDEV_RULE = "packaging/70-dexkit-dex3.rules"
+UDEV_HINT = (
+    "install the udev rule and plug the hand in again: sudo cp "
+    f"{UDEV_RULE} /etc/udev/rules.d/ && sudo udevadm control --reload && sudo udevadm trigger"
+    " (or, without the file, see docs/dex3-usb.md)"
+)
+
+_LOST = frozenset(
+    {
+        errno.ENODEV,
+        errno.ENOENT,
+        errno.ENXIO,
+        errno.EIO,  # what a pulled cable gives on a transfer under way
+        errno.EPROTO,
+        errno.ESHUTDOWN,
+        errno.ECONNREFUSED,
+        errno.ECONNRESET,
+        errno.ECONNABORTED,
+        errno.EHOSTUNREACH,
+        errno.ENETUNREACH,
+    }
+)
+_LATE = frozenset({errno.ETIMEDOUT, errno.EINTR, errno.EAGAIN})
+
+
+def hand_error(error: Exception, what: str) -> HandError:
+    """What a :class:`usb.core.USBError` or another :class:`OSError` says about the hand.
+
+    :param what: what was being done, for the message: ``"opening the left hand"``.
+    """
+    number = error.errno if isinstance(error, OSError) else None
+    text = f"{what}: {error.strerror or error if isinstance(error, OSError) else error}"
+    if number in (errno.EACCES, errno.EPERM):
+        return HandRefused(f"{what}: no permission to use the USB device", hint=UDEV_HINT)
+    if number == errno.EBUSY:
+        return HandRefused(
+            f"{what}: another program holds its USB interface",
+            hint="another dexkit, the vendor's hand service, or a virtual machine that took the "
+            "device over? See: sudo lsof /dev/bus/usb/*/*",
+        )
+    if number in _LATE or isinstance(error, TimeoutError):
+        return HandTimeout(text)
+    if number in _LOST or isinstance(error, ConnectionError):
+        return HandLost(text, hint="is the hand plugged in and powered?")
+    return HandError(text)
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Addresses of the bulk pipes, with bit 7 set for the one that the host reads."""
+
+    out: int
+    into: int
+
+
+@dataclass
+class LinkStatistics:
+    """Counters of a link since it was opened.
+
+    :ivar exchanges: answers received, intact or not.
+    :ivar timeouts: commands that were not answered in time.
+    :ivar late: answers that came after their time and were passed over.
+    :ivar stalls: halts of an endpoint that were cleared.
+    """
+
+    exchanges: int = 0
+    timeouts: int = 0
+    late: int = 0
+    stalls: int = 0
+
+
+class UsbLink:
+    """An opened device whose interface 0 is claimed.
+
+    :param backend: PyUSB backend.
+    :param device: one of the backend's devices.
+    :param name: for messages.
+    :param out_endpoint: address instead of the first bulk OUT of the interface.
+    :param in_endpoint: likewise IN.
+    :raises HandRefused: no permission, another program has it, no such endpoints.
+    :raises HandLost, HandTimeout: it goes away or says nothing meanwhile.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        device: Any,
+        name: str,
+        *,
+        out_endpoint: int | None = None,
+        in_endpoint: int | None = None,
+    ) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self._backend = backend
+        self._handle: Any = None
+        self._claimed = self._detached = False
+        self._drain = True  # whoever had it before may have left an answer behind
+        self._watch_until = 0.0
+        self._buffer = array.array("B", bytes(_ANSWER_ROOM))
+        self._exchange = getattr(backend, "exchange", None)
+        try:
+            self._handle = backend.open_device(device)
+            self._take()
+            self.endpoints = _endpoints(backend, device, name, out_endpoint, in_endpoint)
+            self.serial = _serial(backend, self._handle)
+        except (OSError, NotImplementedError) as error:
+            self.close()
+            raise hand_error(error, f"opening {name}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _take(self) -> None:
+        backend, handle = self._backend, self._handle
+        if _kernel_driver(backend, handle):
+            backend.detach_kernel_driver(handle, _INTERFACE)
+            self._detached = True
+        if not backend.get_configuration(handle):
+            # only if needed: setting it resets the device, toggles and all
+            backend.set_configuration(handle, 1)
+        backend.claim_interface(handle, _INTERFACE)
+        self._claimed = True
+
+    def close(self) -> None:
+        """Give everything back, as far as it is still there. May be called twice."""
+        handle, self._handle = self._handle, None
+        if handle is None:
+            return
+        steps: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        if self._claimed:
+            steps.append((self._backend.release_interface, (handle, _INTERFACE)))
+        if self._detached:
+            steps.append((self._backend.attach_kernel_driver, (handle, _INTERFACE)))
+        steps.append((self._backend.close_device, (handle,)))
+        for step, arguments in steps:
+            try:
+                step(*arguments)
+            except (OSError, NotImplementedError) as error:  # a device that is gone
+                log.debug("closing %s: %s", self.name, error)
+
+    def exchange(self, data: bytes, send_timeout: float, timeout: float) -> bytes:
+        """Send one buffer, return the one that answers it.
+
+        :param data: a whole command frame.
+        :param send_timeout: seconds that the device may take to accept it.
+        :param timeout: seconds until the answer.
+        :raises HandTimeout: no answer in time, or a stalled endpoint, which was cleared.
+        :raises HandLost: the device has gone.
+        :raises HandRefused, HandError: anything else that libusb may say.
+        """
+        if self._handle is None:
+            raise HandLost(f"{self.name} is not open")
+        if self._drain:
+            self._wait_for_late()
+        answer = self._transfer(data, send_timeout, timeout)
+        if self._watch_until:
+            answer = self._newest(answer)
+        self.statistics.exchanges += 1
+        return answer
+
+    def resynchronise(self) -> None:
+        """Before the next command, pass over what the device still sends.
+
+        It answers in order, and an answer does not say to what: one that is late would be taken
+        for that to the next command, and so on for ever.
+        """
+        self._drain = True
+        self._watch_until = time.monotonic() + _WATCH
+
+    # -- details
+
+    def _transfer(self, data: bytes, send_timeout: float, timeout: float) -> bytes:
+        endpoints = self.endpoints
+        endpoint = endpoints.out
+        try:
+            if self._exchange is not None:
+                answer: bytes = self._exchange(
+                    self._handle,
+                    endpoints.out,
+                    data,
+                    endpoints.into,
+                    _ANSWER_ROOM,
+                    _ms(send_timeout + timeout),
+                )
+                return answer
+            count = self._backend.bulk_write(
+                self._handle, endpoint, _INTERFACE, array.array("B", data), _ms(send_timeout)
+            )
+            if count != len(data):
+                raise self._late(f"took {count} of the {len(data)} bytes of a command")
+            endpoint = endpoints.into
+            return self._read(_ms(timeout))
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise self._stalled(getattr(error, "endpoint", endpoint)) from error
+            raise self._failed(error) from error
+
+    def _read(self, timeout: int) -> bytes:
+        count = self._backend.bulk_read(
+            self._handle, self.endpoints.into, _INTERFACE, self._buffer, timeout
+        )
+        return self._buffer[:count].tobytes()
+
+    def _wait_for_late(self) -> None:
+        deadline = time.monotonic() + (_QUIET if self._watch_until else 0.0)
+        while True:
+            found = self._look() is not None
+            if found or time.monotonic() >= deadline:
+                break
+        self._drain = False
+        if found:
+            self._watch_until = 0.0
+
+    def _newest(self, answer: bytes) -> bytes:
+        """``answer``, or the one behind it: then ``answer`` was that to an earlier command."""
+        following = self._look()
+        if following is not None or time.monotonic() > self._watch_until:
+            self._watch_until = 0.0
+        return answer if following is None else following
+
+    def _look(self) -> bytes | None:
+        try:
+            data = self._read(_DRAIN_TIMEOUT)
+        except OSError as error:
+            if error.errno in _LATE:
+                return None
+            raise self._failed(error) from error
+        self.statistics.late += 1
+        return data
+
+    def _late(self, what: str) -> HandTimeout:
+        self.statistics.timeouts += 1
+        self.resynchronise()
+        return HandTimeout(f"{self.name} {what}")
+
+    def _failed(self, error: OSError) -> HandError:
+        translated = hand_error(error, f"exchanging with {self.name}")
+        if isinstance(translated, HandTimeout):
+            return self._late("does not answer")
+        return translated
+
+    def _stalled(self, endpoint: int) -> HandError:
+        name = "IN" if endpoint & _DIRECTION_IN else "OUT"
+        try:
+            self._backend.clear_halt(self._handle, endpoint)
+        except OSError as error:
+            return hand_error(error, f"clearing the stalled {name} endpoint of {self.name}")
+        self.statistics.stalls += 1
+        self.resynchronise()
+        return HandTimeout(f"{self.name} stalled its {name} endpoint {endpoint:#04x}; cleared")
+
+
+def _ms(seconds: float) -> int:
+    return max(1, round(seconds * 1000))  # 0 would be for ever
+
+
+def _serial(backend: Backend, handle: Any) -> str:
+    try:
+        return read_serial(backend, handle)
+    except (OSError, NotImplementedError) as error:
+        log.debug("no serial number: %s", error)  # it is not needed to drive the hand
+        return ""
+
+
+def _kernel_driver(backend: Backend, handle: Any) -> bool:
+    try:
+        return bool(backend.is_kernel_driver_active(handle, _INTERFACE))
+    except NotImplementedError:  # of the operating system
+        return False
+
+
+def _endpoints(
+    backend: Backend, device: Any, name: str, out: int | None, into: int | None
+) -> Endpoints:
+    """The first bulk endpoints of interface 0; the manual does not number them (facts C.1)."""
+    interface = backend.get_interface_descriptor(device, _INTERFACE, 0, 0)
+    found = [
+        backend.get_endpoint_descriptor(device, index, _INTERFACE, 0, 0)
+        for index in range(interface.bNumEndpoints)
+    ]
+    bulk = [e.bEndpointAddress for e in found if e.bmAttributes & _TYPE_MASK == _BULK]
+    for direction, chosen in ((0, out), (_DIRECTION_IN, into)):
+        if chosen is not None and (chosen not in bulk or chosen & _DIRECTION_IN != direction):
+            raise HandRefused(
+                f"{name} has no bulk {'IN' if direction else 'OUT'} endpoint {chosen:#04x}",
+                hint=f"its bulk endpoints: {', '.join(f'{a:#04x}' for a in bulk) or 'none'}",
+            )
+    outs = [a for a in bulk if not a & _DIRECTION_IN] if out is None else [out]
+    ins = [a for a in bulk if a & _DIRECTION_IN] if into is None else [into]
+    if not outs or not ins:
+        raise HandRefused(
+            f"{name} has no bulk OUT and IN endpoint on interface {_INTERFACE}",
+            hint="is it a Dex3-1? See: lsusb -v -d 34b7:",
+        )
+    return Endpoints(outs[0], ins[0])
+
+
+def read_serial(backend: Backend, handle: Any) -> str:
+    """The serial number string of an opened device, empty if it has none.
+
+    It is asked of the device itself: the USB/IP client's device descriptor comes from the
+    server's list, which has no string indices.
+
+    :raises OSError: as libusb.
+    """
+
+    def descriptor(kind: int, index: int, language: int, size: int) -> bytes:
+        data = array.array("B", bytes(size))
+        count = backend.ctrl_transfer(
+            handle, 0x80, 0x06, kind << 8 | index, language, data, _STRING_TIMEOUT
+        )
+        return data[:count].tobytes()
+
+    index = descriptor(1, 0, 0, 18)[16:17]
+    if not index or not index[0]:
+        return ""
+    languages = descriptor(3, 0, 0, 255)
+    if len(languages) < 4:
+        raise OSError(errno.EPROTO, "a device whose strings have no language")
+    (language,) = struct.unpack_from("<H", languages, 2)
+    text = descriptor(3, index[0], language, 255)
+    return text[2 : text[0] if text else 0].decode("utf-16-le", errors="replace")
