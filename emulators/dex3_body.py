@@ -78,8 +78,8 @@ F_1515_108 = MotorModel("F-1515-108", 108.0, 23.0, 0.76, 0.49, 1.37)
 F_1515_214 = MotorModel("F-1515-214", 214.0, 11.0, 1.498, 0.86, 3.1)
 _MOTORS = {m.gear_ratio: m for m in (F_1515_108, F_1515_214)}
 
-# Tuned, not measured. With kp 1.5 and kd 0.2 the joints follow shared/traces/dex3_pinch.mcap as
-# the hands in that recording do, which are simulated as well.
+# Tuned, not measured. With kp 1.5 and kd 0.2 the joints follow the commands of the recording
+# dex3_pinch within 0.03 rad of the hands in it, which are simulated as well.
 _ROTOR_INERTIA = 1.7e-8  # kg m²; 2e-4 at the joint with ratio 108
 _ROTOR_BRAKE = 1e-5  # N m s/rad of shorted windings; 0.12 at the joint with ratio 108
 _COULOMB = 0.002 / 108.0  # N m per unit of ratio
@@ -108,7 +108,7 @@ _CURRENT_MAX = 10.0  # A (seed 002)
 _PAD_LEVER, _TIP_LEVER = 0.06, 0.04  # m
 _PAD_SHARE = (0.3, 0.3, 0.2, 0.2)
 _TIP_SHARE = (0.25, 0.5, 0.25)
-_PALM_SHARE = 1.0 / 12.0
+_PALM_SHARES = (1.0 / 12.0,) * 4
 _PALM_FROM = 6.0  # N of the fingers' pads from which the object is pressed into the palm
 _GRAVITY = 9.81
 _FORCE_MIN, _FORCE_MAX = 0.010 * _GRAVITY, 2.5 * _GRAVITY  # seed 002 "Range of Perception"
@@ -116,31 +116,50 @@ _FORCE_MIN, _FORCE_MAX = 0.010 * _GRAVITY, 2.5 * _GRAVITY  # seed 002 "Range of 
 # the code for "no value" on the wire (30000 counts of 8 Pa).
 _ELEMENT_AREA = 1.05e-4
 
-_SENSOR = {sensor.place: i for i, sensor in enumerate(DEX3_1.sensors)}
-_BLANK = np.full((len(DEX3_1.sensors), 12), math.nan)
-for _i, _sensor in enumerate(DEX3_1.sensors):
-    _BLANK[_i, list(_sensor.slots)] = 0.0
-_SENSOR_TEMPERATURE = np.where(np.isnan(_BLANK), math.nan, AMBIENT)
+# per finger, in the order of the packets tip, pad: (joint that presses it, lever arm)
+_INDEX = {spec.name: i for i, spec in enumerate(DEX3_1.joints[Side.LEFT])}
+_PRESSES = {
+    "thumb tip": ("thumb_2", _TIP_LEVER, _TIP_SHARE),
+    "thumb pad": ("thumb_1", _PAD_LEVER, _PAD_SHARE),
+    "middle tip": ("middle_1", _TIP_LEVER, _TIP_SHARE),
+    "middle pad": ("middle_0", _PAD_LEVER, _PAD_SHARE),
+    "index tip": ("index_1", _TIP_LEVER, _TIP_SHARE),
+    "index pad": ("index_0", _PAD_LEVER, _PAD_SHARE),
+}
+_PLACES = [sensor.place for sensor in DEX3_1.sensors]
+_TOUCH = [(_INDEX[_PRESSES[p][0]], _PRESSES[p][1]) for p in _PLACES if p in _PRESSES]
+_ON_PALM = [_PLACES.index("middle pad"), _PLACES.index("index pad")]
+_SHARES = np.full((len(_PLACES), 12), math.nan)
+for _row, _sensor in zip(_SHARES, DEX3_1.sensors, strict=True):
+    _row[list(_sensor.slots)] = _PRESSES.get(_sensor.place, (None, None, _PALM_SHARES))[2]
+_NO_PRESSURE = 0.0 * _SHARES
+_SENSOR_TEMPERATURE = AMBIENT + _NO_PRESSURE
+
+
+# plain integers: an enum's attribute look-up costs more than what it guards
+_BRAKE, _FOC = int(JointMode.BRAKE), int(JointMode.FOC)
 
 
 class _Motor:
     """One motor and its joint."""
 
     __slots__ = (
+        "before",
         "case",
-        "coming",
         "damping",
         "driving_loss",
+        "droop",
         "error",
+        "feedforward",
         "holding_loss",
         "joint",
-        "kd",
         "kp",
         "mode",
         "model",
+        "most",
         "object_wall",
-        "powered",
         "q",
+        "rests_at",
         "torque",
         "winding",
     )
@@ -167,17 +186,32 @@ class _Motor:
         )
         self.driving_loss = self.model.driving_loss
         self.holding_loss = self.model.holding_loss
-        self.powered = True
+        self.power(True)
         self.error = 0
         self.case = self.winding = AMBIENT
         self.torque = 0.0
+        self.before = 0.0  # rad/s, before the last call of Dex3Body.step
         self.brake()
+
+    def power(self, on: bool) -> None:
+        """Give it torque, or none."""
+        self.most = self.model.tau_max if on else 0.0
+        self.droop = self.most / self.model.dq_max  # torque lost per rad/s
+        self.rests_at = math.nan
+
+    def follow(self, q: float, feedforward: float, kp: float, kd: float) -> None:
+        """Obey the motor's law."""
+        self.mode = _FOC
+        self.q = q
+        self.feedforward = feedforward
+        self.kp = kp
+        self.damping = kd + kp * STEP
+        self.rests_at = math.nan
 
     def brake(self) -> None:
         """Short the windings."""
-        self.mode = int(JointMode.BRAKE)
-        self.q = self.kp = self.coming = 0.0
-        self.kd = self.damping = _ROTOR_BRAKE * self.model.gear_ratio**2
+        self.follow(0.0, 0.0, 0.0, _ROTOR_BRAKE * self.model.gear_ratio**2)
+        self.mode = _BRAKE
 
     def contact(self) -> float:
         """Torque that the object takes, N·m."""
@@ -240,7 +274,9 @@ class Dex3Body:
             for spec, rest in zip(self.specs, DEX3_1.rest_q[side], strict=True)
         )
         self.joints = tuple(motor.joint for motor in self._motors)
-        self._before = [0.0] * len(self._motors)
+        self._lived = STEP
+        self._touched: list[float] = []
+        self._felt = _NO_PRESSURE
         self._to_slow = _SLOW_STEPS
 
     # -- commands ------------------------------------------------------------------------------
@@ -261,15 +297,21 @@ class Dex3Body:
         :param kp: gains below zero count as zero.
         """
         motor = self._motors[joint]
-        if mode != JointMode.FOC or motor.error:
-            motor.brake()
+        if mode != _FOC or motor.error:
+            if motor.mode != _BRAKE:
+                motor.brake()
             return
-        motor.mode = 1
-        motor.q = q
-        motor.kp = kp if kp > 0.0 else 0.0
-        motor.kd = kd if kd > 0.0 else 0.0
-        motor.coming = motor.kd * dq + tau
-        motor.damping = motor.kd + motor.kp * STEP
+        kp = kp if kp > 0.0 else 0.0
+        kd = kd if kd > 0.0 else 0.0
+        feedforward = kd * dq + tau
+        if (
+            motor.q != q
+            or motor.feedforward != feedforward
+            or motor.kp != kp
+            or motor.damping != kd + kp * STEP
+            or motor.mode != _FOC
+        ):
+            motor.follow(q, feedforward, kp, kd)
 
     def use(self, command: HandCommand) -> None:
         """Give every motor its part of ``command``."""
@@ -301,28 +343,31 @@ class Dex3Body:
 
     def step(self, steps: int = 1) -> None:
         """Live through ``steps`` times :data:`STEP`."""
+        if steps <= 0:
+            return
         motors = self._motors
+        for motor in motors:
+            motor.before = motor.joint.dq
+        self._lived = steps * STEP
         for _ in range(steps):
-            self._before = [motor.joint.dq for motor in motors]
             for motor in motors:
                 joint = motor.joint
-                model = motor.model
-                most = model.tau_max
-                if not motor.powered:
-                    joint.drive(0.0, 0.0, most, most, STEP)
-                    motor.torque = 0.0
-                    continue
+                speed = joint.dq
+                if speed == 0.0 and joint.q == motor.rests_at:
+                    continue  # nothing has changed: this step would end as the last one did
+                most = motor.most
                 # the faster it turns, the less it can push on: nothing is left at the top speed
-                along = most * (1.0 - abs(joint.dq) / model.dq_max)
+                along = most - motor.droop * (speed if speed > 0.0 else -speed)
                 motor.torque = joint.drive(
-                    motor.kp * (motor.q - joint.q) + motor.coming,
+                    motor.kp * (motor.q - joint.q) + motor.feedforward,
                     motor.damping,
                     most,
                     along if along > 0.0 else 0.0,
                     STEP,
-                    driving_loss=motor.driving_loss,
-                    holding_loss=motor.holding_loss,
+                    motor.driving_loss,
+                    motor.holding_loss,
                 )
+                motor.rests_at = joint.q if speed == 0.0 == joint.dq else math.nan
             self._to_slow -= 1
             if self._to_slow == 0:
                 self._to_slow = _SLOW_STEPS
@@ -353,7 +398,7 @@ class Dex3Body:
 
     def power(self, joint: int, on: bool) -> None:
         """Cut a motor's power (it is limp then, and would not answer), or give it back."""
-        self._motors[joint].powered = on
+        self._motors[joint].power(on)
         self._motors[joint].brake()
 
     def heat(self, joint: int, celsius: float) -> None:
@@ -374,6 +419,7 @@ class Dex3Body:
     def jam(self, joint: int, stuck: bool) -> None:
         """Have a joint stuck where it is, or free it."""
         self.joints[joint].locked = stuck
+        self._motors[joint].rests_at = math.nan
 
     # -- what can be seen ----------------------------------------------------------------------
 
@@ -389,10 +435,8 @@ class Dex3Body:
 
     @property
     def ddq(self) -> Floats:
-        """Accelerations in the last step, rad/s², shape (7,)."""
-        return np.array(
-            [(j.dq - before) / STEP for j, before in zip(self.joints, self._before, strict=True)]
-        )
+        """Mean accelerations during the last :meth:`step`, rad/s², shape (7,)."""
+        return np.array([(m.joint.dq - m.before) / self._lived for m in self._motors])
 
     @property
     def tau(self) -> Floats:
@@ -412,7 +456,7 @@ class Dex3Body:
     @property
     def powered(self) -> list[bool]:
         """Whether each motor has power."""
-        return [motor.powered for motor in self._motors]
+        return [motor.most > 0.0 for motor in self._motors]
 
     @property
     def temperature(self) -> Floats:
@@ -431,7 +475,7 @@ class Dex3Body:
 
     @property
     def motor_v(self) -> float:
-        """Voltage at the motors, V."""
+        """Voltage at the motors, V, behind the buck converter."""
         return min(self.supply_v, _BUCK_OUTPUT)
 
     @property
@@ -466,20 +510,18 @@ class Dex3Body:
         The first joint of a finger (thumb_1 for the thumb) presses its pad against the object,
         the second its tip. An element feels 10 g to 2500 g: less is 0, more is the most.
         """
-        out = _BLANK.copy()
-        palm = -_PALM_FROM
-        for name, proximal, distal in _FINGERS:
-            pad = self._motors[proximal].contact() / _PAD_LEVER
-            tip = self._motors[distal].contact() / _TIP_LEVER
-            if pad > 0.0:
-                _spread(out, f"{name} pad", pad, _PAD_SHARE)
-                palm += 0.0 if name == "thumb" else pad
-            if tip > 0.0:
-                _spread(out, f"{name} tip", tip, _TIP_SHARE)
-        if palm > 0.0:
-            for i in range(3):
-                _spread(out, f"palm {i}", palm, (_PALM_SHARE,) * 4)
-        return out
+        torques = [motor.contact() for motor in self._motors]
+        if torques == self._touched:
+            return self._felt.copy()
+        forces = [torques[joint] / lever for joint, lever in _TOUCH]
+        palm = sum(forces[i] for i in _ON_PALM) - _PALM_FROM
+        forces += [palm if palm > 0.0 else 0.0] * (len(DEX3_1.sensors) - len(forces))
+        felt: Floats = _SHARES * np.array(forces)[:, np.newaxis]
+        np.minimum(felt, _FORCE_MAX, out=felt)
+        felt[felt < _FORCE_MIN] = 0.0
+        felt /= _ELEMENT_AREA
+        self._touched, self._felt = torques, felt
+        return felt.copy()
 
     @property
     def sensor_temperature(self) -> Floats:
@@ -488,15 +530,29 @@ class Dex3Body:
 
     def state(self, stamp: float) -> HandState:
         """All of it, measured at ``stamp``."""
-        n = len(self._motors)
+        lived = self._lived
+        table = np.array(
+            [
+                (
+                    m.joint.q,
+                    m.joint.dq,
+                    (m.joint.dq - m.before) / lived,
+                    m.torque,
+                    m.case,
+                    m.winding,
+                    self.motor_v,
+                )
+                for m in self._motors
+            ]
+        ).T.copy()
         return HandState(
-            q=self.q,
-            dq=self.dq,
-            ddq=self.ddq,
-            tau_est=self.tau,
-            temperature=self.temperature,
-            winding_temperature=self.winding_temperature,
-            voltage=np.full(n, self.motor_v),
+            q=table[0],
+            dq=table[1],
+            ddq=table[2],
+            tau_est=table[3],
+            temperature=table[4],
+            winding_temperature=table[5],
+            voltage=table[6],
             mode=np.array(self.mode, dtype=np.uint8),
             fault=np.array(self.errors, dtype=np.uint32),
             stamp=stamp,
@@ -509,12 +565,6 @@ class Dex3Body:
 
 
 _IMU = ImuState(accelerometer=(0.0, 0.0, _GRAVITY), temperature=AMBIENT)
-_INDEX = {spec.name: i for i, spec in enumerate(DEX3_1.joints[Side.LEFT])}
-_FINGERS = (
-    ("thumb", _INDEX["thumb_1"], _INDEX["thumb_2"]),
-    ("middle", _INDEX["middle_0"], _INDEX["middle_1"]),
-    ("index", _INDEX["index_0"], _INDEX["index_1"]),
-)
 
 
 def _start(spec: JointSpec, rest: float, start: float | None, object_at: float | None) -> float:
@@ -525,11 +575,3 @@ def _start(spec: JointSpec, rest: float, start: float | None, object_at: float |
         touch = _closed_by(spec, object_at)
         q = min(q, touch) if spec.closing > 0 else max(q, touch)
     return q
-
-
-def _spread(out: Floats, place: str, force: float, shares: tuple[float, ...]) -> None:
-    row = out[_SENSOR[place]]
-    for slot, share in zip(DEX3_1.sensors[_SENSOR[place]].slots, shares, strict=True):
-        felt = min(share * force, _FORCE_MAX)
-        if felt >= _FORCE_MIN:
-            row[slot] = felt / _ELEMENT_AREA

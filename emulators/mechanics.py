@@ -17,6 +17,8 @@ from dexkit.errors import UsageError
 
 __all__ = ["FixedSteps", "Joint", "Wall"]
 
+_STILL = 1e-9  # rad/s; a slower joint rests
+
 
 class FixedSteps:
     """How many fixed steps a body must live to catch up with a clock.
@@ -46,7 +48,7 @@ class FixedSteps:
         return steps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Wall:
     """A one-sided stop.
 
@@ -69,7 +71,7 @@ class Wall:
             raise UsageError("a wall needs a positive stiffness and no negative damping")
 
 
-@dataclass
+@dataclass(slots=True)
 class Joint:
     """State and parameters of one joint; SI units.
 
@@ -144,7 +146,6 @@ class Joint:
         most: float,
         most_along: float,
         dt: float,
-        *,
         driving_loss: float = 0.0,
         holding_loss: float = 0.0,
     ) -> float:
@@ -202,6 +203,8 @@ class Joint:
             velocity = (free + stick) / slow
         else:
             velocity = 0.0
+        if -_STILL < velocity < _STILL:
+            velocity = 0.0  # rounding must not keep it creeping for ever
         self.dq = velocity
         self.q = q + dt * velocity
         end = torque - damping * velocity
