@@ -9,12 +9,17 @@ C.8, A.7; seed 002 "CRC32 Function Calculation Method").
 from __future__ import annotations
 
 from array import array
+from collections.abc import Callable
 
 import fastcrc
 
 from dexkit.errors import EncodeError
 
 __all__ = ["crc32_swapped", "crc32_words"]
+
+crc32_swapped: Callable[[bytes | bytearray | memoryview], int] = fastcrc.crc32.mpeg_2
+"""The same CRC of data whose words have been turned round already: for callers that turn a whole
+frame round at once and then want the CRC of its parts."""
 
 _WORD = next(code for code in "IL" if array(code).itemsize == 4)
 
@@ -30,12 +35,3 @@ def crc32_words(data: bytes | bytearray | memoryview) -> int:
     words.frombytes(data)
     words.byteswap()
     return crc32_swapped(words.tobytes())
-
-
-def crc32_swapped(data: bytes | bytearray | memoryview) -> int:
-    """The same CRC of data whose words have been turned round already.
-
-    For callers that turn a whole frame round at once and then want the CRC of its parts.
-    """
-    value: int = fastcrc.crc32.mpeg_2(data)
-    return value
