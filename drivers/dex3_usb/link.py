@@ -137,6 +137,7 @@ class UsbLink:
         self._handle: Any = None
         self._claimed = self._detached = False
         self._drain = True  # whoever had it before may have left an answer behind
+        self._owed = 0  # answers that were waited for in vain, and may still come
         self._watch_until = 0.0
         self._buffer = array.array("B", bytes(_ANSWER_ROOM))
         self._exchange = getattr(backend, "exchange", None)
@@ -195,19 +196,14 @@ class UsbLink:
         if self._drain:
             self._wait_for_late()
         answer = self._transfer(data, send_timeout, timeout)
-        if self._watch_until:
+        if self._owed:
             answer = self._newest(answer)
         self.statistics.exchanges += 1
         return answer
 
     def resynchronise(self) -> None:
-        """Before the next command, pass over what the device still sends.
-
-        It answers in order, and an answer does not say to what: one that is late would be taken
-        for that to the next command, and so on for ever.
-        """
+        """Before the next command, pass over what the device has still sent."""
         self._drain = True
-        self._watch_until = time.monotonic() + _WATCH
 
     # -- details
 
@@ -222,7 +218,8 @@ class UsbLink:
                     data,
                     endpoints.into,
                     _ANSWER_ROOM,
-                    _ms(send_timeout + timeout),
+                    _ms(send_timeout),
+                    _ms(timeout),
                 )
                 return answer
             count = self._backend.bulk_write(
@@ -232,6 +229,8 @@ class UsbLink:
                 raise self._late(f"took {count} of the {len(data)} bytes of a command")
             endpoint = endpoints.into
             return self._read(_ms(timeout))
+        except HandError:  # HandTimeout is an OSError too
+            raise
         except OSError as error:
             if error.errno == errno.EPIPE:
                 raise self._stalled(getattr(error, "endpoint", endpoint)) from error
@@ -244,21 +243,18 @@ class UsbLink:
         return self._buffer[:count].tobytes()
 
     def _wait_for_late(self) -> None:
-        deadline = time.monotonic() + (_QUIET if self._watch_until else 0.0)
-        while True:
-            found = self._look() is not None
-            if found or time.monotonic() >= deadline:
-                break
         self._drain = False
-        if found:
-            self._watch_until = 0.0
+        deadline = time.monotonic() + _QUIET
+        while (self._look() is not None or self._owed) and time.monotonic() < deadline:
+            pass
 
     def _newest(self, answer: bytes) -> bytes:
-        """``answer``, or the one behind it: then ``answer`` was that to an earlier command."""
-        following = self._look()
-        if following is not None or time.monotonic() > self._watch_until:
-            self._watch_until = 0.0
-        return answer if following is None else following
+        """``answer``, or the last one behind it: then ``answer`` was that to an old command."""
+        while self._owed and (following := self._look()) is not None:
+            answer = following
+        if time.monotonic() > self._watch_until:
+            self._owed = 0  # it was lost
+        return answer
 
     def _look(self) -> bytes | None:
         try:
@@ -268,12 +264,21 @@ class UsbLink:
                 return None
             raise self._failed(error) from error
         self.statistics.late += 1
+        self._owed = max(0, self._owed - 1)
         return data
 
     def _late(self, what: str) -> HandTimeout:
         self.statistics.timeouts += 1
-        self.resynchronise()
+        self._expect_late()
         return HandTimeout(f"{self.name} {what}")
+
+    def _expect_late(self) -> None:
+        """An answer may still come. They come in order, and do not say to what: one that is late
+        would be taken for that to the next command, and so on for ever.
+        """
+        self._drain = True
+        self._owed += 1
+        self._watch_until = time.monotonic() + _WATCH
 
     def _failed(self, error: OSError) -> HandError:
         translated = hand_error(error, f"exchanging with {self.name}")
@@ -288,7 +293,7 @@ class UsbLink:
         except OSError as error:
             return hand_error(error, f"clearing the stalled {name} endpoint of {self.name}")
         self.statistics.stalls += 1
-        self.resynchronise()
+        self._expect_late()
         return HandTimeout(f"{self.name} stalled its {name} endpoint {endpoint:#04x}; cleared")
 
 

@@ -94,14 +94,14 @@ class _Connection:
             raise
 
     def exchange(
-        self, out_ep: int, data: bytes, in_ep: int, length: int, timeout_ms: int
+        self, out_ep: int, data: bytes, in_ep: int, length: int, send_ms: int, timeout_ms: int
     ) -> tuple[int, int, bytes]:
         """Write and read in one go: (status of the write, of the read, data). Raises as submit.
 
         Both are under way at once, as with asynchronous transfers of libusb. If the write
         fails, the read is cancelled.
         """
-        deadline = _deadline(timeout_ms)
+        deadline = _deadline(send_ms)
         write, first = self._write(out_ep, _NO_SETUP, data)
         read, second = self._read(in_ep, _NO_SETUP, length)
         self._send(first + second, deadline)
@@ -110,9 +110,11 @@ class _Connection:
                 number, status, answer = self._reply(deadline)
                 if number == read:
                     return 0, status, answer
-                if number == write and status:
-                    self._cancel(read, in_ep, _IN)
-                    return status, 0, b""
+                if number == write:
+                    if status:
+                        self._cancel(read, in_ep, _IN)
+                        return status, 0, b""
+                    deadline = _deadline(timeout_ms)
         except USBTimeoutError:
             self._cancel(write, out_ep, _OUT)
             self._cancel(read, in_ep, _IN)
@@ -236,16 +238,25 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
         dev_handle.close()
 
     def exchange(
-        self, dev_handle: _Connection, out_ep: int, data: bytes, in_ep: int, size: int, timeout: int
+        self,
+        dev_handle: _Connection,
+        out_ep: int,
+        data: bytes,
+        in_ep: int,
+        size: int,
+        send_timeout: int,
+        timeout: int,
     ) -> bytes:
-        """Bulk write and bulk read in one message; ``timeout`` in ms is for both.
+        """Bulk write and bulk read in one message.
 
+        :param send_timeout: ms for the write.
+        :param timeout: ms for the read, from when the write is done.
         :raises USBTimeoutError: no answer in time.
         :raises USBError: one of the transfers failed, EPIPE where its endpoint is stalled;
             attribute ``endpoint`` says which.
         """
         written, read, answer = dev_handle.exchange(
-            out_ep & 0x0F, data, in_ep & 0x0F, size, timeout
+            out_ep & 0x0F, data, in_ep & 0x0F, size, send_timeout, timeout
         )
         if written or read:
             error = USBError(

@@ -1,0 +1,814 @@
+"""The Dex3-1's USB driver: discovery, opening, exchanging, faults. No process but this one."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import usb.backend.libusb1
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from usb.core import USBError
+
+from dexkit.backends import BackendOptions
+from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb, Server, backend, discovery, find_hand
+from dexkit.drivers.dex3_usb.discovery import parse_server
+from dexkit.drivers.dex3_usb.link import UsbLink
+from dexkit.drivers.dex3_usb.settings import from_options, parse_places
+from dexkit.errors import (
+    HandError,
+    HandLost,
+    HandNotFound,
+    HandRefused,
+    HandTimeout,
+    UsageError,
+)
+from dexkit.hand import HandCommand, JointMode, MotorError, Side
+from dexkit.models import DEX3_1
+from dexkit.wire.dex3_usb import COMMAND_734, COMMAND_1234, PRODUCT_ID, VENDOR_ID, HandCodec
+from tests.dex3_driver_helpers import (
+    Answer,
+    FakeBackend,
+    FakeHand,
+    RawDevice,
+    serving,
+    usb_error,
+)
+
+GO = HandCommand.position(np.full(7, 0.1), kp=1.5, kd=0.2)
+QUICK = Dex3Settings(timeout=0.05, send_timeout=0.05)
+
+
+@pytest.fixture
+def no_usb(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """This machine has libusb and no device, and nothing serves the default port."""
+    empty = FakeBackend(FakeHand())
+    monkeypatch.setattr(empty, "enumerate_devices", list)
+    monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: empty)
+    with socket.socket() as taken:  # bound and not listening: refuses connections
+        taken.bind(("127.0.0.1", 0))
+        monkeypatch.setattr(discovery, "LOCAL_SERVER", Server("127.0.0.1", taken.getsockname()[1]))
+        yield
+
+
+def at(server: Any) -> Server:
+    return parse_server(server.url)[0]
+
+
+def hand_on(server: Any, **values: Any) -> Dex3Usb:
+    return Dex3Usb(
+        Side.LEFT, Dex3Settings(server=at(server), timeout=0.1, send_timeout=0.1, **values)
+    )
+
+
+def fake_hand(fake: FakeBackend, monkeypatch: pytest.MonkeyPatch) -> Dex3Usb:
+    monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: fake)
+    return Dex3Usb(Side.LEFT, QUICK)
+
+
+def exchange_often(hand: Dex3Usb) -> None:
+    for _ in range(1000):
+        hand.exchange(GO)
+
+
+class TestAddress:
+    def test_it_has_a_host_and_perhaps_a_port_and_a_serial_number(self) -> None:
+        assert parse_server("usbip://robot") == (Server("robot", 3240), None)
+        assert parse_server("usbip://10.0.0.5:99/S1") == (Server("10.0.0.5", 99), "S1")
+        assert parse_server("usbip://[::1]:99") == (Server("::1", 99), None)
+        assert str(Server("::1", 99)) == "usbip://[::1]:99"
+
+    @pytest.mark.parametrize(
+        "text",
+        ["robot", "http://robot", "usbip://", "usbip://h:x", "usbip://h/a/b", "usbip://h?x=1"],
+    )
+    def test_anything_else_is_refused_with_an_example(self, text: str) -> None:
+        with pytest.raises(UsageError) as caught:
+            parse_server(text)
+        assert "usbip://" in caught.value.hint
+
+    @given(st.text(max_size=30))
+    @settings(max_examples=100, deadline=None)
+    def test_no_text_does_more_than_be_refused(self, text: str) -> None:
+        for attempt in (text, "usbip://" + text):
+            try:
+                server, _ = parse_server(attempt)
+            except UsageError:
+                continue
+            assert server.host
+
+
+class TestSettings:
+    def options(self, device: str | None = None, **settings: str) -> BackendOptions:
+        return BackendOptions(Side.LEFT, device, settings)
+
+    def test_the_defaults(self) -> None:
+        assert from_options(self.options()) == Dex3Settings()
+
+    def test_all_of_them(self) -> None:
+        found = from_options(
+            self.options(
+                "S1",
+                usb="usbip://h:1",
+                timeout="0.02",
+                send_timeout="0.03",
+                protect="off",
+                frame="734",
+                head="eb90",
+                motors="3.0,3.1,3.2,1.0,1.1,2.0,2.1",
+                out_endpoint="0x04",
+                in_endpoint="133",
+            )
+        )
+        assert found.server == Server("h", 1)
+        assert found.serial == "S1"
+        assert found.layout is COMMAND_734
+        assert found.head == b"\xeb\x90"
+        assert found.bus_map.motors[:2] == ((3, 0), (3, 1))
+        assert (found.protect, found.timeout, found.send_timeout) == (False, 0.02, 0.03)
+        assert (found.out_endpoint, found.in_endpoint) == (0x04, 0x85)
+
+    @pytest.mark.parametrize(
+        ("device", "settings", "server", "serial", "local"),
+        [
+            (None, {}, None, None, True),
+            ("S1", {}, None, "S1", True),
+            (None, {"usb": "system"}, None, None, False),
+            ("usbip://h", {}, Server("h"), None, True),
+            ("usbip://h/S1", {"usb": "usbip://h"}, Server("h"), "S1", True),
+            ("S1", {"usb": "usbip://h/S1"}, Server("h"), "S1", True),
+        ],
+    )
+    def test_where_it_is(
+        self, device: str | None, settings: dict[str, str], server: Any, serial: Any, local: bool
+    ) -> None:
+        found = from_options(self.options(device, **settings))
+        assert (found.server, found.serial, found.local) == (server, serial, local)
+
+    @pytest.mark.parametrize(
+        ("device", "settings"),
+        [
+            (None, {"timeout": "0"}),
+            (None, {"timeout": "x"}),
+            (None, {"timeout": "nan"}),
+            (None, {"protect": "yes"}),
+            (None, {"frame": "1000"}),
+            (None, {"head": "f"}),
+            (None, {"head": "fcfdfe"}),
+            (None, {"motors": "0.0"}),
+            (None, {"motors": "0.0,0.0,0.2,1.0,1.1,2.0,2.1"}),
+            (None, {"motors": "0.15,0.1,0.2,1.0,1.1,2.0,2.1"}),
+            (None, {"motors": "0/1"}),
+            (None, {"sensors": "9.0"}),
+            (None, {"in_endpoint": "0x181"}),
+            (None, {"usb": "tcp://h"}),
+            ("usbip://h", {"usb": "usbip://other"}),
+            ("usbip://h", {"usb": "system"}),
+            ("S1", {"usb": "usbip://h/S2"}),
+        ],
+    )
+    def test_nonsense_is_refused(self, device: str | None, settings: dict[str, str]) -> None:
+        with pytest.raises(UsageError):
+            backend.create(self.options(device, **settings))
+
+    def test_an_unknown_setting_is_refused(self) -> None:
+        with pytest.raises(UsageError, match="no setting 'baud'"):
+            backend.create(self.options(baud="1"))
+
+    @given(st.text(max_size=20))
+    @settings(max_examples=100, deadline=None)
+    def test_places_are_numbers_or_refused(self, text: str) -> None:
+        try:
+            places = parse_places(text)
+        except ValueError:
+            return
+        assert all(bus >= 0 and number >= 0 for bus, number in places)
+
+    def test_the_model_and_its_rate(self) -> None:
+        hand = backend.create(self.options())
+        assert backend.model == DEX3_1.name
+        assert hand.spec.io_rate == 1000.0
+        assert hand.spec.exchange_timeout <= 0.3
+        assert not hand.spec.simulated
+
+
+class TestDiscovery:
+    def test_by_side(self) -> None:
+        left, right = RawDevice(FakeHand()), RawDevice(FakeHand(Side.RIGHT), side=Side.RIGHT)
+        other = RawDevice(FakeHand(), vendor=0x1209)
+        with serving(other, right, left) as server:
+            found = find_hand(Side.LEFT, server=at(server))
+            assert found.side is Side.LEFT
+            assert (left.attachments, right.attachments, other.attachments) == (0, 0, 0)
+            hand = Dex3Usb(Side.RIGHT, Dex3Settings(server=at(server)))
+            with hand:
+                assert right.attachments == 1
+
+    def test_by_serial_number(self) -> None:
+        hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2", None)]
+        with serving(*hands) as server, hand_on(server, serial="A2") as hand:
+            assert hand.serial == "A2"
+            assert hands[1].received
+            assert not hands[0].received
+
+    def test_two_of_a_side_are_listed(self) -> None:
+        hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2")]
+        with (
+            serving(*hands) as server,
+            pytest.raises(HandNotFound, match=r"more than one left.*A1.*A2") as caught,
+        ):
+            hand_on(server).open()
+        assert "--device SERIAL" in caught.value.hint
+
+    def test_the_serial_number_of_the_other_side_is_refused(self) -> None:
+        right = RawDevice(FakeHand(Side.RIGHT), side=Side.RIGHT, serial="R7")
+        with serving(right) as server, pytest.raises(HandRefused, match=r"R7.*right hand"):
+            hand_on(server, serial="R7").open()
+
+    def test_what_there_is_instead_is_named(self) -> None:
+        right = RawDevice(FakeHand(Side.RIGHT), side=Side.RIGHT, serial="R7")
+        with serving(right) as server:
+            with pytest.raises(HandNotFound, match=r"34b7:1010.*there is the right.*R7"):
+                hand_on(server).open()
+            with pytest.raises(HandNotFound, match=r"X9.*there is the right hand R7"):
+                hand_on(server, serial="X9").open()
+
+    def test_nothing_anywhere(self, no_usb: None) -> None:
+        with pytest.raises(HandNotFound, match=r"34b7:1010.*no USB/IP server there") as caught:
+            Dex3Usb(Side.LEFT).open()
+        for word in ("powered", "lsusb -d 34b7:", "dexkit emulate dex3-usb --side left"):
+            assert word in caught.value.hint
+
+    def test_no_server_at_an_address(self, no_usb: None) -> None:
+        with pytest.raises(HandNotFound, match="no USB/IP server at usbip://127") as caught:
+            Dex3Usb(Side.LEFT, Dex3Settings(server=discovery.LOCAL_SERVER)).open()
+        assert "dexkit emulate dex3-usb" in caught.value.hint
+
+    def test_no_libusb(self, no_usb: None, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: None)
+        for local in (True, False):
+            with pytest.raises(HandNotFound, match="libusb is not installed") as caught:
+                Dex3Usb(Side.LEFT, Dex3Settings(local=local)).open()
+            assert "apt install libusb-1.0-0" in caught.value.hint
+
+    def test_the_local_server_is_the_last_resort_and_that_is_said(
+        self,
+        no_usb: None,
+        monkeypatch: pytest.MonkeyPatch,
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        caplog.set_level(logging.INFO)
+        with serving(RawDevice(FakeHand())) as server:
+            monkeypatch.setattr(discovery, "LOCAL_SERVER", at(server))
+            with Dex3Usb(Side.LEFT) as hand:
+                assert hand.serial == "SN1"
+            assert "no left hand on this machine's USB; taking the left Dex3-1 on usbip" in (
+                caplog.text
+            )
+            with pytest.raises(HandNotFound):
+                Dex3Usb(Side.LEFT, Dex3Settings(local=False)).open()
+
+    def test_this_machines_usb_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with serving(RawDevice(FakeHand())) as server:
+            monkeypatch.setattr(discovery, "LOCAL_SERVER", at(server))
+            fake = FakeBackend(FakeHand())
+            with fake_hand(fake, monkeypatch):
+                assert "claim_interface" in fake.calls
+
+    def test_a_server_that_is_none_is_not_found(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+
+            def babble() -> None:
+                peer, _ = listener.accept()
+                with peer:
+                    peer.sendall(b"220 mail.example.org ESMTP\r\n" * 20)
+
+            thread = threading.Thread(target=babble)
+            thread.start()
+            with pytest.raises(HandNotFound, match="Invalid USB/IP DEVLIST reply"):
+                find_hand(Side.LEFT, server=Server("127.0.0.1", listener.getsockname()[1]))
+            thread.join()
+
+
+class TestOpening:
+    """What is asked of libusb, and what becomes of its answers."""
+
+    def test_everything_is_taken_and_given_back(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.kernel_driver = True
+        hand = fake_hand(fake, monkeypatch)
+        hand.open()
+        hand.open()  # is open
+        assert not fake.kernel_driver
+        assert fake.calls.count("claim_interface") == 1
+        assert "set_configuration" not in fake.calls
+        fake.calls.clear()
+        hand.close()
+        hand.close()
+        assert fake.calls == [
+            "bulk_write",
+            "bulk_read",
+            "release_interface",
+            "attach_kernel_driver",
+            "close_device",
+        ]
+        assert fake.kernel_driver
+
+    def test_an_unconfigured_device_is_configured(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.configuration = 0
+        with fake_hand(fake, monkeypatch):
+            assert fake.configuration == 1
+
+    def test_the_first_bulk_endpoints_are_taken_unless_told(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fake = FakeBackend(FakeHand())
+        link = UsbLink(fake, "device", "it")
+        assert (link.endpoints.out, link.endpoints.into) == (0x02, 0x81)
+        link = UsbLink(fake, "device", "it", out_endpoint=0x04, in_endpoint=0x85)
+        assert (link.endpoints.out, link.endpoints.into) == (0x04, 0x85)
+        for wrong in ({"out_endpoint": 0x81}, {"in_endpoint": 0x83}, {"in_endpoint": 0x02}):
+            fake.calls.clear()
+            with pytest.raises(HandRefused, match="no bulk") as caught:
+                UsbLink(fake, "device", "it", **wrong)
+            assert "0x02, 0x81, 0x04, 0x85" in caught.value.hint
+            assert fake.calls[-2:] == ["release_interface", "close_device"]
+        fake.endpoints = [(0x81, 2), (0x02, 3)]
+        with pytest.raises(HandRefused, match="no bulk OUT and IN"):
+            UsbLink(fake, "device", "it")
+
+    @pytest.mark.parametrize("call", ["open_device", "claim_interface", "detach_kernel_driver"])
+    def test_no_permission(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.kernel_driver = True
+        fake.fail[call] = usb_error(errno.EACCES)
+        with pytest.raises(HandRefused, match="no permission") as caught:
+            fake_hand(fake, monkeypatch).open()
+        assert "sudo cp packaging/70-dexkit-dex3.rules /etc/udev/rules.d/" in caught.value.hint
+        assert "udevadm" in caught.value.hint
+        assert ("close_device" in fake.calls) == (call != "open_device")
+
+    def test_no_permission_when_asked_for_a_serial_number(
+        self, no_usb: None, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.fail["open_device"] = usb_error(errno.EACCES)
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: fake)
+        with pytest.raises(HandRefused, match="no permission"):
+            Dex3Usb(Side.LEFT, Dex3Settings(serial="SN1")).open()
+
+    def test_busy(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.fail["claim_interface"] = usb_error(errno.EBUSY)
+        with pytest.raises(HandRefused, match="another program holds") as caught:
+            fake_hand(fake, monkeypatch).open()
+        assert "another dexkit" in caught.value.hint
+        assert "lsof" in caught.value.hint
+        assert "bulk_write" not in fake.calls
+
+    def test_busy_over_usbip(self) -> None:
+        device = RawDevice(FakeHand())
+        with (
+            serving(device) as server,
+            hand_on(server),
+            pytest.raises(HandRefused, match="another program holds"),
+        ):
+            hand_on(server).open()
+
+    @pytest.mark.parametrize("number", [errno.ENODEV, errno.EIO, errno.ENOENT])
+    def test_gone_while_it_is_opened(self, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.fail["claim_interface"] = usb_error(number)
+        with pytest.raises(HandLost):
+            fake_hand(fake, monkeypatch).open()
+        assert fake.calls[-1] == "close_device"
+
+    def test_a_system_without_kernel_drivers(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.fail["is_kernel_driver_active"] = NotImplementedError("as on other systems")
+        with fake_hand(fake, monkeypatch) as hand:
+            hand.exchange(GO)
+
+    def test_no_serial_number_is_no_obstacle(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        fake.fail["ctrl_transfer"] = usb_error(errno.EPIPE)
+        with fake_hand(fake, monkeypatch) as hand:
+            assert hand.serial == ""
+
+    def test_the_rule_is_for_both_hands(self) -> None:
+        path = Path(__file__).parents[1] / "packaging" / "70-dexkit-dex3.rules"
+        active = re.findall(
+            r'^SUB.*idVendor}=="(\w+)".*idProduct}=="(\w+)"', path.read_text(), re.M
+        )
+        assert active == [(f"{VENDOR_ID:04x}", f"{PRODUCT_ID[side]:04x}") for side in Side]
+
+    def test_a_device_that_says_nothing(self) -> None:
+        device = RawDevice(lambda data: [])
+        with serving(device) as server:
+            hand = hand_on(server)
+            before = time.monotonic()
+            with pytest.raises(HandTimeout, match="does not answer") as caught:
+                hand.open()
+            assert time.monotonic() - before < 2.0
+            assert "--set frame=734" in caught.value.hint
+            assert device.plugged  # and is free again:
+            device.script = FakeHand()
+            hand.open()
+            hand.close()
+
+    def test_nothing_moves(self) -> None:
+        device = RawDevice(FakeHand())
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        with serving(device) as server, hand_on(server):
+            pass
+        assert len(device.received) >= 2  # at opening and at closing
+        for data in device.received:
+            command = codec.decode_command(data).command
+            assert command.is_brake
+            assert command.timeout is not None
+            assert not command.timeout.any()
+
+    def test_a_motor_that_is_elsewhere_is_refused(self) -> None:
+        fake = FakeHand()
+        fake.silent = (2, 6)
+        with (
+            serving(RawDevice(fake)) as server,
+            pytest.raises(HandRefused, match=r"thumb_2 \(bus 0 id 2\), index_1") as caught,
+        ):
+            hand_on(server).open()
+        assert "0.0, 0.1, 1.0, 1.1, 2.0" in caught.value.hint
+        assert "--set motors=" in caught.value.hint
+
+
+class TestExchange:
+    def test_one_send_one_receive(self) -> None:
+        device = RawDevice(FakeHand())
+        with serving(device) as server, hand_on(server) as hand:
+            sent = len(device.received)
+            for count in range(1, 20):
+                state = hand.exchange(GO)
+                assert len(device.received) == sent + count
+                assert state.q[0] == pytest.approx(device.script.q(device.script.count), abs=1e-4)  # type: ignore[attr-defined]
+                assert abs(state.stamp - time.monotonic()) < 1.0
+
+    @pytest.mark.parametrize("layout", [COMMAND_1234, COMMAND_734])
+    def test_what_is_on_the_wire(self, layout: Any) -> None:
+        device = RawDevice(FakeHand())
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        q = np.array([0.1, 0.2, 0.3, -0.4, -0.5, -0.6, -0.7])
+        with (
+            serving(device) as server,
+            hand_on(server, layout=layout, head=b"\xeb\x90") as hand,
+        ):
+            hand.exchange(HandCommand.position(q, kp=1.5, kd=0.2))
+        data = device.received[-2]
+        assert len(data) == layout.size
+        assert data[:2] == b"\xeb\x90"
+        decoded = codec.decode_command(data)
+        assert decoded.command.q == pytest.approx(q, abs=1e-5)
+        assert decoded.command.kp == pytest.approx(np.full(7, 1.5), rel=0.03)
+        assert decoded.command.mode.tolist() == [JointMode.FOC] * 7
+        assert decoded.command.timeout is not None
+        assert decoded.command.timeout.all()
+
+    def test_protection_can_be_left_off(self) -> None:
+        device = RawDevice(FakeHand())
+        with serving(device) as server, hand_on(server, protect=False) as hand:
+            hand.exchange(GO)
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        for data in device.received:
+            timeout = codec.decode_command(data).command.timeout
+            assert timeout is not None
+            assert not timeout.any()
+
+    def test_a_tripped_motor_is_locked_once_and_reported(self) -> None:
+        fake = FakeHand()
+        device = RawDevice(fake)
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        with serving(device) as server, hand_on(server) as hand:
+            hand.exchange(GO)
+            fake.tripped[[1, 4]] = True
+            state = hand.exchange(GO)
+            assert np.flatnonzero(state.fault).tolist() == [1, 4]
+            assert state.fault[1] == int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
+            fake.tripped[:] = False
+            state = hand.exchange(GO)
+            assert not state.fault.any()
+            locked = codec.decode_command(device.received[-1]).command
+            assert np.flatnonzero(locked.mode == 0).tolist() == [1, 4]
+            assert locked.timeout is not None
+            assert np.flatnonzero(~locked.timeout).tolist() == [1, 4]
+            assert not locked.kp[[1, 4]].any()
+            hand.exchange(GO)
+            again = codec.decode_command(device.received[-1]).command
+            assert again.mode.all()
+            assert again.timeout is not None
+            assert again.timeout.all()
+            assert hand.statistics.trips == 1
+
+    def test_error_bits_come_through(self) -> None:
+        fake = FakeHand()
+        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+            fake.fault[3] = int(MotorError.OVERCURRENT | MotorError.CASE_TEMPERATURE)
+            state = hand.exchange(GO)
+            assert state.fault.tolist() == [0, 0, 0, 0x81, 0, 0, 0]
+
+    def test_a_motor_that_falls_silent_keeps_its_state_and_is_reported(self) -> None:
+        fake = FakeHand()
+        lost = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+            before = hand.exchange(GO)
+            fake.silent = (0, 5)
+            for count in range(1, 21):
+                state = hand.exchange(GO)
+                assert state.q[0] == before.q[0]
+                assert state.temperature[0] == 30.0
+                assert state.winding_temperature is not None
+                assert not np.isnan(state.winding_temperature).any()
+                assert state.mode.tolist() == [1] * 7
+                assert np.flatnonzero(state.fault).tolist() == ([0, 5] if count >= 10 else [])
+            assert state.fault[5] == lost
+            fake.silent = ()
+            state = hand.exchange(GO)
+            assert not state.fault.any()
+            assert state.q[0] != before.q[0]
+            assert hand.exchange(GO).q[0] != state.q[0]
+
+    def test_a_damaged_packet_is_lost_alone(self) -> None:
+        from dexkit.wire.crc32 import crc32_words
+
+        def spoil(answer: bytes) -> bytes:
+            data = bytearray(answer)
+            data[26 + 10] ^= 0x40  # position of the first motor on bus 0
+            data[1266:] = crc32_words(bytes(data[2:1266])).to_bytes(4, "little")
+            return bytes(data)
+
+        fake = FakeHand()
+        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+            before = hand.exchange(GO)
+            fake.spoil = spoil
+            state = hand.exchange(GO)
+            assert state.q[0] == before.q[0]
+            assert hand.statistics.damaged_packets == 1
+            assert hand.statistics.damaged_frames == 0
+            fake.spoil = lambda answer: answer
+            assert hand.exchange(GO).q[0] != before.q[0]
+
+    @pytest.mark.parametrize(
+        "damage",
+        [
+            lambda a: a[:1000],
+            lambda a: b"",
+            lambda a: a + b"\0",
+            lambda a: a + bytes(700),
+            lambda a: a[:100] + b"\xff" + a[101:],
+            lambda a: b"\0" + a[1:],
+        ],
+        ids=["short", "empty", "long", "longer", "crc", "head"],
+    )
+    def test_a_damaged_frame_is_no_answer_and_the_next_one_is(self, damage: Any) -> None:
+        fake = FakeHand()
+        device = RawDevice(fake)
+        with serving(device) as server, hand_on(server) as hand:
+            hand.exchange(GO)
+            fake.spoil = damage
+            with pytest.raises(HandTimeout, match="no intact answer"):
+                hand.exchange(GO)
+            assert hand.statistics.damaged_frames == 1
+            fake.spoil = lambda answer: answer
+            state = hand.exchange(GO)
+            assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
+
+    def test_not_open(self) -> None:
+        with pytest.raises(HandLost, match="not open"):
+            Dex3Usb(Side.LEFT).exchange(GO)
+
+
+class LateHand(FakeHand):
+    """Answers the command that comes ``next_late`` seconds late, or never."""
+
+    next_late: float | None = 0.0
+
+    def __call__(self, data: bytes) -> Answer:
+        late, self.next_late = self.next_late, 0.0
+        state = self.state()
+        return [] if late is None else [(late, state)]
+
+
+class TestLateAnswers:
+    """An answer belongs to the command that it follows, however late it comes."""
+
+    @pytest.mark.parametrize("late", [0.105, 0.115, 0.15, 0.3])
+    def test_over_usbip(self, late: float) -> None:
+        fake = LateHand()
+        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+            hand.exchange(GO)
+            fake.next_late = late
+            before = time.monotonic()
+            with pytest.raises(HandTimeout):
+                hand.exchange(GO)
+            assert time.monotonic() - before >= 0.09
+            until = time.monotonic() + 0.4
+            good = 0
+            while time.monotonic() < until:
+                try:
+                    state = hand.exchange(GO)
+                except HandTimeout:
+                    continue
+                good += 1
+                assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
+            assert good
+            assert hand.statistics.link.late == hand.statistics.link.timeouts
+
+    def test_a_lost_one_costs_its_time_only(self) -> None:
+        fake = LateHand()
+        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+            fake.next_late = None
+            with pytest.raises(HandTimeout):
+                hand.exchange(GO)
+            for _ in range(5):
+                state = hand.exchange(GO)
+                assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
+            assert hand.statistics.link.late == 0
+            assert hand.statistics.link.timeouts == 1
+
+    def test_on_libusb(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        with fake_hand(fake, monkeypatch) as hand:
+            hand.exchange(GO)
+            kept: list[bytes] = []
+            script = fake.script
+
+            def late(data: bytes) -> Answer:
+                kept.extend(answer for _, answer in script(data))
+                return []
+
+            fake.script = late
+            with pytest.raises(HandTimeout):
+                hand.exchange(GO)
+            fake.script = script
+            fake.pending += kept
+            state = hand.exchange(GO)
+            assert state.q[0] == pytest.approx(script.q(script.count), abs=1e-4)  # type: ignore[attr-defined]
+            assert hand.statistics.link.late == 1
+
+    def test_a_leftover_of_whoever_had_the_hand_before(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        script = FakeHand()
+        fake = FakeBackend(script)
+        fake.pending.append(script.state())
+        with fake_hand(fake, monkeypatch) as hand:
+            state = hand.exchange(GO)
+            assert state.q[0] == pytest.approx(script.q(script.count), abs=1e-4)
+
+
+class TestTroubleOnTheWay:
+    @pytest.mark.parametrize(
+        ("call", "number", "expected"),
+        [
+            ("bulk_write", errno.ENODEV, HandLost),
+            ("bulk_read", errno.ENODEV, HandLost),
+            ("bulk_read", errno.EIO, HandLost),
+            ("bulk_write", errno.ETIMEDOUT, HandTimeout),
+            ("bulk_read", errno.EINTR, HandTimeout),
+            ("bulk_read", errno.EOVERFLOW, HandError),
+            ("bulk_read", errno.ENOMEM, HandError),
+            ("bulk_write", errno.EACCES, HandRefused),
+        ],
+    )
+    def test_what_libusb_says(
+        self,
+        call: str,
+        number: int,
+        expected: type[HandError],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        fake = FakeBackend(FakeHand())
+        with fake_hand(fake, monkeypatch) as hand:
+            fake.fail[call] = usb_error(number)
+            with pytest.raises(expected) as caught:
+                hand.exchange(GO)
+            assert type(caught.value) is expected
+
+    def test_an_error_without_a_number(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        with fake_hand(fake, monkeypatch) as hand:
+            fake.fail["bulk_write"] = USBError("Unknown error", -99, None)
+            with pytest.raises(HandError, match="Unknown error"):
+                hand.exchange(GO)
+
+    @pytest.mark.parametrize("call", ["bulk_write", "bulk_read"])
+    def test_a_stalled_endpoint_is_cleared(
+        self, call: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fake = FakeBackend(FakeHand())
+        with fake_hand(fake, monkeypatch) as hand:
+            fake.fail[call] = usb_error(errno.EPIPE)
+            with pytest.raises(HandTimeout, match=r"stalled its (OUT|IN) endpoint"):
+                hand.exchange(GO)
+            assert fake.calls[-1] == "clear_halt"
+            fake.fail.clear()
+            hand.exchange(GO)
+            assert hand.statistics.link.stalls == 1
+
+    @pytest.mark.parametrize("which", ["out", "into"])
+    def test_a_stalled_endpoint_over_usbip(self, which: str) -> None:
+        fake = FakeHand()
+        device = RawDevice(fake)
+        with serving(device) as server, hand_on(server) as hand:
+            hand.exchange(GO)
+            server.call(getattr(device.pipes, which).stall)
+            with pytest.raises(HandTimeout, match="stalled its"):
+                exchange_often(hand)
+            for _ in range(5):
+                state = hand.exchange(GO)
+                assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
+
+    def test_a_halt_that_cannot_be_cleared(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        with fake_hand(fake, monkeypatch) as hand:
+            fake.fail["bulk_read"] = usb_error(errno.EPIPE)
+            fake.fail["clear_halt"] = usb_error(errno.ENODEV)
+            with pytest.raises(HandLost):
+                hand.exchange(GO)
+
+    def test_a_command_that_is_not_taken_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        with fake_hand(fake, monkeypatch) as hand:
+            monkeypatch.setattr(fake, "bulk_write", lambda *args: 512)
+            with pytest.raises(HandTimeout, match="took 512 of the 1234"):
+                hand.exchange(GO)
+
+    def test_closing_a_hand_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = FakeBackend(FakeHand())
+        hand = fake_hand(fake, monkeypatch)
+        hand.open()
+        for call in ("bulk_write", "release_interface", "attach_kernel_driver", "close_device"):
+            fake.fail[call] = usb_error(errno.ENODEV)
+        hand.close()
+        assert fake.calls[-1] == "close_device"
+        with pytest.raises(HandLost):
+            hand.exchange(GO)
+
+    def test_the_cable_is_pulled_and_put_back(self) -> None:
+        device = RawDevice(FakeHand())
+        with serving(device) as server:
+            hand = hand_on(server)
+            hand.open()
+            hand.exchange(GO)
+            device.plugged = False
+            with pytest.raises(HandLost):
+                exchange_often(hand)
+            with pytest.raises(HandLost):
+                hand.exchange(GO)  # it does not come back by itself
+            hand.close()
+            with pytest.raises(HandNotFound):
+                hand.open()
+            device.plugged = True
+            hand.open()
+            assert hand.exchange(GO).q.shape == (7,)
+            hand.close()
+
+    def test_a_server_that_stops_answering(self) -> None:
+        """Time-outs are kept by the client, whatever the server does."""
+        frozen = threading.Event()
+        fake = FakeHand()
+
+        def script(data: bytes) -> Answer:
+            if len(device.received) == 3:
+                frozen.wait(5.0)  # the server's only thread
+            return fake(data)
+
+        device = RawDevice(script)
+        with serving(device) as server:
+            hand = hand_on(server)
+            hand.open()
+            hand.exchange(GO)
+            for _ in range(3):
+                before = time.monotonic()
+                with pytest.raises(HandTimeout):
+                    hand.exchange(GO)
+                assert time.monotonic() - before < hand.spec.exchange_timeout + 0.5
+            frozen.set()
+            until = time.monotonic() + 5.0
+            while True:
+                try:
+                    state = hand.exchange(GO)
+                except HandTimeout:
+                    assert time.monotonic() < until
+                    continue
+                if state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4):
+                    break
+                assert time.monotonic() < until
+            hand.close()
