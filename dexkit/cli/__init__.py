@@ -22,7 +22,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("dexkit.cli.calibrate", "Find a gripper's zero and speed and store them."),
     "check": ("dexkit.cli.check", "Judge a recording against the requirements."),
     "demo": ("dexkit.cli.demo", "The whole story on emulators, in under a minute."),
-    "emulate": ("dexkit.cli.emulate", "Emulate a device on a pseudo-terminal."),
+    "emulate": ("dexkit.cli.emulate", "Emulate a device, on a pseudo-terminal or USB/IP."),
     "info": ("dexkit.cli.info", "Say what is in a recording."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),

@@ -1,4 +1,4 @@
-"""``dexkit emulate``: emulated devices on a pseudo-terminal."""
+"""``dexkit emulate mx64``: an emulated gripper on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -7,26 +7,20 @@ import json
 import os
 import sys
 import tempfile
-import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import click
 
-from dexkit.cli.common import StopRequest, stop_on_signals
+from dexkit.cli.common import stop_on_signals
+from dexkit.cli.emulate.stdin import read_faults
 from dexkit.clock import RealClock
-from dexkit.errors import DexkitError, EmulatorError
+from dexkit.errors import EmulatorError
 from dexkit.wire import mx64
 
-__all__ = ["command"]
+__all__ = ["emulate_mx64"]
 
 
-@click.group()
-def command() -> None:
-    """Emulate a device on a pseudo-terminal."""
-
-
-@command.command("mx64", context_settings={"show_default": True})
+@click.command("mx64", context_settings={"show_default": True})
 @click.option("--link", required=True, metavar="PATH", help="Link that clients open.")
 @click.option(
     "--id",
@@ -154,11 +148,7 @@ def emulate_mx64(
                 servo.on_eeprom = lambda: store.save([s.eeprom for s in servos])
         with Port(bus, link, check_baudrate=not any_baudrate) as port:
             if faults_from_stdin:
-                threading.Thread(
-                    target=_read_faults,
-                    args=(lambda spec: port.inject(parse_fault(spec)), request),
-                    daemon=True,
-                ).start()
+                read_faults(lambda spec: port.inject(parse_fault(spec)), request)
             port.start()
             answering = ",".join(
                 [str(s.id) for s in bus.servos] + [str(s.id) for s in bus.protocol_1]
@@ -173,21 +163,6 @@ def emulate_mx64(
         if port.overruns:
             summary += f", {port.overruns} bytes not read by the client"
         click.echo(f"stopped: {summary}")
-
-
-def _read_faults(inject: Callable[[str], None], request: StopRequest) -> None:
-    # not sys.stdin: a daemon thread inside a buffered reader can crash the interpreter's exit
-    pending = b""
-    while data := os.read(0, 4096):
-        *lines, pending = (pending + data).split(b"\n")
-        for line in lines:
-            if not line.strip():
-                continue
-            try:
-                inject(line.decode(errors="replace"))
-            except DexkitError as error:
-                click.echo(f"error: {error.message}", err=True)
-    request.set()
 
 
 class _EepromFile:

@@ -1,0 +1,45 @@
+"""``dexkit emulate``: emulated devices, each on the kind of port that the real one has."""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+__all__ = ["command"]
+
+# name -> (module, attribute, one-line help); the help is here so that a listing imports nothing
+_DEVICES = {
+    "dex3-usb": (
+        "dexkit.cli.emulate.dex3_usb",
+        "emulate_dex3_usb",
+        "Emulate a Dex3-1 hand on USB (USB/IP).",
+    ),
+    "mx64": (
+        "dexkit.cli.emulate.mx64",
+        "emulate_mx64",
+        "Emulate a MX-64 with an EZGripper on a pseudo-terminal.",
+    ),
+}
+
+
+class _Devices(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(_DEVICES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        entry = _DEVICES.get(cmd_name)
+        if entry is None:
+            return None
+        command = getattr(importlib.import_module(entry[0]), entry[1])
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, _DEVICES[name][2]) for name in sorted(_DEVICES)])
+
+
+@click.command(cls=_Devices)
+def command() -> None:
+    """Emulate a device, so that programs can be tried without it."""

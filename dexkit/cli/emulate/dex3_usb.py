@@ -1,0 +1,129 @@
+"""``dexkit emulate dex3-usb``: an emulated Dex3-1 on USB/IP."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from dexkit.cli.common import stop_on_signals
+from dexkit.cli.emulate.stdin import read_faults
+from dexkit.errors import EmulatorError
+from dexkit.hand import Side
+
+__all__ = ["emulate_dex3_usb"]
+
+
+def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
+    try:
+        return int(value, 0)
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not an endpoint address such as 0x81") from None
+
+
+@click.command("dex3-usb", context_settings={"show_default": True})
+@click.option(
+    "--side", type=click.Choice(["left", "right", "both"]), default="left", help="Which hand."
+)
+@click.option(
+    "--serial",
+    "serials",
+    multiple=True,
+    metavar="S",
+    help="Serial number; with --side both, give two.  [default: 2024061800 and 2024061801]",
+)
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=3240, help="TCP port; 0 takes a free one."
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    metavar="ADDRESS",
+    help="Address to serve on. Whoever reaches it can move the hand: there is no password.",
+)
+@click.option(
+    "--object",
+    "object_pct",
+    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    metavar="PCT",
+    help="How far the fingers close until they touch an object.  [default: no object]",
+)
+@click.option(
+    "--start",
+    type=click.FloatRange(0, 100),
+    metavar="PCT",
+    help="How far they are closed at first.  [default: at rest, about 20]",
+)
+@click.option(
+    "--out-endpoint", callback=_endpoint, default="0x02", metavar="EP", help="Bulk OUT endpoint."
+)
+@click.option(
+    "--in-endpoint", callback=_endpoint, default="0x81", metavar="EP", help="Bulk IN endpoint."
+)
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="SPEC",
+    help="Have a fault, e.g. unplug@5s:for=2s, silent:id=3, drop:p=0.05; may be repeated.",
+)
+@click.option(
+    "--faults-from-stdin",
+    is_flag=True,
+    help="Also take faults as lines of input, and stop at its end.",
+)
+@click.option("--seed", type=int, default=0, help="Of the faults' chance.")
+def emulate_dex3_usb(
+    side: str,
+    serials: tuple[str, ...],
+    port: int,
+    host: str,
+    object_pct: float | None,
+    start: float | None,
+    out_endpoint: int,
+    in_endpoint: int,
+    faults: tuple[str, ...],
+    faults_from_stdin: bool,
+    seed: int,
+) -> None:
+    """Emulate a Dex3-1 hand on USB, served by USB/IP.
+
+    Prints "ready: URL SIDE ..." for each hand when it can be attached. Ctrl-C or SIGTERM ends it.
+    """
+    from dexkit.emulators.dex3_mcu import Dex3Hands
+
+    sides = tuple(Side) if side == "both" else (Side(side),)
+    with (
+        stop_on_signals() as request,
+        Dex3Hands(
+            sides,
+            host=host,
+            port=port,
+            serials=serials,
+            object_pct=object_pct,
+            start=start,
+            out_endpoint=out_endpoint,
+            in_endpoint=in_endpoint,
+            faults=faults,
+            seed=seed,
+        ) as hands,
+    ):
+        if faults_from_stdin:
+            read_faults(hands.inject, request)
+        click.echo("\n".join([*hands.ready_lines, *_how_to(hands.url, host, hands.busids)]))
+        sys.stdout.flush()
+        while not request.wait(0.2):
+            if hands.error is not None:
+                raise EmulatorError(f"the emulator stopped: {hands.error}") from hands.error
+        for one in sides:
+            summary = hands.device(one).counters.summary() or "nothing was sent"
+            click.echo(f"stopped: {one}: {summary}")
+
+
+def _how_to(url: str, host: str, busids: list[str]) -> list[str]:
+    port = url.rsplit(":", 1)[1]
+    tcp = "" if port == "3240" else f"--tcp-port {port} "
+    lines = ["as a USB device of a Linux host (as root): modprobe vhci-hcd"]
+    lines += [f"  usbip {tcp}attach -r {host} -b {busid}" for busid in busids]
+    lines += ["  lsusb -d 34b7:", f"without kernel support: dexkit serve dex3-usb --usb {url}"]
+    return lines

@@ -1,0 +1,143 @@
+"""A body's state as a frame, at a thousand a second.
+
+The bytes are those of :meth:`dexkit.wire.dex3_usb.HandCodec.encode_state`, which takes a whole
+:class:`~dexkit.hand.HandState` apart for every frame; this writes what changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dexkit.emulators.dex3_body import Dex3Body
+from dexkit.hand import MotorError
+from dexkit.models import DEX3_1
+from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.dex3_usb import (
+    MOTOR_STATE,
+    N_BUSES,
+    SENSOR_STATE,
+    STATE,
+    STATE_BUS_SIZE,
+    BusMap,
+    units,
+)
+
+__all__ = ["AnswerWriter"]
+
+_TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
+
+
+class AnswerWriter:
+    """Writes the state frames of one body.
+
+    :param bus_map: which packet is whose.
+    :param model: ``mode[0]`` of the frames.
+    """
+
+    def __init__(self, body: Dex3Body, bus_map: BusMap, model: int) -> None:
+        self._body = body
+        self._map = bus_map
+        self._model = model
+        self._factors = [
+            tuple(
+                scale.factor(joint.gear_ratio) * units.NUDGE
+                for scale in (units.TORQUE, units.VELOCITY, units.POSITION)
+            )
+            for joint in DEX3_1.joints[body.side]
+        ]
+        self._pressure = b""
+        self._sensors = [b""] * len(bus_map.sensors)
+
+    def frame(self, motors: Sequence[int], tripped: Sequence[bool]) -> bytes:
+        """A state frame of the body as it is now.
+
+        :param motors: indices of those that answer.
+        :param tripped: whether each motor's time-out protection has tripped.
+        """
+        body = self._body
+        buses = [b""] * N_BUSES
+        packets = self._motor_packets(tripped)
+        for index in motors:
+            buses[self._map.motors[index][0]] += packets[index]
+        self._renew_sensors()
+        for (bus, _), packet in zip(self._map.sensors, self._sensors, strict=True):
+            buses[bus] += packet
+        supply, imu = body.supply, body.imu
+        data = STATE.pack(
+            STATE.head,
+            self._model,
+            int(any(tripped)),
+            bytes([body.fans] * 2),
+            *map(len, buses),
+            b"".join(bus.ljust(STATE_BUS_SIZE, b"\0") for bus in buses),
+            *(units.VOLTAGE.encode(v) for v in (supply.power_v, supply.system_v, supply.device_v)),
+            units.CURRENT.encode(supply.power_a),
+            *(units.ACCELERATION.encode(a) for a in imu.accelerometer),
+            *(units.ROTATION.encode(w) for w in imu.gyroscope),
+            0,
+            *(0,) * 4,
+            0,
+        )
+        return data[:-4] + crc32_words(data[2:-4]).to_bytes(4, "little")
+
+    def _motor_packets(self, tripped: Sequence[bool]) -> list[bytes]:
+        body = self._body
+        volts = units.MOTOR_VOLTAGE.encode(body.motor_v)
+        pack = MOTOR_STATE.struct.pack
+        packets = []
+        for (_, number), factors, mode, trip, error, case, winding, tau, dq, q in zip(
+            self._map.motors,
+            self._factors,
+            body.mode,
+            tripped,
+            body.errors,
+            body.temperature.tolist(),
+            body.winding_temperature.tolist(),
+            body.tau.tolist(),
+            body.dq.tolist(),
+            body.q.tolist(),
+            strict=True,
+        ):
+            torque, speed, position = factors
+            data = pack(
+                MOTOR_STATE.head,
+                number | mode << 4 | trip << 7,
+                _within(case, -128, 127),
+                _within(winding, 0, 255),
+                volts,
+                _within(tau * torque, -0x8000, 0x7FFF),
+                _within(dq * speed, -0x8000, 0x7FFF),
+                _within(q * position, -0x80000000, 0x7FFFFFFF),
+                error | _TRIPPED if trip else error,
+                0,
+                0,
+                0,
+            )
+            packets.append(data[:-4] + crc32_words(data[2:-4]).to_bytes(4, "little"))
+        return packets
+
+    def _renew_sensors(self) -> None:
+        """Write the sensor packets again, if anything is felt otherwise than before."""
+        pressure = self._body.pressure
+        key = pressure.tobytes()
+        if key == self._pressure:
+            return
+        self._pressure = key
+        scale = units.PRESSURE
+        with np.errstate(invalid="ignore"):
+            counts = np.clip(pressure * (scale.factor() * units.NUDGE), scale.low, scale.high)
+            counts = np.floor(counts)
+        counts[counts == units.NO_VALUE] += 1.0  # a real reading is never "no value"
+        counts[np.isnan(pressure)] = units.NO_VALUE
+        rows = counts.astype("<u2")
+        heat = np.nan_to_num(self._body.sensor_temperature).astype("i1")
+        for i, (_, number) in enumerate(self._map.sensors):
+            data = SENSOR_STATE.head + bytes([number, 0]) + rows[i].tobytes() + heat[i].tobytes()
+            self._sensors[i] = data + crc32_words(data).to_bytes(4, "little")
+
+
+def _within(value: float, low: int, high: int) -> int:
+    count = int(value)
+    return low if count < low else high if count > high else count

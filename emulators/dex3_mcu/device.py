@@ -1,0 +1,294 @@
+"""The Dex3-1's processor and its seven motors, sans-IO: a frame in, a frame out.
+
+The processor takes a frame apart, hands each motor its packet, and answers with the state of that
+moment. Each motor keeps its last command and watches over its own time-out protection, whatever
+becomes of USB: a cable that is pulled does not stop a motor, its protection does.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from dexkit.clock import Clock, RealClock
+from dexkit.emulators.dex3_body import AMBIENT, STEP, Dex3Body
+from dexkit.emulators.dex3_mcu.answer import AnswerWriter
+from dexkit.emulators.dex3_mcu.settings import Firmware
+from dexkit.emulators.faults import Fault, FaultSchedule
+from dexkit.errors import ChecksumError, WireError
+from dexkit.hand import JointMode, MotorError, Side
+from dexkit.models import DEX3_1
+from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP, BusMap, HandCodec
+
+__all__ = ["Counters", "Dex3Mcu"]
+
+_MOST_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
+_HOT_SLICE = 0.05  # seconds between which a motor held hot may cool
+
+
+@dataclass
+class Counters:
+    """What the hand has seen and done."""
+
+    frames: int = 0
+    answers: int = 0
+    bad_size: int = 0
+    bad_crc: int = 0
+    damaged_packets: int = 0  # lost in good frames, and packets for motors that are not there
+    ignored_packets: int = 0  # good ones that a motor did not take
+    broadcasts: int = 0
+    trips: int = 0
+    unread: int = 0  # answers that made room for a newer one
+    dropped: int = 0
+    corrupted: int = 0
+    delayed: int = 0
+
+    def summary(self) -> str:
+        """One line for the end of a run: what is not zero."""
+        return ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in vars(self).items() if v)
+
+
+class _Motor:
+    """What one motor knows."""
+
+    __slots__ = ("deadline", "silent", "tripped")
+
+    def __init__(self) -> None:
+        self.deadline = math.inf  # when the protection trips
+        self.tripped = False
+        self.silent = False
+
+
+class Dex3Mcu:
+    """One Dex3-1, from its USB endpoints inwards.
+
+    :param body: of the same side; its own by default.
+    :param clock: real time unless given; with a manual clock the hand is deterministic.
+    :param faults: to come, times counted from now. Those for the other side are left out.
+    :param seed: of the faults' chance.
+
+    :ivar plugged: the USB cable is in. The motors' power is another cable.
+    :ivar late: seconds by which the last answer is to be held back.
+    :ivar on_stall: called with ``"in"`` or ``"out"`` when that endpoint shall halt.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        *,
+        body: Dex3Body | None = None,
+        clock: Clock | None = None,
+        firmware: Firmware | None = None,
+        bus_map: BusMap = DEFAULT_BUS_MAP,
+        faults: Sequence[Fault] = (),
+        seed: int = 0,
+    ) -> None:
+        self.side = side
+        self.body = body or Dex3Body(side)
+        self.firmware = firmware or Firmware()
+        self.counters = Counters()
+        self.plugged = True
+        self.late = 0.0
+        self.on_stall: Callable[[str], None] = lambda endpoint: None
+        self._codec = HandCodec(DEX3_1.joints[side], bus_map)
+        self._writer = AnswerWriter(self.body, bus_map, self.firmware.model_code)
+        self._clock: Clock = clock or RealClock()
+        self._random = random.Random(seed)
+        self._motors = [_Motor() for _ in DEX3_1.joints[side]]
+        self._origin = self._now = self._clock.now()
+        self._steps = 0
+        self._hot: dict[int, float] = {}
+        self._overcurrent: set[int] = set()
+        self.schedule = FaultSchedule(start=self._origin)
+        for fault in faults:
+            self.inject(fault)
+
+    # --- time and faults
+
+    def inject(self, fault: Fault) -> None:
+        """Have a fault, its time counted from now."""
+        if fault.side in (None, self.side):
+            self.schedule.add(fault, self._clock.now())
+
+    @property
+    def next_time(self) -> float | None:
+        """When a fault begins or ends next, or None."""
+        return self.schedule.next_time
+
+    @property
+    def tripped(self) -> list[bool]:
+        """Which motors' time-out protection has tripped."""
+        return [motor.tripped for motor in self._motors]
+
+    def advance(self) -> None:
+        """Let the motors live, and faults strike, up to now."""
+        now = self._clock.now()
+        while self._now < now or self.schedule.next_time is not None:
+            following = self.schedule.next_time
+            until = now if following is None else min(now, following)
+            until = min(until, *(motor.deadline for motor in self._motors))
+            if self._hot:
+                until = min(until, self._now + _HOT_SLICE)
+            self._live(max(until, self._now))
+            for index, motor in enumerate(self._motors):
+                if motor.deadline <= self._now:
+                    self._trip(index)
+            for fault, begins in self.schedule.poll(self._now):
+                self._strike(fault, begins)
+            for index, celsius in self._hot.items():
+                self.body.heat(index, celsius)
+            if until >= now:
+                return
+
+    def _live(self, until: float) -> None:
+        self._now = until
+        due = int((until - self._origin) / STEP + 1e-6)
+        most = int(_MOST_CATCH_UP / STEP)
+        if due - self._steps > most:
+            self._steps = due - most
+        if due > self._steps:
+            self.body.step(due - self._steps)
+            self._steps = due
+
+    def _trip(self, index: int) -> None:
+        motor = self._motors[index]
+        motor.deadline = math.inf
+        motor.tripped = True
+        self.counters.trips += 1
+        # without gains FOC is limp
+        mode = JointMode.BRAKE if self.firmware.tripped_brakes else JointMode.FOC
+        self.body.command(index, mode)
+
+    def _strike(self, fault: Fault, begins: bool) -> None:
+        kind = fault.kind
+        if kind in ("stall", "stall-out"):
+            self.on_stall("in" if kind == "stall" else "out")
+            return
+        if kind == "unplug":
+            self.plugged = not self.schedule.of("unplug")
+            return
+        silent, stuck, overcurrent = (
+            {
+                index
+                for active in self.schedule.of(name)
+                for index in range(len(self._motors))
+                if active.device in (None, index)
+            }
+            for name in ("silent", "stuck", "overcurrent")
+        )
+        hot = {
+            index: active["c"]
+            for active in self.schedule.of("overheat")
+            for index in range(len(self._motors))
+            if active.device in (None, index)
+        }
+        for index, motor in enumerate(self._motors):
+            motor.silent = index in silent
+            self.body.jam(index, index in stuck)
+            if index in overcurrent and index not in self._overcurrent:
+                self.body.fail(index, MotorError.OVERCURRENT)
+            elif index in self._overcurrent and index not in overcurrent:
+                self.body.recover(index, MotorError.OVERCURRENT)
+            if index in self._hot and index not in hot:
+                self.body.heat(index, AMBIENT)
+        self._overcurrent, self._hot = overcurrent, hot
+
+    # --- frames
+
+    def exchange(self, data: bytes) -> bytes | None:
+        """Take what the host sent in one transfer; the answer, or None where it is silent.
+
+        :attr:`late` then says how long the answer is to be held back.
+        """
+        self.advance()
+        self.counters.frames += 1
+        answering: list[int] | None = None
+        try:
+            answering = self._obey(data)
+        except ChecksumError:
+            self.counters.bad_crc += 1
+        except WireError:
+            self.counters.bad_size += 1
+        if answering is None:
+            if not self.firmware.answer_bad_frame:
+                return None
+            answering = list(range(len(self._motors)))
+        return self._send(self.state(answering))
+
+    def _obey(self, data: bytes) -> list[int]:
+        """Hand each motor its packet; the motors that answer.
+
+        :raises WireError: the frame is not one.
+        """
+        decoded = self._codec.decode_command(data)
+        counters = self.counters
+        counters.damaged_packets += len(decoded.problems)
+        command = decoded.command
+        assert command.timeout is not None
+        present, silent = decoded.present.tolist(), decoded.silent.tolist()
+        counters.broadcasts += any(silent)
+        values = zip(
+            command.mode.tolist(),
+            command.timeout.tolist(),
+            command.q.tolist(),
+            command.dq.tolist(),
+            command.tau.tolist(),
+            command.kp.tolist(),
+            command.kd.tolist(),
+            strict=True,
+        )
+        firmware = self.firmware
+        answering = []
+        for index, (status, protect, *setpoint) in enumerate(values):
+            motor = self._motors[index]
+            if present[index] and not motor.silent:
+                self._command(index, status, protect, setpoint)
+            if (present[index] or firmware.unaddressed_motors_answer) and not silent[index]:
+                answering.append(index)
+        return answering
+
+    def _command(self, index: int, status: int, protect: bool, setpoint: list[float]) -> None:
+        motor = self._motors[index]
+        known = status in (JointMode.BRAKE, JointMode.FOC)
+        if not known and not self.firmware.other_status_brakes:
+            self.counters.ignored_packets += 1
+            return
+        if not protect:
+            motor.tripped = False
+            motor.deadline = math.inf
+        elif motor.tripped:
+            # stays stopped until the host has taken note, which it says with bit 7 = 0
+            self.counters.ignored_packets += 1
+            return
+        else:
+            motor.deadline = self._now + self.firmware.command_timeout
+        self.body.command(index, status if known else JointMode.BRAKE, *setpoint)
+
+    def state(self, motors: Sequence[int] | None = None) -> bytes:
+        """A state frame of now.
+
+        :param motors: that answer; all by default. One that is silent is left out in any case.
+        """
+        which = range(len(self._motors)) if motors is None else motors
+        heard = [index for index in which if not self._motors[index].silent]
+        return self._writer.frame(heard, self.tripped)
+
+    def _send(self, answer: bytes) -> bytes | None:
+        chance = self._random.random
+        counters = self.counters
+        if any(chance() < fault["p"] for fault in self.schedule.of("drop")):
+            counters.dropped += 1
+            return None
+        if any(chance() < fault["p"] for fault in self.schedule.of("corrupt")):
+            counters.corrupted += 1
+            bit = self._random.randrange(8 * len(answer))
+            spoilt = bytearray(answer)
+            spoilt[bit // 8] ^= 1 << bit % 8
+            answer = bytes(spoilt)
+        late = sum(f["ms"] * 1e-3 for f in self.schedule.of("delay") if chance() < f["p"])
+        counters.delayed += late > 0
+        counters.answers += 1
+        self.late = late + self.firmware.answer_time
+        return answer

@@ -1,0 +1,271 @@
+"""Emulated Dex3-1 hands, ready to be attached: in a thread or in a process of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import IO
+
+from dexkit.clock import Clock, RealClock
+from dexkit.emulators.dex3_body import Dex3Body
+from dexkit.emulators.dex3_mcu.device import Dex3Mcu
+from dexkit.emulators.dex3_mcu.server import Server
+from dexkit.emulators.dex3_mcu.settings import Firmware
+from dexkit.emulators.dex3_mcu.usb import IN_ENDPOINT, OUT_ENDPOINT, Dex3Usb
+from dexkit.emulators.faults import DEX3_FAULTS, parse_fault
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.hand import Side
+from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
+
+__all__ = ["Dex3Hands", "Dex3Process", "emulated_dex3"]
+
+
+class Dex3Hands:
+    """One or two hands behind one server in a thread of this process.
+
+    :param sides: which; the first is at bus id 1-1, the second at 1-2.
+    :param serials: serial numbers in the order of ``sides``; the defaults of
+        :data:`~dexkit.emulators.dex3_mcu.usb.SERIAL` where none is given.
+    :param object_pct: how far the fingers close until they touch an object, percent.
+    :param start: how far they are closed at first, percent; None for the pose at rest.
+    :param faults: specifications, see :mod:`dexkit.emulators.faults`.
+    :raises EmulatorError: the port cannot be had.
+    :raises UsageError: an option that cannot be.
+
+    Looking into a device while a client talks to it gives a snapshot of a moving thing.
+    """
+
+    def __init__(
+        self,
+        sides: Sequence[Side] = (Side.LEFT,),
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        serials: Sequence[str] = (),
+        object_pct: float | None = None,
+        start: float | None = None,
+        out_endpoint: int = OUT_ENDPOINT,
+        in_endpoint: int = IN_ENDPOINT,
+        faults: Sequence[str] = (),
+        firmware: Firmware | None = None,
+        clock: Clock | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not sides or len(set(sides)) != len(sides):
+            raise UsageError("one hand a side, and at least one")
+        if len(serials) > len(sides):
+            raise UsageError(f"{len(serials)} serial numbers for {len(sides)} hand(s)")
+        plan = [parse_fault(spec, DEX3_FAULTS) for spec in faults]
+        clock = clock or RealClock()
+        self._usb = {
+            side: Dex3Usb(
+                Dex3Mcu(
+                    side,
+                    body=Dex3Body(side, object_at=object_pct, start=start),
+                    clock=clock,
+                    firmware=firmware,
+                    faults=plan,
+                    seed=seed + index,
+                ),
+                clock,
+                serial=serials[index] if index < len(serials) else None,
+                out_endpoint=out_endpoint,
+                in_endpoint=in_endpoint,
+            )
+            for index, side in enumerate(sides)
+        }
+        self._server = Server(list(self._usb.values()), host=host, port=port, clock=clock)
+        self._server.start()
+
+    @property
+    def url(self) -> str:
+        """What a driver opens: ``usbip://HOST:PORT``."""
+        return self._server.url
+
+    @property
+    def port(self) -> int:
+        """TCP port of the server."""
+        return self._server.port
+
+    @property
+    def busids(self) -> list[str]:
+        """Bus id of each hand."""
+        return [str(usb.device.busid) for usb in self._usb.values()]
+
+    @property
+    def ready_lines(self) -> list[str]:
+        """A line for each hand: where it is, and what it is called there."""
+        return [
+            f"ready: {self.url} {side} {VENDOR_ID:04x}:{PRODUCT_ID[side]:04x} "
+            f"serial={usb.serial} busid={usb.device.busid}"
+            for side, usb in self._usb.items()
+        ]
+
+    @property
+    def error(self) -> BaseException | None:
+        """What ended the server, or None."""
+        return self._server.error
+
+    def device(self, side: Side = Side.LEFT) -> Dex3Mcu:
+        """The hand's processor."""
+        return self._usb[side].mcu
+
+    def inject(self, spec: str) -> None:
+        """Have a fault now (or at its ``@TIME`` from now)."""
+        fault = parse_fault(spec, DEX3_FAULTS)
+        for usb in self._usb.values():
+            self._server.call(partial(usb.mcu.inject, fault))
+
+    def close(self) -> None:
+        """Cut clients off and free the port."""
+        self._server.close()
+
+    def __enter__(self) -> Dex3Hands:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class Dex3Process:
+    """``dexkit emulate dex3-usb`` in a process of its own.
+
+    :param arguments: of that command.
+    :raises EmulatorError: it did not become ready.
+
+    :ivar url: what a driver opens.
+    :ivar ready_line: the first line that it printed.
+    """
+
+    def __init__(self, arguments: Sequence[str], *, timeout: float = 20.0) -> None:
+        command = [sys.executable, "-m", "dexkit", "emulate", "dex3-usb", "--faults-from-stdin"]
+        self.process = subprocess.Popen(
+            [*command, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        self.output = self.errors = ""
+        try:
+            self.ready_line = self._await_ready(timeout)
+            self.url = self.ready_line.split()[1]
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def port(self) -> int:
+        """TCP port of the server."""
+        return int(self.url.rsplit(":", 1)[1])
+
+    def _await_ready(self, timeout: float) -> str:
+        stdout = self.process.stdout
+        assert stdout is not None
+        deadline = time.monotonic() + timeout
+        line = b""
+        while not line.endswith(b"\n"):
+            left = max(0.0, deadline - time.monotonic())
+            ready, _, _ = select.select([stdout], [], [], left)
+            piece = os.read(stdout.fileno(), 1) if ready else b""
+            if not piece:
+                if self.process.poll() is None and left > 0:
+                    self.process.kill()
+                _, stderr = self.process.communicate()
+                raise EmulatorError(
+                    "the emulated hand did not start",
+                    hint=stderr.decode(errors="replace").strip(),
+                )
+            line += piece
+        return line.decode().strip()
+
+    def inject(self, spec: str) -> None:
+        """Have a fault now (or at its ``@TIME`` from now)."""
+        fault = parse_fault(spec, DEX3_FAULTS)  # complain here, not over there
+        assert fault
+        stdin: IO[bytes] | None = self.process.stdin
+        assert stdin is not None
+        stdin.write(spec.encode() + b"\n")
+        stdin.flush()
+
+    def close(self) -> None:
+        """Stop it; ``output`` and ``errors`` then hold what it printed behind the first line."""
+        if self.process.returncode is not None:
+            return
+        self.process.terminate()
+        try:
+            stdout, stderr = self.process.communicate(timeout=10.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            stdout, stderr = self.process.communicate()
+        self.output = stdout.decode(errors="replace")
+        self.errors = stderr.decode(errors="replace")
+
+
+@contextlib.contextmanager
+def emulated_dex3(
+    sides: Sequence[Side] = (Side.LEFT,),
+    *,
+    process: bool = False,
+    object_pct: float | None = None,
+    start: float | None = None,
+    serials: Sequence[str] = (),
+    port: int = 0,
+    out_endpoint: int = OUT_ENDPOINT,
+    in_endpoint: int = IN_ENDPOINT,
+    faults: Sequence[str] = (),
+    firmware: Firmware | None = None,
+    seed: int = 0,
+) -> Iterator[Dex3Hands | Dex3Process]:
+    """Emulated Dex3-1 hands at ``.url``, that take faults by ``.inject``.
+
+    :param process: run them as ``dexkit emulate dex3-usb`` in a process of its own instead of a
+        thread of this one. A client in the same process competes with the thread for the
+        interpreter, so rates are measured against a process; a thread's hands can be looked into
+        (``.device(side)``).
+    :param firmware: only in a thread.
+
+    The other parameters are those of :class:`Dex3Hands`.
+
+    :raises EmulatorError: it did not become ready.
+    :raises UsageError: an option that cannot be.
+    """
+    hands: Dex3Hands | Dex3Process
+    if process:
+        if firmware is not None:
+            raise UsageError("firmware can be given to a thread only")
+        hands = Dex3Process(
+            [
+                f"--side={sides[0] if len(sides) == 1 else 'both'}",
+                f"--port={port}",
+                f"--out-endpoint={out_endpoint}",
+                f"--in-endpoint={in_endpoint}",
+                f"--seed={seed}",
+                *(f"--serial={serial}" for serial in serials),
+                *(f"--fault={spec}" for spec in faults),
+                *([] if object_pct is None else [f"--object={object_pct:g}"]),
+                *([] if start is None else [f"--start={start:g}"]),
+            ]
+        )
+    else:
+        hands = Dex3Hands(
+            sides,
+            port=port,
+            serials=serials,
+            object_pct=object_pct,
+            start=start,
+            out_endpoint=out_endpoint,
+            in_endpoint=in_endpoint,
+            faults=faults,
+            firmware=firmware,
+            seed=seed,
+        )
+    try:
+        yield hands
+    finally:
+        hands.close()

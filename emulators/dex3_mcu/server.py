@@ -1,0 +1,398 @@
+"""USB/IP over TCP in one thread: devices that are listed, imported, cut off and put back.
+
+Descriptors, control requests, endpoint halts, parked IN transfers and the bytes of the protocol
+are the ``usbip`` package's. Its own listener starts a thread for each connection and never
+closes one, so it cannot be unplugged, cannot say which free port it took, and hands the
+interpreter back and forth between threads in every exchange; this loop does those three things.
+
+One client at a time has a device, as on a real host: a second import is refused as busy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import select
+import socket
+import struct
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from usbip import protocol
+from usbip.device import USBDevice
+
+from dexkit.clock import Clock, RealClock
+from dexkit.errors import EmulatorError
+
+__all__ = ["Plug", "Server"]
+
+_REQUEST = 8  # bytes: version, code, status
+_BUSID = 32
+_COMMAND = 48
+_MOST_PAYLOAD = 1 << 20  # no client of a hand sends as much; a longer one is not a client
+_MOST_UNREAD = 1 << 20
+_ST_DEV_BUSY = 2  # of the kernel's usbip_common.h
+_UNLINKED = -errno.ECONNRESET  # what vhci expects of a transfer that was called back
+_TICK = 4e-3
+_SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
+
+
+class Plug(Protocol):
+    """A device that can be plugged into a :class:`Server`."""
+
+    @property
+    def device(self) -> USBDevice:
+        """Its descriptors and endpoints."""
+        ...
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the cable is in."""
+        ...
+
+    def advance(self) -> float | None:
+        """Live up to now; say when something is due next, or None."""
+        ...
+
+    def attached(self) -> None:
+        """A client has imported it: nothing of an earlier one may be left."""
+        ...
+
+
+class Server:
+    """Serves plugs on a TCP port.
+
+    :param plugs: at least one; they get the bus ids 1-1, 1-2, ... in this order.
+    :param host: address to bind.
+    :param port: 0 takes any free one.
+    :param clock: the plugs' clock.
+    :raises EmulatorError: the port is in use, or the address is not this machine's.
+
+    ``run`` serves until ``stop``; ``start`` does so in a thread. Also a context manager.
+
+    :ivar port: the port taken.
+    :ivar error: what ended the thread, or None.
+    """
+
+    def __init__(
+        self,
+        plugs: Sequence[Plug],
+        *,
+        host: str = "127.0.0.1",
+        port: int = 3240,
+        clock: Clock | None = None,
+    ) -> None:
+        self.host = host
+        self.error: BaseException | None = None
+        self._clock: Clock = clock or RealClock()
+        self._plugs = list(plugs)
+        for index, plug in enumerate(self._plugs):
+            plug.device.set_busid(f"1-{index + 1}")
+            plug.device.busnum, plug.device.devnum = 1, index + 2
+        self._connections: dict[int, _Connection] = {}
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._closed = False
+        self._calls: list[Callable[[], None]] = []
+        self._listener = _listen(host, port)
+        self.port: int = self._listener.getsockname()[1]
+        self._wake_out, self._wake_in = socket.socketpair()
+        self._wake_out.setblocking(False)
+        self._wake_in.setblocking(False)
+        self._poll = select.epoll()
+        self._poll.register(self._listener, select.EPOLLIN)
+        self._poll.register(self._wake_out, select.EPOLLIN)
+
+    @property
+    def url(self) -> str:
+        """What a client opens."""
+        return f"usbip://{self.host}:{self.port}"
+
+    # --- running
+
+    def start(self) -> None:
+        """Serve in a background thread."""
+        self._thread = threading.Thread(target=self._guarded, name="dexkit-usbip", daemon=True)
+        self._thread.start()
+
+    def _guarded(self) -> None:
+        try:
+            self.run()
+        except BaseException as error:
+            self.error = error
+            raise
+
+    def stop(self) -> None:
+        """Ask :meth:`run` to return; from any thread or a signal handler."""
+        self._stopping = True
+        self._wake()
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Have ``function`` called by the serving thread, soon."""
+        self._calls.append(function)  # atomic, as is the pop
+        self._wake()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):
+            self._wake_in.send(b"x")
+
+    def run(self) -> None:
+        """Serve until :meth:`stop`."""
+        clock = self._clock
+        while not self._stopping:
+            while self._calls:
+                self._calls.pop(0)()
+            due: float | None = None
+            for plug in self._plugs:
+                following = plug.advance()
+                if following is not None and (due is None or following < due):
+                    due = following
+            for connection in list(self._connections.values()):
+                if connection.plug is not None and not connection.plug.plugged:
+                    self._drop(connection)
+                else:
+                    self._flush(connection)
+            self._wait(clock, due)
+
+    def _wait(self, clock: Clock, due: float | None) -> None:
+        """Serve what comes within a tick, or until ``due`` if that is sooner."""
+        pause = _TICK
+        if due is not None:
+            pause = min(pause, due - clock.now())
+        if pause < _TICK:
+            pause = max(0.0, pause - _SPIN)
+        for fd, events in self._poll.poll(pause):
+            if fd == self._listener.fileno():
+                self._accept()
+            elif fd == self._wake_out.fileno():
+                with contextlib.suppress(OSError):
+                    self._wake_out.recv(4096)
+            else:
+                connection = self._connections.get(fd)
+                if connection is None:
+                    continue
+                if events & (select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR):
+                    self._receive(connection)
+                if events & select.EPOLLOUT and fd in self._connections:
+                    self._flush(connection)
+
+    # --- connections
+
+    def _accept(self) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except OSError:
+            return
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._connections[sock.fileno()] = _Connection(sock)
+        self._poll.register(sock, select.EPOLLIN)
+
+    def _drop(self, connection: _Connection) -> None:
+        if self._connections.pop(connection.sock.fileno(), None) is None:
+            return
+        self._poll.unregister(connection.sock)
+        if connection.plug is not None:
+            connection.plug.device.reset_io()  # transfers parked for it must not be completed
+        connection.sock.close()
+
+    def _receive(self, connection: _Connection) -> None:
+        try:
+            data = connection.sock.recv(1 << 16)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(connection)
+            return
+        connection.inbox += data
+        try:
+            while self._serve(connection):
+                pass
+        except (_Nonsense, struct.error):
+            connection.closing = True
+        self._flush(connection)
+
+    def _flush(self, connection: _Connection) -> None:
+        outbox = connection.outbox
+        if outbox:
+            try:
+                sent = connection.sock.send(outbox)
+            except BlockingIOError:
+                sent = 0
+            except OSError:
+                self._drop(connection)
+                return
+            del outbox[:sent]
+            if len(outbox) > _MOST_UNREAD:
+                self._drop(connection)
+                return
+        if connection.waiting != bool(outbox):
+            connection.waiting = bool(outbox)
+            mask = select.EPOLLIN | (select.EPOLLOUT if outbox else 0)
+            self._poll.modify(connection.sock, mask)
+        if connection.closing and not outbox:
+            self._drop(connection)
+
+    def _serve(self, connection: _Connection) -> bool:
+        """Serve one message if a whole one is there."""
+        if connection.closing:
+            return False
+        if connection.plug is None:
+            return self._greet(connection)
+        inbox = connection.inbox
+        if len(inbox) < _COMMAND:
+            return False
+        command, direction, length = (
+            int.from_bytes(inbox[at : at + 4], "big") for at in (0, 12, 24)
+        )
+        if command not in (protocol.CMD_SUBMIT, protocol.CMD_UNLINK):
+            raise _Nonsense
+        if command == protocol.CMD_SUBMIT:
+            if length > _MOST_PAYLOAD:
+                raise _Nonsense
+            if direction == 0 and len(inbox) < _COMMAND + length:
+                return False
+        urb = protocol.read_cmd(connection)
+        device = connection.plug.device
+        if urb.command == protocol.CMD_UNLINK:
+            # its flags field is the number of the transfer to call back
+            late = connection.complete(urb.flags)
+            if not late:
+                device.cancel_urb(urb.flags)
+            connection.unlinked(urb, 0 if late else _UNLINKED)
+        else:
+            connection.parked.add(urb.seqnum)
+            if device.handle_urb(urb, connection.respond) is not None:
+                connection.respond(urb)
+        return True
+
+    def _greet(self, connection: _Connection) -> bool:
+        """Serve a list or an import."""
+        inbox = connection.inbox
+        if len(inbox) < _REQUEST:
+            return False
+        code = int.from_bytes(inbox[2:4], "big")
+        present = [plug for plug in self._plugs if plug.plugged]
+        if code == protocol.OP_REQ_IMPORT:
+            if len(inbox) < _REQUEST + _BUSID:
+                return False
+            busid = bytes(inbox[_REQUEST : _REQUEST + _BUSID]).split(b"\0")[0]
+            for plug in present:
+                if plug.device.busid.encode() == busid and self._busy(plug):
+                    connection.outbox += struct.pack(
+                        ">HHI", protocol.VERSION, protocol.OP_REP_IMPORT, _ST_DEV_BUSY
+                    )
+                    connection.closing = True
+                    return False
+        elif code != protocol.OP_REQ_DEVLIST:
+            raise _Nonsense
+        device = protocol.serve_handshake(connection, [plug.device for plug in present])
+        connection.plug = next((p for p in present if p.device is device), None)
+        if connection.plug is None:
+            connection.closing = True
+            return False
+        connection.plug.attached()
+        return True
+
+    def _busy(self, plug: Plug) -> bool:
+        for connection in list(self._connections.values()):
+            if connection.plug is plug:
+                # it may have gone without our having looked yet
+                self._receive(connection)
+        return any(connection.plug is plug for connection in self._connections.values())
+
+    # --- the end
+
+    def close(self) -> None:
+        """Stop, cut all connections and free the port. May be called twice."""
+        if self._closed:
+            return
+        self._closed = True
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+        for connection in list(self._connections.values()):
+            self._drop(connection)
+        self._poll.close()
+        self._listener.close()
+        self._wake_in.close()
+        self._wake_out.close()
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class _Nonsense(Exception):
+    """A client that does not speak USB/IP."""
+
+
+class _Connection:
+    """One client: what came and was not served yet, what shall go.
+
+    ``recv`` and ``sendall`` make it the socket that the protocol's functions want, so that
+    header and data of a reply leave in one piece.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+        self.inbox = bytearray()
+        self.outbox = bytearray()
+        self.plug: Plug | None = None
+        self.parked: set[int] = set()
+        self.closing = False
+        self.waiting = False
+
+    def recv(self, size: int) -> bytes:
+        data = bytes(self.inbox[:size])
+        del self.inbox[:size]
+        return data
+
+    def sendall(self, data: bytes) -> None:
+        self.outbox += data
+
+    def complete(self, seqnum: int) -> bool:
+        """Take a transfer off the list; True if it was completed before."""
+        if seqnum in self.parked:
+            self.parked.discard(seqnum)
+            return False
+        return True
+
+    def respond(self, urb: Any) -> None:
+        if not self.complete(urb.seqnum):
+            protocol.write_ret(self, urb)
+
+    def unlinked(self, urb: Any, status: int) -> None:
+        self.outbox += struct.pack(
+            ">IIIIIi24x",
+            protocol.RET_UNLINK,
+            urb.seqnum,
+            urb.devid,
+            urb.direction,
+            urb.ep,
+            status,
+        )
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(16)
+    except OSError as error:
+        listener.close()
+        hint = "--host takes an address of this machine"
+        if error.errno == errno.EADDRINUSE:
+            hint = "another USB/IP server has it; choose another with --port, or --port 0"
+        elif error.errno == errno.EACCES:
+            hint = "ports below 1024 belong to root"
+        why = error.strerror or str(error)
+        raise EmulatorError(f"cannot serve USB/IP on {host}:{port}: {why}", hint=hint) from error
+    listener.setblocking(False)
+    return listener
