@@ -89,6 +89,8 @@ class HandService:
 
     A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
     and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.
+    Another is ``reconnect_interval``: seconds at most between attempts to open it again when it
+    was lost, for a hand that costs little to look for.
     """
 
     def __init__(
@@ -360,7 +362,8 @@ class HandService:
 
     def _exchange_loop(self, unit: _Unit) -> None:
         core = unit.core
-        backoff = Backoff()
+        longest = getattr(unit.hand, "reconnect_interval", None)
+        backoff = Backoff() if longest is None else Backoff(maximum=longest)
         try:
             while not self._stop.is_set():
                 if not core.connected and not self._reconnect(unit, backoff):
