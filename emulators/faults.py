@@ -252,8 +252,9 @@ class FaultSchedule:
     @property
     def next_time(self) -> float | None:
         """When something begins or ends next, or None."""
-        times = [time for time, _ in (self._begins[:1] + self._ends[:1])]
-        return min(times, default=None)
+        if not self._begins and not self._ends:
+            return None
+        return min(time for time, _ in (self._begins[:1] + self._ends[:1]))
 
     def poll(self, now: float) -> list[tuple[Fault, bool]]:
         """What began (True) or ended (False) up to ``now``, in order of time."""

@@ -12,19 +12,23 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from dexkit.clock import Clock, RealClock
 from dexkit.emulators.dex3_body import AMBIENT, STEP, Dex3Body
 from dexkit.emulators.dex3_mcu.answer import AnswerWriter
+from dexkit.emulators.dex3_mcu.command import CommandReader, MotorCommand
 from dexkit.emulators.dex3_mcu.settings import Firmware
 from dexkit.emulators.faults import Fault, FaultSchedule
 from dexkit.errors import ChecksumError, WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.models import DEX3_1
-from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP, BusMap, HandCodec
+from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP, BusMap, DecodedCommand, HandCodec
 
 __all__ = ["Counters", "Dex3Mcu"]
 
 _MOST_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
+_KNOWN = (int(JointMode.BRAKE), int(JointMode.FOC))
 _HOT_SLICE = 0.05  # seconds between which a motor held hot may cool
 
 
@@ -93,6 +97,7 @@ class Dex3Mcu:
         self.late = 0.0
         self.on_stall: Callable[[str], None] = lambda endpoint: None
         self._codec = HandCodec(DEX3_1.joints[side], bus_map)
+        self._reader = CommandReader(side, bus_map)
         self._writer = AnswerWriter(self.body, bus_map, self.firmware.model_code)
         self._clock: Clock = clock or RealClock()
         self._random = random.Random(seed)
@@ -222,36 +227,28 @@ class Dex3Mcu:
 
         :raises WireError: the frame is not one.
         """
-        decoded = self._codec.decode_command(data)
-        counters = self.counters
-        counters.damaged_packets += len(decoded.problems)
-        command = decoded.command
-        assert command.timeout is not None
-        present, silent = decoded.present.tolist(), decoded.silent.tolist()
-        counters.broadcasts += any(silent)
-        values = zip(
-            command.mode.tolist(),
-            command.timeout.tolist(),
-            command.q.tolist(),
-            command.dq.tolist(),
-            command.tau.tolist(),
-            command.kp.tolist(),
-            command.kd.tolist(),
-            strict=True,
-        )
-        firmware = self.firmware
-        answering = []
-        for index, (status, protect, *setpoint) in enumerate(values):
-            motor = self._motors[index]
-            if present[index] and not motor.silent:
-                self._command(index, status, protect, setpoint)
-            if (present[index] or firmware.unaddressed_motors_answer) and not silent[index]:
-                answering.append(index)
-        return answering
+        silent: set[int] = set()
+        commands = self._reader.read(data)
+        if commands is None:
+            decoded = self._codec.decode_command(data)
+            self.counters.damaged_packets += len(decoded.problems)
+            silent = set(np.flatnonzero(decoded.silent).tolist())
+            self.counters.broadcasts += bool(silent)
+            commands = _present(decoded)
+        for command in commands:
+            if not self._motors[command[0]].silent:
+                self._command(*command)
+        addressed = {index for index, *_ in commands}
+        return [
+            index
+            for index in range(len(self._motors))
+            if index not in silent
+            and (index in addressed or self.firmware.unaddressed_motors_answer)
+        ]
 
-    def _command(self, index: int, status: int, protect: bool, setpoint: list[float]) -> None:
+    def _command(self, index: int, status: int, protect: bool, *setpoint: float) -> None:
         motor = self._motors[index]
-        known = status in (JointMode.BRAKE, JointMode.FOC)
+        known = status in _KNOWN
         if not known and not self.firmware.other_status_brakes:
             self.counters.ignored_packets += 1
             return
@@ -292,3 +289,21 @@ class Dex3Mcu:
         counters.answers += 1
         self.late = late + self.firmware.answer_time
         return answer
+
+
+def _present(decoded: DecodedCommand) -> list[MotorCommand]:
+    command = decoded.command
+    assert command.timeout is not None
+    return [
+        (
+            index,
+            int(command.mode[index]),
+            bool(command.timeout[index]),
+            float(command.q[index]),
+            float(command.dq[index]),
+            float(command.tau[index]),
+            float(command.kp[index]),
+            float(command.kd[index]),
+        )
+        for index in np.flatnonzero(decoded.present).tolist()
+    ]
