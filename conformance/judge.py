@@ -32,20 +32,21 @@ def judge(
     :param requirements: those to report; what they depend on is judged as well. None for all.
     :param subject: what to say of what was judged.
     """
-    wanted = {r.id for r in (catalogue() if requirements is None else requirements)}
+    every = catalogue(recording.model.name)
+    wanted = {r.id for r in (every if requirements is None else requirements)}
     checks = all_checks()
     results: list[Result] = []
     for side in recording.judged:
         found: dict[str, Result] = {}
-        for requirement in catalogue():
+        for requirement in every:
             found[requirement.id] = _judge_one(
                 recording, recording.sides[side], requirement, found, checks
             )
         results += [r for r in found.values() if r.requirement.id in wanted]
-    order = {r.id: i for i, r in enumerate(catalogue())}
+    order = {r.id: i for i, r in enumerate(every)}
     results.sort(key=lambda r: order[r.requirement.id])
     about = {
-        "model": catalogue()[0].model,
+        "model": recording.model.name,
         "dialect": recording.dialect.name,
         "sides": ", ".join(str(s) for s in recording.judged),
     }
@@ -137,7 +138,7 @@ def _missing(context: Context) -> str:
             return f"the stimulus '{requirement.phase}' was not applied to the {context.side} hand"
     if requirement.needs == "endpoints" and not recording.endpoints:
         return "the recording does not say who published and subscribed (record dds_endpoints)"
-    if requirement.needs == "commands" and not len(context.commands):
+    if requirement.needs in ("commands", "session") and not len(context.commands):
         return "no commands to this hand in the recording"
     return ""
 
@@ -147,9 +148,10 @@ def _stage(recording: Recording, side: Side) -> str:
     hand = recording.sides[side]
     topic = hand.states.topic
     if len(hand.states):
-        q = hand.states.q[np.isfinite(hand.states.q)]
-        if len(q) and float(np.ptp(q)) > 0.05 * recording.dialect.q_open:
-            return "moving"
+        for q, joint in zip(hand.states.q.T, hand.joints, strict=True):
+            good = q[np.isfinite(q)]
+            if len(good) and float(np.ptp(good)) > 0.05 * joint.stroke:
+                return "moving"
         return "samples flowing"
     if any(c.topic == topic for c in recording.channels) or any(
         e.topic == topic and e.kind == "writer" for e in recording.endpoints

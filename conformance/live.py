@@ -26,7 +26,9 @@ from dexkit.conformance.stimuli import (
     Script,
     Send,
     Session,
+    script_for,
 )
+from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.wire import Wire
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, TopicConflict, WireError
@@ -66,7 +68,7 @@ class LiveOptions:
         return Plan(
             dialect=dialect,
             sides=self.rig.sides,
-            objects={s: pct / 100 * dialect.q_open for s, pct in self.rig.objects.items()},
+            objects=object_places(dialect, self.rig.objects),
             session=self.session,
             phases=self.phases,
         )
@@ -107,7 +109,12 @@ def record_run(
             Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})
         )
         dialect = rig_options.dialect
-        topics = {t for s in Side for t in dialect.topics(s)}
+        topics = {
+            t
+            for s in Side
+            for t in (*dialect.topics(s), dialect.low_rate_topic.format(side=s))
+            if t
+        }
         # the recorder listens before the hand is there: nothing of its start is missed
         recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
         if rig_options.backend != EXTERNAL:
@@ -117,7 +124,7 @@ def record_run(
             return False
         _refuse_company(recorder_node, options)
         plan = options.plan()
-        script = Script(plan, say)
+        script = script_for(plan, say)
         heart = stack.enter_context(_Heartbeat())
         driver = stack.enter_context(_Driver(rig_options, plan))
         _meet(recorder_node, plan)
@@ -285,8 +292,8 @@ class _Driver:
             self._client.wait_matched(1.0)
 
     def _observe(self) -> Observation:
-        q: dict[Side, float] = {}
-        dq: dict[Side, float] = {}
+        q: dict[Side, Pose] = {}
+        dq: dict[Side, Pose] = {}
         if self._client is not None:
             self._newest.update(self._client.newest())
         for side in self.plan.sides:
@@ -296,7 +303,7 @@ class _Driver:
             with contextlib.suppress(WireError):
                 state = self._wire.read_state(payload, side)
                 if state is not None:
-                    q[side], dq[side] = state[0], state[1]
+                    q[side], dq[side] = state
         joined = self._monitor.first_states() if self._monitor else {}
         return Observation(self.now_ns, q, dq, joined)
 

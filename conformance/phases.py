@@ -27,7 +27,8 @@ class Phase:
     :param name: what was done: ``listen``, ``step``, ``silence``, ...
     :param sides: the sides that it is about.
     :param begin_ns: log time at which it began.
-    :param targets: q that each side was to reach, in the dialect's radians.
+    :param targets: q that joints of each side were to reach, by their index, in the dialect's
+        radians.
     :param observed: what the kit saw beside the recording (a late joiner's reception).
     """
 
@@ -35,7 +36,7 @@ class Phase:
     sides: tuple[Side, ...]
     begin_ns: int
     end_ns: int = 0
-    targets: dict[Side, float] = field(default_factory=dict)
+    targets: dict[Side, dict[int, float]] = field(default_factory=dict)
     params: dict[str, str] = field(default_factory=dict)
     observed: dict[str, float | None] = field(default_factory=dict)
 
@@ -53,7 +54,8 @@ class Stimulus:
     """The whole record.
 
     :param phases: in order of time.
-    :param objects: where each side touches its object, rad, or None where there is none.
+    :param objects: where each side touches its object, or None where there is none: rad for a
+        hand of one joint, percent of closing for others.
     :param stalls: when the machine lacked processor time, so that the hand is not blamed for it.
     """
 
@@ -72,7 +74,10 @@ class Stimulus:
                         "sides": [str(s) for s in p.sides],
                         "begin_ns": p.begin_ns,
                         "end_ns": p.end_ns,
-                        "targets": {str(s): q for s, q in p.targets.items()},
+                        "targets": {
+                            str(s): {str(i): q for i, q in joints.items()}
+                            for s, joints in p.targets.items()
+                        },
                         "params": p.params,
                         "observed": p.observed,
                     }
@@ -103,7 +108,7 @@ class Stimulus:
                         sides=tuple(Side(s) for s in p["sides"]),
                         begin_ns=int(p["begin_ns"]),
                         end_ns=int(p["end_ns"]),
-                        targets={Side(s): float(q) for s, q in p["targets"].items()},
+                        targets={Side(s): _joints(q) for s, q in p["targets"].items()},
                         params=dict(p["params"]),
                         observed=dict(p["observed"]),
                     )
@@ -114,3 +119,10 @@ class Stimulus:
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
+
+
+def _joints(value: Any) -> dict[int, float]:
+    """Targets by joint; a bare number, as the first recordings have it, is the only joint's."""
+    if isinstance(value, dict):
+        return {int(i): float(q) for i, q in value.items()}
+    return {0: float(value)}

@@ -14,6 +14,7 @@ from dexkit.conformance.processes import EMULATED, EXTERNAL, RigOptions
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.stimuli.script import DEFAULT_OBJECT
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording, sides_of
 from dexkit.errors import ConformanceError, UsageError
@@ -25,11 +26,7 @@ if TYPE_CHECKING:
 
     from dexkit.conformance.live import LiveOptions
 
-__all__ = ["DEFAULT_OBJECT", "SuiteOptions", "judge_recording", "live_options", "run_suite"]
-
-DEFAULT_OBJECT = {Side.RIGHT: 37.0}
-"""Percent of opening at which the right hand of a started pair feels an object: 2.0 rad, where
-the shipped session closes on one."""
+__all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite"]
 
 T = TypeVar("T")
 

@@ -1,13 +1,14 @@
 """A recording as the checks see it: per side, columns of commands and states in seconds.
 
 Times are seconds from the beginning of the recording: ``t`` is reception, ``sent`` the source
-timestamp. Positions are in the dialect's radians.
+timestamp. Positions are in the dialect's radians; columns of joints have shape (n, n_joints).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -16,11 +17,20 @@ from numpy.typing import NDArray
 from dexkit.conformance.phases import RECORD, Phase, Stimulus
 from dexkit.conformance.wire import Wire
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Floats, Side
-from dexkit.models import DEX1_1, Dialect, dialect
+from dexkit.hand import Floats, JointSpec, Side
+from dexkit.messages.columns import Columns
+from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 
-__all__ = ["Commands", "Recording", "SideView", "States", "TraceLike", "detect_dialect"]
+__all__ = [
+    "Commands",
+    "Recording",
+    "SideView",
+    "States",
+    "TraceLike",
+    "detect_dialect",
+    "joints_of",
+]
 
 
 class TraceLike(Protocol):
@@ -50,7 +60,9 @@ class States:
     """A side's states. What a sample lacks is NaN.
 
     :param length: motors in the sequence; -1 where the sample does not decode.
+    :param q: shape (n, n_joints), as ``dq``, ``ddq``, ``tau`` and ``mode``.
     :param errors: what is wrong with samples that do not decode, by index.
+    :param columns: every other member, by its path; None without samples.
     """
 
     topic: str
@@ -63,6 +75,7 @@ class States:
     tau: Floats
     mode: Floats
     errors: Mapping[int, str] = field(default_factory=dict)
+    columns: Columns | None = None
 
     def __len__(self) -> int:
         return len(self.t)
@@ -81,7 +94,10 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """The commands to a side, from whichever writer. What a sample lacks is NaN."""
+    """The commands to a side, from whichever writer. What a sample lacks is NaN.
+
+    :param q: shape (n, n_joints), as ``dq``, ``tau``, ``kp``, ``kd`` and ``mode``.
+    """
 
     topic: str
     t: Floats
@@ -91,6 +107,7 @@ class Commands:
     tau: Floats
     kp: Floats
     kd: Floats
+    mode: Floats
 
     def __len__(self) -> int:
         return len(self.t)
@@ -103,6 +120,7 @@ class SideView:
     side: Side
     states: States
     commands: Commands
+    joints: tuple[JointSpec, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +155,7 @@ class Recording:
 
         :param dialect_name: None to take the one that the topics and types show.
         :param sides: the sides to judge; none for those that have a topic.
-        :raises ConformanceError: it has no topic of this model.
+        :raises ConformanceError: it has no topic of the dialect.
         :raises TraceUnsupported: its stimulus record cannot be read.
         """
         chosen = dialect(dialect_name) if dialect_name else detect_dialect(trace)
@@ -152,7 +170,7 @@ class Recording:
         if not judged:
             names = ", ".join(sorted(present)) or "no messages"
             raise ConformanceError(
-                f"no {DEX1_1.title} topic of dialect {chosen.name} in this recording",
+                f"no {model(chosen.model).title} topic of dialect {chosen.name} in this recording",
                 hint=f"it has: {names}",
             )
         # the other side is decoded too: independence is judged with it
@@ -169,6 +187,7 @@ class Recording:
                     s,
                     _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
                     _commands(wire, s, samples.get(chosen.topics(s)[0]), origin),
+                    joints_of(chosen, s),
                 )
                 for s in sorted(Side, key=lambda s: s is not Side.LEFT)
                 if s in judged or any(topic in present for topic in chosen.topics(s))
@@ -187,6 +206,11 @@ class Recording:
             judged=judged,
             notes=notes,
         )
+
+    @property
+    def model(self) -> HandModel:
+        """The hand model that the dialect belongs to."""
+        return model(self.dialect.model)
 
     def seconds(self, time_ns: int) -> float:
         """A log time as seconds of this recording."""
@@ -231,15 +255,23 @@ def detect_dialect(trace: TraceLike) -> Dialect:
         named = sum(topic in topics for topic, _ in cmd + state)
         return exact, named
 
-    best = max(DEX1_1.dialects, key=score)  # the first, unitree_go, wins a tie
+    best = max(DIALECTS.values(), key=score)  # the first, unitree_go, wins a tie
     if score(best) == (0, 0):
         names = ", ".join(sorted(c.topic for c in trace.channels)) or "no topics at all"
-        wanted = ", ".join(sorted({d.topics(s)[1] for d in DEX1_1.dialects for s in Side}))
+        wanted = ", ".join(dict.fromkeys(d.state_topic for d in DIALECTS.values()))
         raise ConformanceError(
-            f"no {DEX1_1.title} in this recording: it has {names}",
-            hint=f"a {DEX1_1.title} publishes one of {wanted}",
+            f"no hand of the Dex family in this recording: it has {names}",
+            hint=f"a hand publishes one of {wanted}",
         )
     return best
+
+
+def joints_of(dialect: Dialect, side: Side) -> tuple[JointSpec, ...]:
+    """A hand's joints in the dialect's radians."""
+    joints = model(dialect.model).joints[side]
+    if math.isnan(dialect.q_open):
+        return joints
+    return tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
 
 
 def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
@@ -249,10 +281,13 @@ def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
 def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> States:
     topic = wire.dialect.topics(side)[1]
     if samples is None or samples.type_name != wire.dialect.state_type:
-        none = np.empty(0)
-        return States(topic, none, none, np.empty(0, np.intp), none, none, none, none, none)
+        t, none = np.empty(0), np.empty((0, wire.joints))
+        return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)
     columns = wire.state.columns(samples.payloads)
-    place = f"{wire.state_sequence}[{wire.dialect.index[side]}]"
+
+    def of(name: str) -> Floats:
+        return _joints(columns, wire, side, wire.state_sequence, name)
+
     sent = _seconds(samples.publish_time_ns, origin)
     sent[samples.publish_time_ns == 0] = np.nan
     return States(
@@ -260,31 +295,44 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
         t=_seconds(samples.log_time_ns, origin),
         sent=sent,
         length=columns.count(wire.state_sequence),
-        q=columns[f"{place}.q"],
-        dq=columns[f"{place}.dq"],
-        ddq=columns[f"{place}.ddq"],
-        tau=columns[f"{place}.tau_est"],
-        mode=columns[f"{place}.mode"],
+        q=of("q"),
+        dq=of("dq"),
+        ddq=of("ddq"),
+        tau=of("tau_est"),
+        mode=of("mode"),
         errors={i: str(e) for i, e in columns.errors.items()},
+        columns=columns,
     )
+
+
+def _joints(columns: Columns, wire: Wire, side: Side, sequence: str, name: str) -> Floats:
+    """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
+    first = wire.dialect.index[side]
+    places = range(first, first + wire.joints)
+    return np.column_stack([columns[f"{sequence}[{i}].{name}"] for i in places])
 
 
 def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> Commands:
     topic = wire.dialect.topics(side)[0]
     if samples is None or samples.type_name != wire.dialect.cmd_type:
-        none = np.empty(0)
-        return Commands(topic, none, np.empty(0, np.intp), none, none, none, none, none)
+        none = np.empty((0, wire.joints))
+        count = np.empty(0, np.intp)
+        return Commands(topic, np.empty(0), count, none, none, none, none, none, none)
     columns = wire.command.columns(samples.payloads)
-    place = f"{wire.command_sequence}[{wire.dialect.index[side]}]"
+
+    def of(name: str) -> Floats:
+        return _joints(columns, wire, side, wire.command_sequence, name)
+
     return Commands(
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
         length=columns.count(wire.command_sequence),
-        q=columns[f"{place}.q"],
-        dq=columns[f"{place}.dq"],
-        tau=columns[f"{place}.tau"],
-        kp=columns[f"{place}.kp"],
-        kd=columns[f"{place}.kd"],
+        q=of("q"),
+        dq=of("dq"),
+        tau=of("tau"),
+        kp=of("kp"),
+        kd=of("kd"),
+        mode=of("mode"),
     )
 
 

@@ -5,15 +5,15 @@ Kept apart from the service on purpose: a mistake there must not be repeated her
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dexkit.hand import Side
+from dexkit.hand import JointMode, Side
 from dexkit.messages import MessageType, message_type
-from dexkit.models import Dialect
+from dexkit.models import DEX1_1, Dialect, model
 
-__all__ = ["Motor", "Wire"]
+__all__ = ["Motor", "Motors", "Wire", "mode_byte"]
 
 # the sequence of motors in a message, and the class of one of them, by type
 _SEQUENCE = {
@@ -31,13 +31,21 @@ class Motor:
     q: float = 0.0
     dq: float = 0.0
     tau: float = 0.0
-    kp: float = 5.0  # xr_teleoperate on Dex1 (facts/unitree-dex B.1)
-    kd: float = 0.05
+    kp: float = DEX1_1.client_gains[0]
+    kd: float = DEX1_1.client_gains[1]
     mode: int = 0
 
 
+Motors = Sequence[Motor]
+"""The motors of one hand, in the dialect's order."""
+
 LIMP = Motor(kp=0.0, kd=0.0)
 """No torque: what fills the place of a motor that is not meant."""
+
+
+def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
+    """RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (facts/unitree-dex B.4)."""
+    return index | status << 4 | timeout << 7
 
 
 class Wire:
@@ -45,6 +53,7 @@ class Wire:
 
     def __init__(self, dialect: Dialect) -> None:
         self.dialect = dialect
+        self.joints = len(model(dialect.model).joints[Side.LEFT])
         self.command: MessageType = message_type(dialect.cmd_type)
         self.state: MessageType = message_type(dialect.state_type)
         self.command_sequence, motor = _SEQUENCE[dialect.cmd_type]
@@ -55,16 +64,18 @@ class Wire:
         self.state_topics = {s: dialect.topics(s)[1] for s in Side}
         self.shared = len(set(self.command_topics.values())) == 1
 
-    def encode(self, motors: Mapping[Side, Motor]) -> list[tuple[str, bytes]]:
-        """(topic, payload) of the commands to these sides, all in one message if they share it."""
+    def encode(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
+        """(topic, payload) of the commands to these sides, all in one message if they share it.
+
+        On a topic of its own a hand is sent as many motors as are given, however wrong.
+        """
         if not self.shared:
             return [
-                (self.command_topics[side], self._payload([motor]))
-                for side, motor in motors.items()
+                (self.command_topics[side], self._payload(motors)) for side, motors in hands.items()
             ]
         places = [LIMP] * self.dialect.length
-        for side, motor in motors.items():
-            places[self.dialect.index[side]] = motor
+        for side, motors in hands.items():
+            places[self.dialect.index[side]] = motors[0]
         return [(self.dialect.cmd_topic, self._payload(places))]
 
     def encode_empty(self, sides: tuple[Side, ...]) -> list[tuple[str, bytes]]:
@@ -72,7 +83,7 @@ class Wire:
         topics = dict.fromkeys(self.command_topics[side] for side in sides)
         return [(topic, self._payload([])) for topic in topics]
 
-    def _payload(self, motors: list[Motor]) -> bytes:
+    def _payload(self, motors: Motors) -> bytes:
         message = self.command.cls()
         setattr(
             message,
@@ -81,45 +92,56 @@ class Wire:
         )
         return self.command.encode(message)
 
-    def read_state(self, data: bytes, side: Side) -> tuple[float, float, float] | None:
-        """(q, dq, tau_est) of a side in a state payload, or None if it is not there.
+    def read_state(
+        self, data: bytes, side: Side
+    ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """(q, dq) of a side's joints in a state payload, or None if they are not all there.
 
         :raises WireError: the payload is not of the dialect's state type.
         """
-        motors = getattr(self.state.decode(data), self.state_sequence)
-        index = self.dialect.index[side]
-        if index >= len(motors):
+        motors = self._mine(getattr(self.state.decode(data), self.state_sequence), side)
+        if motors is None:
             return None
-        motor = motors[index]
-        return motor.q, motor.dq, motor.tau_est
+        return tuple(m.q for m in motors), tuple(m.dq for m in motors)
 
-    def read_command(self, data: bytes, side: Side) -> Motor | None:
-        """A side's motor in a command payload, or None if it is not there.
+    def read_command(self, data: bytes, side: Side) -> tuple[Motor, ...] | None:
+        """A side's motors in a command payload, or None if they are not all there.
 
         :raises WireError: the payload is not of the dialect's command type.
         """
-        motors = getattr(self.command.decode(data), self.command_sequence)
-        index = self.dialect.index[side]
-        if index >= len(motors):
+        motors = self._mine(getattr(self.command.decode(data), self.command_sequence), side)
+        if motors is None:
             return None
-        m = motors[index]
-        return Motor(q=m.q, dq=m.dq, tau=m.tau, kp=m.kp, kd=m.kd, mode=m.mode)
+        return tuple(
+            Motor(q=m.q, dq=m.dq, tau=m.tau, kp=m.kp, kd=m.kd, mode=m.mode) for m in motors
+        )
+
+    def _mine(self, motors: Sequence[Any], side: Side) -> Sequence[Any] | None:
+        first = self.dialect.index[side]
+        mine = motors[first : first + self.joints]
+        return mine if len(mine) == self.joints else None
 
     def state_payload(
-        self, motors: Mapping[Side, Mapping[str, float]], length: int | None = None
+        self,
+        hands: Mapping[Side, Sequence[Mapping[str, Any]]],
+        length: int | None = None,
+        **rest: Any,
     ) -> bytes:
         """A state message, for hands that the kit plays itself.
 
-        :param motors: fields of each side's motor.
+        :param hands: fields of each side's motors.
         :param length: motors in the sequence, if not the dialect's.
+        :param rest: other members of the message.
         """
         count = self.dialect.length if length is None else length
         message, places = self._blank_state(count)
-        for side, fields in motors.items():
-            index = self.dialect.index[side]
-            if index < count:
-                for name, value in fields.items():
-                    setattr(places[index], name, value)
+        for side, motors in hands.items():
+            for index, fields in enumerate(motors, self.dialect.index[side]):
+                if index < count:
+                    for name, value in fields.items():
+                        setattr(places[index], name, value)
+        for name, value in rest.items():
+            setattr(message, name, value)
         return self.state.encode(message)
 
     def _blank_state(self, length: int) -> tuple[Any, list[Any]]:

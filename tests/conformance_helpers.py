@@ -8,6 +8,7 @@ from functools import cache
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
+from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
 
 
@@ -15,7 +16,7 @@ from dexkit.hand import Side
 def short_run() -> MemoryTrace:
     """A good left hand through listening, steps and silence."""
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", "silence"}))
-    return run_virtual(plan)
+    return run_virtual(plan, ReferenceService)
 
 
 def copy_of(trace: MemoryTrace) -> MemoryTrace:

@@ -70,8 +70,10 @@ def test_the_legacy_recording_is_judged_in_its_own_dialect() -> None:
 
 
 def test_a_dex3_recording_is_no_dex1() -> None:
-    with pytest.raises(ConformanceError, match="no Dex1-1 gripper"):
-        Recording.of(open_trace(sample_path("dex3_pinch")))
+    trace = open_trace(sample_path("dex3_pinch"))
+    assert detect_dialect(trace).name == "dex3"
+    with pytest.raises(ConformanceError, match="no Dex1-1 gripper topic"):
+        Recording.of(trace, dialect_name="unitree_go")
 
 
 def test_the_wrong_dialect_fails_by_its_topics() -> None:

@@ -13,8 +13,9 @@ import pytest
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, record_run
-from dexkit.conformance.mutants import zoo
+from dexkit.conformance.mutants import shared
 from dexkit.conformance.mutants.live import LiveMutant
+from dexkit.conformance.mutants.shared import of
 from dexkit.conformance.processes import EXTERNAL, RigOptions
 from dexkit.conformance.requirements import catalogue as requirements
 from dexkit.conformance.requirements import select
@@ -22,7 +23,7 @@ from dexkit.conformance.results import RunResult
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.view import Recording
-from dexkit.conformance.virtual import ReferenceService
+from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
 from dexkit.models import dialect
@@ -131,12 +132,19 @@ def test_a_good_hand_passes_on_dds(tmp_path: Path) -> None:
 
 
 def test_a_hand_that_waits_for_a_command_is_caught_on_dds(tmp_path: Path) -> None:
-    result = run_live(zoo.SilentUntilCommanded, "DEX1-START", tmp_path, sides=(Side.LEFT,))
+    result = run_live(
+        of(shared.SilentUntilCommanded, ReferenceService),
+        "DEX1-START",
+        tmp_path,
+        sides=(Side.LEFT,),
+    )
     assert failed(result) == {("DEX1-START-01", "left")}
 
 
 def test_a_hand_that_asks_for_history_is_caught_on_dds(tmp_path: Path) -> None:
-    result = run_live(zoo.DemandsHistory, "DEX1-QOS", tmp_path, sides=(Side.LEFT,))
+    result = run_live(
+        of(shared.DemandsHistory, ReferenceService), "DEX1-QOS", tmp_path, sides=(Side.LEFT,)
+    )
     assert failed(result) == {("DEX1-QOS-01", "left")}
 
 

@@ -8,9 +8,8 @@ from multiprocessing import get_context
 
 import pytest
 
-from dexkit.conformance.mutants import MUTANTS, plan_for, run_mutant, trial
+from dexkit.conformance.mutants import MUTANTS, REFERENCES, plan_for, run_mutant, trial
 from dexkit.conformance.results import Overall, Verdict
-from dexkit.conformance.virtual import ReferenceService
 from dexkit.hand import Side
 
 BY_NAME = {m.name: m for m in MUTANTS}
@@ -24,7 +23,7 @@ def try_mutant(name: str) -> dict[str, set[str]]:
 
 def try_reference(name: str) -> tuple[Overall, set[Verdict], int]:
     plan = plan_for(sides=(Side.LEFT,)) if name == "left only" else plan_for(name)
-    result = run_mutant(ReferenceService, plan)
+    result = run_mutant(REFERENCES[plan.dialect.model], plan)
     return result.overall, {r.verdict for r in result.results}, result.judged
 
 

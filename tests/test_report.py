@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import zoo
+from dexkit.conformance.mutants import gripper
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.plots import nice_ticks, pieces, thin
 from dexkit.conformance.requirements import catalogue
@@ -105,7 +105,7 @@ def test_nan_in_states_does_not_reach_the_drawing() -> None:
     from dexkit.conformance.mutants import plan_for
 
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"}))
-    view = Recording.of(run_virtual(plan, zoo.NanVelocity))
+    view = Recording.of(run_virtual(plan, gripper.NanVelocity))
     assert "nan" not in "".join(re.findall(r'points="[^"]*"', render(judge(view), view)))
 
 

@@ -1,9 +1,10 @@
 """The checks: each judges a recording for one requirement and one side.
 
 A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes on
-missing evidence, and takes every figure from its requirement's tolerances. Modules, by what
-they look at: :mod:`~dexkit.conformance.checks.discovery`, :mod:`~.timing`, :mod:`~.fields`,
-:mod:`~.motion`, :mod:`~.force`, :mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`.
+missing evidence, and takes every figure from its requirement's tolerances, so that several hand
+models share it. Modules, by what they look at: :mod:`~dexkit.conformance.checks.discovery`,
+:mod:`~.timing`, :mod:`~.fields`, :mod:`~.motion`, :mod:`~.force`, :mod:`~.safety`,
+:mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.dex3` for what only that hand has.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dexkit.conformance.phases import Phase
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.view import Commands, Recording, SideView, States
-from dexkit.hand import Side
+from dexkit.hand import JointSpec, Side
 
 __all__ = ["Check", "Context", "Outcome", "all_checks", "check"]
 
@@ -72,14 +73,18 @@ class Context:
         return self.hand.commands
 
     @property
-    def stroke(self) -> float:
-        """Full stroke in the dialect's radians."""
-        return self.recording.dialect.q_open
+    def joints(self) -> tuple[JointSpec, ...]:
+        """The hand's joints, in the dialect's radians."""
+        return self.hand.joints
 
-    def tolerance(self, name: str) -> float:
-        """A figure of the requirement; ``NAME_stroke`` comes in radians."""
+    def tolerance(self, name: str, joint: int = 0) -> float:
+        """A figure of the requirement; ``NAME_stroke`` comes in radians of that joint."""
         value = self.requirement.tolerance(name)
-        return value * self.stroke if name.endswith("_stroke") else value
+        return value * self.joints[joint].stroke if name.endswith("_stroke") else value
+
+    def named(self, text: str, joint: int) -> str:
+        """``text`` with the joint's name before it, where the hand has several."""
+        return text if len(self.joints) == 1 else f"{self.joints[joint].name}: {text}"
 
     def phases(self, name: str | None = None) -> list[Phase]:
         """The phases of this side, by default those that the requirement needs."""
@@ -90,7 +95,7 @@ class Context:
         return self.recording.seconds(phase.begin_ns), self.recording.seconds(phase.end_ns)
 
     @property
-    def object_q(self) -> float | None:
+    def object_at(self) -> float | None:
         """Where this side touches its object, as far as is known."""
         return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
 
@@ -126,12 +131,13 @@ Check = Callable[[Context], Outcome]
 _REGISTRY: dict[str, Check] = {}
 
 
-def check(requirement_id: str) -> Callable[[Check], Check]:
-    """Register the decorated function as the check of a requirement."""
+def check(*requirement_ids: str) -> Callable[[Check], Check]:
+    """Register the decorated function as the check of these requirements."""
 
     def register(function: Check) -> Check:
-        assert requirement_id not in _REGISTRY, f"{requirement_id} has two checks"
-        _REGISTRY[requirement_id] = function
+        for name in requirement_ids:
+            assert name not in _REGISTRY, f"{name} has two checks"
+            _REGISTRY[name] = function
         return function
 
     return register

@@ -1,4 +1,4 @@
-"""tau_est: in contact, at rest, and its sign."""
+"""tau_est of a gripper: in contact, at rest, and its sign."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
     for phase in reversed(ctx.phases()):
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
-        tau = ctx.states.tau[ctx.states.between(begin, end)]
+        tau = ctx.states.tau[ctx.states.between(begin, end), 0]
         tau = tau[np.isfinite(tau)]
         if len(tau):
             return float(np.median(tau)), begin, end
@@ -22,7 +22,7 @@ def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
 @check("DEX1-FORCE-01")
 def in_contact(ctx: Context) -> Outcome:
     """tau_est while squeezing an object."""
-    if ctx.object_q is None:
+    if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = _squeeze(ctx)
     if found is None:
@@ -48,7 +48,7 @@ def at_rest(ctx: Context) -> Outcome:
         end = begin + window
         rows = states.between(begin, end)
         asked = slice(*np.searchsorted(commands.t, [begin, end]))
-        q, tau, goal = states.q[rows], states.tau[rows], commands.q[asked]
+        q, tau, goal = states.q[rows, 0], states.tau[rows, 0], commands.q[asked, 0]
         free = (
             len(q) >= 5
             and len(goal) >= 3
@@ -57,8 +57,8 @@ def at_rest(ctx: Context) -> Outcome:
             and float(np.ptp(q)) <= ctx.tolerance("max_ripple_stroke")
             and float(np.ptp(goal)) <= ctx.tolerance("max_ripple_stroke")
             and float(np.abs(np.median(q) - np.median(goal))) <= ctx.tolerance("max_error_stroke")
-            and (commands.kp[asked] > 0).all()
-            and not (known and ctx.object_q is not None and float(q.min()) <= ctx.object_q + 0.1)
+            and (commands.kp[asked, 0] > 0).all()
+            and not (known and ctx.object_at is not None and float(q.min()) <= ctx.object_at + 0.1)
         )
         if free:
             taus.append((float(np.median(np.abs(tau))), begin))
@@ -78,7 +78,7 @@ def at_rest(ctx: Context) -> Outcome:
 @check("DEX1-FORCE-03")
 def sign(ctx: Context) -> Outcome:
     """Sign of tau_est while squeezing."""
-    if ctx.object_q is None:
+    if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = _squeeze(ctx)
     if found is None or found[0] == 0.0:

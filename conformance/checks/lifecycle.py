@@ -6,7 +6,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
 
 
-@check("DEX1-START-01")
+@check("DEX1-START-01", "DEX3-START-01")
 def state_first(ctx: Context) -> Outcome:
     """State is there before the first command."""
     first_state = float(ctx.states.t[0])
@@ -31,7 +31,7 @@ def state_first(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-LIFE-01")
+@check("DEX1-LIFE-01", "DEX3-LIFE-01")
 def late_joiner(ctx: Context) -> Outcome:
     """What a subscriber received that was created in mid-session."""
     phase = ctx.phases()[-1]
@@ -52,7 +52,7 @@ def late_joiner(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-LIFE-02")
+@check("DEX1-LIFE-02", "DEX3-LIFE-02")
 def restarted_client(ctx: Context) -> Outcome:
     """The step of the client that took over."""
     return arrival(ctx, "commanded by a restarted client")

@@ -13,12 +13,17 @@ from dexkit.hand import Floats
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the target and what q did.
+    """A step of one joint's target and what q did.
 
+    :param name: of the joint, where the hand has several.
+    :param stroke: of the joint, rad.
     :param start: q before it.
     :param final: q at its end (median of the last 0.2 s).
     """
 
+    name: str
+    joint: int
+    stroke: float
     begin: float
     end: float
     target: float
@@ -39,42 +44,52 @@ class Step:
 
     def __str__(self) -> str:
         return (
-            f"commanded from {self.start:.2f} to {self.target:.2f} rad, q went to {self.final:.2f}"
+            f"{self.name}commanded from {self.start:.2f} to {self.target:.2f} rad, q went to "
+            f"{self.final:.2f}"
         )
 
 
-def step_of(ctx: Context, phase: Phase) -> Step | None:
-    """A phase with a target as a step of this side; None without states in it."""
+def steps_of(ctx: Context, phase: Phase) -> list[Step]:
+    """A phase with targets as steps of this side's joints; those without states are left out."""
     begin, end = ctx.span(phase)
     states = ctx.states
-    rows = states.between(begin, end)
-    t, q = states.t[rows], states.q[rows]
-    before = states.q[states.between(begin - 0.1, begin)]
-    before = before[np.isfinite(before)]
-    good = np.isfinite(q)
-    t, q = t[good], q[good]
-    if not len(q) or ctx.side not in phase.targets:
-        return None
-    return Step(
-        begin=begin,
-        end=end,
-        target=phase.targets[ctx.side],
-        start=float(np.median(before)) if len(before) else float(q[0]),
-        final=float(np.median(q[t >= end - 0.2])) if (t >= end - 0.2).any() else float(q[-1]),
-        t=t,
-        q=q,
-    )
+    rows, before = states.between(begin, end), states.between(begin - 0.1, begin)
+    found = []
+    for joint, target in phase.targets.get(ctx.side, {}).items():
+        t, q = states.t[rows], states.q[rows, joint]
+        earlier = states.q[before, joint]
+        earlier = earlier[np.isfinite(earlier)]
+        good = np.isfinite(q)
+        t, q = t[good], q[good]
+        if not len(q):
+            continue
+        late = t >= end - 0.2
+        found.append(
+            Step(
+                name=ctx.named("", joint),
+                joint=joint,
+                stroke=ctx.joints[joint].stroke,
+                begin=begin,
+                end=end,
+                target=target,
+                start=float(np.median(earlier)) if len(earlier) else float(q[0]),
+                final=float(np.median(q[late])) if late.any() else float(q[-1]),
+                t=t,
+                q=q,
+            )
+        )
+    return found
 
 
 def steps(ctx: Context) -> list[Step]:
-    """The steps of this side."""
-    return [s for p in ctx.phases() if (s := step_of(ctx, p)) is not None]
+    """The steps of this side's joints."""
+    return [s for p in ctx.phases() for s in steps_of(ctx, p)]
 
 
-@check("DEX1-MOVE-01")
+@check("DEX1-MOVE-01", "DEX3-MOVE-01")
 def direction(ctx: Context) -> Outcome:
     """Progress towards the target, as a part of the step."""
-    found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * ctx.stroke]
+    found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * s.stroke]
     if not found:
         return ctx.failed(
             "no step",
@@ -91,8 +106,8 @@ def direction(ctx: Context) -> Outcome:
         )
     step = found[worst]
     moved = float(np.ptp(step.q))
-    verdict = "it did not move" if moved < 0.02 * ctx.stroke else "that is the wrong way"
-    if progress[worst] > -0.05 and moved >= 0.02 * ctx.stroke:
+    verdict = "it did not move" if moved < 0.02 * step.stroke else "that is the wrong way"
+    if progress[worst] > -0.05 and moved >= 0.02 * step.stroke:
         verdict = "it did not get there"
     return ctx.failed(
         f"{progress[worst]:+.0%}",
@@ -102,14 +117,14 @@ def direction(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-MOVE-02")
+@check("DEX1-MOVE-02", "DEX3-MOVE-02")
 def arrives(ctx: Context) -> Outcome:
     """Distance from the target at the end of each step."""
     found = steps(ctx)
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand during the steps")
-    worst = max(found, key=lambda s: s.error)
-    if worst.error <= ctx.tolerance("max_error_stroke"):
+    worst = max(found, key=lambda s: s.error / s.stroke)
+    if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
         return ctx.passed(
             f"{worst.error:.3f} rad",
             f"{len(found)} steps, ending at most {worst.error:.3f} rad off",
@@ -123,7 +138,7 @@ def arrives(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-MOVE-03")
+@check("DEX1-MOVE-03", "DEX3-MOVE-03")
 def settles(ctx: Context) -> Outcome:
     """Ripple of q at the end of each step."""
     ripples = []
@@ -134,25 +149,26 @@ def settles(ctx: Context) -> Outcome:
             ripples.append((float(np.ptp(tail)), step))
     if not ripples:
         return ctx.skipped("too few states at the end of the steps")
-    ripple, step = max(ripples, key=lambda r: r[0])
-    if ripple <= ctx.tolerance("max_ripple_stroke"):
+    ripple, step = max(ripples, key=lambda r: r[0] / r[1].stroke)
+    if ripple <= ctx.tolerance("max_ripple_stroke", step.joint):
         return ctx.passed(
             f"{ripple:.3f} rad", f"ripple of at most {ripple:.3f} rad", ripple_rad=ripple
         )
     return ctx.failed(
         f"{ripple:.2f} rad",
-        f"at the target {step.target:.2f} rad q still moves by {ripple:.2f} rad, peak to peak",
+        f"{step.name}at the target {step.target:.2f} rad q still moves by {ripple:.2f} rad, peak "
+        "to peak",
         ctx.at(ctx.states.topic, step.end - window, step.end),
         ripple_rad=ripple,
     )
 
 
-@check("DEX1-MOVE-04")
+@check("DEX1-MOVE-04", "DEX3-MOVE-04")
 def speed(ctx: Context) -> Outcome:
     """Speed from 10 to 90 % of each large step."""
     found = []
     for step in steps(ctx):
-        if abs(step.size) < ctx.tolerance("min_step_stroke"):
+        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
             continue
         part = (step.q - step.start) / step.size
         low, high = np.argmax(part >= 0.1), np.argmax(part >= 0.9)
@@ -163,7 +179,7 @@ def speed(ctx: Context) -> Outcome:
     if not found:
         return ctx.skipped("no step of that size was finished")
     slowest, step = min(found, key=lambda f: f[0])
-    text = f"{slowest:.2f} rad/s in the slowest of {len(found)} large steps"
+    text = f"{step.name}{slowest:.2f} rad/s in the slowest of {len(found)} large steps"
     if slowest >= ctx.tolerance("min_speed_rad_s"):
         return ctx.passed(f"{slowest:.1f} rad/s", text, speed_rad_s=slowest)
     return ctx.failed(
@@ -174,91 +190,96 @@ def speed(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-MOVE-05")
+@check("DEX1-MOVE-05", "DEX3-MOVE-05")
 def overshoot(ctx: Context) -> Outcome:
     """How far q goes beyond the target."""
     found = [
         (float(np.max((s.q - s.target) * np.sign(s.size))), s)
         for s in steps(ctx)
-        if abs(s.size) >= 0.1 * ctx.stroke
+        if abs(s.size) >= 0.1 * s.stroke
     ]
     if not found:
         return ctx.skipped("no step of that size")
-    beyond, step = max(found, key=lambda f: f[0])
+    beyond, step = max(found, key=lambda f: f[0] / f[1].stroke)
     beyond = max(beyond, 0.0)
-    if beyond <= ctx.tolerance("max_overshoot_stroke"):
+    if beyond <= ctx.tolerance("max_overshoot_stroke", step.joint):
         return ctx.passed(
             f"{beyond:.3f} rad", f"at most {beyond:.3f} rad beyond the target", overshoot_rad=beyond
         )
     return ctx.failed(
         f"{beyond:.2f} rad",
-        f"{beyond:.2f} rad beyond the target {step.target:.2f} rad",
+        f"{step.name}{beyond:.2f} rad beyond the target {step.target:.2f} rad",
         ctx.at(ctx.states.topic, step.begin, step.end),
         overshoot_rad=beyond,
     )
 
 
-@check("DEX1-SIDE-01")
+@check("DEX1-SIDE-01", "DEX3-SIDE-01")
 def independent(ctx: Context) -> Outcome:
     """Motion of this hand while only the other one's target changes."""
-    others = [p for p in ctx.recording.phases("step") if ctx.side not in p.sides]
+    name = ctx.requirement.phase or ""
+    others = [p for p in ctx.recording.phases(name) if ctx.side not in p.sides]
     if not others:
         return ctx.skipped("only one side was commanded")
-    moved: list[tuple[float, float, float]] = []
+    moved: list[tuple[float, float, int, float, float]] = []
     for phase in others:
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
-        t, q = ctx.states.t[rows], ctx.states.q[rows]
+        t, positions = ctx.states.t[rows], ctx.states.q[rows]
         before = ctx.states.q[ctx.states.between(begin - 0.25, begin)]
-        if len(q) < 2 or not len(before):
+        if len(t) < 2 or not len(before):
             continue
         # the mean of each quarter of a second: a hand that hunts about its target is
-        # DEX1-MOVE-03's finding
+        # MOVE-03's finding
         bins = ((t - begin) / 0.25).astype(np.intp)
         counts = np.bincount(bins)
-        means = np.bincount(bins, q)[counts > 0] / counts[counts > 0]
-        moved.append((float(np.abs(means - before.mean()).max()), begin, end))
+        for joint, spec in enumerate(ctx.joints):
+            means = np.bincount(bins, positions[:, joint])[counts > 0] / counts[counts > 0]
+            most = float(np.abs(means - before[:, joint].mean()).max())
+            moved.append((most / spec.stroke, most, joint, begin, end))
     if not moved:
         return ctx.skipped("no state of this hand while the other one moved")
-    most, begin, end = max(moved)
+    _, most, joint, begin, end = max(moved)
     other = "right" if ctx.side == "left" else "left"
-    if most <= ctx.tolerance("max_motion_stroke"):
+    if most <= ctx.tolerance("max_motion_stroke", joint):
         return ctx.passed(
             f"{most:.3f} rad",
-            f"moved by {most:.3f} rad in {len(moved)} steps of the {other} hand",
+            f"moved by {most:.3f} rad in {len(others)} steps of the {other} hand",
             motion_rad=most,
         )
     return ctx.failed(
         f"{most:.2f} rad",
-        f"moved by {most:.2f} rad while only the {other} hand was commanded to move",
+        ctx.named(
+            f"moved by {most:.2f} rad while only the {other} hand was commanded to move", joint
+        ),
         ctx.at(ctx.states.topic, begin, end),
         motion_rad=most,
     )
 
 
-@check("DEX1-GAIN-01")
+@check("DEX1-GAIN-01", "DEX3-GAIN-01")
 def zero_gains(ctx: Context) -> Outcome:
     """Motion towards q while all gains are zero."""
-    worst: tuple[float, Step] | None = None
-    for phase in ctx.phases():
-        step = step_of(ctx, phase)
-        if step is None:
-            continue
-        towards = float(np.max((step.q - step.start) * np.sign(step.size)))
-        if worst is None or towards > worst[0]:
-            worst = (towards, step)
-    if worst is None:
-        return ctx.skipped("no state while the gains were zero")
-    towards, step = max(0.0, worst[0]), worst[1]
-    if towards <= ctx.tolerance("max_motion_stroke"):
+    return not_pulled(ctx, "with kp = kd = 0")
+
+
+def not_pulled(ctx: Context, how: str) -> Outcome:
+    """How far each joint moves towards a q that must not pull."""
+    found = [(float(np.max((s.q - s.start) * np.sign(s.size))), s) for s in steps(ctx)]
+    if not found:
+        return ctx.skipped("no state during this stimulus")
+    towards, step = max(found, key=lambda f: f[0] / f[1].stroke)
+    towards = max(0.0, towards)
+    if towards <= ctx.tolerance("max_motion_stroke", step.joint):
         return ctx.passed(
             f"{towards:.3f} rad",
-            f"moved {towards:.3f} rad towards a q that was {abs(step.size):.2f} rad away",
+            f"{step.name}moved {towards:.3f} rad towards a q that was {abs(step.size):.2f} rad "
+            "away",
             motion_rad=towards,
         )
     return ctx.failed(
         f"{towards:.2f} rad",
-        f"moved {towards:.2f} rad towards q = {step.target:.2f} with kp = kd = 0",
+        f"{step.name}moved {towards:.2f} rad towards q = {step.target:.2f} {how}",
         ctx.at(ctx.states.topic, step.begin, step.end),
         motion_rad=towards,
     )

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.motion import Step, step_of
+from dexkit.conformance.checks.motion import Step, steps, steps_of
 from dexkit.conformance.checks.timing import gaps
 from dexkit.conformance.phases import Phase
 
 
 def _recovery(ctx: Context, phase: Phase) -> Step | None:
-    """The step that follows a bad command."""
+    """The step that follows a bad command, of the joint that did worst in it."""
     for after in ctx.phases("recover"):
         if after.params.get("after") == phase.name and after.begin_ns >= phase.end_ns:
-            return step_of(ctx, after)
+            found = steps_of(ctx, after)
+            return max(found, key=lambda s: s.error / s.stroke) if found else None
     return None
 
 
-def _unharmed(ctx: Context, what: str) -> Outcome:
+def unharmed(ctx: Context, what: str) -> Outcome:
     """State goes on, and the hand obeys afterwards. ``met`` None: nothing wrong so far."""
     topic = ctx.states.topic
     for phase in ctx.phases():
@@ -36,7 +40,7 @@ def _unharmed(ctx: Context, what: str) -> Outcome:
             return ctx.failed(
                 "no state", f"no state after {what}, when a good command came", ctx.at(topic, end)
             )
-        if step.error > ctx.tolerance("max_error_stroke"):
+        if step.error > ctx.tolerance("max_error_stroke", step.joint):
             return ctx.failed(
                 "disobeys",
                 f"after {what}: {step}",
@@ -46,9 +50,12 @@ def _unharmed(ctx: Context, what: str) -> Outcome:
     return Outcome(None)
 
 
-def _stays(ctx: Context, what: str) -> Outcome:
-    """Nothing moves, then :func:`_unharmed`."""
-    most = 0.0
+def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
+    """Failed if a joint moves during the phase; otherwise passed, with how far.
+
+    :param joints: those that must not move; None for all.
+    """
+    far: tuple[float, float, int] = (0.0, 0.0, 0)
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
@@ -57,72 +64,93 @@ def _stays(ctx: Context, what: str) -> Outcome:
         if not len(before) or not len(q):
             continue
         with np.errstate(invalid="ignore"):
-            deviation = np.abs(q - np.median(before))
-        if not np.isfinite(deviation).all():
-            i = int(np.argmin(np.isfinite(deviation)))
-            return ctx.failed(
-                "q not finite",
-                f"q became {q[i]} during {what}",
-                ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-            )
-        i = int(np.argmax(deviation))
-        most = max(most, float(deviation[i]))
-        if most > ctx.tolerance("max_motion_stroke"):
-            return ctx.failed(
-                f"{most:.2f} rad",
-                f"moved by {most:.2f} rad during {what}",
-                ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                motion_rad=most,
-            )
-    outcome = _unharmed(ctx, what)
-    if outcome.met is False:
-        return outcome
+            deviation = np.abs(q - np.median(before, axis=0))
+        for joint in range(len(ctx.joints)) if joints is None else joints:
+            column = deviation[:, joint]
+            if not np.isfinite(column).all():
+                i = int(np.argmin(np.isfinite(column)))
+                return ctx.failed(
+                    "q not finite",
+                    ctx.named(f"q became {q[i, joint]} during {what}", joint),
+                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                )
+            i = int(np.argmax(column))
+            most = float(column[i])
+            if most > ctx.tolerance("max_motion_stroke", joint):
+                return ctx.failed(
+                    f"{most:.2f} rad",
+                    ctx.named(f"moved by {most:.2f} rad during {what}", joint),
+                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                    motion_rad=most,
+                )
+            far = max(far, (most / ctx.joints[joint].stroke, most, joint))
+    _, most, joint = far
     return ctx.passed(
-        f"{most:.3f} rad", f"moved by {most:.3f} rad during {what}, then obeyed", motion_rad=most
+        f"{most:.3f} rad",
+        ctx.named(f"moved by {most:.3f} rad during {what}", joint),
+        motion_rad=most,
     )
 
 
-@check("DEX1-SAFE-01")
+def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
+    """Nothing :func:`moves`, then :func:`unharmed`."""
+    still = moves(ctx, what, joints)
+    if still.met is False:
+        return still
+    after = unharmed(ctx, what)
+    if after.met is False:
+        return after
+    return replace(still, observed=f"{still.observed}, then obeyed")
+
+
+@check("DEX1-SAFE-01", "DEX3-SAFE-01")
 def not_finite(ctx: Context) -> Outcome:
     """NaN and infinity in every field."""
-    return _stays(ctx, "commands with NaN and infinity")
+    return stays(ctx, "commands with NaN and infinity")
 
 
-@check("DEX1-SAFE-02")
+@check("DEX1-SAFE-02", "DEX3-SAFE-02")
 def out_of_range(ctx: Context) -> Outcome:
     """Positions far outside the stroke."""
     margin = ctx.tolerance("margin_rad")
-    low, high = np.inf, -np.inf
+    reached: list[str] = []
+    values: dict[str, float] = {}
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end + 0.1)
-        q = ctx.states.q[rows]
-        if not len(q):
-            continue
-        bad = ~((q >= -margin) & (q <= ctx.stroke + margin))
-        if bad.any():
-            i = int(np.argmax(bad))
-            return ctx.failed(
-                f"{q[i]:.2f} rad",
-                f"q became {q[i]:.2f} rad; the stroke is 0 to {ctx.stroke:.2f} rad",
-                ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-            )
-        low, high = min(low, float(q.min())), max(high, float(q.max()))
-    outcome = _unharmed(ctx, "commands far out of range")
+        for joint, spec in enumerate(ctx.joints):
+            q = ctx.states.q[rows, joint]
+            if not len(q):
+                continue
+            bad = ~((q >= spec.q_min - margin) & (q <= spec.q_max + margin))
+            if bad.any():
+                i = int(np.argmax(bad))
+                return ctx.failed(
+                    f"{q[i]:.2f} rad",
+                    ctx.named(
+                        f"q became {q[i]:.2f} rad; the stroke is {spec.q_min:g} to "
+                        f"{spec.q_max:.2f} rad",
+                        joint,
+                    ),
+                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                )
+            reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} rad")
+            values = {"q_min": float(q.min()), "q_max": float(q.max())}
+    outcome = unharmed(ctx, "commands far out of range")
     if outcome.met is False:
         return outcome
+    figure = reached[0] if len(ctx.joints) == 1 and reached else "within limits"
     return ctx.passed(
-        f"{low:.2f} .. {high:.2f} rad",
+        figure,
         "q stayed within the stroke, then obeyed",
-        q_min=low,
-        q_max=high,
+        **(values if len(ctx.joints) == 1 else {}),
     )
 
 
-@check("DEX1-SAFE-03")
+@check("DEX1-SAFE-03", "DEX3-SAFE-03")
 def empty(ctx: Context) -> Outcome:
     """Commands without a motor in them."""
-    return _stays(ctx, "empty commands")
+    return stays(ctx, "empty commands")
 
 
 def _silences(ctx: Context) -> list[tuple[float, float]]:
@@ -151,8 +179,8 @@ def brakes(ctx: Context) -> Outcome:
     for last, end in _silences(ctx):
         free = states.between(last, last + timeout)
         late = states.between(last + timeout + ctx.tolerance("grace_s"), end)
-        q_free, q_late = states.q[free], states.q[late]
-        before = states.tau[states.between(last - 0.2, last)]
+        q_free, q_late = states.q[free, 0], states.q[late, 0]
+        before = states.tau[states.between(last - 0.2, last), 0]
         if len(q_late) < 5 or not len(q_free) or not len(before):
             continue
         moved = float(np.ptp(q_late))
@@ -164,13 +192,14 @@ def brakes(ctx: Context) -> Outcome:
                 motion_rad=moved,
             )
         # at its stop it would stand still without a brake, too
-        at_stop = not 0.05 * ctx.stroke < float(np.median(q_late)) < 0.95 * ctx.stroke
+        stroke = ctx.joints[0].stroke
+        at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
         if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
             proofs.append(f"was moving, then moved only {moved:.3f} rad")
             values["motion_rad"] = moved
         pressed = float(np.median(np.abs(before)))
-        if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_q is not None:
-            still = float(np.median(np.abs(states.tau[late])))
+        if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_at is not None:
+            still = float(np.median(np.abs(states.tau[late, 0])))
             if still > ctx.tolerance("max_tau_part") * pressed:
                 return ctx.failed(
                     f"{still:.2f} N m",
@@ -181,8 +210,8 @@ def brakes(ctx: Context) -> Outcome:
                 )
             proofs.append(f"pressed with {pressed:.2f} N m, then with {still:.2f} N m")
             values["tau_nm"] = still
-        driven = states.mode[states.between(last - 0.2, last)]
-        if not proofs and (driven > 0).all() and (states.mode[late] == 0).all():
+        driven = states.mode[states.between(last - 0.2, last), 0]
+        if not proofs and (driven > 0).all() and (states.mode[late, 0] == 0).all():
             proofs.append(f"stood still, and reports the brake: mode {driven[-1]:.0f}, then 0")
     if not proofs:
         return ctx.skipped(
@@ -194,7 +223,7 @@ def brakes(ctx: Context) -> Outcome:
     return ctx.passed(figure, "; ".join(proofs), **values)
 
 
-@check("DEX1-WDOG-02")
+@check("DEX1-WDOG-02", "DEX3-WDOG-02")
 def state_in_silence(ctx: Context) -> Outcome:
     """Gaps of the state while no command comes."""
     limit = ctx.tolerance("max_gap_s")
@@ -220,7 +249,7 @@ def state_in_silence(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-WDOG-03")
+@check("DEX1-WDOG-03", "DEX3-WDOG-03")
 def resumes(ctx: Context) -> Outcome:
     """The step after a silence."""
     return arrival(ctx, "after a silence")
@@ -228,11 +257,11 @@ def resumes(ctx: Context) -> Outcome:
 
 def arrival(ctx: Context, when: str) -> Outcome:
     """Whether the phase's step arrives."""
-    found = [s for p in ctx.phases() if (s := step_of(ctx, p)) is not None]
+    found = steps(ctx)
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
-    worst = max(found, key=lambda s: s.error)
-    if worst.error <= ctx.tolerance("max_error_stroke"):
+    worst = max(found, key=lambda s: s.error / s.stroke)
+    if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
         return ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
     return ctx.failed(
         "disobeys",

@@ -31,7 +31,7 @@ def _observed(ctx: Context) -> tuple[Floats, float]:
 def _rate(ctx: Context) -> tuple[float, float] | None:
     """(mean rate outside of gaps, seconds observed), or None if that is too short."""
     intervals, _ = _observed(ctx)
-    steady = intervals[intervals <= 0.1]  # longer ones are DEX1-RATE-03's finding
+    steady = intervals[intervals <= 0.1]  # longer ones are RATE-03's finding
     seconds = float(steady.sum())
     if seconds < ctx.tolerance("min_observed_s"):
         return None
@@ -44,7 +44,7 @@ def _too_short(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-RATE-01")
+@check("DEX1-RATE-01", "DEX3-RATE-01")
 def mean_rate(ctx: Context) -> Outcome:
     """Mean rate outside of gaps."""
     clock = ctx.states.clock
@@ -67,7 +67,7 @@ def mean_rate(ctx: Context) -> Outcome:
     return ctx.passed(f"{rate:.1f} Hz", f"{rate:.1f} Hz over {seconds:.1f} s", rate_hz=rate)
 
 
-@check("DEX1-RATE-02")
+@check("DEX1-RATE-02", "DEX3-RATE-02")
 def vendor_rate(ctx: Context) -> Outcome:
     """Mean rate compared with the vendor's."""
     measured = _rate(ctx)
@@ -80,7 +80,7 @@ def vendor_rate(ctx: Context) -> Outcome:
     return ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
 
 
-@check("DEX1-RATE-03")
+@check("DEX1-RATE-03", "DEX3-RATE-03")
 def no_gap(ctx: Context) -> Outcome:
     """Longest silence of the state."""
     limit = ctx.tolerance("max_gap_s")
@@ -108,7 +108,7 @@ def no_gap(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-RATE-04")
+@check("DEX1-RATE-04", "DEX3-RATE-04")
 def regular(ctx: Context) -> Outcome:
     """99th percentile of the intervals."""
     intervals, seconds = _observed(ctx)
@@ -121,7 +121,7 @@ def regular(ctx: Context) -> Outcome:
     return ctx.failed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
 
 
-@check("DEX1-ORDER-01")
+@check("DEX1-ORDER-01", "DEX3-ORDER-01")
 def order(ctx: Context) -> Outcome:
     """Source timestamps rise from sample to sample."""
     sent = ctx.states.sent
@@ -140,27 +140,41 @@ def order(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-FRESH-01")
+@check("DEX1-FRESH-01", "DEX3-FRESH-01")
 def fresh(ctx: Context) -> Outcome:
     """How long a value stays while the gripper moves."""
-    t, q = ctx.states.t, ctx.states.q
+    worst: Outcome | None = None
+    for joint in range(len(ctx.joints)):
+        outcome = _fresh(ctx, joint)
+        if outcome.met is False:
+            return outcome
+        held = outcome.values.get("hold_s", -1.0)
+        if worst is None or held > worst.values.get("hold_s", -1.0):
+            worst = outcome
+    assert worst is not None
+    return worst
+
+
+def _fresh(ctx: Context, joint: int) -> Outcome:
+    t, q = ctx.states.t, ctx.states.q[:, joint]
     good = np.isfinite(q)
     t, q = t[good], q[good]
     if len(q) < 2:
         return ctx.skipped("fewer than two states with a position")
     changes = np.flatnonzero(np.diff(q) != 0) + 1
     if len(changes) < 3:
-        return ctx.skipped("the gripper does not move in this recording")
+        return ctx.skipped("the hand does not move in this recording")
     size = np.diff(q)[changes - 1]
-    big = np.abs(size) >= ctx.tolerance("min_change_stroke")
+    least = ctx.tolerance("min_change_stroke", joint)
+    big = np.abs(size) >= least
     same_way = np.sign(size[1:]) == np.sign(size[:-1])
     # a value held between two large changes of one direction was old when it was sent again
     moving = big[1:] & big[:-1] & same_way
     holds = np.diff(t[changes])[moving]
     travel = float(np.ptp(q))
     if len(holds) < ctx.tolerance("min_intervals"):
-        if travel < ctx.tolerance("min_change_stroke"):
-            return ctx.skipped("the gripper does not move in this recording")
+        if travel < least:
+            return ctx.skipped("the hand does not move in this recording")
         # changes too small to be called steps: fresher than the rule asks for
         fastest = float(np.median(np.diff(t[changes])))
         return ctx.passed(
@@ -169,11 +183,11 @@ def fresh(ctx: Context) -> Outcome:
     hold = float(np.median(holds))
     text = f"a new value every {hold * 1e3:.1f} ms while moving (median of {len(holds)})"
     if hold <= ctx.tolerance("max_hold_s"):
-        return ctx.passed(f"{hold * 1e3:.1f} ms", text, hold_s=hold)
+        return ctx.passed(f"{hold * 1e3:.1f} ms", ctx.named(text, joint), hold_s=hold)
     starts = t[changes][:-1][moving]
     return ctx.failed(
         f"{hold * 1e3:.0f} ms",
-        text,
+        ctx.named(text, joint),
         *(ctx.at(ctx.states.topic, float(s), float(s) + hold) for s in starts[:3]),
         hold_s=hold,
     )

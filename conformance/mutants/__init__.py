@@ -1,8 +1,7 @@
 """Deliberately wrong hands: each does one thing wrong, and the checks must notice exactly that.
 
-A mutant is a small change of :class:`~dexkit.conformance.virtual.ReferenceService` or of its
-hand. :attr:`Mutant.kills` is the requirement that must catch it; ``also`` names what cannot but
-fail with it. No other requirement may fail or warn: it would be caught for the wrong reason.
+A mutant is a small change of its model's reference service or of its hand. :attr:`Mutant.kills` is
+the requirement that must catch it; ``also`` names what cannot but fail with it. No other requirement may fail or warn: it would be caught for the wrong reason.
 """
 
 from __future__ import annotations
@@ -12,14 +11,16 @@ from dataclasses import dataclass
 from functools import cache
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants.zoo import ZOO
+from dexkit.conformance.mutants import gripper
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli import Plan, Session, phases_for
+from dexkit.conformance.stimuli.script import DEFAULT_OBJECT, object_places
 from dexkit.conformance.view import Recording
-from dexkit.conformance.virtual import ReferenceService, run_virtual
+from dexkit.conformance.virtual import Service, run_virtual
+from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
-from dexkit.models import dialect
+from dexkit.models import DEX1_1, dialect
 
 __all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
 
@@ -30,12 +31,14 @@ SESSION_SECONDS = 4.0
 class Mutant:
     """One wrong hand.
 
+    :param model: the hand model that it is a bad copy of.
     :param kills: the requirement that must catch it.
     :param also: requirements that fail or warn with it.
     """
 
     name: str
-    service: type[ReferenceService]
+    model: str
+    service: type[Service]
     kills: str
     also: tuple[str, ...] = ()
 
@@ -46,13 +49,17 @@ class Mutant:
 
 
 MUTANTS: tuple[Mutant, ...] = tuple(
-    Mutant(service.__name__, service, kills, also) for service, kills, also in ZOO
+    Mutant(service.__name__, model, service, kills, also)
+    for model, zoo in ((DEX1_1.name, gripper.ZOO),)
+    for service, kills, also in zoo
 )
+REFERENCES: dict[str, type[Service]] = {DEX1_1.name: ReferenceService}
+"""The good hand of each model."""
 
 
 @cache
-def _session() -> Session:
-    return Session.default().first_seconds(SESSION_SECONDS)
+def _session(model: str) -> Session:
+    return Session.default(model).first_seconds(SESSION_SECONDS)
 
 
 def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(Side)) -> Plan:
@@ -61,13 +68,13 @@ def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(
     return Plan(
         dialect=chosen,
         sides=tuple(sides),
-        objects={Side.RIGHT: 0.37 * chosen.q_open} if Side.RIGHT in sides else {},
-        session=_session(),
-        phases=phases_for(catalogue()),
+        objects=object_places(chosen, {s: p for s, p in DEFAULT_OBJECT.items() if s in sides}),
+        session=_session(chosen.model),
+        phases=phases_for(catalogue(chosen.model)),
     )
 
 
-def run_mutant(service: type[ReferenceService], plan: Plan | None = None) -> RunResult:
+def run_mutant(service: type[Service], plan: Plan | None = None) -> RunResult:
     """Judge one service, on the virtual clock."""
     chosen = plan or plan_for()
     trace = run_virtual(chosen, service)

@@ -6,7 +6,7 @@ import threading
 import time
 
 from dexkit.clock import Rate
-from dexkit.conformance.virtual import TICK, ReferenceService
+from dexkit.conformance.virtual import Service
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 
 __all__ = ["LiveMutant"]
@@ -16,10 +16,10 @@ class LiveMutant:
     """Serves a virtual service in real time, from a thread; a context manager.
 
     The hand does what it does on the virtual clock, except what only the virtual wire can do:
-    :attr:`~ReferenceService.serves_late_readers`. Clients are told apart by their writers.
+    :attr:`~Service.serves_late_readers`. Clients are told apart by their writers.
     """
 
-    def __init__(self, service: ReferenceService, domain: int, interface: str = "lo") -> None:
+    def __init__(self, service: Service, domain: int, interface: str = "lo") -> None:
         self.service = service
         self._node = DdsNode(domain=domain, interface=interface)
         self._stop = threading.Event()
@@ -47,7 +47,8 @@ class LiveMutant:
         self._node.close()
 
     def _run(self) -> None:
-        rate = Rate(1.0 / TICK)
+        tick = self.service.tick
+        rate = Rate(1.0 / tick)
         last = time.monotonic()
         while not self._stop.is_set():
             for topic, reader in self._readers.items():
@@ -56,9 +57,9 @@ class LiveMutant:
                     self.service.receive(topic, sample.data, client)
             # late ticks are lived through, so that the hand does not slow down with the machine
             now = time.monotonic()
-            while last + TICK <= now:
-                last += TICK
-                for state in self.service.advance(TICK):
+            while last + tick <= now:
+                last += tick
+                for state in self.service.advance(tick):
                     self._writer(state.topic, state.type_name).write_raw(state.payload)
             rate.wait()
 

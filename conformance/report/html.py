@@ -195,11 +195,11 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
         return f"<h3>{hand.side} hand</h3><p>No state of this hand was received.</p>"
     span = (0.0, max(view.duration, 0.1))
     bands = _bands(view, hand.side) + _alarms(result, hand.side)
-    stroke = view.dialect.q_open
-    goal = np.clip(commands.q, -0.1 * stroke, 1.1 * stroke)  # wild ones would squash the rest
+    stroke = hand.joints[0].stroke
+    goal = np.clip(commands.q[:, 0], -0.1 * stroke, 1.1 * stroke)  # wild ones would squash the rest
     lines = [
         Line("command", "cmd", commands.t, goal),
-        Line("state", "state", states.t, states.q),
+        Line("state", "state", states.t, states.q[:, 0]),
     ]
     touch = view.stimulus.objects.get(hand.side) if view.stimulus else None
     felt = [(touch, "object")] if touch is not None else []
@@ -240,7 +240,7 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
         _plot(
             time_plot(
                 f"{hand.side} hand, force",
-                [Line("force", "force", states.t, states.tau)],
+                [Line("force", "force", states.t, states.tau[:, 0])],
                 unit="N m",
                 span=span,
                 bands=_bands(view, hand.side, label=False),

@@ -23,14 +23,26 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["CONFIDENCE", "Level", "Requirement", "catalogue", "load", "parse", "select"]
+__all__ = [
+    "CONFIDENCE",
+    "LAYERS",
+    "Level",
+    "Requirement",
+    "catalogue",
+    "load",
+    "models",
+    "parse",
+    "select",
+]
 
 CONFIDENCE = ("vendor document", "vendor code", "measured", "inferred")
 """How sure the source of a requirement is, from best to least."""
 
-_ID = re.compile(r"^[A-Z0-9]+-[A-Z]+-\d\d$")
-_NEEDS = ("nothing", "endpoints", "state", "commands", "motion")
+_ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
+_NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
+LAYERS = ("dds", "usb")
+"""Where a requirement is judged: on the topics, or on the hand's own USB device."""
 _KEYS = {
     "id",
     "area",
@@ -70,12 +82,13 @@ class Requirement:
     :param sentence: the norm, tolerances filled in.
     :param confidence: one of :data:`CONFIDENCE`.
     :param needs: what a recording must hold to judge it: ``nothing`` (absence is the finding),
-        ``endpoints`` (what discovery saw), ``state``, ``commands``, ``motion``, or
-        ``phase:NAME``, a phase of the kit's own stimulus (``other-phase:NAME``: one in which the
-        other side is moved).
+        ``endpoints`` (what discovery saw), ``state``, ``commands``, ``session`` (commands of
+        some length; a live run replays one), ``motion``, or ``phase:NAME``, a phase of the kit's
+        own stimulus (``other-phase:NAME``: one in which the other side is moved).
     :param after: requirements that must not have failed, or this one is blocked.
     :param dialects: the dialects that it applies to.
     :param tolerances: the figures that the check compares with.
+    :param layer: one of :data:`LAYERS`; a file's ``layer``, ``dds`` where it says nothing.
     :param realtime: a machine that is short of processor time can make a good hand fail it; a
         failure is then not blamed on the hand.
     :param advice: likely cause and what to try, printed with a failure.
@@ -96,6 +109,7 @@ class Requirement:
     dialects: tuple[str, ...] = ()
     tolerances: Mapping[str, float] = field(default_factory=dict)
     realtime: bool = False
+    layer: str = "dds"
 
     @property
     def phase(self) -> str | None:
@@ -132,6 +146,9 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
     """
     document = tomllib.loads(text)
     hand = model(str(document.get("model", "")))
+    layer = str(document.get("layer", "dds"))
+    if layer not in LAYERS:
+        raise UsageError(f"{origin}: layer is one of {', '.join(LAYERS)}")
     dialect_names = tuple(d.name for d in hand.dialects)
     found: dict[str, Requirement] = {}
     for entry in document.get("requirement", []):
@@ -174,6 +191,7 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
             dialects=tuple(entry.get("dialects", dialect_names)),
             tolerances=tolerances,
             realtime=bool(entry.get("realtime", False)),
+            layer=layer,
         )
     return tuple(found.values())
 
@@ -187,12 +205,30 @@ def load(path: Path) -> tuple[Requirement, ...]:
 
 
 @cache
-def catalogue() -> tuple[Requirement, ...]:
-    """All requirements that ship with dexkit, in their order."""
+def _shipped() -> tuple[Requirement, ...]:
     found: list[Requirement] = []
     for path in sorted(Path(__file__).parent.glob("*.toml")):
         found += load(path)
     return tuple(found)
+
+
+@cache
+def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requirement, ...]:
+    """The requirements that ship with dexkit, in their order.
+
+    :param model: only those of that hand model; None for all.
+    :param layer: only those judged there; None for all.
+    """
+    return tuple(
+        r
+        for r in _shipped()
+        if (model is None or r.model == model) and (layer is None or r.layer == layer)
+    )
+
+
+def models() -> tuple[str, ...]:
+    """The hand models that have requirements."""
+    return tuple(dict.fromkeys(r.model for r in _shipped()))
 
 
 def select(

@@ -41,6 +41,7 @@ def _needs(requirement: Requirement) -> str:
         "endpoints": "what discovery saw",
         "state": "any state",
         "commands": "any commanded session",
+        "session": "any commanded session",
         "motion": "any motion",
     }.get(requirement.needs)
     if where is None:

@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from dexkit.conformance.view import Commands, Recording
-from dexkit.conformance.wire import Motor
+from dexkit.conformance.wire import Motor, Motors
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
+from dexkit.models import DEX1_1, DEX3_1, Dialect, model
 from dexkit.traces import open_trace, sample_path
 
-__all__ = ["DEFAULT_SECONDS", "DEFAULT_SESSION", "Session"]
+__all__ = ["DEFAULT_SECONDS", "DEFAULT_SESSIONS", "Session"]
 
-DEFAULT_SESSION = "dex1_pick_place"
+DEFAULT_SESSIONS = {DEX1_1.name: "dex1_pick_place", DEX3_1.name: "dex3_pinch"}
 DEFAULT_SECONDS = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """The commands of a recording, in its own dialect's radians.
-
-    :param stroke: full stroke of that dialect.
-    """
+    """The commands of a recording, in its own dialect's radians."""
 
     name: str
-    stroke: float
+    dialect: Dialect
     duration: float
     commands: dict[Side, Commands]
 
@@ -37,7 +35,7 @@ class Session:
         """The commands of a recording, from the first one on.
 
         :param seconds: no more than so much of it; None for all.
-        :raises ConformanceError: it holds no commands to a hand of this model.
+        :raises ConformanceError: it holds no commands to a hand of the family.
         :raises TraceError: it cannot be read.
         """
         recording = Recording.of(open_trace(path))
@@ -52,21 +50,34 @@ class Session:
         end = last if seconds is None else min(last, begin + seconds)
         return cls(
             name=path.stem,
-            stroke=recording.dialect.q_open,
+            dialect=recording.dialect,
             duration=end - begin,
             commands={s: _cut(c, begin, end) for s, c in found.items()},
         )
 
     @classmethod
-    def default(cls) -> Session:
-        """The session that ships with dexkit."""
-        return cls.load(sample_path(DEFAULT_SESSION), seconds=DEFAULT_SECONDS)
+    def default(cls, hand_model: str = DEX1_1.name) -> Session:
+        """The session that ships with dexkit for that model."""
+        return cls.load(sample_path(DEFAULT_SESSIONS[hand_model]), seconds=DEFAULT_SECONDS)
+
+    def for_hand(self, target: Dialect) -> Session:
+        """The session itself, if a hand of that dialect can be asked to repeat it.
+
+        :raises ConformanceError: it was recorded with another model.
+        """
+        if self.dialect.model == target.model:
+            return self
+        raise ConformanceError(
+            f"the session {self.name} is of a {model(self.dialect.model).title}, the hand is a "
+            f"{model(target.model).title}",
+            hint="give a session of the same model: --trace FILE.mcap",
+        )
 
     def first_seconds(self, seconds: float) -> Session:
         """Only the beginning of it."""
         return Session(
             self.name,
-            self.stroke,
+            self.dialect,
             min(seconds, self.duration),
             {s: _cut(c, 0.0, seconds) for s, c in self.commands.items()},
         )
@@ -76,42 +87,40 @@ class Session:
         """The sides that it commands."""
         return tuple(self.commands)
 
-    def first(self, side: Side, stroke: float) -> Motor:
-        """The first command to a side, for a hand of that stroke."""
-        return self._motor(side, 0, stroke)
+    def first(self, side: Side, target: Dialect) -> Motors:
+        """The first command to a side, in another dialect's radians."""
+        return self._motors(side, 0, target)
 
-    def timeline(self, sides: Sequence[Side], stroke: float) -> list[tuple[int, dict[Side, Motor]]]:
-        """(ns from the beginning, command), in order of time, for hands of that stroke."""
+    def timeline(
+        self, sides: Sequence[Side], target: Dialect
+    ) -> list[tuple[int, dict[Side, Motors]]]:
+        """(ns from the beginning, command), in order of time, in another dialect's radians."""
         events = [
             (round(float(t) * 1e9), side, i)
             for side in sides
             for i, t in enumerate(self.commands[side].t)
-            if np.isfinite(self.commands[side].q[i])
+            if np.isfinite(self.commands[side].q[i]).all()
         ]
         events.sort(key=lambda e: e[0])
-        return [(at, {side: self._motor(side, i, stroke)}) for at, side, i in events]
+        return [(at, {side: self._motors(side, i, target)}) for at, side, i in events]
 
-    def _motor(self, side: Side, i: int, stroke: float) -> Motor:
+    def _motors(self, side: Side, i: int, target: Dialect) -> Motors:
         c = self.commands[side]
-        scale = stroke / self.stroke
-        return Motor(
-            q=float(c.q[i]) * scale,
-            dq=float(c.dq[i]) * scale,
-            tau=float(c.tau[i]),
-            kp=float(c.kp[i]),
-            kd=float(c.kd[i]),
-        )
+        scale = 1.0 if target.name == self.dialect.name else target.q_open / self.dialect.q_open
+        return [
+            Motor(
+                q=float(c.q[i, k]) * scale,
+                dq=float(c.dq[i, k]) * scale,
+                tau=float(c.tau[i, k]),
+                kp=float(c.kp[i, k]),
+                kd=float(c.kd[i, k]),
+                mode=int(c.mode[i, k]),
+            )
+            for k in range(c.q.shape[1])
+        ]
 
 
 def _cut(c: Commands, begin: float, end: float) -> Commands:
     rows = slice(int(np.searchsorted(c.t, begin)), int(np.searchsorted(c.t, end, "right")))
-    return Commands(
-        c.topic,
-        c.t[rows] - begin,
-        c.length[rows],
-        c.q[rows],
-        c.dq[rows],
-        c.tau[rows],
-        c.kp[rows],
-        c.kd[rows],
-    )
+    columns = {f.name: getattr(c, f.name)[rows] for f in fields(c) if f.name != "topic"}
+    return Commands(c.topic, **{**columns, "t": c.t[rows] - begin})

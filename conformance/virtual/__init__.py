@@ -1,110 +1,30 @@
 """A conformance run without DDS, devices or waiting: a hand in memory on a virtual clock.
 
 The same script drives it and the same checks judge it as in a live run; half a minute of hand
-takes a fraction of a second. It exists to prove the checks: :class:`ReferenceHand` and
-:class:`ReferenceService` do everything right, and each mutant in
-:mod:`dexkit.conformance.mutants` changes one thing.
+takes a fraction of a second. It exists to prove the checks: the reference hands
+(:mod:`~dexkit.conformance.virtual.gripper`, :mod:`~dexkit.conformance.virtual.dex3`) do everything
+right, and each mutant in :mod:`dexkit.conformance.mutants` changes one thing.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from dexkit.conformance.phases import RECORD, Stimulus
-from dexkit.conformance.stimuli import Join, Leave, Observation, Plan, Restart, Script, Send
+from dexkit.conformance.stimuli import Join, Leave, Observation, Plan, Restart, Send, script_for
+from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.wire import Motor, Wire
 from dexkit.errors import WireError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, Dialect
+from dexkit.models import Dialect
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 
-__all__ = ["MemoryTrace", "ReferenceHand", "ReferenceService", "Sample", "run_virtual"]
+__all__ = ["MemoryTrace", "Sample", "Service", "run_virtual"]
 
-TICK = 0.003  # seconds: the slowest rate of the vendor's service, 333 Hz (facts/unitree-dex B.2)
 EPOCH_NS = 1_700_000_000_000_000_000
-
-
-class ReferenceHand:
-    """A gripper that obeys tau = kp (q - q_now) + kd (dq - dq_now) + tau, as the vendor's does.
-
-    One inertia with friction between two stops, and an object if there is one. Brakes a second
-    after the last command, clamps what is out of range, drops what is not finite.
-
-    :param stroke: fully open, rad.
-    :param touch: q at which it touches an object, or None.
-    """
-
-    inertia = 0.001  # kg m²
-    viscous = 0.13  # N m s/rad: with a lead of 0.18 rad this moves at some 6.5 rad/s, as recorded
-    coulomb = 0.02  # N m
-    tau_max = 2.0  # N m
-    stiffness = 40.0  # N m/rad of stops and object
-    brake = 1.0  # N m s/rad of a motor with its windings shorted
-    timeout = DEX1_1.command_timeout
-
-    def __init__(self, stroke: float, touch: float | None = None) -> None:
-        self.stroke = stroke
-        self.touch = touch
-        self.q = 0.3 * stroke if touch is None else touch + 0.15 * stroke
-        self.dq = 0.0
-        self.tau = 0.0
-        self.now = 0.0
-        self.goal: Motor | None = None
-        self.heard = -math.inf
-
-    def command(self, motor: Motor) -> None:
-        """A command came."""
-        fields = (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
-        if all(math.isfinite(x) for x in fields):
-            self.goal = self.accept(motor)
-            self.heard = self.now
-
-    def accept(self, motor: Motor) -> Motor:
-        """Within the limits."""
-        q = min(max(motor.q, 0.0), self.stroke)
-        return Motor(q, motor.dq, motor.tau, motor.kp, motor.kd)
-
-    @property
-    def braking(self) -> bool:
-        """Whether no command is in force."""
-        return self.goal is None or self.now - self.heard > self.timeout
-
-    def motor_torque(self) -> float:
-        """What the motor does, N m."""
-        goal = self.goal
-        if goal is None or self.braking:
-            return 0.0
-        tau = goal.kp * (goal.q - self.q) + goal.kd * (goal.dq - self.dq) + goal.tau
-        return min(max(tau, -self.tau_max), self.tau_max)
-
-    def step(self, dt: float) -> None:
-        """Let time pass."""
-        self.now += dt
-        self.tau = self.motor_torque()
-        force = self.tau + self.contact()
-        damping = self.viscous + (self.brake if self.braking else 0.0)
-        # implicit in the damping, so that a stiff brake is stable at this step
-        dq = (self.dq + dt * force / self.inertia) / (1.0 + dt * damping / self.inertia)
-        slip = dt * self.coulomb / self.inertia
-        self.dq = 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
-        self.q += dt * self.dq
-
-    def contact(self) -> float:
-        """Force of stops and object."""
-        floor = 0.0 if self.touch is None else self.touch
-        if self.q < floor:
-            return self.stiffness * (floor - self.q)
-        if self.q > self.stroke:
-            return self.stiffness * (self.stroke - self.q)
-        return 0.0
-
-    def fields(self) -> dict[str, float]:
-        """The state's fields."""
-        return {"q": self.q, "dq": self.dq, "tau_est": self.tau}
 
 
 @dataclass(frozen=True)
@@ -117,14 +37,18 @@ class Sample:
     sent: float
 
 
-class ReferenceService:
+class Service:
     """Puts hands on the topics, as a good service does.
 
-    :param touch: where each side touches an object.
+    Its own hands never move; each model's reference service plays good ones.
+
+    :param touch: where each side touches an object, in the plan's terms.
     """
 
-    hand: type[ReferenceHand] = ReferenceHand
-    period = TICK
+    tick = 0.003
+    """Seconds by which time passes."""
+    period = 0.003
+    """Seconds from state to state."""
     serves_late_readers = True
     reader_durability = "Volatile"
     writer_reliability = "reliable"
@@ -135,7 +59,6 @@ class ReferenceService:
         self.dialect = dialect
         self.wire = Wire(dialect)
         self.sides = tuple(sides)
-        self.hands = {s: self.hand(dialect.q_open, touch.get(s)) for s in self.sides}
         self.command_type = dialect.cmd_type
         self.state_type = dialect.state_type
         self.now = 0.0
@@ -169,40 +92,49 @@ class ReferenceService:
             if self.wire.command_topics[side] != topic:
                 continue
             try:
-                motor = self.wire.read_command(payload, side)
+                motors = self.wire.read_command(payload, side)
             except WireError:
                 continue
-            if motor is not None:
-                self.command(side, motor)
+            if motors is not None:
+                self.motors(side, motors)
 
-    def command(self, side: Side, motor: Motor) -> None:
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         """One side's part of it."""
-        if self.dialect.name == "unitree_hg" and math.isfinite(motor.q):
-            # seed 000: gains and feed-forward of a command are not used, the ends snap
-            q = 0.0 if motor.q <= 0.1 else self.dialect.q_open if motor.q >= 6.0 else motor.q
-            motor = Motor(q=q)
-        self.hands[side].command(motor)
+        return
 
     def advance(self, dt: float) -> list[Sample]:
         """Let time pass; what was published meanwhile."""
         self.now += dt
-        for hand in self.hands.values():
-            hand.step(dt)
+        self.live(dt)
         if self.now + 1e-9 < self._due:
             return []
         self._due += self.period
         return self.publish()
 
+    def positions(self, side: Side) -> Pose:
+        """Where a hand is."""
+        return (0.0,) * self.wire.joints
+
+    def live(self, dt: float) -> None:
+        """Let time pass for the hands."""
+        return
+
     def publish(self) -> list[Sample]:
         """One state of everybody."""
-        fields = {s: h.fields() for s, h in self.hands.items()}
         if self.wire.shared:
-            return [self.sample(self.dialect.state_topic, fields)]
-        return [self.sample(self.wire.state_topics[s], {s: f}) for s, f in fields.items()]
+            return [self.sample(self.dialect.state_topic, self.sides)]
+        return [self.sample(self.wire.state_topics[s], (s,)) for s in self.sides]
 
-    def sample(self, topic: str, fields: Mapping[Side, Mapping[str, float]]) -> Sample:
-        """A state message."""
-        return Sample(topic, self.state_type, self.wire.state_payload(fields), self.now)
+    def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
+        """A state message of these sides."""
+        return Sample(topic, self.state_type, self.payload(sides), self.now)
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        """The state of these sides on the wire.
+
+        :param length: motors in the sequence, if not the dialect's.
+        """
+        return self.wire.state_payload({}, length)
 
 
 @dataclass
@@ -243,14 +175,13 @@ class MemoryTrace:
         return found
 
 
-def run_virtual(
-    plan: Plan, service_class: type[ReferenceService] = ReferenceService
-) -> MemoryTrace:
+def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
     """Go through the plan with a service of that class, and return the recording."""
     service = service_class(plan.dialect, plan.sides, plan.objects)
     trace = MemoryTrace(endpoints=service.endpoints())
-    script = Script(plan)
+    script = script_for(plan)
     wire = Wire(plan.dialect)
+    states = {wire.state_topics[s] for s in plan.sides}
     newest: dict[str, bytes] = {}
     joined: dict[Side, float] = {}
     joined_at: float | None = None
@@ -260,12 +191,12 @@ def run_virtual(
     def advance(until: float) -> None:
         nonlocal now
         while now + 1e-9 < until:
-            now += TICK
-            for sample in service.advance(TICK):
+            now += service.tick
+            for sample in service.advance(service.tick):
                 sent = EPOCH_NS + round(sample.sent * 1e9)
                 log = EPOCH_NS + round(now * 1e9) + 100_000
                 trace.put(sample.topic, sample.type_name, log, sent, sample.payload)
-                if sample.type_name != plan.dialect.state_type:
+                if sample.type_name != plan.dialect.state_type or sample.topic not in states:
                     continue
                 newest[sample.topic] = sample.payload
                 if joined_at is not None and service.serves_late_readers:
@@ -274,13 +205,13 @@ def run_virtual(
                             joined.setdefault(side, now - joined_at)
 
     def observe() -> Observation:
-        q: dict[Side, float] = {}
-        dq: dict[Side, float] = {}
+        q: dict[Side, Pose] = {}
+        dq: dict[Side, Pose] = {}
         for side in plan.sides:
             payload = newest.get(wire.state_topics[side])
             state = None if payload is None else wire.read_state(payload, side)
             if state is not None:
-                q[side], dq[side] = state[0], state[1]
+                q[side], dq[side] = state
         return Observation(EPOCH_NS + round(now * 1e9), q, dq, dict(joined))
 
     steps = script.run()

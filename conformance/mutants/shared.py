@@ -1,0 +1,317 @@
+"""Wrong hands of any model: each is mixed into a model's reference service by :func:`of`."""
+
+# ruff: noqa: D102  (each class says what it does wrong; its methods only override)
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TypeVar
+
+from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.wire import Motor, mode_byte
+from dexkit.hand import Side
+from dexkit.messages import message_type
+
+S = TypeVar("S", bound=Service)
+
+
+def of(mixin: type[Service], reference: type[S]) -> type[S]:
+    """The wrong hand that the reference becomes with ``mixin``."""
+    return type(mixin.__name__, (mixin, reference), {"__doc__": mixin.__doc__})
+
+
+# -------------------------------------------------------------------------------- discovery
+
+
+class OldTopic(Service):
+    """Publishes on the topic of an older stack."""
+
+    def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
+        return replace(super().sample(topic, sides), topic="rt/unitree_actuator/state")
+
+
+class OtherStateType(Service):
+    """Publishes another type of the family on the right topic."""
+
+    def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
+        go, hg = "unitree_go::msg::dds_::MotorStates_", "unitree_hg::msg::dds_::HandState_"
+        kind = message_type(hg if self.dialect.state_type == go else go)
+        return Sample(topic, kind.name, kind.encode(kind.cls()), self.now)
+
+
+class OtherCommandType(Service):
+    """Subscribes to the right topic with the wrong type."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        go, hg = "unitree_go::msg::dds_::MotorCmds_", "unitree_hg::msg::dds_::HandCmd_"
+        self.command_type = hg if self.dialect.cmd_type == go else go
+
+
+class DemandsHistory(Service):
+    """Asks for TRANSIENT_LOCAL commands, which no official client offers."""
+
+    reader_durability = "TransientLocal"
+
+
+class BestEffortWriter(Service):
+    """Publishes state best effort."""
+
+    writer_reliability = "best_effort"
+
+
+# --------------------------------------------------------------------------------- start-up
+
+
+class SilentUntilCommanded(Service):
+    """Publishes nothing before the first command."""
+
+    spoken_to = False
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.spoken_to = True
+        super().motors(side, motors)
+
+    def publish(self) -> list[Sample]:
+        return super().publish() if self.spoken_to else []
+
+
+# --------------------------------------------------------------------------- rate and order
+
+
+class SlowPublisher(Service):
+    """Publishes at 125 Hz."""
+
+    period = 0.008
+
+
+class HalfRate(Service):
+    """Publishes at 222 Hz: enough, but not what the vendor does."""
+
+    period = 0.0045
+
+
+class Hiccup(Service):
+    """Is silent for 0.3 s once, as when the device is waited for in the publishing thread."""
+
+    def publish(self) -> list[Sample]:
+        return [] if 2.0 < self.now < 2.3 else super().publish()
+
+
+class Bursts(Service):
+    """Publishes ten states at once."""
+
+    together = 10
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.waiting: list[list[Sample]] = []
+
+    def publish(self) -> list[Sample]:
+        self.waiting.append(super().publish())
+        if len(self.waiting) < self.together:
+            return []
+        burst = [
+            replace(sample, sent=self.now + i * 1e-6)
+            for i, samples in enumerate(self.waiting)
+            for sample in samples
+        ]
+        self.waiting = []
+        return burst
+
+
+class RepeatsOldStates(Service):
+    """Sends every hundredth state a second time, after the next one."""
+
+    count = 0
+    old: tuple[Sample, ...] = ()
+
+    def publish(self) -> list[Sample]:
+        samples = super().publish()
+        self.count += 1
+        if self.count % 100 == 0:
+            self.old = tuple(samples)
+        elif self.count % 100 == 1:
+            samples += self.old
+        return samples
+
+
+class StaleState(Service):
+    """Measures five times a second and publishes the same values in between."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.measured: dict[tuple[Side, ...], tuple[float, bytes]] = {}
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        at, _ = self.measured.get(sides, (-1.0, b""))
+        if self.now - at >= 0.2:
+            self.measured[sides] = (self.now, super().payload(sides, length))
+        return self.measured[sides][1]
+
+
+class Frozen(Service):
+    """Publishes the first measurement for ever, at full rate."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.first: dict[tuple[Side, ...], bytes] = {}
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        if sides not in self.first:
+            self.first[sides] = super().payload(sides, length)
+        return self.first[sides]
+
+
+# ----------------------------------------------------------------------------------- fields
+
+
+class OneTooMany(Service):
+    """Publishes a sequence with one motor too many."""
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        return super().payload(sides, self.dialect.length + 1)
+
+
+class EmptyNowAndThen(Service):
+    """Publishes an empty sequence when the device did not answer."""
+
+    count = 0
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        self.count += 1
+        return super().payload(sides, 0 if self.count % 500 == 0 else length)
+
+
+# ----------------------------------------------------------------------------------- motion
+
+
+class Swapped(Service):
+    """Left commands move the right hand."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
+
+
+# ----------------------------------------------------------------------------------- safety
+
+
+class NanIsZero(Service):
+    """Takes NaN and infinity for 0."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        def zeroed(value: float) -> float:
+            return value if math.isfinite(value) else 0.0
+
+        super().motors(
+            side,
+            tuple(
+                Motor(zeroed(m.q), zeroed(m.dq), zeroed(m.tau), zeroed(m.kp), zeroed(m.kd), m.mode)
+                for m in motors
+            ),
+        )
+
+
+class EmptyIsZero(Service):
+    """Takes an empty command for one of zeros, with its default gains."""
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        super().receive(topic, payload, client)
+        for side in self.sides:
+            mine = self.wire.command_topics[side] == topic
+            if mine and self.wire.read_command(payload, side) is None:
+                motors = (Motor(mode=mode_byte(i)) for i in range(self.wire.joints))
+                self.motors(side, tuple(motors))
+
+
+class DiesOfEmpty(Service):
+    """Crashes on a command without motors, and is restarted a second later."""
+
+    dead_until = 0.0
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        sequence = getattr(self.wire.command.decode(payload), self.wire.command_sequence)
+        if not sequence and any(self.wire.command_topics[s] == topic for s in self.sides):
+            self.dead_until = self.now + 0.4
+        super().receive(topic, payload, client)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.now < self.dead_until else super().publish()
+
+
+class QuietInSilence(Service):
+    """Publishes only while it is commanded."""
+
+    heard = math.inf
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.heard = self.now
+        super().motors(side, motors)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.now - self.heard > 0.6 else super().publish()
+
+
+# ------------------------------------------------------------------------------- life cycle
+
+
+class ServesOnlyTheFirst(Service):
+    """Serves only the subscribers that were there when it started."""
+
+    serves_late_readers = False
+
+
+class BoundToOneClient(Service):
+    """Obeys only the first client that it ever heard."""
+
+    master: int | None = None
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if self.master is None:
+            self.master = client
+        if client == self.master:
+            super().receive(topic, payload, client)
+
+
+# --------------------------------------------------------------------------------- tracking
+
+
+class WaitsForRest(Service):
+    """Takes a new target only when it has stood still for a tenth of a second."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.seen: dict[tuple[Side, int], tuple[float, float]] = {}
+        self.taken: dict[tuple[Side, int], float] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        for joint, motor in enumerate(motors):
+            key = side, joint
+            q, since = self.seen.get(key, (math.inf, self.now))
+            if not abs(motor.q - q) < 0.002:
+                self.seen[key] = (motor.q, self.now)
+            elif self.now - since >= 0.1:
+                self.taken[key] = motor.q
+        here = self.positions(side)
+        super().motors(
+            side,
+            tuple(replace(m, q=self.taken.get((side, i), here[i])) for i, m in enumerate(motors)),
+        )
+
+
+class Delayed(Service):
+    """Carries out each command 0.15 s late."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.queue: list[tuple[float, Side, tuple[Motor, ...]]] = []
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.queue.append((self.now + 0.15, side, motors))
+
+    def live(self, dt: float) -> None:
+        while self.queue and self.queue[0][0] <= self.now:
+            _, side, motors = self.queue.pop(0)
+            super().motors(side, motors)
+        super().live(dt)

@@ -1,0 +1,186 @@
+"""The stimulus for a gripper of one joint, the Dex1-1.
+
+Order of the phases: what may disturb a hand comes after what needs it undisturbed.
+
+============== =====================================================================================
+listen         no commands; state must flow
+approach       slowly to mid stroke
+step           large steps of one side, the others hold
+nan, out-of-   bad commands, each followed by ``recover``, a good step
+range, empty
+limp           zero gains, with a q far towards closed
+replay         a recorded session, as recorded
+late-joiner    a new subscriber appears
+squeeze        close on the object, if there is one, by xr_teleoperate's lead
+drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
+silence        ... the commands stop for two command time-outs
+resume         a step after the silence
+restart        the client goes away, another comes, and makes a step
+============== =====================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from dexkit.conformance.stimuli.script import Payloads, Plan, Pose, Script, Steps
+from dexkit.conformance.wire import Motor, Motors
+from dexkit.hand import Side
+
+__all__ = ["GripperScript"]
+
+LEAD = 0.18 / 5.4  # of the stroke: how far xr_teleoperate commands ahead (facts/unitree-dex B.3)
+_BAD = {
+    "nan": "broken commands (NaN and infinity): nothing may move",
+    "out-of-range": "commands far out of range: no harm may be done",
+    "empty": "empty commands: nothing may move",
+}
+
+
+class GripperScript(Script):
+    """The script of a gripper."""
+
+    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(plan, say)
+        self._stroke = plan.dialect.q_open
+        # seed 000: in unitree_hg the gains, dq and tau of a command are not used
+        self._gains_used = plan.dialect.name != "unitree_hg"
+
+    def _provoke(self) -> Steps:
+        sides = self.plan.sides
+        if "step" in self.plan.phases:
+            for side in sides:
+                yield from self._steps(side)
+        for name in ("nan", "out-of-range", "empty"):
+            if name in self.plan.phases:
+                yield from self._bad(name)
+        if "limp" in self.plan.phases and self._gains_used:
+            yield from self._limp()
+        if "replay" in self.plan.phases and self.plan.session is not None:
+            yield from self._replay(self.plan.session)
+            yield from self._everyone("center", {s: self._home(s) for s in sides})
+        if "late-joiner" in self.plan.phases:
+            yield from self._late_joiner()
+        if self.plan.phases & {"squeeze", "silence", "resume"}:
+            yield from self._squeeze_and_silence()
+
+    # -- places -----------------------------------------------------------------------------
+
+    def _low(self, side: Side) -> float:
+        """Nearly closed, clear of the object."""
+        touch = self.plan.objects.get(side)
+        return 0.1 * self._stroke if touch is None else touch + 0.1 * self._stroke
+
+    def _middle(self, side: Side) -> float:
+        return max(0.5 * self._stroke, self._low(side) + 0.02 * self._stroke)
+
+    def _high(self) -> float:
+        return 0.9 * self._stroke
+
+    def _home(self, side: Side) -> Pose:
+        return (self._middle(side),)
+
+    def _other_place(self) -> dict[Side, Pose]:
+        """The middle or above it, whichever is farther from here."""
+        places: dict[Side, Pose] = {}
+        for side in self.plan.sides:
+            here = self._obs.q.get(side, (0.0,))[0]
+            above, middle = 0.7 * self._stroke, self._middle(side)
+            places[side] = (above if abs(above - here) > abs(middle - here) else middle,)
+        return places
+
+    def _reachable(self, side: Side) -> bool:
+        return self._goal[side][0] > self.plan.objects.get(side, -math.inf)
+
+    def _motors(self, side: Side, pose: Pose) -> Motors:
+        return (Motor(q=pose[0]),)
+
+    # -- phases -----------------------------------------------------------------------------
+
+    def _steps(self, side: Side) -> Steps:
+        self._say(f"large steps of the {side} hand; the other one must not move")
+        for target in (self._high(), self._low(side), self._middle(side)):
+            self._goal[side] = (target,)
+            phase = self._begin("step", (side,), targets={side: {0: target}})
+            yield from self._until_settled(phase, (side,), least=0.6, most=2.5)
+
+    def _bad(self, name: str) -> Steps:
+        self._say(_BAD[name])
+        sides = self.plan.sides
+        yield from self._hold(0.2)
+        if name == "nan":
+            yield from self._burst(name, [self._all(m) for m in self._not_finite()], 0.5)
+        elif name == "out-of-range":
+            far = [self._all(Motor(q=q)) for q in (1000.0, -1000.0)]
+            yield from self._burst(name, far, 1.0, each=0.5)
+        else:
+            yield from self._burst(name, [self._wire.encode_empty(sides)], 0.5)
+        yield from self._everyone("recover", self._other_place(), after=name)
+        yield from self._everyone("center", {s: self._home(s) for s in sides})
+
+    def _all(self, motor: Motor) -> Payloads:
+        return self._wire.encode(dict.fromkeys(self.plan.sides, (motor,)))
+
+    def _not_finite(self) -> list[Motor]:
+        """One bad field each; where it is not q, q is far away, to show whether it was taken."""
+        far = self._high()
+        bad = [Motor(q=math.nan), Motor(q=math.inf), Motor(q=-math.inf)]
+        if self._gains_used:
+            bad += [
+                Motor(q=far, kp=math.nan),
+                Motor(q=far, kd=math.inf),
+                Motor(q=far, tau=math.nan),
+                Motor(q=far, dq=-math.inf),
+            ]
+        return bad
+
+    def _limp(self) -> Steps:
+        self._say("commands without force (zero gains): the hand must not be pulled")
+        sides = self.plan.sides
+        yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
+        low = {s: self._low(s) for s in sides}
+        phase = self._begin("limp", sides, targets={s: {0: q} for s, q in low.items()})
+        yield from self._hold(0.5, {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in low.items()})
+        self._end(phase)
+        yield from self._everyone("center", {s: self._home(s) for s in sides})
+
+    def _squeeze_and_silence(self) -> Steps:
+        sides = self.plan.sides
+        pressing = [s for s in sides if s in self.plan.objects]
+        free = [s for s in sides if s not in pressing]
+        if free:
+            nearly_closed = dict.fromkeys(free, (0.15 * self._stroke,))
+            yield from self._everyone("center", {**self._goal, **nearly_closed})
+        beyond = {s: self.plan.objects[s] - 1.5 * LEAD * self._stroke for s in pressing}
+        squeeze = {s: (Motor(q=q),) for s, q in beyond.items()}
+        if pressing:
+            self._say("squeezing the object")
+            phase = self._begin("squeeze", pressing, targets={s: {0: q} for s, q in beyond.items()})
+            yield from self._hold(1.5, squeeze)
+            self._end(phase)
+        if not self.plan.phases & {"silence", "resume"}:
+            return
+        if free and self._gains_used:
+            yield from self._drive(free, squeeze)
+        self._say("... silence: after a second the hand must brake")
+        yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
+        yield from self._everyone("resume", self._other_place())
+
+    def _drive(self, sides: Sequence[Side], others: Mapping[Side, Motors]) -> Steps:
+        """Open at a steady low speed by velocity feedback alone, whatever the friction."""
+        self._say("slow motion, and then ...")
+        phase = self._begin("drive", sides)
+        slow = 0.16 * self._stroke  # rad/s: far from the stop even after a whole time-out
+        wanted = dict.fromkeys(sides, slow)
+        while self._elapsed(phase) < 0.8:
+            for s in sides:
+                if self._obs.dq.get(s, (0.0,))[0] < slow:
+                    wanted[s] = min(wanted[s] * 1.02, 10 * slow)
+            yield from self._command(
+                {
+                    **others,
+                    **{s: (Motor(self._goal[s][0], wanted[s], kp=0.0, kd=0.5),) for s in sides},
+                }
+            )
+        self._end(phase)

@@ -1,0 +1,355 @@
+"""What every script shares: actions and observations, sending at a steady rate, phases, waiting
+until a hand has settled, and the stimuli that are the same for every hand.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from dexkit.conformance.phases import Phase
+from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.view import joints_of
+from dexkit.conformance.wire import Motor, Motors, Wire
+from dexkit.hand import JointSpec, Side
+from dexkit.models import Dialect, HandModel, model
+
+__all__ = [
+    "DEFAULT_OBJECT",
+    "Action",
+    "Join",
+    "Leave",
+    "Observation",
+    "Payloads",
+    "Plan",
+    "Pose",
+    "Restart",
+    "Script",
+    "Send",
+    "Steps",
+    "object_places",
+]
+
+DEFAULT_OBJECT = {Side.RIGHT: 37.0}
+"""Percent of opening at which the right hand of a started pair feels an object: 2.0 rad of a
+gripper, where the shipped session closes on one."""
+SETTLED = 0.02
+"""Part of a joint's range within which it counts as being where it should."""
+Payloads = list[tuple[str, bytes]]
+Pose = tuple[float, ...]
+"""q of every joint of a hand, rad."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a runner tells the script.
+
+    :param now_ns: the recording's clock.
+    :param q: newest pose of each side that has published one; dq likewise.
+    :param joined: after :class:`Join`, seconds until each side's first state arrived there.
+    """
+
+    now_ns: int
+    q: Mapping[Side, Pose] = field(default_factory=dict)
+    dq: Mapping[Side, Pose] = field(default_factory=dict)
+    joined: Mapping[Side, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Send:
+    """Publish these (topic, payload), then wait until a time."""
+
+    payloads: Payloads
+    until_ns: int
+
+
+@dataclass(frozen=True)
+class Join:
+    """Create a second participant with a reader on every state topic."""
+
+
+@dataclass(frozen=True)
+class Leave:
+    """Remove it."""
+
+
+@dataclass(frozen=True)
+class Restart:
+    """Remove the commanding client, and create a new one."""
+
+
+Action = Send | Join | Leave | Restart
+Steps = Generator[Action, Observation, None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do to whom.
+
+    :param objects: where a side touches an object: in the dialect's radians for a hand of one
+        joint, percent of closing for others.
+    :param phases: names of the phases to go through; see
+        :func:`dexkit.conformance.stimuli.phases_for`.
+    """
+
+    dialect: Dialect
+    sides: tuple[Side, ...]
+    objects: Mapping[Side, float] = field(default_factory=dict)
+    session: Session | None = None
+    phases: frozenset[str] = frozenset()
+
+
+def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Side, float]:
+    """Percent of opening as the script takes it: radians, where the dialect has such a scale."""
+    if math.isnan(dialect.q_open):
+        return dict(percents)
+    return {s: pct / 100 * dialect.q_open for s, pct in percents.items()}
+
+
+class Script(ABC):
+    """The stimulus for one plan; each model's script says what is done in which order."""
+
+    motion = "step"
+    """The phase in which the hand moves, for requirements that need any motion."""
+
+    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+        self.plan = plan
+        self.phases: list[Phase] = []
+        self._say = say
+        self._wire = Wire(plan.dialect)
+        self._model: HandModel = model(plan.dialect.model)
+        self._joints: dict[Side, tuple[JointSpec, ...]] = {
+            s: joints_of(plan.dialect, s) for s in Side
+        }
+        self._goal: dict[Side, Pose] = {}
+        self._next_ns = 0
+        self._period_ns = round(1e9 / self._model.command_rate)
+        self._obs = Observation(0)
+
+    def run(self) -> Steps:
+        """The whole script."""
+        self._obs = yield Send([], 0)
+        self._next_ns = self._obs.now_ns
+        yield from self._listen()
+        yield from self._approach()
+        if not self._obs.q:
+            self._say("no state on any topic: nothing more can be asked of this hand")
+            return
+        yield from self._provoke()
+        if "restart" in self.plan.phases:
+            self._say("the commanding program is restarted: the new one must be obeyed")
+            yield Restart()
+            yield from self._everyone("restart", self._other_place())
+        yield from self._hold(0.2)
+
+    @abstractmethod
+    def _provoke(self) -> Steps:
+        """Everything between the first motion and the restart."""
+
+    @abstractmethod
+    def _home(self, side: Side) -> Pose:
+        """Where the hand is brought at first: clear of stops and of the object."""
+
+    @abstractmethod
+    def _other_place(self) -> dict[Side, Pose]:
+        """A pose worth moving to from here."""
+
+    @abstractmethod
+    def _motors(self, side: Side, pose: Pose) -> Motors:
+        """The command to hold a pose, as the official client would send it."""
+
+    # -- sending ----------------------------------------------------------------------------
+
+    def _send(self, payloads: Payloads) -> Steps:
+        """Send now, wait for the next tick of the client's rate."""
+        late = self._obs.now_ns - self._next_ns
+        if late > self._period_ns:
+            self._next_ns += late
+        self._next_ns += self._period_ns
+        self._obs = yield Send(payloads, self._next_ns)
+
+    def _command(self, motors: Mapping[Side, Motors] | None = None) -> Steps:
+        """Everybody holds its goal, but for those named."""
+        given = motors or {}
+        every = {s: given.get(s) or self._motors(s, pose) for s, pose in self._goal.items()}
+        yield from self._send(self._wire.encode({**every, **given}))
+
+    def _wait(self, seconds: float) -> Steps:
+        """Send nothing."""
+        self._next_ns = max(self._next_ns, self._obs.now_ns) + round(seconds * 1e9)
+        self._obs = yield Send([], self._next_ns)
+
+    def _elapsed(self, phase: Phase) -> float:
+        return (self._obs.now_ns - phase.begin_ns) / 1e9
+
+    def _begin(
+        self,
+        name: str,
+        sides: Sequence[Side],
+        *,
+        targets: Mapping[Side, Mapping[int, float]] | None = None,
+        **params: str,
+    ) -> Phase:
+        """Begin a phase; ``targets`` are its moving joints."""
+        goals = {s: dict(joints) for s, joints in (targets or {}).items()}
+        phase = Phase(name, tuple(sides), self._obs.now_ns, targets=goals, params=params)
+        self.phases.append(phase)
+        return phase
+
+    def _end(self, phase: Phase) -> None:
+        phase.end_ns = self._obs.now_ns
+
+    def _hold(self, seconds: float, motors: Mapping[Side, Motors] | None = None) -> Steps:
+        begin = self._obs.now_ns
+        while self._obs.now_ns - begin < seconds * 1e9:
+            yield from self._command(motors)
+
+    def _until_settled(
+        self, phase: Phase | None, sides: Sequence[Side], *, least: float, most: float
+    ) -> Steps:
+        """Hold the goals until the sides have stood near them for a while."""
+        begin = self._obs.now_ns
+        near_since: int | None = None
+        low: dict[Side, Pose] = {}
+        high: dict[Side, Pose] = {}
+        while True:
+            yield from self._command()
+            now, q = self._obs.now_ns, self._obs.q
+            if not all(s in q and self._near(s, q[s], self._goal[s]) for s in sides):
+                near_since = None
+            elif near_since is None:
+                near_since = now
+                low = {s: q[s] for s in sides}
+                high = dict(low)
+            else:
+                low = {s: tuple(map(min, low[s], q[s])) for s in sides}
+                high = {s: tuple(map(max, high[s], q[s])) for s in sides}
+                if not all(self._near(s, low[s], high[s], 0.5) for s in sides):
+                    near_since = None
+            settled = near_since is not None and now - near_since >= self._settling * 1e9
+            elapsed = (now - begin) / 1e9
+            if elapsed >= most or (settled and elapsed >= least):
+                break
+        if phase is not None:
+            self._end(phase)
+
+    _settling = 0.4
+    """Seconds that a hand must stand near its goal."""
+
+    def _near(self, side: Side, a: Pose, b: Pose, part: float = 1.0) -> bool:
+        return all(
+            abs(x - y) <= part * SETTLED * joint.stroke
+            for x, y, joint in zip(a, b, self._joints[side], strict=True)
+        )
+
+    def _everyone(
+        self,
+        name: str,
+        poses: Mapping[Side, Pose],
+        *,
+        least: float = 0.6,
+        most: float = 2.5,
+        **params: str,
+    ) -> Steps:
+        """A step of all sides at once, as a phase."""
+        self._goal.update(poses)
+        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        phase = self._begin(name, self.plan.sides, targets=targets, **params)
+        yield from self._until_settled(phase, self.plan.sides, least=least, most=most)
+
+    # -- the same for every hand --------------------------------------------------------------
+
+    def _listen(self) -> Steps:
+        self._say("listening: the hand must report its state before anybody commands it")
+        phase = self._begin("listen", self.plan.sides)
+        while self._elapsed(phase) < 1.2:
+            yield from self._wait(0.05)
+        self._end(phase)
+
+    def _approach(self) -> Steps:
+        """Slowly to the middle: the first motion of an unknown hand."""
+        self._say("moving slowly to the middle")
+        phase = self._begin("approach", self.plan.sides)
+        home = {s: self._home(s) for s in self.plan.sides}
+        start = {s: self._obs.q.get(s, home[s]) for s in self.plan.sides}
+        while True:
+            reach = 0.6 * self._elapsed(phase)
+            self._goal = {
+                s: tuple(
+                    q + max(-reach * j.stroke, min(reach * j.stroke, end - q))
+                    for q, end, j in zip(pose, home[s], self._joints[s], strict=True)
+                )
+                for s, pose in start.items()
+            }
+            if all(
+                abs(q - end) < 1e-6
+                for s in start
+                for q, end in zip(self._goal[s], home[s], strict=True)
+            ):
+                break
+            yield from self._command()
+        yield from self._until_settled(phase, self.plan.sides, least=0.3, most=2.0)
+
+    def _burst(
+        self, name: str, bursts: Sequence[Payloads], seconds: float, *, each: float = 0.0
+    ) -> Steps:
+        """Bad commands, as a phase: in turn, or each for a while."""
+        phase = self._begin(name, self.plan.sides)
+        count = 0
+        while self._elapsed(phase) < seconds:
+            at = int(self._elapsed(phase) / each) if each else count
+            count += 1
+            yield from self._send(bursts[min(at, len(bursts) - 1) if each else at % len(bursts)])
+        self._end(phase)
+
+    def _replay(self, session: Session) -> Steps:
+        sides = [s for s in self.plan.sides if s in session.sides]
+        if not sides:
+            return
+        dialect = self.plan.dialect
+        timeline = session.timeline(sides, dialect)
+        newest = {s: session.first(s, dialect) for s in sides}
+        self._goal.update({s: tuple(m.q for m in motors) for s, motors in newest.items()})
+        reachable = [s for s in sides if self._reachable(s)]
+        yield from self._until_settled(None, reachable, least=0.6, most=2.0)
+        self._say(f"replaying {session.duration:.0f} s of the recorded session {session.name}")
+        phase = self._begin("replay", sides, session=session.name)
+        start = self._obs.now_ns
+        for i, (at, motors) in enumerate(timeline):
+            newest.update(motors)
+            payloads = self._wire.encode(newest if self._wire.shared else motors)
+            later = timeline[i + 1][0] if i + 1 < len(timeline) else at + self._period_ns
+            self._obs = yield Send(payloads, start + later)
+        self._end(phase)
+        self._next_ns = self._obs.now_ns
+        self._goal.update({s: tuple(m.q for m in newest[s]) for s in sides})
+
+    def _reachable(self, side: Side) -> bool:
+        """Whether nothing stands between a hand and its goal."""
+        return True
+
+    def _late_joiner(self) -> Steps:
+        self._say("a second listener joins late: it must hear the hand at once")
+        phase = self._begin("late-joiner", self.plan.sides)
+        yield Join()
+        while self._elapsed(phase) < 3.0:
+            yield from self._command()
+            if self._elapsed(phase) >= 0.3 and set(self.plan.sides) <= set(self._obs.joined):
+                break
+        phase.observed = {f"first_state_s_{s}": self._obs.joined.get(s) for s in self.plan.sides}
+        self._end(phase)
+        self._obs = yield Leave()
+
+    def _silence(self, name: str, seconds: float) -> Steps:
+        """No command at all, as a phase."""
+        phase = self._begin(name, self.plan.sides)
+        while self._elapsed(phase) < seconds:
+            yield from self._wait(0.05)
+        self._end(phase)
+
+
+def changed(motors: Motors, joint: int, motor: Motor) -> list[Motor]:
+    """The same command with one motor replaced."""
+    return [motor if i == joint else m for i, m in enumerate(motors)]

@@ -1,0 +1,137 @@
+"""A gripper that does everything right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from dexkit.conformance.stimuli.script import Pose
+from dexkit.conformance.virtual import Service
+from dexkit.conformance.wire import Motor
+from dexkit.hand import Side
+from dexkit.models import DEX1_1, Dialect
+
+__all__ = ["ReferenceHand", "ReferenceService"]
+
+
+class ReferenceHand:
+    """A gripper that obeys tau = kp (q - q_now) + kd (dq - dq_now) + tau, as the vendor's does.
+
+    One inertia with friction between two stops, and an object if there is one. Brakes a second
+    after the last command, clamps what is out of range, drops what is not finite.
+
+    :param stroke: fully open, rad.
+    :param touch: q at which it touches an object, or None.
+    """
+
+    inertia = 0.001  # kg m²
+    viscous = 0.13  # N m s/rad: with a lead of 0.18 rad this moves at some 6.5 rad/s, as recorded
+    coulomb = 0.02  # N m
+    tau_max = 2.0  # N m
+    stiffness = 40.0  # N m/rad of stops and object
+    brake = 1.0  # N m s/rad of a motor with its windings shorted
+    timeout = DEX1_1.command_timeout
+
+    def __init__(self, stroke: float, touch: float | None = None) -> None:
+        self.stroke = stroke
+        self.touch = touch
+        self.q = 0.3 * stroke if touch is None else touch + 0.15 * stroke
+        self.dq = 0.0
+        self.tau = 0.0
+        self.now = 0.0
+        self.goal: Motor | None = None
+        self.heard = -math.inf
+
+    def command(self, motor: Motor) -> None:
+        """A command came."""
+        fields = (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
+        if all(math.isfinite(x) for x in fields):
+            self.goal = self.accept(motor)
+            self.heard = self.now
+
+    def accept(self, motor: Motor) -> Motor:
+        """Within the limits."""
+        q = min(max(motor.q, 0.0), self.stroke)
+        return Motor(q, motor.dq, motor.tau, motor.kp, motor.kd)
+
+    @property
+    def braking(self) -> bool:
+        """Whether no command is in force."""
+        return self.goal is None or self.now - self.heard > self.timeout
+
+    def motor_torque(self) -> float:
+        """What the motor does, N m."""
+        goal = self.goal
+        if goal is None or self.braking:
+            return 0.0
+        tau = goal.kp * (goal.q - self.q) + goal.kd * (goal.dq - self.dq) + goal.tau
+        return min(max(tau, -self.tau_max), self.tau_max)
+
+    def step(self, dt: float) -> None:
+        """Let time pass."""
+        self.now += dt
+        self.tau = self.motor_torque()
+        force = self.tau + self.contact()
+        damping = self.viscous + (self.brake if self.braking else 0.0)
+        # implicit in the damping, so that a stiff brake is stable at this step
+        dq = (self.dq + dt * force / self.inertia) / (1.0 + dt * damping / self.inertia)
+        slip = dt * self.coulomb / self.inertia
+        self.dq = 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
+        self.q += dt * self.dq
+
+    def contact(self) -> float:
+        """Force of stops and object."""
+        floor = 0.0 if self.touch is None else self.touch
+        if self.q < floor:
+            return self.stiffness * (floor - self.q)
+        if self.q > self.stroke:
+            return self.stiffness * (self.stroke - self.q)
+        return 0.0
+
+    def fields(self) -> dict[str, float]:
+        """The state's fields."""
+        return {"q": self.q, "dq": self.dq, "tau_est": self.tau}
+
+
+class ReferenceService(Service):
+    """Grippers on their topics.
+
+    Its period is the slowest of the vendor's service, 333 Hz (facts/unitree-dex B.2).
+    """
+
+    hand: type[ReferenceHand] = ReferenceHand
+
+    def __init__(
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+    ) -> None:
+        super().__init__(dialect, sides, touch)
+        self.hands = {s: self.hand(dialect.q_open, touch.get(s)) for s in self.sides}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        """One side's part of a command message."""
+        self.command(side, motors[0])
+
+    def command(self, side: Side, motor: Motor) -> None:
+        """A gripper's motor is commanded."""
+        if self.dialect.name == "unitree_hg" and math.isfinite(motor.q):
+            # seed 000: gains and feed-forward of a command are not used, the ends snap
+            q = 0.0 if motor.q <= 0.1 else self.dialect.q_open if motor.q >= 6.0 else motor.q
+            motor = Motor(q=q)
+        self.hands[side].command(motor)
+
+    def positions(self, side: Side) -> Pose:
+        """Where a gripper is."""
+        return (self.hands[side].q,)
+
+    def live(self, dt: float) -> None:
+        """Let time pass for the grippers."""
+        for hand in self.hands.values():
+            hand.step(dt)
+
+    def fields(self, side: Side) -> dict[str, float]:
+        """What a side's motor says of itself."""
+        return self.hands[side].fields()
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        """The state of these grippers on the wire."""
+        return self.wire.state_payload({s: [self.fields(s)] for s in sides}, length)
