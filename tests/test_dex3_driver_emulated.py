@@ -1,0 +1,326 @@
+"""The Dex3-1's USB driver against an emulated hand: motion, faults, cables, and the service."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
+from dexkit.drivers.dex3_usb.discovery import parse_server
+from dexkit.emulators.dex3_mcu import Dex3Hands, emulated_dex3
+from dexkit.errors import HandError, HandLost, HandNotFound, HandTimeout
+from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
+from dexkit.messages import encode, message_type, unitree_hg
+from dexkit.models import DEX3_1, dialect
+from dexkit.service import HandService
+from tests.service_helpers import FakeNode, wait_until
+
+GOAL = {
+    Side.LEFT: np.array([0.3, 0.5, 0.8, -0.6, -0.7, -0.5, -0.9]),
+    Side.RIGHT: np.array([-0.2, -0.4, -0.6, 0.5, 0.4, 0.7, 0.3]),
+}
+TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
+LOST = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+
+def hand_at(url: str, side: Side = Side.LEFT) -> Dex3Usb:
+    return Dex3Usb(side, Dex3Settings(server=parse_server(url)[0]))
+
+
+def go(q: np.ndarray, **values: float) -> HandCommand:  # type: ignore[type-arg]
+    return HandCommand.position(q, **{"kp": 1.5, "kd": 0.1, **values})
+
+
+def drive(
+    hand: Dex3Usb,
+    command: HandCommand,
+    until: Callable[[HandState], object],
+    timeout: float = 5.0,
+) -> HandState:
+    """Exchange, time-outs allowed, until the state is as wanted."""
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            state = hand.exchange(command)
+        except HandTimeout:
+            state = None
+        if state is not None and until(state):
+            return state
+        assert time.monotonic() < deadline, f"not within {timeout} s: {state}"
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("process", [False, True], ids=["thread", "process"])
+def test_both_hands_go_where_they_are_told(process: bool) -> None:
+    with emulated_dex3((Side.LEFT, Side.RIGHT), process=process) as emulated:
+        hands = {side: hand_at(emulated.url, side) for side in Side}
+        for hand in hands.values():
+            hand.open()
+        assert hands[Side.LEFT].serial != hands[Side.RIGHT].serial
+        for side, hand in hands.items():
+            rest = hand.exchange(HandCommand.brake(7))
+            assert rest.q == pytest.approx(np.array(DEX3_1.rest_q[side]), abs=0.01)
+        for side, hand in hands.items():
+            goal = GOAL[side]
+            state = drive(hand, go(goal), lambda s, q=goal: np.abs(s.q - q).max() < 0.02)  # type: ignore[misc]
+            assert state.mode.tolist() == [JointMode.FOC] * 7
+            assert not state.fault.any()
+            assert state.voltage == pytest.approx(np.full(7, 24.0), abs=1.0)
+            assert state.supply is not None
+            assert state.supply.power_v == pytest.approx(24.0, abs=0.5)
+            assert state.pressure is not None
+            assert np.isfinite(state.pressure).sum() == 33
+            assert state.imu is not None
+            assert abs(np.linalg.norm(state.imu.accelerometer) - 9.81) < 0.1
+        for hand in hands.values():
+            hand.close()
+
+
+def test_the_units_are_right_on_both_ends() -> None:
+    """What the motors are told and what the driver reads are the body's own values."""
+    with emulated_dex3() as emulated:
+        assert isinstance(emulated, Dex3Hands)
+        body = emulated.device().body
+        with hand_at(emulated.url) as hand:
+            state = drive(hand, go(GOAL[Side.LEFT], kp=1.0), lambda s: np.abs(s.dq).max() > 1.0)
+            assert (
+                np.sign(state.dq[1:]).tolist()
+                == np.sign(GOAL[Side.LEFT] - np.array(DEX3_1.rest_q[Side.LEFT])).tolist()[1:]
+            )
+            drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.01)
+            time.sleep(0.3)
+            state = hand.exchange(go(GOAL[Side.LEFT]))
+            assert state.q == pytest.approx(body.q, abs=1e-3)
+            # a torque of its own, held against nothing but the gains: kp (q - q_now) + tau = 0
+            push = 0.15
+            pushed = go(GOAL[Side.LEFT], tau=push)
+            for _ in range(600):
+                state = hand.exchange(pushed)
+                time.sleep(0.001)
+            assert state.q - GOAL[Side.LEFT] == pytest.approx(np.full(7, push / 1.5), abs=0.02)
+
+
+def test_opening_and_closing_move_nothing() -> None:
+    with emulated_dex3() as emulated:
+        assert isinstance(emulated, Dex3Hands)
+        body = emulated.device().body
+        before = np.array(body.q)
+        for _ in range(2):
+            with hand_at(emulated.url) as hand:
+                for _ in range(20):
+                    hand.exchange(HandCommand.brake(7))
+        assert np.array(body.q) == pytest.approx(before, abs=1e-3)
+
+
+class TestFaults:
+    @pytest.mark.parametrize(
+        "fault", ["drop:p=0.2", "corrupt:p=0.2", "delay:ms=150,p=0.2,for=1s", "delay:ms=2"]
+    )
+    def test_the_hand_gets_there_all_the_same(self, fault: str) -> None:
+        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+            emulated.inject(fault)
+            state = drive(
+                hand,
+                go(GOAL[Side.LEFT]),
+                lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02,
+                timeout=10.0,
+            )
+            assert not (state.fault & ~np.uint32(LOST | TRIPPED)).any()
+            statistics = hand.statistics
+            if fault.startswith("drop"):
+                assert statistics.link.timeouts > 0
+            if fault.startswith("corrupt"):
+                assert statistics.damaged_frames + statistics.damaged_packets > 0
+
+    @pytest.mark.parametrize("fault", ["stall", "stall-out"])
+    def test_a_stall_is_cleared(self, fault: str) -> None:
+        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+            emulated.inject(fault)
+            drive(hand, go(GOAL[Side.LEFT]), lambda s: hand.statistics.link.stalls == 1)
+            drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
+            assert hand.statistics.link.stalls == 1
+
+    def test_a_silent_motor_shows(self) -> None:
+        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+            emulated.inject("silent:id=4,for=500ms")
+            state = drive(hand, go(GOAL[Side.LEFT]), lambda s: s.fault[4] & LOST)
+            assert np.flatnonzero(state.fault & LOST).tolist() == [4]
+            drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault[4] & LOST)
+
+    def test_motor_errors_show(self) -> None:
+        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+            emulated.inject("overcurrent:id=2,for=300ms")
+            drive(hand, HandCommand.brake(7), lambda s: s.fault[2] & int(MotorError.OVERCURRENT))
+            drive(hand, HandCommand.brake(7), lambda s: not s.fault.any())
+
+
+class TestTimeoutProtection:
+    def test_motors_that_stopped_are_reported_and_go_on(self) -> None:
+        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+            assert isinstance(emulated, Dex3Hands)
+            device = emulated.device()
+            hand.exchange(go(GOAL[Side.LEFT]))
+            wait_until(lambda: all(device.tripped), 3.0, "the motors to stop")
+            state = hand.exchange(go(GOAL[Side.LEFT]))
+            assert (state.fault & TRIPPED).all()
+            drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault.any())
+            drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
+            assert hand.statistics.trips == 1
+
+    def test_a_driver_that_is_killed_leaves_nothing_driven(self) -> None:
+        code = f"""
+import sys, numpy as np
+from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
+from dexkit.drivers.dex3_usb.discovery import parse_server
+from dexkit.hand import HandCommand, Side
+hand = Dex3Usb(Side.LEFT, Dex3Settings(server=parse_server(sys.argv[1])[0]))
+hand.open()
+for count in range(10**9):
+    hand.exchange(HandCommand.position(np.array({GOAL[Side.LEFT].tolist()}), kp=1.5, kd=0.2))
+    if count == 100:
+        print("driving", flush=True)
+"""
+        with emulated_dex3() as emulated:
+            assert isinstance(emulated, Dex3Hands)
+            device = emulated.device()
+            process = subprocess.Popen(
+                [sys.executable, "-c", code, emulated.url], stdout=subprocess.PIPE
+            )
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"driving\n"
+            assert not any(device.tripped)
+            os.kill(process.pid, signal.SIGKILL)
+            killed = time.monotonic()
+            process.wait()
+            process.stdout.close()
+            wait_until(lambda: all(device.tripped), 3.0, "the motors to stop")
+            assert 0.9 < time.monotonic() - killed < 2.0
+            # whoever comes next finds a hand that works
+            with hand_at(emulated.url) as hand:
+                assert not hand.exchange(HandCommand.brake(7)).fault.any()
+
+    def test_a_closed_hand_is_braked_and_not_tripped(self) -> None:
+        with emulated_dex3() as emulated:
+            assert isinstance(emulated, Dex3Hands)
+            device = emulated.device()
+            with hand_at(emulated.url) as hand:
+                hand.exchange(go(GOAL[Side.LEFT]))
+            state = device.body.state(0.0)
+            assert state.mode.tolist() == [JointMode.BRAKE] * 7
+            time.sleep(1.2)
+            assert not any(device.tripped)
+
+
+class TestCable:
+    def test_lost_quickly_and_found_again(self) -> None:
+        with emulated_dex3() as emulated:
+            hand = hand_at(emulated.url)
+            hand.open()
+            hand.exchange(go(GOAL[Side.LEFT]))
+            emulated.inject("unplug:for=300ms")
+            pulled = time.monotonic()
+            with pytest.raises(HandLost):
+                drive(hand, go(GOAL[Side.LEFT]), lambda s: False)
+            assert time.monotonic() - pulled < 0.25
+            hand.close()
+            with pytest.raises(HandNotFound):
+                hand.open()
+            while True:
+                try:
+                    hand.open()
+                    break
+                except HandError:
+                    assert time.monotonic() - pulled < 1.3
+                    time.sleep(0.01)
+            assert np.isfinite(hand.exchange(HandCommand.brake(7)).q).all()
+            hand.close()
+
+
+D = dialect("dex3")
+CMD, STATE = D.topics(Side.LEFT)
+STATES = message_type(D.state_type)
+
+
+def message(q: np.ndarray) -> bytes:  # type: ignore[type-arg]
+    return encode(
+        unitree_hg.HandCmd_(
+            [
+                unitree_hg.MotorCmd_(mode=0x10 | i, q=float(v), kp=1.5, kd=0.2)
+                for i, v in enumerate(q)
+            ]
+        )
+    )
+
+
+class TestService:
+    def test_unplugged_in_mid_motion(self) -> None:
+        """Publishing goes on with the fault visible; back within a second; nothing stale moves."""
+        node = FakeNode()
+        with emulated_dex3() as emulated:
+            assert isinstance(emulated, Dex3Hands)
+            device = emulated.device()
+            hand = hand_at(emulated.url)
+            with HandService(hand, node=node, dialect="dex3", state_rate=200.0) as service:  # type: ignore[arg-type]
+                core = service.cores[Side.LEFT]
+                node.deliver(CMD, message(GOAL[Side.LEFT]))
+                wait_until(lambda: core.driving)
+                emulated.inject("unplug:for=1500ms")
+                wait_until(lambda: not device.plugged)
+                pulled = time.monotonic()
+                wait_until(lambda: not core.connected, 0.5, "the loss")
+                sent = len(node.sent)
+                time.sleep(0.2)
+                assert len(node.sent) - sent > 15
+                view = core.view()
+                assert view is not None
+                assert all(bits & LOST for bits in view.fault)
+                lost = STATES.decode(next(d for t, d in reversed(node.sent) if t == STATE))
+                assert all(motor.motorstate & LOST for motor in lost.motor_state)
+                # the motors stop by themselves; the last command, and one sent meanwhile, do not
+                # count any more when the cable is back
+                wait_until(lambda: all(device.tripped), 2.0, "the protection")
+                still = np.array(device.body.q)
+                node.deliver(CMD, message(-0.5 * GOAL[Side.LEFT]))
+                wait_until(lambda: device.plugged, 3.0)
+                back = time.monotonic()
+                assert back - pulled > 1.0
+                wait_until(lambda: core.connected, 1.0, "the reconnection")
+                done = core.counters.exchanges
+                wait_until(lambda: core.counters.exchanges > done + 50)
+                assert not core.driving
+                assert np.array(device.body.q) == pytest.approx(still, abs=0.02)
+                assert not any(device.tripped)
+                view = core.view()
+                assert view is not None
+                assert not any(view.fault)
+                node.deliver(CMD, message(GOAL[Side.LEFT]))
+                wait_until(lambda: core.driving)
+                assert core.counters.reconnects == 1
+
+    def test_attempts_to_reopen_keep_coming(self) -> None:
+        """After a long absence too, a hand is found within half a second of its return."""
+        node = FakeNode()
+        with emulated_dex3() as emulated:
+            hand = hand_at(emulated.url)
+            tried: list[float] = []
+            opening = hand.open
+
+            def noted() -> None:
+                tried.append(time.monotonic())
+                opening()
+
+            hand.open = noted  # type: ignore[method-assign]
+            with HandService(hand, node=node, dialect="dex3", state_rate=100.0) as service:  # type: ignore[arg-type]
+                emulated.inject("unplug:for=2500ms")
+                core = service.cores[Side.LEFT]
+                wait_until(lambda: core.counters.reconnects == 1, 8.0)
+                gaps = np.diff(tried[1:])
+                assert len(gaps) >= 3
+                assert gaps.max() < hand.reconnect_interval + 0.3
