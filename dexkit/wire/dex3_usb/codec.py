@@ -15,6 +15,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,14 @@ from dexkit.wire.dex3_usb.packets import (
 __all__ = ["DEFAULT_BUS_MAP", "BusMap", "DecodedCommand", "HandCodec"]
 
 _N_VALUES = 12
+_NOTHING = (math.nan,) * 5
+_COMMAND_SCALES = (
+    units.POSITION,
+    units.VELOCITY,
+    units.TORQUE,
+    units.STIFFNESS,
+    units.DAMPING,
+)
 
 
 @dataclass(frozen=True)
@@ -150,6 +159,14 @@ class HandCodec:
         self.frames = 0
         self.damaged = 0
         self.sensor_lost = np.zeros(len(bus_map.sensors), np.uint32)
+        # a broadcast reaches every motor of its bus
+        self._joints_at: dict[tuple[int, int], list[int]] = {}
+        for joint, (bus, number) in enumerate(bus_map.motors):
+            self._joints_at[bus, number] = [joint]
+            self._joints_at.setdefault((bus, BROADCAST_ID), []).append(joint)
+        self._command_units = [
+            tuple(1 / scale.factor(ratio) for scale in _COMMAND_SCALES) for ratio in self.ratios
+        ]
         self._encoder = _CommandEncoder(self.ratios, bus_map, layout, head)
         self._plan: _StatePlan | None = None
         self._swap = bytearray(STATE.covered[1] - STATE.covered[0])
@@ -242,36 +259,26 @@ class HandCodec:
         """
         frame = parse_command(data)
         n = len(self.joints)
-        values = np.full((5, n), math.nan)
+        values = [_NOTHING] * n
         mode = np.zeros(n, np.uint8)
         timeout = np.zeros(n, np.bool_)
         present = np.zeros(n, np.bool_)
         silent = np.zeros(n, np.bool_)
         problems = list(frame.problems)
-        for bus, packets in enumerate(frame.buses):
-            for position, packet in enumerate(packets):
-                assert isinstance(packet, MotorCmd)
-                address = (bus, packet.id)
-                broadcast = packet.id == BROADCAST_ID
-                if not broadcast and address not in self.bus_map.motors:
-                    error = WireError(f"this hand has no motor {packet.id} there")
-                    problems.append(Problem(bus, position * MOTOR_CMD.size, error))
-                for joint, owner in enumerate(self.bus_map.motors):
-                    if owner != address and not (broadcast and owner[0] == bus):
-                        continue
-                    ratio = self.ratios[joint]
-                    values[:, joint] = (
-                        units.POSITION.decode(packet.pos_des, ratio),
-                        units.VELOCITY.decode(packet.spd_des, ratio),
-                        units.TORQUE.decode(packet.tor_des, ratio),
-                        units.STIFFNESS.decode(packet.k_pos, ratio),
-                        units.DAMPING.decode(packet.k_spd, ratio),
-                    )
-                    mode[joint] = packet.status
-                    timeout[joint] = packet.timeout
-                    silent[joint] = broadcast and (silent[joint] or not present[joint])
-                    present[joint] = True
-        q, dq, tau, kp, kd = values
+        for bus, packet in frame.motors:
+            broadcast = packet.id == BROADCAST_ID
+            joints = self._joints_at.get((bus, packet.id), ())
+            if not joints and not broadcast:
+                error = WireError(f"this hand has no motor {packet.id} there")
+                problems.append(Problem(bus, None, error))
+            counts = (packet.pos_des, packet.spd_des, packet.tor_des, packet.k_pos, packet.k_spd)
+            for joint in joints:
+                values[joint] = tuple(map(mul, counts, self._command_units[joint]))
+                mode[joint] = packet.status
+                timeout[joint] = packet.timeout
+                silent[joint] = broadcast and (silent[joint] or not present[joint])
+                present[joint] = True
+        q, dq, tau, kp, kd = np.array(values).T.copy()
         command = HandCommand(q=q, dq=dq, tau=tau, kp=kp, kd=kd, mode=mode, timeout=timeout)
         return DecodedCommand(command, present, silent, problems, frame)
 

@@ -118,8 +118,12 @@ class MotorCmd:
 
         :raises WireError: wrong length, head or CRC.
         """
-        mode, res, *values = _open(MOTOR_CMD, data)
-        tor, spd, pos, k_pos, k_spd = values
+        return cls._of(*_open(MOTOR_CMD, data))
+
+    @classmethod
+    def _of(
+        cls, mode: int, res: int, tor: int, spd: int, pos: int, k_pos: int, k_spd: int
+    ) -> MotorCmd:
         return cls(mode & 15, mode >> 4 & 7, mode > 127, tor, spd, pos, k_pos, k_spd, res)
 
 
@@ -173,7 +177,10 @@ class MotorState:
 
         :raises WireError: wrong length, head or CRC.
         """
-        mode, *values = _open(MOTOR_STATE, data)
+        return cls._of(*_open(MOTOR_STATE, data))
+
+    @classmethod
+    def _of(cls, mode: int, *values: int) -> MotorState:
         return cls(mode & 15, mode >> 4 & 7, mode > 127, *values)
 
 
@@ -210,17 +217,15 @@ class SensorState:
 
         :raises WireError: wrong length, head or CRC.
         """
-        mode, reverse, *values = _open(SENSOR_STATE, data)
-        return cls(mode & 15, mode >> 4, tuple(values[:12]), tuple(values[12:]), reverse)
+        return cls._of(*_open(SENSOR_STATE, data))
+
+    @classmethod
+    def _of(cls, mode: int, reverse: int, *values: int) -> SensorState:
+        return cls(mode & 15, mode >> 4, values[:12], values[12:], reverse)
 
 
 Packet: TypeAlias = MotorCmd | MotorState | SensorState
 
-_CLASSES: dict[str, type[Packet]] = {
-    MOTOR_CMD.name: MotorCmd,
-    MOTOR_STATE.name: MotorState,
-    SENSOR_STATE.name: SensorState,
-}
 TO_HAND = (MOTOR_CMD,)
 """What the buses of a command frame hold."""
 FROM_HAND = (MOTOR_STATE, SENSOR_STATE)
@@ -229,19 +234,20 @@ FROM_HAND = (MOTOR_STATE, SENSOR_STATE)
 
 @dataclass(frozen=True)
 class Problem:
-    """Bytes of a bus buffer that were lost.
+    """Bytes of a bus buffer that were lost, or a packet that is nobody's.
 
     :param bus: which one.
-    :param offset: of the first byte in that buffer.
+    :param offset: of the first byte in that buffer; None where the packet itself is good.
     :param error: what is wrong with them.
     """
 
     bus: int
-    offset: int
+    offset: int | None
     error: WireError
 
     def __str__(self) -> str:
-        return f"bus {self.bus}, offset {self.offset}: {self.error}"
+        where = "" if self.offset is None else f", offset {self.offset}"
+        return f"bus {self.bus}{where}: {self.error}"
 
 
 def scan_bus(
@@ -305,9 +311,17 @@ def parse_bus(
     data: Bytes, kinds: Sequence[Structure] = FROM_HAND, bus: int = 0
 ) -> tuple[list[Packet], list[Problem]]:
     """The packets of a bus buffer, and what was lost. See :func:`scan_bus`."""
+    data = bytes(data)
     found, problems = scan_bus(data, kinds, bus)
-    packets = [_CLASSES[k.name].parse(bytes(data[o : o + k.size])) for o, k in found]
-    return packets, problems
+    return [_packet(kind, data, offset) for offset, kind in found], problems
+
+
+def _packet(kind: Structure, data: bytes, offset: int) -> Packet:
+    """One that :func:`scan_bus` has found, and checked."""
+    values = kind.struct.unpack_from(data, offset)[1:-1]
+    if kind is MOTOR_CMD:
+        return MotorCmd._of(*values)
+    return MotorState._of(*values) if kind is MOTOR_STATE else SensorState._of(*values)
 
 
 def bus_part(
