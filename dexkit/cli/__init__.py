@@ -22,6 +22,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("dexkit.cli.calibrate", "Find a gripper's zero and speed and store them."),
     "check": ("dexkit.cli.check", "Judge a recording against the requirements."),
     "demo": ("dexkit.cli.demo", "The whole story on emulators, in under a minute."),
+    "doctor": ("dexkit.cli.doctor", "Say why a client and a hand do not meet."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, on a pseudo-terminal or USB/IP."),
     "info": ("dexkit.cli.info", "Say what is in a recording."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),

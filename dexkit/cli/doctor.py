@@ -1,0 +1,221 @@
+"""``dexkit doctor``: why a client and a hand do not meet."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.common import StopRequest, stop_on_signals
+from dexkit.errors import UsageError
+from dexkit.models import DIALECTS, MODELS, Dialect
+
+if TYPE_CHECKING:
+    from dexkit.doctor import Finding, Observations, Readiness, Verdict
+
+__all__ = ["command"]
+
+_REFRESH = 1.0  # seconds between looks
+
+
+def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int]:
+    """``0-10``, ``0,1,5-7`` or ``none``."""
+    if text == "none":
+        return []
+    found: list[int] = []
+    for part in text.split(","):
+        low, dash, high = part.partition("-")
+        if not low.isdigit() or (dash and not high.isdigit()):
+            raise click.BadParameter("write 0-10, or 0,1,5-7, or none")
+        first, last = int(low), int(high if dash else low)
+        if not 0 <= first <= last <= 230:
+            raise click.BadParameter("domains are 0 to 230")
+        found += range(first, last + 1)
+    return found
+
+
+@click.command("doctor")
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 230),
+    help="Domain that the client uses: 0 is the robot, 1 xr_teleoperate --sim.  [default: any]",
+)
+@click.option(
+    "--scan",
+    default="0-10",
+    show_default=True,
+    callback=_scan,
+    metavar="RANGE",
+    help="Also look at these domains; none for no others.",
+)
+@click.option(
+    "--interface",
+    "interfaces",
+    multiple=True,
+    metavar="IF",
+    help="Look at this network interface as well as at lo; may be repeated.",
+)
+@click.option(
+    "--model", type=click.Choice(["dex1", "dex3"]), help="Only this hand counts.  [default: any]"
+)
+@click.option("--dialect", type=click.Choice(list(DIALECTS)), help="Only this dialect counts.")
+@click.option(
+    "--device",
+    "devices",
+    multiple=True,
+    metavar="PATH",
+    help="Also look at a serial port and ask for servos on it, at 'usb', or at usbip://HOST:PORT.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON (docs/doctor.md).")
+@click.option("--watch", is_flag=True, help="Look again and again until Ctrl-C.")
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0.2, 600),
+    default=2.0,
+    show_default=True,
+    help="How long samples are watched.",
+)
+def command(
+    domain: int | None,
+    scan: list[int],
+    interfaces: tuple[str, ...],
+    model: str | None,
+    dialect: str | None,
+    devices: tuple[str, ...],
+    as_json: bool,
+    watch: bool,
+    seconds: float,
+) -> int:
+    """Say why a client and a hand do not meet, and what to do.
+
+    For the worst day: "Waiting to subscribe dds...". Looks at DDS domains without publishing
+    any topic and without CycloneDDS, at this Python, and at the device if one is named. Traffic
+    stays on this machine unless --interface names a network. A servo on a named serial port is
+    asked who it is, and nothing else.
+
+    Exit codes: 0 healthy, 1 problems found, 2 it could not look, 130 interrupted.
+    """
+    from dexkit.doctor.rules import Wish, diagnose, readiness, verdict
+
+    if domain is None and not scan:
+        raise UsageError("no domain to look at", hint="give --domain or --scan")
+    wish = Wish(domain, _dialects(model, dialect), bool(devices) and domain is None)
+    with stop_on_signals() as stop:
+        first = True
+        before = ""
+        while True:
+            seen = _look(
+                sorted({*scan, *([] if domain is None else [domain])}),
+                tuple(dict.fromkeys(("lo", *interfaces))),
+                devices,
+                seconds,
+                stop,
+                _progress(quiet=as_json or not first),
+            )
+            if stop:
+                # a watch is ended like this; a single look is cut short
+                return 0 if watch and not first else 130
+            findings = diagnose(seen, wish)
+            states = readiness(seen, wish)
+            said = verdict(seen, findings, wish)
+            if as_json:
+                from dexkit.doctor.report import as_data
+
+                click.echo(
+                    json.dumps(as_data(seen, findings, said, states), indent=None if watch else 2)
+                )
+                sys.stdout.flush()
+            else:
+                key = json.dumps([[f.id, f.where] for f in findings] + [str(s) for s in states])
+                if key != before:
+                    _print(seen, findings, said, states, watch=watch, first=first)
+                before = key
+            first = False
+            if not watch:
+                return 0 if said.healthy else 1
+            stop.wait(_REFRESH)
+
+
+def _dialects(model: str | None, dialect: str | None) -> tuple[Dialect, ...]:
+    names = {"dex1": "dex1-1", "dex3": "dex3-1"}
+    if dialect is not None:
+        chosen = DIALECTS[dialect]
+        if model is not None and chosen.model != names[model]:
+            raise UsageError(f"--dialect {dialect} is not one of {names[model]}")
+        return (chosen,)
+    # every dialect of a model would be one too many: which it is shows when it is seen
+    return MODELS[names[model]].dialects if model is not None else ()
+
+
+def _look(
+    domains: list[int],
+    interfaces: tuple[str, ...],
+    devices: tuple[str, ...],
+    seconds: float,
+    stop: StopRequest,
+    progress: Callable[[str], object],
+) -> Observations:
+    from dexkit.cli import doctor_devices
+    from dexkit.doctor import dds, network, usb
+    from dexkit.doctor.environment import environment
+    from dexkit.doctor.observations import Observations
+
+    known = network.interfaces()
+    progress("looking at this Python")
+    env = environment()
+    ports = [] if devices else doctor_devices.ports()
+    hands = list(usb.devices())
+    usb_wanted = False
+    for device in devices:
+        if device == "usb":
+            usb_wanted = True
+        elif device.startswith("usbip:"):
+            hands += doctor_devices.on_server(device)
+        else:
+            ports.append(doctor_devices.look_at(device, progress=progress))
+    views = dds.look(domains, interfaces, seconds=seconds, stop=stop.event, progress=progress)
+    progress("")
+    return Observations(
+        domains=views,
+        looked_at=interfaces,
+        seconds=seconds,
+        interfaces=known,
+        sockets=network.dds_sockets(domains),
+        environment=env,
+        serial=tuple(ports),
+        usb=tuple(hands),
+        usb_wanted=usb_wanted,
+    )
+
+
+def _progress(*, quiet: bool) -> Callable[[str], object]:
+    if quiet or not sys.stderr.isatty():
+        return lambda text: None
+    return lambda text: click.echo(f"\r\x1b[K{text}", err=True, nl=False)
+
+
+def _print(
+    seen: Observations,
+    findings: list[Finding],
+    said: Verdict,
+    states: list[Readiness],
+    *,
+    watch: bool,
+    first: bool,
+) -> None:
+    from rich.console import Console
+
+    from dexkit.doctor.report import print_report
+
+    console = Console(soft_wrap=True)
+    if watch:
+        if not first:
+            console.print()
+        ready = any(s.ready for s in states)
+        console.rule(time.strftime("%H:%M:%S") + (": a client would now start" if ready else ""))
+    print_report(console, seen, findings, said, states)
+    sys.stdout.flush()

@@ -1,0 +1,25 @@
+"""``dexkit doctor``: why a client and a hand do not meet, from what can be seen.
+
+:mod:`rules` judges :mod:`observations` and is pure; :mod:`dds` (with the sans-IO
+:mod:`observer` and :mod:`rtps`), :mod:`network`, :mod:`usb`, :mod:`environment` and
+:mod:`processes` gather them; :mod:`catalogue` holds the texts. What takes a driver (asking a servo
+who it is) is done by the command line.
+"""
+
+from dexkit.doctor.catalogue import DIAGNOSES, Diagnosis, Finding, Severity
+from dexkit.doctor.observations import Observations
+from dexkit.doctor.rules import Readiness, Verdict, Wish, diagnose, readiness, verdict
+
+__all__ = [
+    "DIAGNOSES",
+    "Diagnosis",
+    "Finding",
+    "Observations",
+    "Readiness",
+    "Severity",
+    "Verdict",
+    "Wish",
+    "diagnose",
+    "readiness",
+    "verdict",
+]

@@ -1,0 +1,433 @@
+"""Every diagnosis that the doctor knows: the source of the report, the table in the docs, --json.
+
+Ids are stable and never used again for something else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+__all__ = ["DIAGNOSES", "Diagnosis", "Finding", "Severity", "table"]
+
+
+class Severity(Enum):
+    """How bad it is."""
+
+    ERROR = "error"
+    """A client or a hand cannot work like this."""
+    WARNING = "warning"
+    """It works badly, or soon will not."""
+    NOTE = "note"
+    """Good to know."""
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """A thing that can be wrong.
+
+    :param title: what it is, in a sentence without a name or number.
+    :param symptom: what the user sees of it.
+    :param why: why it has that effect.
+    :param fix: what to do, where nothing more particular can be said.
+    """
+
+    id: str
+    severity: Severity
+    title: str
+    symptom: str
+    why: str
+    fix: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A diagnosis that was made.
+
+    :param seen: what was seen, with names and numbers.
+    :param fix: what to do about it.
+    :param where: domain, topic, path or interface, for programs.
+    """
+
+    diagnosis: Diagnosis
+    seen: str
+    fix: str = ""
+    severity: Severity = Severity.NOTE
+    where: dict[str, str | int] = field(default_factory=dict)
+
+    @property
+    def id(self) -> str:
+        """Id of the diagnosis."""
+        return self.diagnosis.id
+
+
+_WAITS = "the client prints 'Waiting to subscribe dds...' for ever"
+_E, _W, _N = Severity.ERROR, Severity.WARNING, Severity.NOTE
+
+# In the order in which they are told: what explains the others comes first.
+_ALL = (
+    Diagnosis(
+        "DDS-CYCLONE-11",
+        _E,
+        "a CycloneDDS 11 participant that crashes its 0.10 peers is on the domain",
+        "clients, the hand's service or the robot's own programs die with a segmentation fault",
+        "Unitree's stack is CycloneDDS 0.10.x; a participant of 11.x with Unitree's types, even "
+        "one that only reads, crashes 0.10.x peers when they ask it for a type",
+        "stop that process now and install 'cyclonedds>=0.10.2,<0.11' for it; restart what died",
+    ),
+    Diagnosis(
+        "NET-LO-MULTICAST",
+        _E,
+        "loopback has no multicast, so two processes of Unitree's SDK do not find each other",
+        _WAITS + ", though hand and client run on one machine",
+        "Unitree's SDK finds peers by multicast; where 'lo' lacks the MULTICAST flag each process "
+        "of it waits for the other to call",
+        "sudo ip link set lo multicast on, then restart both; or let one of the two be "
+        "dexkit, which calls its peers on loopback by port and needs no multicast",
+    ),
+    Diagnosis(
+        "NET-INTERFACE",
+        _E,
+        "hand and client are on different network interfaces",
+        _WAITS + "; discovery tools on either side show only their own half",
+        "DDS uses the interface it is told to; who is on another one is not seen",
+        "name the same interface on both sides: the robot's network is 192.168.123.x",
+    ),
+    Diagnosis(
+        "NET-MULTICAST",
+        _W,
+        "the network interface has no multicast",
+        "processes on that network do not find each other",
+        "DDS finds peers by multicast",
+        "sudo ip link set INTERFACE multicast on, or use an interface that has it",
+    ),
+    Diagnosis(
+        "DDS-NOBODY",
+        _E,
+        "nobody publishes the state of a Dex hand",
+        _WAITS,
+        "a client waits for the first state before it sends anything",
+        "start the hand: the vendor's service, or 'dexkit serve BACKEND --side both'",
+    ),
+    Diagnosis(
+        "DDS-OTHER-DOMAIN",
+        _E,
+        "the hand is on another DDS domain than the client",
+        _WAITS + ", though the hand runs",
+        "domains do not hear each other; xr_teleoperate uses 0, and 1 with --sim",
+        "put both on one domain: 'dexkit serve ... --domain N', xr_teleoperate with or without "
+        "--sim",
+    ),
+    Diagnosis(
+        "DDS-OTHER-STACK",
+        _E,
+        "the hand speaks the topics of another generation of Unitree's stack",
+        _WAITS + ", though the hand runs on the right domain",
+        "xr_teleoperate v1.1 and the simulator used rt/unitree_actuator/*, later versions use "
+        "rt/dex1/*; names that differ never match, and nobody is told",
+        "make both use the same: 'dexkit serve ... --dialect NAME', or another version of the "
+        "client",
+    ),
+    Diagnosis(
+        "DDS-NAME",
+        _E,
+        "a topic's name is nearly that of a hand",
+        _WAITS + ", though the hand publishes something",
+        "DDS matches names letter by letter; on DDS the topics begin with rt/",
+        "use the exact name",
+    ),
+    Diagnosis(
+        "DDS-TYPE",
+        _E,
+        "two processes use the same topic with different types",
+        _WAITS + "; no error is shown on either side",
+        "a reader and a writer whose type names differ never match",
+        "use the same type on both sides",
+    ),
+    Diagnosis(
+        "DDS-LAYOUT",
+        _E,
+        "two processes use the same type name with different layouts",
+        _WAITS + ", or values are shifted and nonsensical",
+        "Unitree changed the messages in December 2024 and February 2025 without renaming them",
+        "install the same, newest version of unitree_sdk2 or unitree_ros2 on both sides",
+    ),
+    Diagnosis(
+        "DDS-QOS",
+        _E,
+        "a reader asks for more than the writer offers",
+        "topic and type are right and still nothing arrives",
+        "DDS matches only a writer that offers at least what the reader requests",
+        "let the writer be reliable and volatile, and the reader best-effort and volatile, as "
+        "Unitree's SDK does",
+    ),
+    Diagnosis(
+        "DDS-ONE-SIDE",
+        _E,
+        "only one of the two hands publishes",
+        _WAITS + ", though one hand runs",
+        "xr_teleoperate waits for the first state of both hands",
+        "start the other hand too; 'dexkit serve sim-dex1 --side right' stands in for a "
+        "missing one",
+    ),
+    Diagnosis(
+        "DDS-SILENT",
+        _E,
+        "a state topic is announced but no state comes",
+        _WAITS + ", though the topic is listed",
+        "a client needs samples, not only a topic",
+        "look at the hand's service: its log, its device; restart it",
+    ),
+    Diagnosis(
+        "DDS-UNREADABLE",
+        _E,
+        "the samples of a topic are not what their type says",
+        "the client ignores them or shows nonsense",
+        "a sample that does not decode is dropped",
+        "install the same version of the messages on both sides",
+    ),
+    Diagnosis(
+        "DDS-ALL-ZERO",
+        _E,
+        "a hand publishes positions that are all exactly 0",
+        _WAITS + ", though the state arrives",
+        "clients of the Dex3-1, and xr_teleoperate v1.1 with grippers, take all zero for 'no "
+        "state yet'",
+        "check that the hand is powered and its motors answer; an emulator must rest a little "
+        "off zero",
+    ),
+    Diagnosis(
+        "DDS-TWO-PUBLISHERS",
+        _E,
+        "two processes publish the same topic",
+        "the hand or the displayed hand jumps between two positions",
+        "a reader takes the samples of every writer as they come",
+        "stop one of them",
+    ),
+    Diagnosis(
+        "DDS-HAND-DEAF",
+        _E,
+        "a hand publishes its state but does not listen to commands",
+        "the client starts, the hand never moves",
+        "no process reads the command topic",
+        "restart the hand's service with commands enabled",
+    ),
+    Diagnosis(
+        "DDS-UNHEARD",
+        _E,
+        "commands are published that nobody reads",
+        "the client runs, the hand never moves",
+        "no hand has a reader of that topic and type",
+        "start the hand, on the same domain and topic",
+    ),
+    Diagnosis(
+        "DDS-LATE-JOINER",
+        _W,
+        "the hand was started after the client of a Dex3-1",
+        "the client shows the hand, the hand never moves",
+        "xr_teleoperate's Dex3-1 controller forks before it sends; the fork does not learn of "
+        "hands that appear later",
+        "restart the client, and always start the hand first",
+    ),
+    Diagnosis(
+        "DDS-FROZEN",
+        _E,
+        "the state does not follow commands that change",
+        "the displayed hand stands still",
+        "the state is published, but nothing new is measured",
+        "look at the hand's service: has it lost its device? 'dexkit doctor --device PATH' "
+        "looks at a serial port",
+    ),
+    Diagnosis(
+        "DDS-RATE",
+        _W,
+        "states come too seldom",
+        "the hand lags and moves slowly",
+        "xr_teleoperate limits each command to a step from the last state, so that a slow state "
+        "is a slow hand",
+        "close what loads the machine; on a serial line set the adapter's latency timer to 1 ms",
+    ),
+    Diagnosis(
+        "DDS-NO-CLIENT",
+        _N,
+        "nobody reads the hand's state",
+        "-",
+        "no client is up, or it is on another domain or interface",
+        "start the client",
+    ),
+    Diagnosis(
+        "ENV-CYCLONEDDS-11",
+        _E,
+        "a CycloneDDS other than 0.10 is installed in dexkit's Python",
+        "dexkit refuses to use it; other programs would crash the robot's",
+        "11.x participants with Unitree's types crash 0.10.x peers",
+        "pip install 'cyclonedds>=0.10.2,<0.11'",
+    ),
+    Diagnosis(
+        "ENV-CYCLONEDDS-MISSING",
+        _W,
+        "CycloneDDS is not installed in dexkit's Python",
+        "dexkit serve, record and replay say that DDS is not available",
+        "they need CycloneDDS 0.10; its wheels are for CPython 3.8 to 3.10 on x86-64 Linux (the "
+        "doctor itself does without)",
+        "use Python 3.10 on x86-64: 'uv python install 3.10', or pip install "
+        "'cyclonedds>=0.10.2,<0.11' there",
+    ),
+    Diagnosis(
+        "ENV-CYCLONEDDS-BROKEN",
+        _E,
+        "CycloneDDS is installed but does not load",
+        "dexkit serve, record and replay say that DDS is not available",
+        "its library cannot be loaded",
+        "pip install --force-reinstall 'cyclonedds>=0.10.2,<0.11'; unset CYCLONEDDS_HOME",
+    ),
+    Diagnosis(
+        "ENV-URI",
+        _E,
+        "CYCLONEDDS_URI is set and is of no use",
+        "programs of the C++ SDK and ROS 2 do not start, or are on another interface",
+        "CycloneDDS stops at a configuration that it cannot read",
+        "unset CYCLONEDDS_URI, or repair it: file:///PATH or the XML itself",
+    ),
+    Diagnosis(
+        "ENV-SDK",
+        _N,
+        "unitree_sdk2py does not import in dexkit's Python",
+        "clients started with this Python stop with an ImportError",
+        "the package on PyPI lacks a part of itself",
+        "install it from Unitree's repository unitree_sdk2_python; dexkit does not need it",
+    ),
+    Diagnosis(
+        "SERIAL-MISSING",
+        _E,
+        "there is no such serial port",
+        "the hand's service does not start",
+        "the adapter is not plugged in, or has another name now",
+        "plug it in; use the name under /dev/serial/by-id, which stays the same",
+    ),
+    Diagnosis(
+        "SERIAL-PERMISSION",
+        _E,
+        "this user may not use the serial port",
+        "the hand's service does not start",
+        "serial ports belong to a group",
+        "sudo usermod -a -G dialout $USER, then log in again",
+    ),
+    Diagnosis(
+        "SERIAL-BUSY",
+        _E,
+        "another program has the serial port",
+        "the hand's service does not start, or both programs get half of the answers",
+        "a servo has one master",
+        "stop the other program",
+    ),
+    Diagnosis(
+        "SERIAL-NOT-A-PORT",
+        _E,
+        "it is not a serial port that can be used",
+        "the hand's service does not start",
+        "it does not take a baud rate, or cannot be opened",
+        "give the port of the servo's adapter, e.g. /dev/ttyUSB0",
+    ),
+    Diagnosis(
+        "SERIAL-PROTOCOL-1",
+        _E,
+        "the servo speaks Protocol 1.0",
+        "dexkit refuses to drive it",
+        "its registers are others than those of Protocol 2.0",
+        "upgrade it with ROBOTIS DYNAMIXEL Wizard 2 (firmware recovery, model MX-64(2.0))",
+    ),
+    Diagnosis(
+        "SERIAL-OTHER-SERVO",
+        _E,
+        "the servo that answers is not an MX-64",
+        "dexkit refuses to drive it",
+        "another model has other registers and limits",
+        "give the port of the EZGripper, e.g. its name under /dev/serial/by-id",
+    ),
+    Diagnosis(
+        "SERIAL-NO-ANSWER",
+        _E,
+        "nothing answers on the serial port",
+        "the hand's service finds no servo",
+        "no servo answers at any baud rate, with either protocol",
+        "is the 12 V supply on? Is the cable in? Is it the right port?",
+    ),
+    Diagnosis(
+        "SERIAL-BAUD",
+        _W,
+        "the servo is set to another baud rate than the driver's first choice",
+        "at a fixed baud rate the hand is not found; below 1 Mbaud states come less often",
+        "a new servo is set to 57600",
+        "'dexkit serve ezgripper --set baudrate=auto' finds it; DYNAMIXEL Wizard 2 sets it to "
+        "1000000",
+    ),
+    Diagnosis(
+        "SERIAL-LATENCY",
+        _W,
+        "the adapter holds back what it receives",
+        "the hand lags: some 60 exchanges a second at best",
+        "an FTDI adapter waits for its latency timer before it hands over a short answer",
+        "echo 1 | sudo tee /sys/bus/usb-serial/devices/NAME/latency_timer",
+    ),
+    Diagnosis(
+        "USB-MISSING",
+        _E,
+        "no Dex3-1 is on USB",
+        "the hand's service does not start",
+        "the hand's board is not seen",
+        "is the hand powered (24 to 58 V) and its cable in? 'lsusb' must list it",
+    ),
+    Diagnosis(
+        "USB-PERMISSION",
+        _E,
+        "this user may not use the hand's USB device",
+        "the hand's service does not start: access denied",
+        "USB devices belong to root unless a udev rule says otherwise",
+        "add a udev rule",
+    ),
+    Diagnosis(
+        "USB-DRIVER",
+        _W,
+        "a kernel driver holds the hand's USB interface",
+        "the hand's service does not start: resource busy",
+        "an interface is used by the kernel or by a program, not by both",
+        "unbind the driver",
+    ),
+    Diagnosis(
+        "USB-BUSY",
+        _E,
+        "another program has the hand's USB device open",
+        "the hand's service does not start: resource busy",
+        "an interface is used by one program at a time",
+        "stop the other program",
+    ),
+    Diagnosis(
+        "USB-UNREACHABLE",
+        _E,
+        "the USB device cannot be reached",
+        "the hand's service does not start",
+        "the server of the emulated device, or the device itself, does not answer",
+        "is 'dexkit emulate dex3-usb' running at that address?",
+    ),
+)
+
+DIAGNOSES: dict[str, Diagnosis] = {d.id: d for d in _ALL}
+assert len(DIAGNOSES) == len(_ALL)
+
+
+def table() -> str:
+    """The diagnoses as a Markdown table: symptom, diagnosis, remedy."""
+    rows = ["| You see | Diagnosis | What to do |", "| --- | --- | --- |"]
+    rows += [
+        f"| {_cell(d.symptom)} | `{d.id}` ({d.severity}): {d.title}; {d.why} | {_cell(d.fix)} |"
+        for d in DIAGNOSES.values()
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")

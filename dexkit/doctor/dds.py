@@ -1,0 +1,315 @@
+"""Looking at domains: the sockets of the observers, and what they saw as observations."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from dexkit.doctor import rtps
+from dexkit.doctor.network import address_of
+from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
+from dexkit.doctor.observer import Observer, Send
+from dexkit.doctor.processes import command_line, environment_of, start_time
+from dexkit.doctor.rtps import EndpointData, Locator
+from dexkit.doctor.topics import is_hand_topic
+from dexkit.errors import DdsSetupError, DexkitError
+from dexkit.messages import message_type
+
+__all__ = ["DISCOVERY_SECONDS", "look"]
+
+DISCOVERY_SECONDS = 0.7
+"""How long an empty domain is waited on; a participant on this machine answers within 10 ms."""
+
+_GROUP = "239.255.0.1"  # of discovery (RTPS 9.6.2.3)
+_INDICES = 61  # participants on one machine and domain that are called by port, as dexkit.dds
+_ANNOUNCE_AT = (0.0, 0.15, 0.5, 1.2, 2.5)
+_TICK = 0.05
+_BUFFER = 4 << 20
+_DECODE_EVERY = 0.02  # seconds between samples of a stream whose positions are read
+_LOOPBACK = "127.0.0.1"
+
+
+@dataclass
+class _Watch:
+    """One writer's samples as they come."""
+
+    endpoint: EndpointData
+    first_time: float
+    first_sequence: int
+    last_time: float
+    last_sequence: int
+    samples: int = 0
+    first: bytes = b""
+    identical: bool = True
+    low: list[float] = field(default_factory=list)
+    high: list[float] = field(default_factory=list)
+    q: tuple[float, ...] = ()
+    nonzero: bool = False
+    undecodable: int = 0
+    decoded_at: float = float("-inf")
+    newest: bytes = b""
+
+    def take(self, sequence: int, data: bytes, now: float) -> None:
+        if self.samples and sequence <= self.last_sequence:
+            return
+        self.samples += 1
+        self.last_time, self.last_sequence, self.newest = now, sequence, data
+        if not self.first:
+            self.first = data
+        elif data != self.first:
+            self.identical = False
+        if now - self.decoded_at >= _DECODE_EVERY:
+            self.decoded_at = now
+            self.decode(data)
+
+    def decode(self, data: bytes) -> None:
+        try:
+            decoded = message_type(self.endpoint.type_name).decode(data)
+        except DexkitError:
+            self.undecodable += 1
+            return
+        motors = next(
+            getattr(decoded, name)
+            for name in ("cmds", "states", "motor_cmd", "motor_state")
+            if hasattr(decoded, name)
+        )
+        q = [float(motor.q) for motor in motors]
+        self.nonzero = self.nonzero or any(q)
+        self.q = tuple(q)
+        if len(q) != len(self.low):
+            self.low, self.high = list(q), list(q)
+        self.low = [min(pair) for pair in zip(self.low, q, strict=True)]
+        self.high = [max(pair) for pair in zip(self.high, q, strict=True)]
+
+    def stream(self, until: float, since: float) -> Stream:
+        if self.samples:
+            self.decode(self.newest)
+        gaps = self.last_sequence - self.first_sequence
+        elapsed = self.last_time - self.first_time
+        # one that falls silent has the rate of what came in the whole time
+        if until - self.last_time > max(0.3, 3 * elapsed / max(gaps, 1)):
+            elapsed = until - self.first_time
+        return Stream(
+            topic=self.endpoint.topic,
+            writer=self.endpoint.guid.hex(),
+            seconds=until - since,
+            samples=self.samples,
+            rate=gaps / elapsed if gaps and elapsed > 0 else 0.0,
+            identical=self.identical and self.samples > 1,
+            q=self.q,
+            q_span=max((h - low for low, h in zip(self.low, self.high, strict=True)), default=0.0),
+            nonzero=self.nonzero,
+            undecodable=self.undecodable,
+        )
+
+
+class _Window:
+    """One domain, seen from one interface."""
+
+    def __init__(self, domain: int, interface: str) -> None:
+        self.domain = domain
+        self.interface = interface
+        self.address = address_of(interface)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            with contextlib.suppress(OSError):
+                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+            self.socket.bind((self.address, 0))
+            self.socket.setblocking(False)
+            packed = socket.inet_aton(self.address)
+            self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, packed)
+            # no further than the next network, and to the other processes of this machine
+            self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+            self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        except OSError as error:
+            self.socket.close()
+            raise DdsSetupError(f"cannot look at {interface}: {error.strerror}") from error
+        self.watches: dict[bytes, _Watch] = {}
+        self.wanted_since: dict[bytes, float] = {}
+        self.observer = Observer(
+            os.urandom(12),
+            Locator(self.address, self.socket.getsockname()[1]),
+            properties={
+                "__ProcessName": "dexkit doctor",
+                "__Pid": str(os.getpid()),
+                "__Hostname": socket.gethostname(),
+            },
+            wanted=is_hand_topic,
+            on_sample=self.sample,
+        )
+
+    def sample(self, writer: EndpointData, sequence: int, data: bytes, now: float) -> None:
+        watch = self.watches.get(writer.guid)
+        if watch is None:
+            watch = self.watches[writer.guid] = _Watch(writer, now, sequence, now, sequence)
+        watch.take(sequence, data, now)
+
+    def everywhere(self, packet: bytes) -> list[Send]:
+        """A packet to wherever a participant may listen."""
+        places = [Locator(_GROUP, rtps.spdp_multicast_port(self.domain)), *self.observer.addresses]
+        if self.address == _LOOPBACK:
+            # where loopback has no multicast, its participants listen to these ports alone
+            places += [
+                Locator(_LOOPBACK, rtps.unicast_port(self.domain, i)) for i in range(_INDICES)
+            ]
+        return [(packet, place) for place in dict.fromkeys(places) if place.port < 65536]
+
+    def send(self, packets: Iterable[Send]) -> None:
+        for packet, place in packets:
+            try:
+                self.socket.sendto(packet, (place.address, place.port))
+            except OSError as error:
+                # no multicast on this interface, an address of another network, a full buffer:
+                # whoever is not reached is not seen, which is what the look is about
+                if error.errno == errno.EBADF:
+                    raise
+
+    def receive(self) -> None:
+        for _ in range(512):
+            try:
+                packet, (address, _port) = self.socket.recvfrom(65536)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:
+                continue
+            self.send(self.observer.receive(packet, time.monotonic(), address))
+
+    @property
+    def streaming(self) -> bool:
+        """A topic of a hand is written here, so that it pays to wait."""
+        return any(
+            is_writer and is_hand_topic(e.topic, e.type_name)
+            for e, is_writer in self.observer.endpoints.values()
+        )
+
+
+def look(
+    domains: Sequence[int],
+    interfaces: Sequence[str] = ("lo",),
+    *,
+    seconds: float = 2.0,
+    stop: threading.Event | None = None,
+    progress: Callable[[str], object] = lambda text: None,
+) -> tuple[DomainView, ...]:
+    """Look at domains without disturbing anybody: no topic is written.
+
+    :param seconds: how long the samples of hands are watched where there are any.
+    :param stop: ends the look early.
+    :raises DdsSetupError: an interface is not there or has no address.
+    """
+    stop = stop or threading.Event()
+    windows: list[_Window] = []
+    selector = selectors.DefaultSelector()
+    try:
+        for domain in domains:
+            for interface in interfaces:
+                window = _Window(domain, interface)
+                windows.append(window)
+                selector.register(window.socket, selectors.EVENT_READ, window)
+        began = time.monotonic()
+        progress(f"looking at {len(domains)} domains")
+        _run(windows, selector, began, DISCOVERY_SECONDS, stop)
+        # topics that are read were asked for as soon as they were seen
+        if any(window.streaming for window in windows):
+            progress(f"watching the samples for {seconds:g} s")
+            _run(windows, selector, began, DISCOVERY_SECONDS + seconds, stop)
+        until = time.monotonic()
+        for window in windows:
+            window.send(window.everywhere(window.observer.farewell()))
+        return tuple(
+            _view(domain, [w for w in windows if w.domain == domain], began, until)
+            for domain in domains
+        )
+    finally:
+        selector.close()
+        for window in windows:
+            window.socket.close()
+
+
+def _run(
+    windows: Sequence[_Window],
+    selector: selectors.BaseSelector,
+    began: float,
+    until: float,
+    stop: threading.Event,
+) -> None:
+    announce = [t for t in _ANNOUNCE_AT if t < until]
+    next_tick = 0.0
+    while not stop.is_set():
+        now = time.monotonic() - began
+        if now >= until:
+            return
+        if announce and now >= announce[0]:
+            announce.pop(0)
+            for window in windows:
+                window.send(window.everywhere(window.observer.announcement()))
+                window.receive()
+        if now >= next_tick:
+            next_tick = now + _TICK
+            for window in windows:
+                window.send(window.observer.tick(now + began))
+        for key, _ in selector.select(min(_TICK, max(until - now, 0.0))):
+            key.data.receive()
+
+
+def _view(number: int, windows: Sequence[_Window], began: float, until: float) -> DomainView:
+    participants: dict[str, Participant] = {}
+    endpoints: dict[str, Endpoint] = {}
+    streams: dict[str, Stream] = {}
+    own = {window.observer.prefix for window in windows}
+    for window in windows:
+        for prefix, data in window.observer.participants.items():
+            if prefix not in own:
+                participants.setdefault(prefix.hex(), _participant(data, window.interface))
+        for guid, (found, is_writer) in window.observer.endpoints.items():
+            if guid[:12] in own:
+                continue
+            endpoints[guid.hex()] = Endpoint(
+                topic=found.topic,
+                type_name=found.type_name,
+                kind="writer" if is_writer else "reader",
+                key=guid.hex(),
+                participant=guid[:12].hex(),
+                qos=found.qos,
+                type_hash=found.type_hash,
+            )
+            if is_writer and is_hand_topic(found.topic, found.type_name):
+                watch = window.watches.get(guid)
+                seen = (
+                    watch.stream(until, began)
+                    if watch
+                    else Stream(found.topic, guid.hex(), until - began, 0)
+                )
+                known = streams.get(seen.writer)
+                if known is None or seen.samples > known.samples:
+                    streams[seen.writer] = seen
+    order = sorted(endpoints.values(), key=lambda e: (e.topic, e.kind, e.type_name, e.key))
+    return DomainView(number, tuple(participants.values()), tuple(order), tuple(streams.values()))
+
+
+def _participant(data: rtps.ParticipantData, interface: str) -> Participant:
+    host = data.properties.get("__Hostname", "")
+    text = data.properties.get("__Pid", "")
+    pid = int(text) if text.isdigit() else 0
+    here = bool(pid) and host == socket.gethostname()
+    return Participant(
+        key=data.prefix.hex(),
+        vendor=rtps.vendor_name(data.vendor),
+        version=data.version,
+        process=data.properties.get("__ProcessName", ""),
+        pid=pid,
+        host=host,
+        addresses=tuple(dict.fromkeys(p.address for p in (*data.data, *data.discovery))),
+        multicast=data.multicast,
+        interface=interface,
+        command=command_line(pid) if here else "",
+        started=start_time(pid) if here else None,
+        dds_config=environment_of(pid, "CYCLONEDDS_URI") if here else "",
+    )

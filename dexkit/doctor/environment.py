@@ -1,0 +1,97 @@
+"""The Python that dexkit runs in, and CycloneDDS's configuration variable."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+from xml.etree import ElementTree
+
+from dexkit.doctor.observations import Environment
+
+__all__ = ["environment", "uri_problem"]
+
+_PATIENCE = 20.0  # seconds for an import
+_SDK = ("unitree-sdk2", "unitree-sdk2py", "unitree_sdk2py")
+
+
+def environment() -> Environment:
+    """Look at this Python; libraries are imported in a process of their own, if installed."""
+    cyclonedds = _version("cyclonedds")
+    sdk = next((v for name in _SDK if (v := _version(name))), "")
+    uri = os.environ.get("CYCLONEDDS_URI", "")
+    return Environment(
+        python=platform.python_version(),
+        machine=platform.machine(),
+        cyclonedds=cyclonedds,
+        cyclonedds_error=_import_problem("cyclonedds.core") if cyclonedds else "",
+        sdk=sdk,
+        sdk_error=_import_problem("unitree_sdk2py") if sdk else "",
+        uri=uri,
+        uri_error=uri_problem(uri),
+    )
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _import_problem(module: str) -> str:
+    """Why a module does not import, or empty. A crash of it is not ours."""
+    code = f"import {module}"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+            stdin=subprocess.DEVNULL,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"'{code}' does not end"
+    if done.returncode == 0:
+        return ""
+    if done.returncode < 0:
+        return f"'{code}' dies of signal {-done.returncode}"
+    lines = done.stderr.strip().splitlines()
+    return lines[-1] if lines else f"'{code}' fails"
+
+
+def uri_problem(uri: str) -> str:
+    """Why a CYCLONEDDS_URI is of no use, or empty: each of its parts is XML or a file of it."""
+    for part in _parts(uri):
+        text = part
+        if not part.startswith("<"):
+            path = Path(unquote(urlsplit(part).path) if part.startswith("file:") else part)
+            try:
+                text = path.read_text()
+            except (OSError, UnicodeDecodeError) as error:
+                reason = getattr(error, "strerror", None) or "it is not text"
+                return f"{path} cannot be read: {reason}"
+        try:
+            # a configuration may be several elements in a row
+            root = ElementTree.fromstring(f"<all>{_without_declaration(text)}</all>")
+        except ElementTree.ParseError as error:
+            return f"it is not XML: {error}"
+        if not len(root):
+            return "it holds no configuration"
+    return ""
+
+
+def _without_declaration(text: str) -> str:
+    text = text.strip()
+    return text.partition("?>")[2] if text.startswith("<?xml") else text
+
+
+def _parts(uri: str) -> list[str]:
+    """CycloneDDS takes a list with commas; inside XML they mean nothing."""
+    uri = uri.strip()
+    return [uri] if uri.startswith("<") else [p.strip() for p in uri.split(",") if p.strip()]

@@ -1,0 +1,138 @@
+"""Network interfaces of this machine, and who listens to DDS on them, from /proc and /sys."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import re
+import socket
+import struct
+from pathlib import Path
+
+from dexkit.doctor.observations import DdsSocket, Interface
+from dexkit.doctor.processes import command_line, open_sockets
+from dexkit.errors import DdsSetupError
+
+__all__ = ["ROBOT_NETWORK", "address_of", "dds_sockets", "interfaces"]
+
+ROBOT_NETWORK = "192.168.123."
+"""Where Unitree's robots are (facts/unitree-dex A.6)."""
+
+_SIOCGIFADDR = 0x8915
+_IFF_UP, _IFF_LOOPBACK, _IFF_MULTICAST = 0x1, 0x8, 0x1000
+_GROUP = "0100FFEF"  # 239.255.0.1 as /proc/net/igmp writes it on little-endian machines
+
+
+def address_of(interface: str) -> str:
+    """The IPv4 address of an interface.
+
+    :raises DdsSetupError: it is not there, or has none.
+    """
+    found = {one.name: one for one in interfaces()}
+    if interface not in found:
+        raise DdsSetupError(
+            f"there is no network interface {interface!r}", hint=f"this machine has: {_list(found)}"
+        )
+    if not found[interface].addresses:
+        raise DdsSetupError(
+            f"network interface {interface!r} has no IPv4 address"
+            + ("" if found[interface].up else " and is down"),
+            hint=f"is the cable plugged in? This machine has: {_list(found)}",
+        )
+    return found[interface].addresses[0]
+
+
+def _list(found: dict[str, Interface]) -> str:
+    return ", ".join(
+        f"{one.name} ({', '.join(one.addresses)})" if one.addresses else one.name
+        for one in found.values()
+    )
+
+
+def interfaces(proc: Path = Path("/proc"), sysfs: Path = Path("/sys")) -> tuple[Interface, ...]:
+    """Network interfaces of this machine."""
+    joined = _joined(proc)
+    found = []
+    for _, name in socket.if_nameindex():
+        try:
+            flags = int((sysfs / "class/net" / name / "flags").read_text(), 16)
+        except (OSError, ValueError):
+            flags = _flags(name)
+        found.append(
+            Interface(
+                name=name,
+                up=bool(flags & _IFF_UP),
+                loopback=bool(flags & _IFF_LOOPBACK),
+                multicast=bool(flags & _IFF_MULTICAST),
+                addresses=_addresses(name),
+                discovery=name in joined,
+            )
+        )
+    return tuple(found)
+
+
+def _ioctl(request: int, name: str) -> bytes:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as handle:
+        return fcntl.ioctl(handle.fileno(), request, struct.pack("256s", name.encode()[:15]))
+
+
+def _addresses(name: str) -> tuple[str, ...]:
+    with contextlib.suppress(OSError):
+        return (socket.inet_ntoa(_ioctl(_SIOCGIFADDR, name)[20:24]),)
+    return ()
+
+
+def _flags(name: str) -> int:
+    """The flags where /sys is another network namespace's."""
+    with contextlib.suppress(OSError):
+        return int(struct.unpack_from("H", _ioctl(0x8913, name), 16)[0])  # SIOCGIFFLAGS
+    return 0
+
+
+def _joined(proc: Path) -> set[str]:
+    """Interfaces on which some process has joined the multicast group of discovery."""
+    found: set[str] = set()
+    name = ""
+    with contextlib.suppress(OSError):
+        for line in (proc / "net/igmp").read_text().splitlines()[1:]:
+            if not line.startswith("\t"):
+                name = line.split()[1].rstrip(":")
+            elif line.split()[0] == _GROUP:
+                found.add(name)
+    return found
+
+
+def dds_sockets(domains: list[int], proc: Path = Path("/proc")) -> tuple[DdsSocket, ...]:
+    """Processes of this machine that listen on the ports of a domain, one entry each.
+
+    Only domains up to 99 are recognised: the ports of higher ones are also handed out to
+    ordinary sockets.
+    """
+    try:
+        lines = (proc / "net/udp").read_text().splitlines()[1:]
+    except OSError:
+        return ()
+    ports = []
+    for line in lines:
+        fields = line.split()
+        match = re.fullmatch(r"([0-9A-F]{8}):([0-9A-F]{4})", fields[1])
+        if match is None:
+            continue
+        port = int(match[2], 16)
+        domain, offset = divmod(port - 7400, 250)
+        # discovery by multicast, or by unicast with an index
+        if (
+            0 <= domain < 100
+            and domain in domains
+            and (offset == 0 or (offset >= 10 and not offset % 2))
+        ):
+            ports.append((domain, port, fields[9]))
+    if not ports:
+        return ()
+    owners = open_sockets()
+    found: dict[tuple[int, int], DdsSocket] = {}
+    for domain, port, inode in ports:
+        pid = owners.get(inode, 0)
+        command = command_line(pid) if pid else ""
+        found.setdefault((domain, pid), DdsSocket(domain, port, pid, command))
+    return tuple(found[key] for key in sorted(found))

@@ -1,0 +1,108 @@
+"""The doctor's report: on a terminal, and as data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from dexkit.doctor.catalogue import Finding, Severity
+from dexkit.doctor.observations import DomainView, Endpoint, Observations
+from dexkit.doctor.rules import Readiness, Verdict
+from dexkit.doctor.topics import roles, short
+
+__all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
+
+SCHEMA_VERSION = 1
+"""Of the JSON report; raised when a field changes its meaning or goes."""
+
+_COLOUR = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
+
+
+def as_data(
+    seen: Observations, findings: list[Finding], said: Verdict, states: list[Readiness]
+) -> dict[str, Any]:
+    """The report as JSON data; docs/doctor.md describes it."""
+    return {
+        "version": SCHEMA_VERSION,
+        "healthy": said.healthy,
+        "verdict": said.text,
+        "ready": [dataclasses.asdict(state) for state in states],
+        "findings": [
+            {
+                "id": f.id,
+                "severity": str(f.severity),
+                "title": f.diagnosis.title,
+                "seen": f.seen,
+                "why": f.diagnosis.why,
+                "fix": f.fix,
+                "where": f.where,
+            }
+            for f in findings
+        ],
+        "observations": _finite(dataclasses.asdict(seen)),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no infinity; no deadline is null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_report(
+    console: Console,
+    seen: Observations,
+    findings: list[Finding],
+    said: Verdict,
+    states: list[Readiness],
+) -> None:
+    """Verdict, findings with remedies, then what is where."""
+    colour = "green" if said.healthy else "red"
+    console.print(f"[bold {colour}]{escape(said.text)}[/]")
+    for finding in findings:
+        colour = _COLOUR[finding.severity]
+        console.print(f"\n[{colour}]{finding.severity}[/] [bold]{finding.id}[/]")
+        console.print(f"  seen: {escape(finding.seen)}", highlight=False)
+        console.print(f"  why:  {escape(finding.diagnosis.why)}", highlight=False)
+        console.print(f"  do:   [bold]{escape(finding.fix)}[/]", highlight=False)
+    for state in states:
+        text = "a client gets past its wait" if state.ready else f"a client waits: {state.missing}"
+        console.print(f"\ndomain {state.domain}, {state.dialect}: {escape(text)}", highlight=False)
+    table = Table(
+        "domain", "topic", "type", "what", "Hz", "process", box=None, padding=(0, 2, 0, 0)
+    )
+    for view in seen.domains:
+        for endpoint in view.endpoints:
+            table.add_row(*(escape(cell) for cell in _row(view, endpoint)))
+        if view.participants and not view.endpoints:
+            for participant in view.participants:
+                table.add_row(str(view.number), "-", "-", "-", "", escape(participant.name))
+    if table.row_count:
+        console.print()
+        console.print(table)
+    looked = ", ".join(str(view.number) for view in seen.domains)
+    if looked:
+        console.print(f"\n[dim]looked at domains {looked} on {', '.join(seen.looked_at)}[/dim]")
+
+
+def _row(view: DomainView, endpoint: Endpoint) -> tuple[str, ...]:
+    stream = view.stream(endpoint)
+    rate = f"{stream.rate:.0f}" if stream and stream.samples else ("0" if stream else "")
+    mark = "" if roles(endpoint.topic) else " (not a hand's)"
+    kind = "publishes" if endpoint.kind == "writer" else "reads"
+    return (
+        str(view.number),
+        endpoint.topic + mark,
+        short(endpoint.type_name),
+        kind,
+        rate,
+        view.owner(endpoint),
+    )

@@ -1,0 +1,825 @@
+"""From what was seen to what is wrong: pure functions, no IO."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+from dexkit.doctor.catalogue import DIAGNOSES, Finding, Severity
+from dexkit.doctor.observations import (
+    DomainView,
+    Endpoint,
+    Environment,
+    Observations,
+    Participant,
+    Policies,
+    SerialPort,
+    Stream,
+    UsbDevice,
+)
+from dexkit.doctor.topics import Role, nearly, roles, short
+from dexkit.hand import Side
+from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.wire import dex3_usb, mx64
+
+__all__ = ["Readiness", "Verdict", "Wish", "diagnose", "readiness", "verdict"]
+
+_FROZEN_COMMANDS = 0.1  # rad that commands move while an honest state could not stand still
+_MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
+_DRIVER_BAUD = 1_000_000
+_DURABILITY = ("volatile", "transient_local", "transient", "persistent")
+# xr_teleoperate v1.1 and every client of a Dex3-1 wait for a q that is not 0 (F B.1)
+_ZERO_IS_NO_STATE = frozenset({"unitree_actuator", "dex3"})
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the user asked about.
+
+    :param domain: None for whatever domain has a hand or a client.
+    :param dialects: those that count; empty for whatever is found.
+    :param devices_only: a device was asked about and nothing on DDS.
+    """
+
+    domain: int | None = None
+    dialects: tuple[Dialect, ...] = ()
+    devices_only: bool = False
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """Whether a client of a dialect would get past its wait on a domain.
+
+    :param missing: what it still waits for, or empty.
+    """
+
+    domain: int
+    dialect: str
+    ready: bool
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The result in one sentence.
+
+    :param healthy: no errors and no warnings.
+    """
+
+    healthy: bool
+    text: str
+
+
+def _finding(
+    name: str, seen: str, fix: str = "", severity: Severity | None = None, **where: str | int
+) -> Finding:
+    known = DIAGNOSES[name]
+    return Finding(known, seen, fix or known.fix, severity or known.severity, where)
+
+
+def diagnose(seen: Observations, wish: Wish | None = None) -> list[Finding]:
+    """Everything that is wrong with what was seen, what explains the rest first."""
+    wish = wish or Wish()
+    found = [*_domains(seen, wish), *_network(seen, wish)]
+    if seen.environment is not None:
+        found += _environment(seen.environment)
+    for port in seen.serial:
+        found += _serial(port)
+    found += _usb(seen)
+    order = {name: i for i, name in enumerate(DIAGNOSES)}
+    rank = list(Severity)
+    return sorted(found, key=lambda f: (rank.index(f.severity), order[f.id]))
+
+
+def verdict(seen: Observations, findings: list[Finding], wish: Wish | None = None) -> Verdict:
+    """What to say first."""
+    wish = wish or Wish()
+    problems = [f for f in findings if f.severity is not Severity.NOTE]
+    states = readiness(seen, wish)
+    ready = [r for r in states if r.ready]
+    good = " and ".join(
+        f"{_title(DIALECTS[r.dialect])} on domain {r.domain} ({r.dialect})" for r in ready
+    )
+    if not problems:
+        text = f"Healthy: {good}; a client gets past its wait." if good else "Nothing is wrong."
+        return Verdict(True, text)
+    first = problems[0]
+    more = f" ({len(problems) - 1} more below)" if len(problems) > 1 else ""
+    title = first.diagnosis.title
+    if first.severity is Severity.WARNING:
+        return Verdict(False, f"It works, but {title}{more}.")
+    tail = "" if not ready else f" A client of {good} would get past its wait all the same."
+    return Verdict(False, f"{title[:1].upper()}{title[1:]}{more}.{tail}")
+
+
+def _title(dialect: Dialect) -> str:
+    return MODELS[dialect.model].title
+
+
+# --- who is what
+
+
+@dataclass(frozen=True)
+class _Part:
+    """An endpoint in its role."""
+
+    view: DomainView
+    endpoint: Endpoint
+    role: Role
+
+    @property
+    def who(self) -> str:
+        return self.view.owner(self.endpoint)
+
+
+def _parts(view: DomainView, kind: str, role: str, wish: Wish) -> list[_Part]:
+    """Endpoints of a kind whose topic and type have a role in a dialect that counts."""
+    return [
+        _Part(view, endpoint, found)
+        for endpoint in view.endpoints
+        if endpoint.kind == kind
+        for found in roles(endpoint.topic, endpoint.type_name)
+        if found.kind == role and (not wish.dialects or found.dialect in wish.dialects)
+    ]
+
+
+def _hands(view: DomainView, wish: Wish) -> list[_Part]:
+    return _parts(view, "writer", "state", wish)
+
+
+def _clients(view: DomainView, wish: Wish) -> list[_Part]:
+    """What a client has: readers of states, and writers of commands."""
+    return _parts(view, "reader", "state", wish) + _parts(view, "writer", "cmd", wish)
+
+
+def _focus(seen: Observations, wish: Wish) -> list[DomainView]:
+    """The domains that are judged."""
+    if wish.domain is not None:
+        return [v for v in seen.domains if v.number == wish.domain]
+    return [v for v in seen.domains if _hands(v, wish) or _clients(v, wish)] or [
+        v for v in seen.domains if v.number in (0, 1)
+    ]
+
+
+def _wanted(views: Iterable[DomainView], wish: Wish) -> list[Dialect]:
+    """The dialects in question: asked for, or a client's, or a hand's."""
+    if wish.dialects:
+        return list(wish.dialects)
+    views = list(views)
+    for parts in (_clients, _hands):
+        found = {p.role.dialect.name for v in views for p in parts(v, wish)}
+        if found:
+            return [d for d in DIALECTS.values() if d.name in found]
+    return []
+
+
+def readiness(seen: Observations, wish: Wish | None = None) -> list[Readiness]:
+    """Whether a client would get past 'Waiting to subscribe dds...' (facts/unitree-dex B.1)."""
+    wish = wish or Wish()
+    out = []
+    for view in _focus(seen, wish):
+        names = {p.role.dialect.name for p in _hands(view, wish) + _clients(view, wish)}
+        for dialect in DIALECTS.values():
+            if dialect.name in names:
+                missing = _missing(view, dialect)
+                out.append(Readiness(view.number, dialect.name, not missing, missing))
+    return out
+
+
+def _missing(view: DomainView, dialect: Dialect) -> str:
+    wish = Wish(dialects=(dialect,))
+    for side in Side:
+        parts = [p for p in _hands(view, wish) if side in p.role.sides]
+        who = "both hands" if dialect.topics(Side.LEFT) == dialect.topics(Side.RIGHT) else side
+        if not parts:
+            return f"nobody publishes the state of the {side} hand"
+        readers = [
+            p.endpoint
+            for p in _parts(view, "reader", "state", wish)
+            if p.endpoint.topic == parts[0].endpoint.topic
+        ]
+        if any(all(_qos_problem(p.endpoint.qos, r.qos) for p in parts) for r in readers):
+            return f"the state of {who} and its reader do not match"
+        flowing = [s for p in parts if (s := view.stream(p.endpoint)) and s.samples > s.undecodable]
+        if not flowing:
+            return f"no state of {who} comes"
+        if dialect.name in _ZERO_IS_NO_STATE and not any(s.nonzero for s in flowing):
+            return f"all positions of {who} are exactly 0"
+    return ""
+
+
+# --- DDS
+
+
+def _domains(seen: Observations, wish: Wish) -> Iterator[Finding]:
+    focus = _focus(seen, wish)
+    for view in seen.domains:
+        yield from _versions(view)
+    found = [f for view in focus for f in _names_and_types(view, wish)]
+    yield from found
+    for view in focus:
+        yield from _matches(view)
+        yield from _listeners(view, wish)
+        yield from _streams(view, wish)
+    yield from _absent(seen, focus, wish, explained=bool(found))
+
+
+def _versions(view: DomainView) -> Iterator[Finding]:
+    for one in view.participants:
+        parts = re.match(r"(\d+)\.(\d+)", one.version)
+        if one.vendor != "CycloneDDS" or parts is None:
+            continue
+        if (int(parts[1]), int(parts[2])) <= (0, 10):
+            continue
+        typed = any(
+            e.participant == one.key and e.type_name.startswith(("unitree_", "std_msgs"))
+            for e in view.endpoints
+        )
+        peers = [p.name for p in view.participants if p.version.startswith("0.10.")]
+        risk = ("has Unitree's types" if typed else "has no endpoint of Unitree's types yet") + (
+            f"; in danger: {', '.join(peers)}" if peers else "; no 0.10 peer is (still) there"
+        )
+        yield _finding(
+            "DDS-CYCLONE-11",
+            f"{one.name} runs CycloneDDS {one.version} on domain {view.number} and {risk}",
+            severity=Severity.ERROR if typed else Severity.WARNING,
+            domain=view.number,
+            pid=one.pid,
+        )
+
+
+def _names_and_types(view: DomainView, wish: Wish) -> Iterator[Finding]:
+    told: set[tuple[str, str]] = set()
+    for endpoint in view.endpoints:
+        key = (endpoint.topic, endpoint.kind)
+        verb = "publishes" if endpoint.kind == "writer" else "reads"
+        near = nearly(endpoint.topic)
+        if near is not None and key not in told:
+            told.add(key)
+            yield _finding(
+                "DDS-NAME",
+                f"{view.owner(endpoint)} {verb} {endpoint.topic!r} on domain {view.number}; "
+                f"{near[0]!r} was probably meant: {near[1]}",
+                fix=f"write {near[0]!r}",
+                domain=view.number,
+                topic=endpoint.topic,
+            )
+    topics = sorted({e.topic for e in view.endpoints if roles(e.topic)})
+    for topic in topics:
+        here = [e for e in view.endpoints if e.topic == topic]
+        types = sorted({e.type_name for e in here})
+        right = {r.type_name for r in roles(topic)}
+        if len(types) < 2 and set(types) <= right:
+            if not wish.dialects:
+                continue
+            wanted = [r for r in roles(topic) if r.dialect in wish.dialects]
+            if not wanted or types[0] in {r.type_name for r in wanted}:
+                continue
+            served = roles(topic, types[0])[0].dialect.name
+            asked = ", ".join(d.name for d in wish.dialects)
+            detail = f"that is the dialect {served}, not {asked}"
+            fix = f"'dexkit serve ... --dialect {asked}', or a client of {served}"
+        else:
+            detail = " and ".join(
+                sorted({r.dialect.name + " has " + short(r.type_name) for r in roles(topic)})
+            )
+            fix = "use the same type on both sides: " + detail
+        uses = "; ".join(
+            f"{view.owner(e)} {'publishes' if e.kind == 'writer' else 'reads'} {short(e.type_name)}"
+            for e in here
+        )
+        yield _finding(
+            "DDS-TYPE",
+            f"{topic} on domain {view.number}: {uses} ({detail})",
+            fix=fix,
+            domain=view.number,
+            topic=topic,
+        )
+
+
+def _matches(view: DomainView) -> Iterator[Finding]:
+    """Readers and writers of one topic and type that do not match."""
+    told: set[tuple[str, str, str]] = set()
+    writers = [e for e in view.endpoints if e.kind == "writer" and roles(e.topic)]
+    readers = [e for e in view.endpoints if e.kind == "reader"]
+    for writer, reader in product(writers, readers):
+        if (writer.topic, writer.type_name) != (reader.topic, reader.type_name):
+            continue
+        problem = _qos_problem(writer.qos, reader.qos)
+        pair = f"{view.owner(reader)} reads {reader.topic} of {view.owner(writer)}"
+        if problem and (key := ("qos", writer.key, reader.participant)) not in told:
+            told.add(key)
+            yield _finding(
+                "DDS-QOS",
+                f"{pair} on domain {view.number}, but {problem}",
+                domain=view.number,
+                topic=writer.topic,
+            )
+        ends = view.participant(writer.participant), view.participant(reader.participant)
+        # other versions of CycloneDDS describe the same type differently
+        alike = ends[0] and ends[1] and _series(ends[0]) == _series(ends[1])
+        hashes = writer.type_hash, reader.type_hash
+        if alike and all(hashes) and hashes[0] != hashes[1]:
+            key = ("layout", writer.topic, reader.participant)
+            if key not in told:
+                told.add(key)
+                yield _finding(
+                    "DDS-LAYOUT",
+                    f"{pair} on domain {view.number}; both say {short(writer.type_name)} and "
+                    "describe it differently",
+                    domain=view.number,
+                    topic=writer.topic,
+                )
+
+
+def _series(participant: Participant) -> str:
+    return ".".join(participant.version.split(".")[:2])
+
+
+def _qos_problem(offered: Policies, requested: Policies) -> str:
+    """Why a writer's offer does not do for a reader, or empty."""
+    if requested.reliability == "reliable" and offered.reliability != "reliable":
+        return "the reader asks for reliable and the writer is best-effort"
+    if _DURABILITY.index(requested.durability) > _DURABILITY.index(offered.durability):
+        return f"the reader asks for {requested.durability} and the writer is {offered.durability}"
+    if requested.deadline < offered.deadline:
+        return f"the reader asks for a sample every {requested.deadline:g} s, which is not promised"
+    if requested.liveliness > offered.liveliness:
+        return "the reader asks for a stronger liveliness than the writer offers"
+    if requested.exclusive != offered.exclusive:
+        return "one side wants exclusive ownership and the other shared"
+    mine, theirs = set(offered.partitions or ("",)), set(requested.partitions or ("",))
+    if not mine & theirs and not any("*" in p or "?" in p for p in mine | theirs):
+        return f"they are in different partitions ({sorted(mine)} and {sorted(theirs)})"
+    return ""
+
+
+def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
+    for part in _first(_hands(view, wish)):
+        dialect = part.role.dialect
+        cmd = dialect.topics(part.role.sides[0])[0]
+        if not any(
+            e.kind == "reader" and e.topic == cmd and e.type_name == dialect.cmd_type
+            for e in view.endpoints
+        ):
+            yield _finding(
+                "DDS-HAND-DEAF",
+                f"{part.who} publishes {part.endpoint.topic} on domain {view.number}, and nobody "
+                f"reads {cmd}",
+                domain=view.number,
+                topic=cmd,
+            )
+    for part in _first(_parts(view, "writer", "cmd", wish)):
+        topic, type_name = part.endpoint.topic, part.endpoint.type_name
+        readers = [
+            e
+            for e in view.endpoints
+            if e.kind == "reader" and e.topic == topic and e.type_name == type_name
+        ]
+        stream = view.stream(part.endpoint)
+        if not readers:
+            rate = f" {stream.rate:.0f} times a second" if stream and stream.rate else ""
+            yield _finding(
+                "DDS-UNHEARD",
+                f"{part.who} publishes {topic}{rate} on domain {view.number}, and nobody reads it",
+                domain=view.number,
+                topic=topic,
+            )
+        elif part.role.dialect.model == "dex3-1" and not (stream and stream.samples):
+            late = _late(view, part.endpoint, readers)
+            if late:
+                yield _finding(
+                    "DDS-LATE-JOINER",
+                    f"{late} reads {topic} on domain {view.number}; it was started after "
+                    f"{part.who}, whose commands do not arrive here either",
+                    domain=view.number,
+                    topic=topic,
+                )
+    for state in _first(_hands(view, wish)):
+        topic = state.endpoint.topic
+        if not any(e.kind == "reader" and e.topic == topic for e in view.endpoints):
+            yield _finding(
+                "DDS-NO-CLIENT",
+                f"nobody reads {topic} on domain {view.number}",
+                domain=view.number,
+                topic=topic,
+            )
+    for role in ("state", "cmd"):
+        by_topic: dict[tuple[str, str], dict[str, _Part]] = {}
+        for part in _parts(view, "writer", role, wish):
+            key = (part.endpoint.topic, part.endpoint.type_name)
+            by_topic.setdefault(key, {})[part.endpoint.participant] = part
+        for (topic, _), parts in sorted(by_topic.items()):
+            if len(parts) > 1:
+                yield _finding(
+                    "DDS-TWO-PUBLISHERS",
+                    f"{topic} on domain {view.number} is published by "
+                    + " and by ".join(sorted(p.who for p in parts.values())),
+                    domain=view.number,
+                    topic=topic,
+                )
+
+
+def _first(parts: Iterable[_Part]) -> list[_Part]:
+    """One part a topic and type."""
+    return list({(p.endpoint.topic, p.endpoint.type_name): p for p in parts}.values())
+
+
+def _late(view: DomainView, writer: Endpoint, readers: Iterable[Endpoint]) -> str:
+    """Name of a reader's process that is younger than the writer's, or empty."""
+    client = view.participant(writer.participant)
+    for reader in readers:
+        hand = view.participant(reader.participant)
+        if not (client and hand and client.started and hand.started):
+            continue
+        if hand.started > client.started and hand.pid != client.pid:
+            return hand.name
+    return ""
+
+
+def _streams(view: DomainView, wish: Wish) -> Iterator[Finding]:
+    for part in _hands(view, wish):
+        stream = view.stream(part.endpoint)
+        if stream is None or stream.seconds <= 0:
+            continue
+        dialect, topic = part.role.dialect, part.endpoint.topic
+        what = f"{topic} of {part.who} on domain {view.number}"
+        if not stream.samples:
+            yield _finding(
+                "DDS-SILENT",
+                f"{what}: no sample in {stream.seconds:.1f} s",
+                domain=view.number,
+                topic=topic,
+            )
+            continue
+        if stream.undecodable and stream.undecodable >= stream.samples:
+            yield _finding(
+                "DDS-UNREADABLE",
+                f"{what}: {stream.samples} samples are not {short(part.endpoint.type_name)}",
+                domain=view.number,
+                topic=topic,
+            )
+            continue
+        if not stream.nonzero and dialect.name in _ZERO_IS_NO_STATE:
+            yield _finding(
+                "DDS-ALL-ZERO", f"{what}: every q is 0.0", domain=view.number, topic=topic
+            )
+        least = MODELS[dialect.model].min_state_rate
+        if stream.samples > 1 and stream.rate < least * _MARGIN:
+            yield _finding(
+                "DDS-RATE",
+                f"{what}: {stream.rate:.0f} a second; clients need {least:g}",
+                domain=view.number,
+                topic=topic,
+            )
+        command = _command(view, part, wish)
+        if stream.identical and command is not None and command.q_span >= _FROZEN_COMMANDS:
+            yield _finding(
+                "DDS-FROZEN",
+                f"{what}: {stream.samples} identical states while the commands moved by "
+                f"{command.q_span:.2f} rad",
+                domain=view.number,
+                topic=topic,
+            )
+
+
+def _command(view: DomainView, hand: _Part, wish: Wish) -> Stream | None:
+    """What a client sends to a hand."""
+    for part in _parts(view, "writer", "cmd", wish):
+        if part.role.dialect is hand.role.dialect and part.role.sides == hand.role.sides:
+            stream = view.stream(part.endpoint)
+            if stream is not None and stream.samples:
+                return stream
+    return None
+
+
+def _absent(
+    seen: Observations, focus: list[DomainView], wish: Wish, *, explained: bool
+) -> Iterator[Finding]:
+    """States that should be there and are not."""
+    everything = Wish()
+    wanted = _wanted(focus, wish)
+    # a hand and a client that do not meet because of the domain
+    elsewhere = [p for v in seen.domains if v not in focus for p in _hands(v, wish)]
+    apart = False
+    if wish.domain is None:
+        for view in focus:
+            clients = [p for p in _clients(view, wish) if p.endpoint.kind == "reader"]
+            needed = {p.role.dialect.name for p in clients}
+            served = {p.role.dialect.name for p in _hands(view, everything)}
+            others = [
+                p
+                for v in focus
+                if v is not view
+                for p in _hands(v, wish)
+                if p.role.dialect.name in needed - served
+            ]
+            if others:
+                apart = True
+                yield _other_domain(others, f"{clients[0].who} waits on domain {view.number}")
+    hands = [p for v in focus for p in _hands(v, wish)]
+    if not hands and elsewhere:
+        apart = True
+        asked = " and ".join(str(v.number) for v in focus)
+        yield _other_domain(elsewhere, f"nobody publishes a hand's state on domain {asked}")
+    if wish.domain is None and hands and not apart:
+        odd = [p for p in _first(hands) if p.view.number > 1]
+        if odd and not any(_clients(v, wish) for v in focus):
+            yield _other_domain(
+                odd, "xr_teleoperate looks at domain 0, or 1 with --sim", Severity.WARNING
+            )
+    for view in focus:
+        here = _hands(view, everything)
+        names = {p.role.dialect.name for p in here}
+        needed_dialects = [
+            d
+            for d in (wish.dialects or wanted)
+            if wish.dialects
+            or any(
+                p.role.dialect is d and p.endpoint.kind == "reader" for p in _clients(view, wish)
+            )
+        ]
+        for dialect in needed_dialects:
+            if dialect.name in names:
+                continue
+            others = [p for p in here if p.role.dialect.model == dialect.model]
+            same_topic = [p for p in others if p.endpoint.topic in dialect.topics(p.role.sides[0])]
+            if others and not same_topic:  # a type that differs is told as that
+                explained = True
+                other = others[0]
+                yield _finding(
+                    "DDS-OTHER-STACK",
+                    f"{other.who} publishes {other.endpoint.topic} "
+                    f"({other.role.dialect.name}) on domain {view.number}; the client needs "
+                    f"{dialect.topics(Side.LEFT)[1]} ({dialect.name})",
+                    fix=f"'dexkit serve ... --dialect {dialect.name}', or a client of "
+                    f"{other.role.dialect.name}",
+                    domain=view.number,
+                    topic=other.endpoint.topic,
+                )
+        for dialect in wanted:
+            parts = [p for p in _hands(view, wish) if p.role.dialect is dialect]
+            sides = {side for p in parts for side in p.role.sides}
+            if len(sides) == 1:
+                (there,) = sides
+                other_side = Side.RIGHT if there is Side.LEFT else Side.LEFT
+                yield _finding(
+                    "DDS-ONE-SIDE",
+                    f"domain {view.number} has {dialect.topics(there)[1]}, but not "
+                    f"{dialect.topics(other_side)[1]}",
+                    domain=view.number,
+                    topic=dialect.topics(other_side)[1],
+                )
+    if not hands and not explained and not apart:
+        people = sum(len(v.participants) for v in focus)
+        numbers = ", ".join(str(v.number) for v in seen.domains)
+        which = " and ".join(str(v.number) for v in focus) or numbers
+        who = f"{people} other DDS process{'es' if people != 1 else ''}" if people else "no process"
+        yield _finding(
+            "DDS-NOBODY",
+            f"there is {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
+            f"on {', '.join(seen.looked_at)}",
+            fix=_elsewhere(seen),
+            severity=Severity.NOTE if wish.devices_only else None,
+        )
+
+
+def _other_domain(parts: list[_Part], instead: str, severity: Severity | None = None) -> Finding:
+    part = parts[0]
+    where = " and ".join(str(n) for n in sorted({p.view.number for p in parts}))
+    return _finding(
+        "DDS-OTHER-DOMAIN",
+        f"{part.who} publishes {part.endpoint.topic} on domain {where}; {instead}",
+        severity=severity,
+        domain=part.view.number,
+        topic=part.endpoint.topic,
+    )
+
+
+def _elsewhere(seen: Observations) -> str:
+    """What to do when nobody is seen: start a hand, or look elsewhere."""
+    text = DIAGNOSES["DDS-NOBODY"].fix
+    others = [
+        f"{i.name} ({', '.join(i.addresses)})"
+        for i in sorted(seen.interfaces, key=lambda i: not _robot(i.addresses))
+        if i.up and i.addresses and i.name not in seen.looked_at
+    ]
+    if others:
+        text += f"; if it runs elsewhere: --interface NAME, this machine has {', '.join(others)}"
+    return text
+
+
+def _robot(addresses: Iterable[str]) -> bool:
+    return any(a.startswith("192.168.123.") for a in addresses)  # F A.6
+
+
+# --- network
+
+
+def _network(seen: Observations, wish: Wish) -> Iterator[Finding]:
+    by_name = {i.name: i for i in seen.interfaces}
+    for name in seen.looked_at:
+        known = by_name.get(name)
+        if known and not known.loopback and not known.multicast:
+            yield _finding(
+                "NET-MULTICAST",
+                f"{name} ({', '.join(known.addresses)}) has no multicast",
+                fix=DIAGNOSES["NET-MULTICAST"].fix.replace("INTERFACE", name),
+                interface=name,
+            )
+    focus = _focus(seen, wish)
+    for view in focus:
+        hands, clients = _hands(view, wish), _clients(view, wish)
+        yield from _apart(view, hands, clients)
+        loopback = next((i for i in seen.interfaces if i.loopback), None)
+        if loopback and not loopback.multicast:
+            yield from _deaf_loopback(view, hands, clients, loopback.name)
+    yield from _hidden(seen, focus)
+
+
+def _pairs(hands: list[_Part], clients: list[_Part]) -> Iterator[tuple[Participant, Participant]]:
+    """Participants of a hand and a client that should talk to each other, each pair once."""
+    told = set()
+    for hand, client in product(hands, clients):
+        keys = (hand.endpoint.participant, client.endpoint.participant)
+        if hand.role.dialect is not client.role.dialect or keys in told:
+            continue
+        told.add(keys)
+        ends = [hand.view.participant(key) for key in keys]
+        if ends[0] and ends[1] and keys[0] != keys[1]:
+            yield ends[0], ends[1]
+
+
+def _apart(view: DomainView, hands: list[_Part], clients: list[_Part]) -> Iterator[Finding]:
+    for hand, client in _pairs(hands, clients):
+        local = [all(a.startswith("127.") for a in p.addresses) for p in (hand, client)]
+        if hand.addresses and client.addresses and local[0] != local[1]:
+            yield _finding(
+                "NET-INTERFACE",
+                f"on domain {view.number} {hand.name} is at {', '.join(hand.addresses)} and "
+                f"{client.name} at {', '.join(client.addresses)}",
+                domain=view.number,
+            )
+
+
+def _deaf_loopback(
+    view: DomainView, hands: list[_Part], clients: list[_Part], name: str
+) -> Iterator[Finding]:
+    for ends in _pairs(hands, clients):
+        local = all(a.startswith("127.") for p in ends for a in p.addresses)
+        calls = any("dexkit" in p.command or "<Peer" in p.dds_config for p in ends)
+        if local and all(p.command for p in ends) and not calls:
+            yield _finding(
+                "NET-LO-MULTICAST",
+                f"{name} has no MULTICAST flag, and on domain {view.number} neither "
+                f"{ends[0].name} nor {ends[1].name} calls its peers by port",
+                fix=DIAGNOSES["NET-LO-MULTICAST"].fix.replace("set lo", f"set {name}"),
+                domain=view.number,
+                interface=name,
+            )
+
+
+def _hidden(seen: Observations, focus: list[DomainView]) -> Iterator[Finding]:
+    """Processes of this machine on a domain that did not answer where it was looked."""
+    for view in focus:
+        known = {p.pid for p in view.participants}
+        # one of another user has no pid here; it is probably one of those that answered
+        hidden = [
+            s for s in seen.sockets if s.domain == view.number and s.pid and s.pid not in known
+        ]
+        if not hidden:
+            continue
+        joined = [i.name for i in seen.interfaces if i.discovery and i.name not in seen.looked_at]
+        on = f"; DDS discovery listens on {', '.join(joined)}" if joined else ""
+        names = ", ".join(f"{s.command or 'a process'} (pid {s.pid})" for s in hidden)
+        yield _finding(
+            "NET-INTERFACE",
+            f"{names} on this machine uses domain {view.number} but does not answer on "
+            f"{', '.join(seen.looked_at)}{on}",
+            fix="start both sides with the same interface; look there with "
+            f"--interface {joined[0] if joined else 'NAME'}",
+            severity=Severity.WARNING,
+            domain=view.number,
+        )
+
+
+# --- environment
+
+
+def _environment(env: Environment) -> Iterator[Finding]:
+    if not env.cyclonedds:
+        yield _finding(
+            "ENV-CYCLONEDDS-MISSING", f"Python {env.python} on {env.machine} has no cyclonedds"
+        )
+    elif not env.cyclonedds.startswith("0.10."):
+        yield _finding("ENV-CYCLONEDDS-11", f"cyclonedds {env.cyclonedds} is installed")
+    elif env.cyclonedds_error:
+        yield _finding(
+            "ENV-CYCLONEDDS-BROKEN", f"cyclonedds {env.cyclonedds}: {env.cyclonedds_error}"
+        )
+    if env.uri_error:
+        yield _finding("ENV-URI", f"CYCLONEDDS_URI={env.uri}: {env.uri_error}")
+    if env.sdk_error:
+        yield _finding("ENV-SDK", f"version {env.sdk}: {env.sdk_error}")
+
+
+# --- serial
+
+
+def _serial(port: SerialPort) -> Iterator[Finding]:
+    path = port.path
+    if not port.exists:
+        yield _finding("SERIAL-MISSING", f"there is no {path}", path=path)
+        return
+    if not port.readable:
+        group = f"; it belongs to the group {port.group}" if port.group else ""
+        fix = DIAGNOSES["SERIAL-PERMISSION"].fix.replace("dialout", port.group or "dialout")
+        yield _finding("SERIAL-PERMISSION", f"no permission to use {path}{group}", fix, path=path)
+    served = [h for h in port.holders if "dexkit" in h and "serve" in h]
+    if port.holders and port.named:
+        yield _finding(
+            "SERIAL-BUSY",
+            f"{path} is open in {', '.join(port.holders)}"
+            + ("; that is a service, as it should be; nothing was sent" if served else ""),
+            severity=Severity.NOTE if served and len(port.holders) == 1 else None,
+            path=path,
+        )
+    elif port.error:
+        yield _finding("SERIAL-NOT-A-PORT", f"{path}: {port.error}", path=path)
+    if port.latency_timer is not None and port.latency_timer > 1:
+        name = path.rpartition("/")[2]
+        yield _finding(
+            "SERIAL-LATENCY",
+            f"the latency timer of {path} is {port.latency_timer} ms",
+            fix=DIAGNOSES["SERIAL-LATENCY"].fix.replace("NAME", name),
+            path=path,
+        )
+    if not port.asked:
+        return
+    old = [s for s in port.servos if s.protocol == 1]
+    new = [s for s in port.servos if s.protocol == 2]
+    for servo in old:
+        yield _finding(
+            "SERIAL-PROTOCOL-1",
+            f"id {servo.id} (model {servo.model}) on {path} at {servo.baudrate} baud",
+            path=path,
+        )
+    for servo in new:
+        if servo.model == mx64.MODEL_PROTOCOL_1:
+            yield _finding("SERIAL-PROTOCOL-1", f"id {servo.id} on {path} is an MX-64", path=path)
+        elif servo.model != mx64.MODEL:
+            yield _finding(
+                "SERIAL-OTHER-SERVO",
+                f"id {servo.id} on {path} is model {servo.model}, not {mx64.MODEL}",
+                path=path,
+            )
+        elif servo.baudrate != _DRIVER_BAUD:
+            yield _finding(
+                "SERIAL-BAUD",
+                f"id {servo.id} on {path} answers at {servo.baudrate} baud, not {_DRIVER_BAUD}",
+                path=path,
+            )
+    if not port.servos:
+        yield _finding("SERIAL-NO-ANSWER", f"no servo answers on {path}", path=path)
+
+
+# --- USB
+
+
+def _usb(seen: Observations) -> Iterator[Finding]:
+    if seen.usb_wanted and not seen.usb:
+        yield _finding("USB-MISSING", "no Dex3-1 is on this machine's USB")
+    for device in seen.usb:
+        yield from _usb_device(device)
+
+
+def _usb_device(device: UsbDevice) -> Iterator[Finding]:
+    what = f"the {device.side + ' ' if device.side else ''}hand at {device.where}"
+    if device.error:
+        yield _finding("USB-UNREACHABLE", f"{device.where}: {device.error}", device=device.where)
+        return
+    if not device.writable:
+        yield _finding(
+            "USB-PERMISSION",
+            f"{what}: {device.node} may not be written",
+            fix=f'echo \'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{dex3_usb.VENDOR_ID:04x}", '
+            'MODE="0660", GROUP="plugdev", TAG+="uaccess"\' | sudo tee '
+            "/etc/udev/rules.d/70-dex3.rules; sudo udevadm control --reload; plug it in again",
+            device=device.where,
+        )
+    kernel = [d for d in device.drivers if d not in ("usbfs",)]
+    if kernel:
+        yield _finding(
+            "USB-DRIVER",
+            f"{what} is bound to the driver {', '.join(kernel)}",
+            fix=f"echo {device.where}:1.0 | sudo tee /sys/bus/usb/drivers/{kernel[0]}/unbind; "
+            "dexkit detaches it by itself when it may use the device",
+            device=device.where,
+        )
+    served = [h for h in device.holders if "dexkit" in h and "serve" in h]
+    if device.holders and not served:
+        yield _finding(
+            "USB-BUSY", f"{what} is open in {', '.join(device.holders)}", device=device.where
+        )
