@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.emulators.mechanics import Joint, Wall
+from dexkit.emulators.mechanics import FixedSteps, Joint, Wall
 from dexkit.errors import UsageError
 
 DT = 1e-3
@@ -132,3 +132,102 @@ def test_nonsense_is_refused() -> None:
         Wall(0.0, 1, 0.0)
     with pytest.raises(UsageError):
         Wall(0.0, 1, 1.0, -1.0)
+
+
+# -- under a motor ---------------------------------------------------------------------------
+
+
+def test_a_motor_is_a_torque_where_its_gains_are_soft() -> None:
+    driven, pushed = Joint(inertia=0.01, viscous=0.1), Joint(inertia=0.01, viscous=0.1)
+    for _ in range(500):
+        driven.drive(0.3, 0.0, 1.0, 1.0, DT)
+        pushed.step(0.3, DT)
+    assert driven.dq == pytest.approx(pushed.dq)
+    assert driven.q == pytest.approx(pushed.q)
+
+
+@pytest.mark.parametrize("damping", [0.1, 10.0, 1e4])
+def test_stiff_gains_are_stable(damping: float) -> None:
+    """Taken explicitly, the stiffest of these would grow by a factor of 50000 a step."""
+    joint = Joint(inertia=2e-4, coulomb=0.002, dq=5.0)
+    for _ in range(200):
+        before = abs(joint.dq)
+        torque = joint.drive(0.0, damping, 1e9, 1e9, DT)
+        assert 0.0 <= joint.dq <= before
+        assert torque == pytest.approx(-damping * joint.dq)
+    assert joint.dq == 0.0
+
+
+@pytest.mark.parametrize("damping", [0.1, 1.0, 10.0])
+def test_a_blocked_motor_gives_its_whole_torque(damping: float) -> None:
+    joint = Joint(inertia=2e-4, coulomb=0.002, walls=(Wall(0.0, -1, 60.0, 0.1),))
+    torque = 0.0
+    for _ in range(5000):
+        torque = joint.drive(0.4, damping, 0.7, 0.7, DT)
+    assert torque == pytest.approx(0.4, rel=1e-3)
+    assert joint.contact == pytest.approx(-0.4, abs=0.003)
+
+
+def test_a_motor_gives_no_more_than_it_has() -> None:
+    joint = Joint(inertia=0.01)
+    assert joint.drive(5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(0.7)  # from rest
+    assert joint.drive(5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(0.3)  # along
+    assert joint.drive(-5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(-0.7)  # against
+    joint.locked = True
+    assert joint.drive(-5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(-0.7)
+    assert joint.dq == 0.0
+
+
+def test_gearing_takes_when_driving_and_helps_when_holding() -> None:
+    def at_rest(load: float) -> bool:
+        joint = Joint(inertia=0.01, spring=1.0, spring_rest=-load)  # pulls with -load
+        joint.drive(1.0, 0.0, 2.0, 2.0, DT, 0.4, 0.5)
+        return joint.dq == 0.0
+
+    assert [at_rest(load) for load in (0.55, 0.65, 1.45, 1.55)] == [False, True, True, False]
+
+
+@given(
+    st.lists(st.tuples(st.floats(-50, 50), st.floats(0, 1e5)), min_size=1, max_size=40),
+    st.floats(0.0, 0.9),
+    st.floats(0.0, 2.0),
+)
+@settings(deadline=None)
+def test_no_law_drives_it_through_its_stops(
+    laws: list[tuple[float, float]], driving_loss: float, holding_loss: float
+) -> None:
+    joint = Joint(
+        inertia=2e-4,
+        coulomb=0.002,
+        walls=(Wall(-1.0, 1, 200.0, 0.1), Wall(1.0, -1, 200.0, 0.1)),
+    )
+    for torque, damping in laws:
+        for _ in range(20):
+            given_torque = joint.drive(torque, damping, 0.76, 0.76, DT, driving_loss, holding_loss)
+            assert abs(given_torque) <= 0.76
+            assert abs(joint.q) < 1.2
+
+
+# -- time ------------------------------------------------------------------------------------
+
+
+def test_steps_keep_up_with_a_clock_without_drift() -> None:
+    steps = FixedSteps(0.5e-3)
+    steps.restart(100.0)
+    lived = 0
+    for i in range(1, 1001):
+        lived += steps.due(100.0 + i * 0.0013)
+        assert abs(lived - i * 2.6) < 1.001
+    assert steps.due(100.0 + 1.3) == 0
+    assert steps.due(99.0) == 0  # a clock that goes back costs nothing
+    assert steps.done == lived == 2600
+
+
+def test_a_long_pause_is_skipped() -> None:
+    steps = FixedSteps(1e-3, most=0.5)
+    steps.restart(0.0)
+    assert steps.due(3600.0) == 500
+    assert steps.due(3600.001) == 1
+    assert steps.done == 3_600_001
+    steps.restart(7.0)
+    assert steps.due(7.25) == 250
