@@ -220,7 +220,7 @@ def _example() -> str:
         for part in parts:
             texts.append(data[cut : cut + part].hex())
             cut += part
-        lines.append(f"{at:<5}{' '.join(texts):<58}{comment}")
+        lines.append(f"{at:<5}{' '.join(texts):<61}{comment}")
 
     line(0, [2, 4, 4, 4, 4, 4, 4], "head, mode, cmd_size[5]")
     sizes = [len(part) for part in ((0,) * 60, (0,) * 40, (0,) * 40)]
