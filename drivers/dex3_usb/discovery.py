@@ -111,7 +111,7 @@ def find_hand(
             candidates = _on_server(server)
         except OSError as error:
             raise HandNotFound(
-                f"no USB/IP server at {server}: {error}",
+                f"no USB/IP server at {server}: {error.__cause__ or error.strerror or error}",
                 hint=f"start one there: dexkit emulate dex3-usb --side {side}, or usbipd for a "
                 "real hand",
             ) from error

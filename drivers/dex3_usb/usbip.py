@@ -18,6 +18,7 @@ A backend object lists the server's devices once: make a new one for each connec
 from __future__ import annotations
 
 import errno
+import math
 import socket
 import struct
 import time
@@ -32,6 +33,7 @@ __all__ = ["UsbIpBackend"]
 _SUBMIT = struct.Struct(">IIIIIIiiii8s")
 _UNLINK = struct.Struct(">IIIIII24x")
 _REPLY = struct.Struct(">II12xii20x")  # command, seqnum, status, actual_length
+_TIMEVAL = struct.Struct("@ll")
 _CMD_SUBMIT, _CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 1, 2, 3, 4
 _OUT, _IN = 0, 1
 _NO_SETUP = bytes(8)
@@ -48,6 +50,10 @@ class _Connection:
     """
 
     def __init__(self, sock: socket.socket, devid: int) -> None:
+        # The time-outs are the kernel's: with Python's own, each call waits twice, and gives the
+        # interpreter away twice, which a process that serves two hands feels.
+        sock.settimeout(None)
+        self._waits: dict[int, int] = {}
         self._sock = sock
         self._devid = devid
         self._seq = 0
@@ -156,7 +162,7 @@ class _Connection:
     def _send(self, message: bytes, deadline: float) -> None:
         self._check()
         try:
-            self._sock.settimeout(max(deadline - time.monotonic(), 1e-3))
+            self._limit(socket.SO_SNDTIMEO, deadline)
             self._sock.sendall(message)
         except OSError as error:  # a part may be on its way: what follows would be misread
             raise self._break(f"the connection broke: {error}") from error
@@ -191,15 +197,24 @@ class _Connection:
             self._begin, self._end = 0, len(rest)
             self._view[: self._end] = rest
         try:
-            self._sock.settimeout(max(deadline - time.monotonic(), 1e-6))
+            self._limit(socket.SO_RCVTIMEO, deadline)
             count = self._sock.recv_into(self._view[self._end :])
-        except TimeoutError as error:
+        except BlockingIOError as error:
             raise USBTimeoutError("no answer over USB/IP", errno=errno.ETIMEDOUT) from error
         except OSError as error:
             raise self._break(f"the connection broke: {error}") from error
         if not count:
             raise self._break("the server closed the connection")
         self._end += count
+
+    def _limit(self, option: int, deadline: float) -> None:
+        """Let the next call wait until ``deadline``, a millisecond at least."""
+        wait = max(1, math.ceil((deadline - time.monotonic()) * 1000))
+        if self._waits.get(option) != wait:
+            self._sock.setsockopt(
+                socket.SOL_SOCKET, option, _TIMEVAL.pack(wait // 1000, wait % 1000 * 1000)
+            )
+            self._waits[option] = wait
 
     def _check(self) -> None:
         if self._broken:
