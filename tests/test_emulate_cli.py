@@ -1,4 +1,4 @@
-"""``dexkit emulate mx64``: the port, its link, its end, its files (issue section 4)."""
+"""``dexkit emulate``: the ports, their end, their files, faults while they run."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import usbip
 from click.testing import CliRunner
 
 from dexkit.cli.emulate import command
@@ -397,3 +398,92 @@ def test_port_in_the_callers_thread_can_be_stopped() -> None:
         assert os.path.islink(port.path)
     assert not os.path.islink(port.path)
     assert not os.path.exists(os.path.dirname(port.path))
+
+
+# --- the hand on USB/IP
+
+
+def emulate_dex3(*arguments: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "dexkit", "emulate", "dex3-usb", "--port", "0", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.Signals) -> None:
+    process = emulate_dex3("--side", "both", "--serial", "A1", "--serial", "B2")
+    assert process.stdout is not None
+    lines = [process.stdout.readline().decode().rstrip() for _ in range(7)]
+    port = lines[0].split()[1].rsplit(":", 1)[1]
+    assert lines == [
+        f"ready: usbip://127.0.0.1:{port} left 34b7:1010 serial=A1 busid=1-1",
+        f"ready: usbip://127.0.0.1:{port} right 34b7:1011 serial=B2 busid=1-2",
+        "as a USB device of a Linux host (as root): modprobe vhci-hcd",
+        f"  usbip --tcp-port {port} attach -r 127.0.0.1 -b 1-1",
+        f"  usbip --tcp-port {port} attach -r 127.0.0.1 -b 1-2",
+        "  lsusb -d 34b7:",
+        f"without kernel support: dexkit serve dex3-usb --usb usbip://127.0.0.1:{port}",
+    ]
+    with usbip.host.open(busid="1-2", transport=usbip.USBIP("127.0.0.1", int(port))) as handle:
+        handle.bulk_out(0x02, bytes(1234))
+        assert len(handle.bulk_in(0x81, 1270)) == 1270
+        process.send_signal(signum)  # with a client attached
+        out, err = process.communicate(timeout=10)
+    assert process.returncode == 0
+    assert out.decode().splitlines() == [
+        "stopped: left: nothing was sent",
+        "stopped: right: 1 frames, 1 answers, 1 bad crc",
+    ]
+    assert err == b""
+
+
+def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
+    process = emulate_dex3("--faults-from-stdin", "--fault", "drop@1h:for=1s")
+    _, err = process.communicate(timeout=10)
+    assert process.returncode == 2
+    assert b"'1h' is not a time" in err
+    assert b"silent" in err  # the hint names what a hand can have
+
+    process = emulate_dex3("--faults-from-stdin")
+    assert process.stdin is not None
+    assert process.stdout is not None
+    port = int(process.stdout.readline().decode().split()[1].rsplit(":", 1)[1])
+    transport = usbip.USBIP("127.0.0.1", port)
+    assert len(usbip.host.list_devices(transport)) == 1
+    process.stdin.write(b"fire\nunplug\n")
+    process.stdin.flush()
+    wait_for(lambda: usbip.host.list_devices(transport) == [])
+    _, err = process.communicate(timeout=10)  # closes its input
+    assert process.returncode == 0
+    assert b"there is no kind 'fire'" in err
+    assert b"Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--serial", "a", "--serial", "b"], "2 serial numbers for 1 hand"),
+        (["--out-endpoint", "0x81"], "an OUT endpoint is 0x01 to 0x0f, not 0x81"),
+        (["--in-endpoint", "one"], "'one' is not an endpoint address such as 0x81"),
+        (["--host", "203.0.113.1"], "cannot serve USB/IP on 203.0.113.1"),
+        (["--start", "80", "--object", "40"], "inside the object"),
+        (["--side", "middle"], "middle"),
+    ],
+)
+def test_hand_that_cannot_be(arguments: list[str], says: str) -> None:
+    _, err = emulate_dex3(*arguments).communicate(timeout=20)
+    assert says in err.decode()
+    assert "Traceback" not in err.decode()
+
+
+def test_help_lists_the_devices_and_their_options() -> None:
+    result = CliRunner().invoke(command, ["--help"])
+    assert "dex3-usb" in result.output
+    assert "mx64" in result.output
+    result = CliRunner().invoke(command, ["dex3-usb", "--help"])
+    for option in ("--side", "--serial", "--port", "--host", "--object", "--fault", "--seed"):
+        assert option in result.output
+    assert CliRunner().invoke(command, ["dex9"]).exit_code == 2

@@ -1,0 +1,547 @@
+"""The emulated Dex3-1 as USB clients see it: PyUSB, and two others, over USB/IP."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import usb.core
+import usb.util
+import usbip
+import usbip_backend.backend
+from usbip import protocol
+from usbip.core import IN, OUT
+
+from dexkit.emulators.dex3_mcu import (
+    SERIAL,
+    Dex3Hands,
+    Dex3Process,
+    Firmware,
+    Server,
+    emulated_dex3,
+)
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.hand import HandCommand, HandState, JointMode, Side
+from dexkit.models import DEX3_1
+from dexkit.wire.dex3_usb import PRODUCT, PRODUCT_ID, STATE, VENDOR_ID, HandCodec
+
+OUT_EP, IN_EP = 0x02, 0x81
+BOTH = (Side.LEFT, Side.RIGHT)
+REST = np.array(DEX3_1.rest_q[Side.LEFT])
+
+
+@pytest.fixture(autouse=True)
+def _no_margin(monkeypatch: pytest.MonkeyPatch) -> None:
+    # this client adds two seconds to every time-out, for servers that have one of their own
+    monkeypatch.setattr(usbip_backend.backend._UsbipConnection, "_SERVER_TIMEOUT_MARGIN_MS", 0)
+
+
+class Host:
+    """A host's view of a server: PyUSB, with the USB/IP client of ``pyusb-usbip-backend``."""
+
+    def __init__(self, port: int) -> None:
+        self.backend = usbip_backend.get_backend("127.0.0.1", port)
+
+    def find(self, side: Side = Side.LEFT) -> Any:
+        device = usb.core.find(backend=self.backend, idVendor=VENDOR_ID, idProduct=PRODUCT_ID[side])
+        assert device is not None
+        device.set_configuration()
+        return device
+
+    def close(self) -> None:
+        for connection in self.backend._conns.values():
+            connection.close()
+
+
+@contextlib.contextmanager
+def host(port: int) -> Iterator[Host]:
+    opened = Host(port)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def brake(side: Side = Side.LEFT) -> bytes:
+    return HandCodec(DEX3_1.joints[side]).encode(HandCommand.brake(7))
+
+
+def exchange(device: Any, frame: bytes = b"", side: Side = Side.LEFT) -> HandState:
+    frame = frame or brake(side)
+    assert device.write(OUT_EP, frame, 1000) == len(frame)
+    answer = bytes(device.read(IN_EP, STATE.size, 1000))
+    return HandCodec(DEX3_1.joints[side]).decode(answer, 0.0)
+
+
+def wait_for(what: object, seconds: float = 5.0) -> None:
+    deadline = time.monotonic() + seconds
+    assert callable(what)
+    while not what():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.005)
+
+
+def inside(hands: Dex3Hands | Dex3Process) -> Dex3Hands:
+    assert isinstance(hands, Dex3Hands)
+    return hands
+
+
+# --- in a process of its own: what the device is
+
+
+@pytest.fixture(scope="module")
+def both() -> Iterator[Dex3Process]:
+    with emulated_dex3(BOTH, process=True) as hands:
+        assert isinstance(hands, Dex3Process)
+        yield hands
+
+
+def test_descriptors_are_the_manuals(both: Dex3Process) -> None:
+    with host(both.port) as computer:
+        found = list(usb.core.find(backend=computer.backend, find_all=True))
+        assert [(d.idVendor, d.idProduct) for d in found] == [(0x34B7, 0x1010), (0x34B7, 0x1011)]
+        for device, side in zip(found, BOTH, strict=True):
+            raw = device.ctrl_transfer(0x80, 6, 0x0100, 0, 18)
+            assert bytes(raw[8:14]) == struct.pack(
+                "<HHH", VENDOR_ID, PRODUCT_ID[side], 0x0100
+            )  # bcdDevice 1.00
+            assert list(raw[14:17]) == [1, 2, 3]  # Mfr=1, Product=2, SerialNumber=3
+            assert [usb.util.get_string(device, i) for i in (1, 2, 3)] == [
+                "UnitreeTC",
+                PRODUCT[side],
+                SERIAL[side],
+            ]
+            assert device.speed == usb.util.SPEED_HIGH
+            assert device.bNumConfigurations == 1
+            interface = device[0][(0, 0)]
+            assert (interface.bInterfaceNumber, interface.bInterfaceClass) == (0, 0xFF)
+            assert [
+                (e.bEndpointAddress, usb.util.endpoint_type(e.bmAttributes), e.wMaxPacketSize)
+                for e in interface
+            ] == [
+                (OUT_EP, usb.util.ENDPOINT_TYPE_BULK, 512),
+                (IN_EP, usb.util.ENDPOINT_TYPE_BULK, 512),
+            ]
+        assert len({(d.bus, d.address) for d in found}) == 2
+
+
+def test_both_hands_exchange_at_once(both: Dex3Process) -> None:
+    with host(both.port) as computer:
+        devices = {side: computer.find(side) for side in BOTH}
+        for device in devices.values():
+            usb.util.claim_interface(device, 0)
+        for side in BOTH * 20:
+            state = exchange(devices[side], side=side)
+            assert state.q == pytest.approx(DEX3_1.rest_q[side], abs=1e-3)
+        for device in devices.values():
+            usb.util.release_interface(device, 0)
+
+
+def test_an_unknown_request_stalls_the_control_pipe(both: Dex3Process) -> None:
+    with host(both.port) as computer:
+        device = computer.find()
+        with pytest.raises(usb.core.USBError) as caught:
+            device.ctrl_transfer(0xC1, 0x42, 0, 0, 8)
+        assert caught.value.errno == errno.EPIPE
+        exchange(device)
+
+
+def test_an_endpoint_that_is_not_there(both: Dex3Process) -> None:
+    with host(both.port) as computer:
+        computer.find()
+        connection = next(iter(computer.backend._conns.values()))
+        status, _ = connection.submit(direction=IN, ep=5, setup=bytes(8), transfer_buffer_length=8)
+        assert status == -errno.ENODEV
+
+
+def test_another_client_library_sees_the_same(both: Dex3Process) -> None:
+    transport = usbip.USBIP("127.0.0.1", both.port)
+    listed = usbip.host.list_devices(transport)
+    assert [(d["busid"], d["speed"], d["bNumInterfaces"]) for d in listed] == [
+        ("1-1", 3, 1),  # 3 is high speed
+        ("1-2", 3, 1),
+    ]
+    assert [d["interfaces"] for d in listed] == [[(0xFF, 0, 0)]] * 2
+    with usbip.host.open(VENDOR_ID, PRODUCT_ID[Side.RIGHT], transport=transport) as handle:
+        handle.bulk_out(OUT_EP, brake())
+        assert len(handle.bulk_in(IN_EP, STATE.size)) == STATE.size
+
+
+# --- transfers
+
+
+def test_a_read_without_a_write_times_out() -> None:
+    with emulated_dex3() as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        started = time.monotonic()
+        with pytest.raises(usb.core.USBError) as caught:
+            device.read(IN_EP, STATE.size, 100)
+        assert caught.value.errno == errno.ETIMEDOUT
+        assert 0.09 < time.monotonic() - started < 2.0
+        exchange(device)
+
+
+def test_frames_in_without_reading_leave_the_newest_answer() -> None:
+    with emulated_dex3() as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        foc = codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2))
+        device.write(OUT_EP, brake(), 1000)
+        device.write(OUT_EP, brake(), 1000)
+        device.write(OUT_EP, foc, 1000)
+        answer = codec.decode(bytes(device.read(IN_EP, STATE.size, 1000)), 0.0)
+        assert answer.mode.tolist() == [JointMode.FOC] * 7
+        with pytest.raises(usb.core.USBError):
+            device.read(IN_EP, STATE.size, 50)
+        assert inside(hands).device().counters.unread == 2
+
+
+def test_a_longer_queue_keeps_answers_in_order() -> None:
+    with (
+        emulated_dex3(firmware=Firmware(queue=2)) as hands,
+        host(inside(hands).port) as computer,
+    ):
+        device = computer.find()
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        foc = codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2))
+        for frame in (brake(), brake(), foc):
+            device.write(OUT_EP, frame, 1000)
+        modes = [
+            int(codec.decode(bytes(device.read(IN_EP, STATE.size, 1000)), 0.0).mode[0])
+            for _ in range(2)
+        ]
+        assert modes == [0, 1]
+
+
+def test_a_transfer_ends_with_a_short_packet() -> None:
+    with emulated_dex3() as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        frame = brake()
+        for part in (frame[:512], frame[512:1024], frame[1024:]):
+            device.write(OUT_EP, part, 1000)
+        assert len(device.read(IN_EP, STATE.size, 1000)) == STATE.size
+        counters = inside(hands).device().counters
+        assert (counters.frames, counters.bad_size) == (1, 0)
+        # what never ends is no frame, and does not pile up
+        for _ in range(20):
+            device.write(OUT_EP, bytes(4096), 1000)
+        device.write(OUT_EP, b"", 1000)
+        device.read(IN_EP, STATE.size, 1000)
+        assert counters.bad_size == 1
+        exchange(device)
+
+
+def test_an_answer_can_be_read_in_packets() -> None:
+    with emulated_dex3() as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        device.write(OUT_EP, brake(), 1000)
+        parts = [bytes(device.read(IN_EP, 512, 1000)) for _ in range(3)]
+        assert [len(part) for part in parts] == [512, 512, 246]
+        HandCodec(DEX3_1.joints[Side.LEFT]).decode(b"".join(parts), 0.0)
+
+
+def test_endpoint_numbers_and_serial_are_options() -> None:
+    with (
+        emulated_dex3(out_endpoint=0x01, in_endpoint=0x83, serials=["X7"]) as hands,
+        host(inside(hands).port) as computer,
+    ):
+        device = computer.find()
+        assert [e.bEndpointAddress for e in device[0][(0, 0)]] == [0x01, 0x83]
+        assert usb.util.get_string(device, device.ctrl_transfer(0x80, 6, 0x0100, 0, 18)[16]) == "X7"
+        device.write(0x01, brake(), 1000)
+        assert len(device.read(0x83, STATE.size, 1000)) == STATE.size
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"out_endpoint": 0x82},
+        {"in_endpoint": 0x01},
+        {"out_endpoint": 0},
+        {"sides": ()},
+        {"sides": (Side.LEFT, Side.LEFT)},
+        {"serials": ["a", "b"]},
+        {"faults": ["fire"]},
+        {"object_pct": 100.0},
+        {"firmware": Firmware(), "process": True},
+    ],
+)
+def test_options_that_cannot_be(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError), emulated_dex3(**wrong):
+        pass
+
+
+# --- faults on the wire
+
+
+@pytest.mark.parametrize("spec", ["stall", "stall-out"])
+def test_a_stalled_endpoint_until_the_host_clears_it(spec: str) -> None:
+    endpoint = IN_EP if spec == "stall" else OUT_EP
+    with emulated_dex3() as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        exchange(device)
+        hands.inject(spec)
+        halted = lambda: device.ctrl_transfer(0x82, 0, 0, endpoint, 2)[0]  # noqa: E731
+        wait_for(lambda: halted() == 1)
+        with pytest.raises(usb.core.USBError) as caught:
+            exchange(device)
+        assert caught.value.errno == errno.EPIPE
+        device.clear_halt(endpoint)
+        assert halted() == 0
+        exchange(device)
+
+
+def test_a_stall_ends_a_read_that_waits() -> None:
+    with emulated_dex3(faults=["stall@300ms"]) as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        with pytest.raises(usb.core.USBError) as caught:
+            device.read(IN_EP, STATE.size, 5000)
+        assert caught.value.errno == errno.EPIPE
+
+
+def test_unplug_cuts_the_client_off_and_hides_the_hand() -> None:
+    with emulated_dex3(BOTH) as hands:
+        port = inside(hands).port
+        with host(port) as computer, host(port) as later:
+            device, other = computer.find(), computer.find(Side.RIGHT)
+            exchange(device)
+            hands.inject("unplug:side=left,for=300ms")
+            wait_for(lambda: not inside(hands).device().plugged)
+            wait_for(lambda: _lost(device))
+            exchange(other, side=Side.RIGHT)
+            listed = list(usb.core.find(backend=later.backend, find_all=True))
+            assert [d.idProduct for d in listed] == [PRODUCT_ID[Side.RIGHT]]
+            wait_for(lambda: inside(hands).device().plugged)
+        with host(port) as again:
+            assert exchange(again.find()).q == pytest.approx(REST, abs=1e-3)
+
+
+def _lost(device: Any) -> bool:
+    try:
+        device.write(OUT_EP, brake(), 200)
+    except usb.core.USBError:
+        return True
+    return False
+
+
+def test_an_unplugged_hand_cannot_be_imported() -> None:
+    with emulated_dex3() as hands, host(inside(hands).port) as computer:
+        devices = list(usb.core.find(backend=computer.backend, find_all=True))
+        hands.inject("unplug")
+        wait_for(lambda: not inside(hands).device().plugged)
+        with pytest.raises(usb.core.USBError):
+            devices[0].set_configuration()
+
+
+def test_delayed_answers_keep_their_order() -> None:
+    with (
+        emulated_dex3(faults=["delay:ms=80"], firmware=Firmware(queue=3)) as hands,
+        host(inside(hands).port) as computer,
+    ):
+        device = computer.find()
+        codec = HandCodec(DEX3_1.joints[Side.LEFT])
+        started = time.monotonic()
+        device.write(OUT_EP, brake(), 1000)
+        first = codec.decode(bytes(device.read(IN_EP, STATE.size, 2000)), 0.0)
+        assert time.monotonic() - started > 0.075
+        device.write(OUT_EP, brake(), 1000)
+        device.write(OUT_EP, codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2)), 1000)
+        second, third = (
+            codec.decode(bytes(device.read(IN_EP, STATE.size, 2000)), 0.0) for _ in range(2)
+        )
+        assert [s.mode[0] for s in (first, second, third)] == [0, 0, 1]
+
+
+def test_a_dropped_answer_is_a_time_out_and_nothing_stale_follows() -> None:
+    with emulated_dex3(faults=["drop:for=10s"]) as hands, host(inside(hands).port) as computer:
+        device = computer.find()
+        device.write(OUT_EP, brake(), 1000)
+        with pytest.raises(usb.core.USBError) as caught:
+            device.read(IN_EP, STATE.size, 100)
+        assert caught.value.errno == errno.ETIMEDOUT
+        assert inside(hands).device().counters.dropped == 1
+
+
+# --- the protocol below PyUSB
+
+
+@contextlib.contextmanager
+def imported(port: int, busid: bytes = b"1-1") -> Iterator[socket.socket]:
+    with socket.create_connection(("127.0.0.1", port), timeout=5.0) as sock:
+        protocol.client_import(sock, busid)
+        yield sock
+
+
+def submit(sock: socket.socket, seqnum: int, direction: int, ep: int, data: bytes) -> None:
+    length = len(data) if direction == OUT else STATE.size
+    command = (protocol.CMD_SUBMIT, seqnum, 0x10002, direction, ep, 0, length, 0, 0, 0)
+    sock.sendall(struct.pack(">IIIIIIiiii8s", *command, bytes(8)) + data)
+
+
+def reply(sock: socket.socket) -> tuple[int, int, int, int]:
+    """(command, seqnum, status, length) of the next reply's header."""
+    raw = protocol._recvall(sock, 48)
+    assert raw is not None, "the connection was closed"
+    command, seqnum, _, _, _, status, actual = struct.unpack(">IIIIIii", raw[:28])
+    return command, seqnum, status, actual
+
+
+def test_a_waiting_read_is_called_back() -> None:
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        submit(sock, 1, IN, 1, b"")
+        sock.sendall(struct.pack(">IIIIII24x", protocol.CMD_UNLINK, 2, 0x10002, 0, 0, 1))
+        assert reply(sock)[:3] == (protocol.RET_UNLINK, 2, -errno.ECONNRESET)
+        # its answer goes to the next read
+        submit(sock, 3, OUT, 2, brake())
+        assert reply(sock)[:3] == (protocol.RET_SUBMIT, 3, 0)
+        submit(sock, 4, IN, 1, b"")
+        assert reply(sock) == (protocol.RET_SUBMIT, 4, 0, STATE.size)
+        protocol._recvall(sock, STATE.size)
+        # too late for one that is done
+        sock.sendall(struct.pack(">IIIIII24x", protocol.CMD_UNLINK, 5, 0x10002, 0, 0, 4))
+        assert reply(sock)[:3] == (protocol.RET_UNLINK, 5, 0)
+
+
+def test_an_exchange_in_one_message() -> None:
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        submit(sock, 1, IN, 1, b"")  # a read that waits is answered by the write behind it
+        submit(sock, 2, OUT, 2, brake())
+        seen = {}
+        for _ in range(2):
+            _, seqnum, status, actual = reply(sock)
+            assert status == 0
+            seen[seqnum] = protocol._recvall(sock, actual) if seqnum == 1 else b""
+        assert len(seen[1] or b"") == STATE.size
+
+
+def test_a_hand_has_one_client_and_the_next_may_follow() -> None:
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with imported(port) as first:
+            with pytest.raises(usbip.core.NotFound, match="status 2"), imported(port):  # busy
+                pass
+            submit(first, 1, OUT, 2, brake())
+            reply(first)
+        with imported(port) as second:
+            submit(second, 1, IN, 1, b"")
+            second.settimeout(0.1)
+            with pytest.raises(TimeoutError):
+                reply(second)  # the first one's answer is not for the second
+
+
+def test_no_such_bus() -> None:
+    with (
+        emulated_dex3() as hands,
+        pytest.raises(usbip.core.NotFound),
+        imported(inside(hands).port, b"1-9"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        bytes(8),
+        bytes(100),
+        struct.pack(">HHI", protocol.VERSION, 0x8099, 0),
+        b"\xff" * 5000,
+    ],
+)
+def test_who_does_not_speak_usbip_is_cut_off(garbage: bytes) -> None:
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with socket.create_connection(("127.0.0.1", port), timeout=5.0) as sock:
+            sock.sendall(garbage)
+            with contextlib.suppress(ConnectionResetError):
+                assert sock.recv(100) == b""
+        with host(port) as computer:
+            exchange(computer.find())
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        struct.pack(">IIIIIIiiii8s", 9, 1, 0, 0, 2, 0, 0, 0, 0, 0, bytes(8)),
+        struct.pack(">IIIIIIiiii8s", 1, 1, 0, 0, 2, 0, 2**31 - 1, 0, 0, 0, bytes(8)),
+        struct.pack(">IIIIIIiiii8s", 1, 1, 0, 0, 2, 0, -1, 0, 0, 0, bytes(8)),
+    ],
+    ids=["unknown command", "two gigabytes", "less than nothing"],
+)
+def test_nonsense_after_the_import_is_cut_off(command: bytes) -> None:
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with imported(port) as sock, contextlib.suppress(ConnectionResetError):
+            sock.sendall(command)
+            assert sock.recv(100) == b""
+        with host(port) as computer:
+            exchange(computer.find())
+
+
+def test_a_client_that_dies_in_the_middle_of_a_frame() -> None:
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with imported(port) as sock:
+            sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 1, 0, 0, 2, 0, 1234, 0, 0, 0, bytes(8)))
+            sock.sendall(bytes(700))
+        with host(port) as computer:
+            assert exchange(computer.find()).mode.tolist() == [0] * 7
+        assert inside(hands).device().counters.frames == 1
+
+
+def keep_asking(sock: socket.socket) -> None:
+    for seqnum in range(10**6):
+        submit(sock, seqnum, IN, 0, b"")  # a control transfer without a request: refused
+
+
+def test_a_client_that_reads_nothing_is_cut_off() -> None:
+    with emulated_dex3(BOTH) as hands, socket.socket() as deaf:
+        port = inside(hands).port
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.settimeout(5.0)
+        deaf.connect(("127.0.0.1", port))
+        protocol.client_import(deaf, b"1-1")
+        with pytest.raises(ConnectionError):
+            keep_asking(deaf)
+        with host(port) as computer:
+            exchange(computer.find(Side.RIGHT), side=Side.RIGHT)
+            exchange(computer.find())
+
+
+# --- the server's own
+
+
+def test_the_port_is_in_use() -> None:
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with pytest.raises(EmulatorError) as caught, emulated_dex3(port=port):
+            pass
+        assert str(port) in caught.value.message
+        assert "--port" in caught.value.hint
+        with pytest.raises(EmulatorError) as caught, emulated_dex3(port=port, process=True):
+            pass
+        assert "--port" in caught.value.hint
+
+
+def test_an_address_that_is_not_this_machines() -> None:
+    with pytest.raises(EmulatorError, match="cannot serve"):
+        Server([], host="203.0.113.1", port=0)
+
+
+def test_closing_cuts_clients_off_and_frees_the_port() -> None:
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with host(port) as computer:
+            device = computer.find()
+            exchange(device)
+            hands.close()
+            assert _lost(device)
+    with emulated_dex3(port=port), host(port) as computer:
+        exchange(computer.find())
