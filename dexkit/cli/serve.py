@@ -23,6 +23,7 @@ from dexkit.service import (
     Estimation,
     Fill,
     HandService,
+    Publisher,
     diagnose,
     prepare_process,
 )
@@ -33,6 +34,7 @@ __all__ = ["command"]
 log = logging.getLogger("dexkit.serve")
 
 _STATUS_PERIOD = 0.5  # seconds
+_PHASE = 0.15  # of a period: publishing has ended, exchanges may begin
 _LONELY = 10.0  # seconds without a client before a hint
 
 
@@ -152,21 +154,23 @@ def command(
     ):
         if not granted:
             log.info("no real-time priority: this user has no rtprio limit (docs/service.md)")
+        publisher = Publisher(state_rate or model_by_name(language.model).state_rate)
         services = [
             HandService(
                 group,
                 node=node,
                 domain=chosen,
                 dialect=language,
-                state_rate=state_rate,
+                publisher=publisher,
+                phase=_PHASE + (1 - _PHASE) * i / len(groups),
                 estimation=Estimation(estimator),
                 fill=Fill(fill),
                 wait_for_device=wait_for_device,
                 force=force,
             )
-            for group in groups
+            for i, group in enumerate(groups)
         ]
-        prepare_process()
+        prepare_process(len(hands))
         with ExitStack() as running:
             _on_sigusr1(running, services)
             for service in services:

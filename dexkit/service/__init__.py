@@ -13,6 +13,7 @@ from dexkit.service.counters import HandCounters, TopicCounters
 from dexkit.service.diagnose import diagnose
 from dexkit.service.dialects import DialectMap, Fill, Remark, StateView, dialect_map
 from dexkit.service.estimator import JointEstimator, StateEstimator
+from dexkit.service.publisher import Publisher
 from dexkit.service.realtime import prepare_process, real_time
 from dexkit.service.service import HandService
 
@@ -25,6 +26,7 @@ __all__ = [
     "HandCounters",
     "HandService",
     "JointEstimator",
+    "Publisher",
     "Remark",
     "StateEstimator",
     "StateView",

@@ -100,6 +100,9 @@ class HandCore:
         # guards the estimator, which all three threads touch, and the time-outs, which two do
         self._lock = threading.Lock()
         self._estimator = StateEstimator(spec)
+        self._speeds: Sequence[tuple[float, float]] | None = None
+        self._following = self._brake  # what the estimator is to follow when it is needed
+        self._resyncs = 0  # of estimators before this one
         self._soft_start = not spec.simulated if soft_start is None else soft_start
         self._starting = self._soft_start
         self._start_q: Floats | None = None
@@ -140,7 +143,7 @@ class HandCore:
                 admitted = _braked(admitted, self._tripped)
             self._command = (admitted, now)
             if self._connected and not self._starting and self._faulted is None:
-                self._estimator.follow(admitted, now)
+                self._follow(admitted, now)
         return True
 
     def opened(self, spec: HandSpec, speeds: Sequence[tuple[float, float]] | None = None) -> None:
@@ -153,7 +156,8 @@ class HandCore:
         now = self._clock.now()
         self.spec = spec
         with self._lock:
-            self._estimator = StateEstimator(spec, speeds)
+            self._speeds = speeds
+            self._begin_prediction(now)
         self.measured_rate = self.spec.io_rate
         self._slow = self.spec.io_rate < self._min_rate
         self._window = (now, 0)
@@ -174,6 +178,7 @@ class HandCore:
         if state.q.shape != (n,) or not np.isfinite(state.q).all():
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")
         now = self._clock.now()
+        predicted = self.predicting
         self._observe_rate(now)
         self._answered = now
         self._missed = 0
@@ -182,7 +187,10 @@ class HandCore:
             self._not_before = now
         self.counters.exchanges += 1
         with self._lock:
-            self._estimator.measure(state, now)
+            if self.predicting:
+                if not predicted:
+                    self._begin_prediction(now)
+                self._estimator.measure(state, now)
             tripped = tuple(self._tripped.tolist()) if self._tripped.any() else ()
         self._view = StateView(state, tuple(state.fault.tolist()), tripped=tripped)
 
@@ -219,7 +227,7 @@ class HandCore:
         self._driving = self._holding = False
         self.counters.losses += 1
         with self._lock:
-            self._estimator.follow(self._brake, self._clock.now())
+            self._follow(self._brake, self._clock.now())
 
     def retry_failed(self) -> None:
         """An attempt to open the link again failed."""
@@ -249,7 +257,7 @@ class HandCore:
     @property
     def resyncs(self) -> int:
         """Times that the prediction was more than 10 % of the stroke off."""
-        return self._estimator.resyncs
+        return self._resyncs + self._estimator.resyncs
 
     @property
     def holding(self) -> bool:
@@ -276,12 +284,12 @@ class HandCore:
                     self.counters.brakes += 1
                 self._driving = False
                 self._start_q = None
-                self._estimator.follow(self._brake, now)
+                self._follow(self._brake, now)
                 return command
             self._driving = True
             if self._starting:
                 command = self._slew(command, now)
-                self._estimator.follow(command, now)
+                self._follow(command, now)
         return command
 
     def view(self) -> StateView | None:
@@ -317,7 +325,7 @@ class HandCore:
             return self._brake
         if self._held is None or self._held[0] is not newest[0]:
             self._held = (newest[0], _at_rest(_braked(newest[0], self._tripped)))
-            self._estimator.follow(self._held[1], now)
+            self._follow(self._held[1], now)
         if not self._holding and not self._held[1].is_brake:
             self._holding = True
             self.counters.holds += 1
@@ -333,6 +341,16 @@ class HandCore:
                 self.counters.brakes += 1
             self._tripped |= newest[0].timeout
         return True
+
+    def _follow(self, command: HandCommand, now: float) -> None:
+        self._following = command
+        if self.predicting:  # a hand of seven joints that is fast enough need not pay for it
+            self._estimator.follow(command, now)
+
+    def _begin_prediction(self, now: float) -> None:
+        self._resyncs += self._estimator.resyncs
+        self._estimator = StateEstimator(self.spec, self._speeds)
+        self._estimator.follow(self._following, now)
 
     def _stale(self, view: StateView) -> StateView:
         link = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)

@@ -5,7 +5,8 @@ Three activities, each with its own clock:
 * *receive* waits for samples and hands the newest command to the core;
 * *exchange*, one thread a hand, talks to the hand as fast as its ``io_rate`` allows, and opens
   it again with growing delays when it was lost;
-* *publish* writes state at fixed deadlines, whatever the hand does meanwhile.
+* *publish* writes state at fixed deadlines, whatever the hand does meanwhile; one thread for all
+  the services of a process (:class:`~dexkit.service.publisher.Publisher`).
 
 All three share one interpreter lock, so the publishing thread does little: it writes bytes that
 were encoded once for each new state.
@@ -29,14 +30,13 @@ from dexkit.models import dialect as dialect_by_name
 from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
-from dexkit.service.realtime import go_first, precise_timers
+from dexkit.service.publisher import Publisher, align
 
 __all__ = ["HandService", "Node"]
 
 log = logging.getLogger("dexkit.service")
 _counters_log = logging.getLogger("dexkit.service.counters")
 
-_SPIN = 150e-6  # covers the 50..100 us by which a sleeping thread wakes late
 _DISCOVERY = 0.3  # seconds to look for another publisher of the state topic
 _JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-out
 
@@ -82,6 +82,8 @@ class HandService:
     :param node: DDS node to use; it stays open at stop. Without it one is made and closed.
     :param dialect: by default the first of the hand model's.
     :param state_rate: Hz; by default that of the model.
+    :param publisher: publishes the state, at its own rate, also for other services.
+    :param phase: when in a period the hand is exchanged with, 0 to 1; state is published at 0.
     :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
     :param force: start even if somebody else publishes the state topic.
@@ -102,6 +104,8 @@ class HandService:
         interface: str = "lo",
         dialect: str | Dialect | None = None,
         state_rate: float | None = None,
+        publisher: Publisher | None = None,
+        phase: float = 0.5,
         estimation: Estimation = Estimation.AUTO,
         fill: Fill = Fill.KNOWN,
         wait_for_device: bool = False,
@@ -127,6 +131,10 @@ class HandService:
         self.counters = TopicCounters()
         self.domain, self.interface = domain, interface
         self._clock: Clock = clock if clock is not None else RealClock()
+        if publisher is not None:
+            self.state_rate = publisher.hz
+        self._phase = phase
+        self._publisher = publisher or Publisher(self.state_rate, self._clock)
         self._node, self._own_node = node, node is None
         self._wait_for_device, self._force = wait_for_device, force
         self._units = [
@@ -146,7 +154,9 @@ class HandService:
         self._cmd_type = message_type(self.dialect.cmd_type)
         self._stop = threading.Event()
         self._wake = threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._receiving: threading.Thread | None = None
+        self._low_rate_every = 0
+        self._ticks = 0
         self._reader: _Reader | None = None
         self._writer: _Writer | None = None
         self._low_rate_writer: _Writer | None = None
@@ -192,16 +202,15 @@ class HandService:
         self._writer = node.writer(self.state_topic, self.dialect.state_type)
         if self.low_rate_topic:
             self._low_rate_writer = node.writer(self.low_rate_topic, self.dialect.state_type)
+            self._low_rate_every = max(1, round(self.state_rate / self.model.low_rate))
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
         for unit in self._units:
             unit.thread = self._thread(f"exchange-{unit.side}", self._exchange_loop, unit)
-        self._threads = [
-            self._thread("receive", self._receive_loop),
-            self._thread("publish", self._publish_loop),
-        ]
-        for thread in [*self._threads, *(u.thread for u in self._units)]:
+        self._receiving = self._thread("receive", self._receive_loop)
+        for thread in [self._receiving, *(u.thread for u in self._units)]:
             assert thread is not None
             thread.start()
+        self._publisher.add(self._tick)
 
     def stop(self) -> None:
         """Brake, release the hands, publish the last state, leave DDS. May be called twice."""
@@ -211,6 +220,7 @@ class HandService:
     def _release(self) -> None:
         self._stop.set()
         self._wake.set()
+        self._publisher.remove(self._tick)
         for unit in self._units:
             thread = unit.thread
             if thread is not None and thread.ident is not None:
@@ -220,10 +230,9 @@ class HandService:
                     self._close_hand(unit)
             else:
                 self._close_hand(unit)
-        for thread in self._threads:
-            if thread.ident is not None:
-                thread.join()
-        if self._writer is not None and self._threads:
+        if self._receiving is not None and self._receiving.ident is not None:
+            self._receiving.join()
+        if self._writer is not None and self._receiving is not None:
             self._publish(self._compose(), low_rate=True)
         for entity in (self._reader, self._writer, self._low_rate_writer):
             if entity is not None:
@@ -368,6 +377,7 @@ class HandService:
             while not self._stop.is_set():
                 if not core.connected and not self._reconnect(unit, backoff):
                     continue
+                align(self._clock, core.spec.io_rate, self._phase)
                 rate = Rate(core.spec.io_rate, self._clock)
                 while core.connected and not self._stop.is_set():
                     rate.wait()
@@ -425,17 +435,17 @@ class HandService:
 
     # -- publish ----------------------------------------------------------------------------
 
-    def _publish_loop(self) -> None:
-        precise_timers()
-        go_first()
-        rate = Rate(self.state_rate, self._clock, spin=min(_SPIN, 0.2 / self.state_rate))
-        every = max(1, round(self.state_rate / self.model.low_rate)) if self.low_rate_topic else 0
-        while True:
-            missed = rate.wait()
-            if self._stop.is_set():
-                return  # the last state is written when the hands have been released
-            self.counters.publish_misses += missed
-            self._publish(self._compose(), low_rate=bool(every) and rate.loops % every == 0)
+    def _tick(self, missed: int) -> None:
+        if self.failure is not None:
+            return
+        self.counters.publish_misses += missed
+        self._ticks += 1
+        every = self._low_rate_every
+        try:
+            self._publish(self._compose(), low_rate=every > 0 and self._ticks % every == 0)
+        except Exception as error:  # nothing may die in silence
+            log.exception("%s: publishing failed", self.state_topic)
+            self.failure = error
 
     def _compose(self) -> bytes | None:
         """The sample for now; None without a state.
