@@ -6,6 +6,7 @@ import errno
 import logging
 import re
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -17,13 +18,14 @@ import pytest
 import usb.backend.libusb1
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from usb.core import USBError
+from usb.core import USBError, USBTimeoutError
 
 from dexkit.backends import BackendOptions
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb, Server, backend, discovery, find_hand
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.drivers.dex3_usb.link import UsbLink
 from dexkit.drivers.dex3_usb.settings import from_options, parse_places
+from dexkit.drivers.dex3_usb.usbip import _Connection
 from dexkit.errors import (
     HandError,
     HandLost,
@@ -812,3 +814,109 @@ class TestTroubleOnTheWay:
                     break
                 assert time.monotonic() < until
             hand.close()
+
+
+class TestUsbIpClient:
+    """The transfers over USB/IP, with a server that a test writes byte by byte."""
+
+    def reply(self, seq: int, data: bytes = b"", status: int = 0, command: int = 3) -> bytes:
+        # as the kernel's server does: everything but the number is 0
+        return (
+            struct.pack(">IIIIIiiiii8x", command, seq, 0, 0, 0, status, len(data), 0, 0, 0) + data
+        )
+
+    def connected(self) -> tuple[_Connection, socket.socket]:
+        client, server = socket.socketpair()
+        server.settimeout(5.0)
+        return _Connection(client, 0x10002), server
+
+    def exchange(self, connection: _Connection, timeout: int = 50) -> tuple[int, int, bytes]:
+        return connection.exchange(2, b"command", 1, 64, timeout, timeout)
+
+    def test_replies_in_pieces_and_in_either_order(self) -> None:
+        connection, server = self.connected()
+        first = self.reply(1, b"") + self.reply(2, b"answer")
+        second = self.reply(4, b"other") + self.reply(3)
+        pieces = [first[:10], first[10:60], first[60:], second]
+
+        def serve() -> None:
+            for piece in pieces:
+                server.sendall(piece)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        assert self.exchange(connection, 2000) == (0, 0, b"answer")
+        assert self.exchange(connection, 2000) == (0, 0, b"other")
+        thread.join()
+        assert len(server.recv(4096)) == 2 * (48 + 7 + 48)
+        connection.close()
+        server.close()
+
+    def test_a_cancelled_transfer_is_not_taken_for_another(self) -> None:
+        connection, server = self.connected()
+        before = time.monotonic()
+        with pytest.raises(USBTimeoutError):
+            self.exchange(connection, 20)
+        assert time.monotonic() - before < 1.0
+        sent = server.recv(4096)
+        numbers = [struct.unpack_from(">II", sent, at) for at in (0, 55, 103, 151)]
+        assert numbers == [(1, 1), (1, 2), (2, 3), (2, 4)]  # two transfers, two calls back
+        # the write was done after all, the late answer crosses the calls back, which succeed
+        server.sendall(self.reply(1) + self.reply(2, b"late") + self.reply(3, command=4))
+        server.sendall(self.reply(4, command=4) + self.reply(5) + self.reply(6, b"right"))
+        assert self.exchange(connection, 2000) == (0, 0, b"right")
+        connection.close()
+        server.close()
+
+    def test_a_timeout_in_the_middle_of_a_reply(self) -> None:
+        connection, server = self.connected()
+        whole = self.reply(1) + self.reply(2, b"late answer")
+        server.sendall(whole[:-4])
+        with pytest.raises(USBTimeoutError):
+            self.exchange(connection, 20)
+        server.sendall(whole[-4:] + self.reply(3, command=4) + self.reply(4, command=4))
+        server.sendall(self.reply(5) + self.reply(6, b"right"))
+        assert self.exchange(connection, 2000) == (0, 0, b"right")
+        connection.close()
+        server.close()
+
+    def test_a_broken_connection_stays_broken(self) -> None:
+        connection, server = self.connected()
+        server.close()
+        for _ in range(2):
+            with pytest.raises(USBError) as caught:
+                self.exchange(connection)
+            assert caught.value.errno == errno.ENODEV
+        connection.close()
+        connection.close()
+
+    @given(
+        st.lists(
+            st.one_of(
+                st.binary(max_size=120),
+                st.builds(
+                    lambda seq, command, size, data: (
+                        struct.pack(">IIIIIiiiii8x", command, seq, 0, 0, 0, 0, size, 0, 0, 0) + data
+                    ),
+                    st.integers(0, 4),
+                    st.integers(0, 5),
+                    st.integers(-2, 100),
+                    st.binary(max_size=80),
+                ),
+            ),
+            max_size=4,
+        )
+    )
+    @settings(max_examples=100, deadline=None)
+    def test_whatever_a_server_sends(self, chunks: list[bytes]) -> None:
+        connection, server = self.connected()
+        server.sendall(b"".join(chunks))
+        server.shutdown(socket.SHUT_WR)
+        try:
+            _, _, data = self.exchange(connection, 20)
+            assert len(data) <= 64
+        except USBError:
+            pass
+        finally:
+            connection.close()
+            server.close()
