@@ -1,4 +1,4 @@
-"""Network interfaces of this machine, and who listens to DDS on them, from /proc and /sys."""
+"""Network interfaces of this machine, and who listens to DDS on them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["ROBOT_NETWORK", "address_of", "dds_sockets", "interfaces"]
 ROBOT_NETWORK = "192.168.123."
 """Where Unitree's robots are (facts/unitree-dex A.6)."""
 
-_SIOCGIFADDR = 0x8915
+_SIOCGIFADDR, _SIOCGIFFLAGS = 0x8915, 0x8913
 _IFF_UP, _IFF_LOOPBACK, _IFF_MULTICAST = 0x1, 0x8, 0x1000
 _GROUP = "0100FFEF"  # 239.255.0.1 as /proc/net/igmp writes it on little-endian machines
 
@@ -49,15 +49,12 @@ def _list(found: dict[str, Interface]) -> str:
     )
 
 
-def interfaces(proc: Path = Path("/proc"), sysfs: Path = Path("/sys")) -> tuple[Interface, ...]:
+def interfaces(proc: Path = Path("/proc")) -> tuple[Interface, ...]:
     """Network interfaces of this machine."""
     joined = _joined(proc)
     found = []
     for _, name in socket.if_nameindex():
-        try:
-            flags = int((sysfs / "class/net" / name / "flags").read_text(), 16)
-        except (OSError, ValueError):
-            flags = _flags(name)
+        flags = _flags(name)
         found.append(
             Interface(
                 name=name,
@@ -83,9 +80,9 @@ def _addresses(name: str) -> tuple[str, ...]:
 
 
 def _flags(name: str) -> int:
-    """The flags where /sys is another network namespace's."""
+    # not from /sys, which may be another network namespace's
     with contextlib.suppress(OSError):
-        return int(struct.unpack_from("H", _ioctl(0x8913, name), 16)[0])  # SIOCGIFFLAGS
+        return int(struct.unpack_from("H", _ioctl(_SIOCGIFFLAGS, name), 16)[0])
     return 0
 
 

@@ -183,9 +183,17 @@ def readiness(seen: Observations, wish: Wish | None = None) -> list[Readiness]:
         names = {p.role.dialect.name for p in _hands(view, wish) + _clients(view, wish)}
         for dialect in DIALECTS.values():
             if dialect.name in names:
-                missing = _missing(view, dialect)
+                missing = _missing(view, dialect) or _unmet(seen, view, dialect)
                 out.append(Readiness(view.number, dialect.name, not missing, missing))
     return out
+
+
+def _unmet(seen: Observations, view: DomainView, dialect: Dialect) -> str:
+    """Why hand and client do not find each other although both are there, or empty."""
+    wish = Wish(dialects=(dialect,))
+    hands, clients = _hands(view, wish), _clients(view, wish)
+    found = [*_apart(view, hands, clients), *_deaf_loopback(seen, view, hands, clients)]
+    return found[0].diagnosis.title if found else ""
 
 
 def _missing(view: DomainView, dialect: Dialect) -> str:
@@ -633,9 +641,7 @@ def _network(seen: Observations, wish: Wish) -> Iterator[Finding]:
     for view in focus:
         hands, clients = _hands(view, wish), _clients(view, wish)
         yield from _apart(view, hands, clients)
-        loopback = next((i for i in seen.interfaces if i.loopback), None)
-        if loopback and not loopback.multicast:
-            yield from _deaf_loopback(view, hands, clients, loopback.name)
+        yield from _deaf_loopback(seen, view, hands, clients)
     yield from _hidden(seen, focus)
 
 
@@ -665,8 +671,11 @@ def _apart(view: DomainView, hands: list[_Part], clients: list[_Part]) -> Iterat
 
 
 def _deaf_loopback(
-    view: DomainView, hands: list[_Part], clients: list[_Part], name: str
+    seen: Observations, view: DomainView, hands: list[_Part], clients: list[_Part]
 ) -> Iterator[Finding]:
+    name = next((i.name for i in seen.interfaces if i.loopback and not i.multicast), "")
+    if not name:
+        return
     for ends in _pairs(hands, clients):
         local = all(a.startswith("127.") for p in ends for a in p.addresses)
         calls = any("dexkit" in p.command or "<Peer" in p.dds_config for p in ends)
