@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.errors import EncodeError
@@ -49,12 +49,14 @@ def test_vectors(data: bytes, crc: int) -> None:
 words = st.lists(st.binary(min_size=4, max_size=4), max_size=40).map(b"".join)
 
 
+@settings(deadline=None)
 @given(words)
 def test_agrees_with_the_bitwise_one(data: bytes) -> None:
     assert crc32_words(data) == bitwise(data)
     assert crc32_words(memoryview(bytearray(data))) == bitwise(data)
 
 
+@settings(deadline=None)
 @given(words)
 def test_swapped_words(data: bytes) -> None:
     swapped = b"".join(data[i : i + 4][::-1] for i in range(0, len(data), 4))

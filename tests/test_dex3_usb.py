@@ -178,12 +178,13 @@ sensor_states = st.builds(
 packets = st.one_of(motor_cmds, motor_states, sensor_states)
 
 
+@settings(deadline=None)
 @given(packets)
 def test_packets_survive(packet: Any) -> None:
     assert type(packet).parse(packet.pack()) == packet
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(packets)
 def test_every_flipped_bit_is_noticed(packet: Any) -> None:
     data = bytearray(packet.pack())
@@ -238,7 +239,7 @@ def test_any_order() -> None:
     assert not problems
 
 
-@settings(max_examples=100)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.one_of(motor_states, sensor_states), max_size=5), st.data())
 def test_one_damaged_packet_is_lost_alone(packets: list[Any], data: st.DataObject) -> None:
     parts = [p.pack() for p in packets]
@@ -268,6 +269,7 @@ def test_a_wrong_crc_is_one_problem_and_says_where() -> None:
     assert "bus 0, offset 44: MotorState_t: CRC is 0x9C8D9944" in str(problems[0])
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=60), motor_states, st.binary(max_size=60), sensor_states)
 def test_garbage_hides_nothing(a: bytes, motor: Any, b: bytes, sensor: Any) -> None:
     found, problems = d.parse_bus(a + motor.pack() + b + sensor.pack())
@@ -332,7 +334,7 @@ def test_state_frames_survive() -> None:
     assert len(frame.sensors) == 5
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.lists(motor_cmds, max_size=7), min_size=5, max_size=5),
     st.sampled_from(d.COMMAND_LAYOUTS),
@@ -409,7 +411,7 @@ def test_a_damaged_packet_in_a_good_frame() -> None:
     assert [(p.bus, p.offset) for p in frame.problems] == [(0, 26)]
 
 
-@settings(max_examples=150)
+@settings(max_examples=100, deadline=None)
 @given(
     st.binary(max_size=400),
     st.lists(st.integers(0, 2**32 - 1), min_size=5, max_size=5),

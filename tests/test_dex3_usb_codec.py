@@ -67,12 +67,14 @@ def test_figures_of_the_fact_sheet() -> None:
     assert units.PRESSURE.decode(1) == 8.0
 
 
+@settings(deadline=None)
 @given(scales, ratios, st.integers(-(2**31), 2**31 - 1))
 def test_counts_survive(scale: d.Scale, ratio: float, count: int) -> None:
     count = min(max(count, scale.low), scale.high)
     assert scale.encode(scale.decode(count, ratio), ratio) == count
 
 
+@settings(deadline=None)
 @given(scales, ratios, st.floats(-1e7, 1e7))
 def test_values_are_off_by_less_than_a_count(scale: d.Scale, ratio: float, value: float) -> None:
     count = scale.encode(value, ratio)
@@ -85,6 +87,7 @@ def test_values_are_off_by_less_than_a_count(scale: d.Scale, ratio: float, value
     assert abs(back) <= abs(wanted) + one * 1e-5, "away from zero"
 
 
+@settings(deadline=None)
 @given(scales, ratios, st.floats(allow_nan=True, allow_infinity=True))
 def test_saturation_and_no_nan(scale: d.Scale, ratio: float, value: float) -> None:
     if math.isfinite(value):
@@ -135,7 +138,7 @@ modes = st.lists(st.integers(0, 7), min_size=7, max_size=7).map(lambda x: np.arr
 motor_places = st.permutations([(b, i) for b in range(4) for i in range(4)]).map(lambda x: x[:7])
 
 
-@settings(max_examples=150)
+@settings(max_examples=100, deadline=None)
 @given(
     st.builds(HandCommand, rows, rows, rows, rows, rows, modes),
     st.one_of(st.booleans(), flags),
@@ -352,7 +355,7 @@ def test_a_tripped_motor() -> None:
     assert codec.decode(d.pack_state(frame), 0.0).fault[0] == MotorError.MOTOR_SAW_HOST_TIMEOUT
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(
     st.sets(st.integers(0, 6)),
     st.sets(st.integers(0, 8)),
@@ -486,7 +489,7 @@ def test_what_a_device_cannot_say() -> None:
     assert decoded.supply == SupplyState(0.0, 0.0, 0.0, 0.0)
 
 
-@settings(max_examples=150)
+@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(2, 1266), st.booleans())
 def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
     codec = d.HandCodec(JOINTS)
