@@ -21,6 +21,7 @@ import usbip
 from click.testing import CliRunner
 
 from dexkit.cli.emulate import command
+from dexkit.emulators.dex3_mcu import Dex3Process
 from dexkit.emulators.faults import FAULT_KINDS
 from dexkit.emulators.mx64 import (
     Bus,
@@ -225,6 +226,13 @@ def test_helper_reports_why_it_did_not_start() -> None:
         pass
     assert "fire" in caught.value.hint
     assert all(kind in caught.value.hint for kind in FAULT_KINDS)
+
+
+def test_helper_does_not_wait_for_ever() -> None:
+    with pytest.raises(EmulatorError, match="did not start"):
+        EmulatedProcess([], timeout=0.01)
+    with pytest.raises(EmulatorError, match="did not start"):
+        Dex3Process(["--port=0"], timeout=0.01)
 
 
 def test_helper_refuses_what_it_cannot_do() -> None:

@@ -3,14 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import select
-import subprocess
-import sys
-import time
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import IO
 
 from dexkit.clock import Clock, RealClock
 from dexkit.emulators.dex3_body import Dex3Body
@@ -19,7 +13,8 @@ from dexkit.emulators.dex3_mcu.server import Server
 from dexkit.emulators.dex3_mcu.settings import Firmware
 from dexkit.emulators.dex3_mcu.usb import IN_ENDPOINT, OUT_ENDPOINT, Dex3Usb
 from dexkit.emulators.faults import DEX3_FAULTS, parse_fault
-from dexkit.errors import EmulatorError, UsageError
+from dexkit.emulators.process import EmulatorProcess
+from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
 
@@ -133,78 +128,23 @@ class Dex3Hands:
         self.close()
 
 
-class Dex3Process:
+class Dex3Process(EmulatorProcess):
     """``dexkit emulate dex3-usb`` in a process of its own.
 
     :param arguments: of that command.
     :raises EmulatorError: it did not become ready.
 
     :ivar url: what a driver opens.
-    :ivar ready_line: the first line that it printed.
     """
 
     def __init__(self, arguments: Sequence[str], *, timeout: float = 20.0) -> None:
-        command = [sys.executable, "-m", "dexkit", "emulate", "dex3-usb", "--faults-from-stdin"]
-        self.process = subprocess.Popen(
-            [*command, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        self.output = self.errors = ""
-        try:
-            self.ready_line = self._await_ready(timeout)
-            self.url = self.ready_line.split()[1]
-        except BaseException:
-            self.close()
-            raise
+        super().__init__("dex3-usb", arguments, DEX3_FAULTS, timeout=timeout)
+        self.url = self.ready_line.split()[1]
 
     @property
     def port(self) -> int:
         """TCP port of the server."""
         return int(self.url.rsplit(":", 1)[1])
-
-    def _await_ready(self, timeout: float) -> str:
-        stdout = self.process.stdout
-        assert stdout is not None
-        deadline = time.monotonic() + timeout
-        line = b""
-        while not line.endswith(b"\n"):
-            left = max(0.0, deadline - time.monotonic())
-            ready, _, _ = select.select([stdout], [], [], left)
-            piece = os.read(stdout.fileno(), 1) if ready else b""
-            if not piece:
-                if self.process.poll() is None and left > 0:
-                    self.process.kill()
-                _, stderr = self.process.communicate()
-                raise EmulatorError(
-                    "the emulated hand did not start",
-                    hint=stderr.decode(errors="replace").strip(),
-                )
-            line += piece
-        return line.decode().strip()
-
-    def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now)."""
-        fault = parse_fault(spec, DEX3_FAULTS)  # complain here, not over there
-        assert fault
-        stdin: IO[bytes] | None = self.process.stdin
-        assert stdin is not None
-        stdin.write(spec.encode() + b"\n")
-        stdin.flush()
-
-    def close(self) -> None:
-        """Stop it; ``output`` and ``errors`` then hold what it printed behind the first line."""
-        if self.process.returncode is not None:
-            return
-        self.process.terminate()
-        try:
-            stdout, stderr = self.process.communicate(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            stdout, stderr = self.process.communicate()
-        self.output = stdout.decode(errors="replace")
-        self.errors = stderr.decode(errors="replace")
 
 
 @contextlib.contextmanager

@@ -1,9 +1,9 @@
 """USB/IP over TCP in one thread: devices that are listed, imported, cut off and put back.
 
 Descriptors, control requests, endpoint halts, parked IN transfers and the bytes of the protocol
-are the ``usbip`` package's. Its own listener starts a thread for each connection and never
-closes one, so it cannot be unplugged, cannot say which free port it took, and hands the
-interpreter back and forth between threads in every exchange; this loop does those three things.
+are the ``usbip`` package's. Its own listener is as fast, but never closes a connection that it
+has accepted, so nothing can be unplugged; it cannot say which free port it took; and its devices
+only live while a client talks to them.
 
 One client at a time has a device, as on a real host: a second import is refused as busy.
 """
@@ -30,6 +30,7 @@ __all__ = ["Plug", "Server"]
 _REQUEST = 8  # bytes: version, code, status
 _BUSID = 32
 _COMMAND = 48
+_FIELDS = struct.Struct(">I8xI8xI")  # of a command: its code, direction, length of the data
 _MOST_PAYLOAD = 1 << 20  # no client of a hand sends as much; a longer one is not a client
 _MOST_UNREAD = 1 << 18  # bytes of replies that a client may leave unread
 _ST_DEV_BUSY = 2  # of the kernel's usbip_common.h
@@ -148,8 +149,8 @@ class Server:
                 following = plug.advance()
                 if following is not None and (due is None or following < due):
                     due = following
-            for connection in list(self._connections.values()):
-                if connection.plug is not None and not connection.plug.plugged:
+            for connection in [c for c in self._connections.values() if c.wants_attention]:
+                if connection.cut_off:
                     self._drop(connection)
                 else:
                     self._flush(connection)
@@ -209,7 +210,7 @@ class Server:
             return
         connection.inbox += data
         try:
-            while self._serve(connection):
+            while connection.inbox and self._serve(connection):
                 pass
         except (_Nonsense, struct.error):
             connection.closing = True
@@ -245,9 +246,7 @@ class Server:
         inbox = connection.inbox
         if len(inbox) < _COMMAND:
             return False
-        command, direction, length = (
-            int.from_bytes(inbox[at : at + 4], "big") for at in (0, 12, 24)
-        )
+        command, direction, length = _FIELDS.unpack_from(inbox)
         if command not in (protocol.CMD_SUBMIT, protocol.CMD_UNLINK):
             raise _Nonsense
         if command == protocol.CMD_SUBMIT:
@@ -347,6 +346,16 @@ class _Connection:
         self.parked: set[int] = set()
         self.closing = False
         self.waiting = False
+
+    @property
+    def cut_off(self) -> bool:
+        """Its device has been unplugged."""
+        return self.plug is not None and not self.plug.plugged
+
+    @property
+    def wants_attention(self) -> bool:
+        """There is something to send, or it is cut off."""
+        return bool(self.outbox) or self.cut_off
 
     def recv(self, size: int) -> bytes:
         data = bytes(self.inbox[:size])

@@ -5,21 +5,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import select
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
-from typing import IO
 
 from dexkit.clock import RealClock
-from dexkit.emulators.faults import parse_fault
+from dexkit.emulators.faults import MX64_FAULTS, parse_fault
 from dexkit.emulators.mx64.bus import Bus
 from dexkit.emulators.mx64.port import Port
 from dexkit.emulators.mx64.servo import Servo
 from dexkit.emulators.mx64.settings import Firmware, Physics
-from dexkit.errors import EmulatorError, UsageError
+from dexkit.emulators.process import EmulatorProcess
+from dexkit.errors import UsageError
 
 __all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
 
@@ -63,7 +59,7 @@ class EmulatedThread:
         self.port.close()
 
 
-class EmulatedProcess:
+class EmulatedProcess(EmulatorProcess):
     """A gripper in a process of its own: ``dexkit emulate mx64``.
 
     :param arguments: of that command, without ``--link``.
@@ -83,60 +79,11 @@ class EmulatedProcess:
             self._directory = tempfile.TemporaryDirectory(prefix="dexkit-mx64-")
             link = os.path.join(self._directory.name, "tty")
         self.path = os.path.abspath(os.fspath(link))
-        command = [sys.executable, "-m", "dexkit", "emulate", "mx64", "--link", self.path]
-        self.process = subprocess.Popen(
-            [*command, "--faults-from-stdin", *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        self.output = self.errors = ""
-        try:
-            self.ready_line = self._await_ready(timeout)
-        except BaseException:
-            self.close()
-            raise
-
-    def _await_ready(self, timeout: float) -> str:
-        stdout = self.process.stdout
-        assert stdout is not None
-        deadline = time.monotonic() + timeout
-        line = b""
-        while not line.endswith(b"\n"):
-            left = max(0.0, deadline - time.monotonic())
-            ready, _, _ = select.select([stdout], [], [], left)
-            piece = os.read(stdout.fileno(), 1) if ready else b""
-            if not piece:
-                if self.process.poll() is None and left > 0:
-                    self.process.kill()
-                _, stderr = self.process.communicate()
-                raise EmulatorError(
-                    "the emulated gripper did not start",
-                    hint=stderr.decode(errors="replace").strip(),
-                )
-            line += piece
-        return line.decode().strip()
-
-    def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now)."""
-        fault = parse_fault(spec)  # complain here, not over there
-        assert fault
-        stdin: IO[bytes] | None = self.process.stdin
-        assert stdin is not None
-        stdin.write(spec.encode() + b"\n")
-        stdin.flush()
+        super().__init__("mx64", ["--link", self.path, *arguments], MX64_FAULTS, timeout=timeout)
 
     def close(self) -> None:
         """Stop it; ``output`` and ``errors`` then hold what it printed behind the ready line."""
-        if self.process.returncode is None:
-            self.process.terminate()
-            try:
-                stdout, stderr = self.process.communicate(timeout=10.0)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                stdout, stderr = self.process.communicate()
-            self.output = stdout.decode(errors="replace")
-            self.errors = stderr.decode(errors="replace")
+        super().close()
         if self._directory is not None:
             self._directory.cleanup()
             self._directory = None

@@ -1,0 +1,98 @@
+"""An emulator in a process of its own: ``dexkit emulate DEVICE``, started, told and stopped."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from typing import IO
+
+from dexkit.emulators.faults import FaultFamily, parse_fault
+from dexkit.errors import EmulatorError
+
+__all__ = ["EmulatorProcess"]
+
+
+class EmulatorProcess:
+    """``dexkit emulate DEVICE --faults-from-stdin ...``, ready.
+
+    :param arguments: of that command.
+    :param faults: the faults that the device can have.
+    :param timeout: seconds until it must have said that it is ready.
+    :raises EmulatorError: it did not; the hint is what it said instead.
+
+    :ivar ready_line: the first line that it printed.
+    :ivar output: after :meth:`close`: what it printed behind that line.
+    :ivar errors: likewise to standard error.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        arguments: Sequence[str],
+        faults: FaultFamily,
+        *,
+        timeout: float = 20.0,
+    ) -> None:
+        self._faults = faults
+        self.output = self.errors = ""
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "dexkit", "emulate", device, "--faults-from-stdin", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            self.ready_line = self._await_ready(device, timeout)
+        except BaseException:
+            self.close()
+            raise
+
+    def _await_ready(self, device: str, timeout: float) -> str:
+        stdout = self.process.stdout
+        assert stdout is not None
+        deadline = time.monotonic() + timeout
+        line = b""
+        while not line.endswith(b"\n"):
+            left = max(0.0, deadline - time.monotonic())
+            ready, _, _ = select.select([stdout], [], [], left)
+            piece = os.read(stdout.fileno(), 1) if ready else b""
+            if not piece:
+                try:
+                    self.process.wait(left)  # an output that was closed ends soon, and says why
+                except subprocess.TimeoutExpired:
+                    self.process.kill()
+                _, stderr = self.process.communicate()
+                raise EmulatorError(
+                    f"the emulated {device} did not start",
+                    hint=stderr.decode(errors="replace").strip(),
+                )
+            line += piece
+        return line.decode().strip()
+
+    def inject(self, spec: str) -> None:
+        """Have a fault now (or at its ``@TIME`` from now).
+
+        :raises UsageError: there is no such fault.
+        """
+        parse_fault(spec, self._faults)  # complain here, not over there
+        stdin: IO[bytes] | None = self.process.stdin
+        assert stdin is not None
+        stdin.write(spec.encode() + b"\n")
+        stdin.flush()
+
+    def close(self) -> None:
+        """Stop it. May be called twice."""
+        if self.process.returncode is not None:
+            return
+        self.process.terminate()
+        try:
+            stdout, stderr = self.process.communicate(timeout=10.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            stdout, stderr = self.process.communicate()
+        self.output = stdout.decode(errors="replace")
+        self.errors = stderr.decode(errors="replace")
