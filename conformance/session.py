@@ -14,7 +14,7 @@ from dexkit.conformance.processes import EMULATED, EXTERNAL, RigOptions
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.stimuli.script import DEFAULT_OBJECT
+from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording, sides_of
 from dexkit.errors import ConformanceError, UsageError
@@ -127,7 +127,7 @@ class SuiteOptions:
         chosen = dialect(dialect_name)
         shared = len({chosen.topics(s) for s in Side}) == 1
         if not objects and started and not devices and not (shared and backend not in EMULATED):
-            by_side = {s: pct for s, pct in DEFAULT_OBJECT.items() if s in sides}
+            by_side = {s: pct for s, pct in DEFAULT_OBJECTS[chosen.model].items() if s in sides}
         if domain is None and (backend == EXTERNAL or devices):
             domain = 0
         if domain is not None and not 0 <= domain <= 230:

@@ -31,6 +31,7 @@ _MODULES = (
     "safety",
     "lifecycle",
     "tracking",
+    "dex3",
 )
 
 

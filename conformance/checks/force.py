@@ -7,16 +7,24 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 
 
-def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
-    """(median tau_est, begin, end) over the last half second of the last squeeze."""
+def squeezes(ctx: Context) -> tuple[float, float] | None:
+    """(begin, end) of the last half second of the last squeeze that has states."""
     for phase in reversed(ctx.phases()):
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
-        tau = ctx.states.tau[ctx.states.between(begin, end), 0]
-        tau = tau[np.isfinite(tau)]
-        if len(tau):
-            return float(np.median(tau)), begin, end
+        tau = ctx.states.tau[ctx.states.between(begin, end)]
+        if np.isfinite(tau).all(axis=1).any():
+            return begin, end
     return None
+
+
+def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
+    """(median tau_est, begin, end) of a gripper while it squeezes."""
+    span = squeezes(ctx)
+    if span is None:
+        return None
+    tau = ctx.states.tau[ctx.states.between(*span), 0]
+    return float(np.median(tau[np.isfinite(tau)])), *span
 
 
 @check("DEX1-FORCE-01")

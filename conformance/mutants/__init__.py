@@ -1,7 +1,8 @@
 """Deliberately wrong hands: each does one thing wrong, and the checks must notice exactly that.
 
 A mutant is a small change of its model's reference service or of its hand. :attr:`Mutant.kills` is
-the requirement that must catch it; ``also`` names what cannot but fail with it. No other requirement may fail or warn: it would be caught for the wrong reason.
+the requirement that must catch it; ``also`` names what cannot but fail with it. No other
+requirement may fail or warn: it would be caught for the wrong reason.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from dexkit.conformance.mutants import gripper
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli import Plan, Session, phases_for
-from dexkit.conformance.stimuli.script import DEFAULT_OBJECT, object_places
+from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import Service, run_virtual
+from dexkit.conformance.virtual.dex3 import Dex3Service
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, dialect
+from dexkit.models import DEX1_1, DEX3_1, dialect
 
 __all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
 
@@ -53,7 +55,10 @@ MUTANTS: tuple[Mutant, ...] = tuple(
     for model, zoo in ((DEX1_1.name, gripper.ZOO),)
     for service, kills, also in zoo
 )
-REFERENCES: dict[str, type[Service]] = {DEX1_1.name: ReferenceService}
+REFERENCES: dict[str, type[Service]] = {
+    DEX1_1.name: ReferenceService,
+    DEX3_1.name: Dex3Service,
+}
 """The good hand of each model."""
 
 
@@ -68,7 +73,7 @@ def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(
     return Plan(
         dialect=chosen,
         sides=tuple(sides),
-        objects=object_places(chosen, {s: p for s, p in DEFAULT_OBJECT.items() if s in sides}),
+        objects=default_objects(chosen, sides),
         session=_session(chosen.model),
         phases=phases_for(catalogue(chosen.model)),
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.stimuli.dex3 import Dex3Script
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.script import (
     Action,
@@ -24,7 +25,7 @@ from dexkit.conformance.stimuli.script import (
     Send,
 )
 from dexkit.conformance.stimuli.session import Session
-from dexkit.models import DEX1_1
+from dexkit.models import DEX1_1, DEX3_1
 
 __all__ = [
     "SCRIPTS",
@@ -41,7 +42,7 @@ __all__ = [
     "script_for",
 ]
 
-SCRIPTS: dict[str, type[Script]] = {DEX1_1.name: GripperScript}
+SCRIPTS: dict[str, type[Script]] = {DEX1_1.name: GripperScript, DEX3_1.name: Dex3Script}
 """The script of each model."""
 
 

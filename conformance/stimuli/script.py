@@ -14,10 +14,10 @@ from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import joints_of
 from dexkit.conformance.wire import Motor, Motors, Wire
 from dexkit.hand import JointSpec, Side
-from dexkit.models import Dialect, HandModel, model
+from dexkit.models import DEX1_1, DEX3_1, Dialect, HandModel, model
 
 __all__ = [
-    "DEFAULT_OBJECT",
+    "DEFAULT_OBJECTS",
     "Action",
     "Join",
     "Leave",
@@ -29,12 +29,14 @@ __all__ = [
     "Script",
     "Send",
     "Steps",
+    "default_objects",
     "object_places",
 ]
 
-DEFAULT_OBJECT = {Side.RIGHT: 37.0}
-"""Percent of opening at which the right hand of a started pair feels an object: 2.0 rad of a
-gripper, where the shipped session closes on one."""
+DEFAULT_OBJECTS = {DEX1_1.name: {Side.RIGHT: 37.0}, DEX3_1.name: {Side.RIGHT: 60.0}}
+"""Where the hands of a pair that the kit starts feel an object. Percent of opening for a gripper:
+2.0 rad, where the shipped session closes on one. Percent of closing for others: nearly as far as
+the shipped session closes."""
 SETTLED = 0.02
 """Part of a joint's range within which it counts as being where it should."""
 Payloads = list[tuple[str, bytes]]
@@ -102,10 +104,16 @@ class Plan:
 
 
 def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Side, float]:
-    """Percent of opening as the script takes it: radians, where the dialect has such a scale."""
+    """Percents as the script takes them: of opening in radians, of closing as they are."""
     if math.isnan(dialect.q_open):
         return dict(percents)
     return {s: pct / 100 * dialect.q_open for s, pct in percents.items()}
+
+
+def default_objects(dialect: Dialect, sides: Sequence[Side]) -> dict[Side, float]:
+    """The default objects of a pair of hands, as the script takes them."""
+    percents = DEFAULT_OBJECTS[dialect.model]
+    return object_places(dialect, {s: p for s, p in percents.items() if s in sides})
 
 
 class Script(ABC):

@@ -1,0 +1,473 @@
+"""What only a Dex3-1 has: joints in an order, a mode byte, sensors, time-out protection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.force import squeezes
+from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
+from dexkit.conformance.checks.safety import arrival, stays
+from dexkit.conformance.stimuli.dex3 import DRIVEN, SLOW, WRONG_IDS
+from dexkit.hand import Floats, JointMode
+
+_SLOTS = 12  # of a PressSensorState_
+
+
+# ------------------------------------------------------------------------------------- topics
+
+
+@check("DEX3-TOPIC-03")
+def low_rate_topic(ctx: Context) -> Outcome:
+    """The low-rate copy of the state."""
+    dialect = ctx.recording.dialect
+    topic = dialect.low_rate_topic.format(side=ctx.side)
+    found = [
+        c
+        for c in ctx.recording.channels
+        if c.topic == topic and c.type_name == dialect.state_type and c.message_count
+    ]
+    if not found:
+        return ctx.failed("no topic", f"nobody publishes {topic} with {dialect.state_type}")
+    rate = found[0].message_count / max(ctx.recording.duration, 1e-9)
+    text = f"{found[0].message_count} samples on {topic}, {rate:.1f} Hz"
+    if rate <= ctx.tolerance("max_rate_hz"):
+        return ctx.passed(f"{rate:.0f} Hz", text, rate_hz=rate)
+    return ctx.failed(f"{rate:.0f} Hz", text, rate_hz=rate)
+
+
+@check("DEX3-START-02")
+def rest_pose(ctx: Context) -> Outcome:
+    """Whether any q is not 0 before the first command."""
+    first = float(ctx.commands.t[0]) if len(ctx.commands) else float("inf")
+    q = ctx.states.q[ctx.states.t < first]
+    q = q[np.isfinite(q).all(axis=1)]
+    if not len(q):
+        return ctx.skipped("no state before the first command")
+    zero = ~q.any(axis=1)
+    if zero.any():
+        return ctx.failed(
+            "all zero",
+            f"q is exactly 0 in every joint in {int(zero.sum())} of {len(q)} states before the "
+            "first command",
+            ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(zero))])),
+        )
+    most = float(np.abs(q).max(axis=1).min())
+    return ctx.passed("not zero", f"at least one joint is {most:.3f} rad or more from 0")
+
+
+# ------------------------------------------------------------------------------------ sensors
+
+
+def _packets(ctx: Context) -> NDArray[np.intp]:
+    assert ctx.states.columns is not None
+    count = ctx.states.columns.count("press_sensor_state")
+    return count[count >= 0]
+
+
+def _pressure(ctx: Context, packet: int, rows: slice = slice(None)) -> Floats:
+    """A packet's pressures, shape (n, 12)."""
+    assert ctx.states.columns is not None
+    return ctx.states.columns[f"press_sensor_state[{packet}].pressure"][rows]
+
+
+@check("DEX3-SENS-01")
+def packets(ctx: Context) -> Outcome:
+    """Number of sensor packets."""
+    found = np.unique(_packets(ctx))
+    most = ctx.tolerance("max_packets")
+    seen = " or ".join(str(n) for n in found)
+    if len(found) == 1 and found[0] <= most:
+        return ctx.passed(seen, f"{seen} sensor packets in each state")
+    return ctx.failed(seen, f"{seen} sensor packets, from state to state")
+
+
+@check("DEX3-SENS-02")
+def pressures(ctx: Context) -> Outcome:
+    """Every pressure is a number that is not negative."""
+    count = int(_packets(ctx).max(initial=0))
+    if not count:
+        return ctx.skipped("the states hold no sensor packets")
+    assert ctx.states.columns is not None
+    have = ctx.states.columns.count("press_sensor_state")
+    for packet in range(count):
+        values = _pressure(ctx, packet)
+        good = (np.isfinite(values) & (values >= 0)).all(axis=1) | (have <= packet)
+        if not good.all():
+            i = int(np.argmin(good))
+            slot = int(np.argmin(np.isfinite(values[i]) & (values[i] >= 0)))
+            return ctx.failed(
+                f"{values[i, slot]}",
+                f"pressure {values[i, slot]} in slot {slot} of packet {packet}",
+                ctx.at(ctx.states.topic, float(ctx.states.t[i])),
+            )
+    return ctx.passed("all finite", f"{count} packets of {_SLOTS}")
+
+
+@check("DEX3-SENS-03")
+def no_value(ctx: Context) -> Outcome:
+    """Nine packets; 33 elements, and the code for "no sensor here" elsewhere, always the same."""
+    count = int(_packets(ctx).max(initial=0))
+    code = ctx.tolerance("no_value")
+    if count != ctx.tolerance("packets"):
+        return ctx.failed(f"{count} packets", f"{count} sensor packets in a state")
+    marked = [_pressure(ctx, packet) == code for packet in range(count)]
+    elements = count * _SLOTS - sum(int(m[0].sum()) for m in marked)
+    changes = sum(int((m != m[0]).any()) for m in marked)
+    if changes:
+        return ctx.failed("changes", f"the slots without a value change in {changes} packets")
+    text = f"{elements} of {count * _SLOTS} slots hold a value, the others {code:g}"
+    if elements == ctx.tolerance("elements"):
+        return ctx.passed(f"{elements} elements", text)
+    return ctx.failed(f"{elements} elements", text)
+
+
+@check("DEX3-SENS-04")
+def touch(ctx: Context) -> Outcome:
+    """Pressure before and while squeezing."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    phase = ctx.phases()[-1]
+    begin, end = ctx.span(phase)
+    count = int(_packets(ctx).max(initial=0))
+    if not count:
+        return ctx.skipped("the states hold no sensor packets")
+    before, during = ctx.states.between(begin - 0.2, begin), ctx.states.between(end - 0.3, end)
+    rises = []
+    for packet in range(count):
+        free, held = _pressure(ctx, packet, before), _pressure(ctx, packet, during)
+        if not len(free) or not len(held):
+            return ctx.skipped("no state before or while it squeezed")
+        rises.append(float((np.median(held, axis=0) - np.median(free, axis=0)).max()))
+    touched = [i for i, rise in enumerate(rises) if rise > 0]
+    text = f"pressure rises in {len(touched)} of {count} packets while squeezing"
+    if len(touched) >= ctx.tolerance("min_packets"):
+        return ctx.passed(f"{len(touched)} packets", text, packets=len(touched))
+    return ctx.failed("no touch", text, ctx.at(ctx.states.topic, begin, end))
+
+
+@check("DEX3-IMU-01")
+def attitude(ctx: Context) -> Outcome:
+    """Norm of the quaternion, or nothing in it."""
+    assert ctx.states.columns is not None
+    columns = ctx.states.columns
+    quaternion = columns["imu_state.quaternion"][columns.ok]
+    norm = np.linalg.norm(quaternion, axis=1)
+    bad = (norm != 0.0) & ~(np.abs(norm - 1.0) <= ctx.tolerance("max_error"))
+    if bad.any():
+        i = int(np.argmax(bad))
+        return ctx.failed(
+            f"norm {norm[i]:.2f}",
+            f"the quaternion's norm is {norm[i]:.3f} in {int(bad.sum())} states",
+            ctx.at(ctx.states.topic, float(ctx.states.t[columns.ok][i])),
+        )
+    if not norm.any():
+        return ctx.passed("not filled", "the quaternion is 0: no IMU")
+    return ctx.passed("norm 1", f"a norm of {norm.min():.3f} to {norm.max():.3f}")
+
+
+# ---------------------------------------------------------------------------------- mode byte
+
+
+def _modes(ctx: Context, rows: slice = slice(None)) -> NDArray[np.intp]:
+    """Mode bytes of whole states, shape (n, 7)."""
+    mode = ctx.states.mode[rows]
+    return mode[np.isfinite(mode).all(axis=1)].astype(np.intp)
+
+
+@check("DEX3-MODE-01")
+def ids(ctx: Context) -> Outcome:
+    """Bits 0 to 3 of each motor's mode byte."""
+    mode = _modes(ctx)
+    found = mode & 15
+    wrong = (found != np.arange(len(ctx.joints))).any(axis=1)
+    if not wrong.any():
+        return ctx.passed("0 .. 6", f"{len(mode)} states")
+    row = found[int(np.argmax(wrong))]
+    joint = int(np.argmax(row != np.arange(len(ctx.joints))))
+    return ctx.failed(
+        f"id {row[joint]}",
+        ctx.named(f"motor {joint} says id {row[joint]}, in {int(wrong.sum())} states", joint),
+        ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(wrong))])),
+    )
+
+
+@check("DEX3-MODE-02")
+def status(ctx: Context) -> Outcome:
+    """Bits 4 to 6 while driven and while locked."""
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        for a, b, wanted, when in (
+            (begin - 0.1, begin - 0.01, JointMode.FOC, "driven"),
+            (end - 0.2, end - 0.01, JointMode.BRAKE, "locked"),
+        ):
+            mode = _modes(ctx, ctx.states.between(a, b))
+            if not len(mode):
+                return ctx.skipped(f"no state while {when}")
+            found = np.median(mode >> 4 & 7, axis=0)
+            if (found != wanted).any():
+                joint = int(np.argmax(found != wanted))
+                return ctx.failed(
+                    f"status {found[joint]:g}",
+                    ctx.named(f"status {found[joint]:g} while {when}", joint),
+                    ctx.at(ctx.states.topic, a, b),
+                )
+    return ctx.passed("1, then 0", "1 while driven, 0 while locked")
+
+
+@check("DEX3-MODE-03")
+def locked(ctx: Context) -> Outcome:
+    """Motion towards q while the motors are locked."""
+    return not_pulled(ctx, "with status 0, which locks the motor")
+
+
+@check("DEX3-MODE-04")
+def wrong_id(ctx: Context) -> Outcome:
+    """A motor whose place in the sequence says to hold, while another one bears its id."""
+    first, other = WRONG_IDS
+    names = [ctx.joints[i].name for i in WRONG_IDS]
+    quiet = [j for j in range(len(ctx.joints)) if j != first]
+    return stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
+
+
+# ------------------------------------------------------------------------------------- joints
+
+
+@check("DEX3-JOINT-01")
+def order(ctx: Context) -> Outcome:
+    """Which joint moves when one is told to."""
+    found = 0
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        for step in steps_of(ctx, phase):
+            rows = ctx.states.between(begin, end)
+            before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+            if not len(before) or abs(step.size) < 0.05 * step.stroke:
+                continue
+            moved = np.abs(ctx.states.q[rows] - np.median(before, axis=0)).max(axis=0)
+            strokes = np.array([j.stroke for j in ctx.joints])
+            others = [j for j in range(len(ctx.joints)) if j != step.joint]
+            limit = ctx.tolerance("max_others_stroke", 0) / ctx.joints[0].stroke
+            wrong = [j for j in others if not moved[j] <= limit * strokes[j]]
+            own = float(moved[step.joint])
+            name = ctx.joints[step.joint].name
+            if own < ctx.tolerance("min_progress") * abs(step.size) or wrong:
+                seen = ", ".join(f"{ctx.joints[j].name} moved {moved[j]:.2f} rad" for j in wrong)
+                return ctx.failed(
+                    ctx.joints[wrong[0]].name if wrong else "no motion",
+                    f"{name} was told to go {abs(step.size):.2f} rad and moved {own:.2f} rad; "
+                    + (seen or "no joint moved"),
+                    ctx.at(ctx.states.topic, begin, end),
+                )
+            found += 1
+    if not found:
+        return ctx.failed("no step", "there is no state while the joints were moved")
+    return ctx.passed(f"{found} of {found}", f"{found} steps, each of the joint that was told")
+
+
+@check("DEX3-GAIN-02")
+def stiffness(ctx: Context) -> Outcome:
+    """Time to half-way of a soft step, compared with a stiff one."""
+    stiff = {s.joint: s for p in ctx.recording.phases("stiff", ctx.side) for s in steps_of(ctx, p)}
+    worst: tuple[float, int] | None = None
+    for step in steps(ctx):
+        reference = stiff.get(step.joint)
+        if reference is None:
+            continue
+        quick, slow = (_half_way(s) for s in (reference, step))
+        if quick is None:
+            return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
+        # one that never gets there took at least as long as it was given
+        ratio = (slow if slow is not None else step.end - step.begin) / max(quick, 1e-3)
+        if worst is None or ratio < worst[0]:
+            worst = (ratio, step.joint)
+    if worst is None:
+        return ctx.skipped("no state during the steps")
+    ratio, joint = worst
+    text = ctx.named(f"a soft step takes {ratio:.1f} times as long to half-way", joint)
+    if ratio >= ctx.tolerance("min_ratio"):
+        return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio)
+    return ctx.failed(f"x {ratio:.1f}", text, ratio=ratio)
+
+
+def _half_way(step: Step) -> float | None:
+    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
+    if not len(part) or not (part >= 0.5).any():
+        return None
+    return float(step.t[int(np.argmax(part >= 0.5))]) - step.begin
+
+
+@check("DEX3-FORCE-01")
+def contact(ctx: Context) -> Outcome:
+    """Closing torque of the joints that press on an object."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    rows = squeezes(ctx)
+    if rows is None:
+        return ctx.skipped("no state while it squeezed")
+    begin, end = rows
+    tau = np.median(ctx.states.tau[ctx.states.between(begin, end)], axis=0)
+    closing = np.array([j.closing for j in ctx.joints])
+    felt = tau * closing
+    pressing = felt[closing != 0]
+    weakest, strongest = float(pressing.min()), float(pressing.max())
+    text = f"tau_est towards closing from {weakest:.2f} to {strongest:.2f} N m while squeezing"
+    if strongest >= ctx.tolerance("min_tau_nm") and weakest > -ctx.tolerance("min_tau_nm"):
+        return ctx.passed(f"{strongest:.2f} N m", text, tau_nm=strongest)
+    return ctx.failed(
+        f"{strongest:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=strongest
+    )
+
+
+# ---------------------------------------------------------------------------- when commands end
+
+
+def _moved(ctx: Context, joints: Sequence[int], begin: float, end: float) -> Floats:
+    """How far each joint moves from begin to end, as parts of its stroke."""
+    q = ctx.states.q[ctx.states.between(begin, end)][:, list(joints)]
+    if len(q) < 5:
+        return np.full(len(joints), np.nan)
+    return np.asarray(np.ptp(q, axis=0) / [ctx.joints[j].stroke for j in joints])
+
+
+def _silence(ctx: Context) -> tuple[float, float, float]:
+    """(last command, time-out with grace, end) of the phase."""
+    begin, end = ctx.span(ctx.phases()[-1])
+    sent = ctx.commands.t[ctx.commands.t <= end]
+    last = min(float(sent[-1]), begin + 0.05) if len(sent) else begin
+    late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+    return last, late, end
+
+
+def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
+    """Joints that move when commands end move no longer after the time-out."""
+    last, late, end = _silence(ctx)
+    before = _moved(ctx, joints, last, last + ctx.tolerance("timeout_s"))
+    after = _moved(ctx, joints, late, end)
+    if np.isnan(after).any() or np.isnan(before).any():
+        return ctx.skipped("too few states in the silence")
+    worst = int(np.argmax(after))
+    joint = joints[worst]
+    rad = float(after[worst]) * ctx.joints[joint].stroke
+    if after[worst] > ctx.requirement.tolerance("max_motion_stroke"):
+        return ctx.failed(
+            f"{rad:.2f} rad",
+            ctx.named(
+                f"moved by {rad:.2f} rad more than {ctx.tolerance('timeout_s'):g} s after the "
+                "last command",
+                joint,
+            ),
+            ctx.at(ctx.states.topic, late, end),
+            motion_rad=rad,
+        )
+    if before.min() < ctx.requirement.tolerance("min_travel_stroke"):
+        return ctx.skipped(
+            "not every joint that was set in motion still moved when the commands stopped: "
+            "braking cannot be told from standing"
+        )
+    return ctx.passed("stops", f"moving, then still ({rad:.3f} rad)", motion_rad=rad)
+
+
+@check("DEX3-WDOG-01")
+def nothing_left_moving(ctx: Context) -> Outcome:
+    """Joints that were driven by a velocity, without protection."""
+    if ctx.object_at is not None:
+        return ctx.skipped("this hand held an object when the commands stopped")
+    return _stops(ctx, DRIVEN)
+
+
+@check("DEX3-GUARD-01")
+def brakes(ctx: Context) -> Outcome:
+    """Joints on their way, by velocity or to a position, with protection."""
+    return _stops(ctx, (*DRIVEN, *SLOW))
+
+
+@check("DEX3-GUARD-02")
+def tells(ctx: Context) -> Outcome:
+    """Bit 7 of the state's mode byte before and after the time-out."""
+    last, late, end = _silence(ctx)
+    before = _modes(ctx, ctx.states.between(last - 0.2, last + 0.5)) >> 7
+    after = _modes(ctx, ctx.states.between(late, end)) >> 7
+    if not len(before) or not len(after):
+        return ctx.skipped("no state in the silence")
+    if before.any():
+        return ctx.failed(
+            "too early", "bit 7 is set while commands come", ctx.at(ctx.states.topic, last)
+        )
+    if not after.all():
+        joint = int(np.argmin(after.all(axis=0)))
+        return ctx.failed(
+            "not set",
+            ctx.named("bit 7 is not set after the time-out", joint),
+            ctx.at(ctx.states.topic, late, end),
+        )
+    return ctx.passed("set", "bit 7 is set in every motor after the time-out, and not before")
+
+
+@check("DEX3-GUARD-03")
+def latches(ctx: Context) -> Outcome:
+    """Motion by commands that do not clear the protection."""
+    return not_pulled(ctx, "while the time-out protection was tripped and not cleared")
+
+
+@check("DEX3-GUARD-04")
+def clears(ctx: Context) -> Outcome:
+    """The step after the protection was cleared."""
+    return arrival(ctx, "commanded without bit 7 after the protection had tripped")
+
+
+@check("DEX3-HOLD-01")
+def holds(ctx: Context) -> Outcome:
+    """Without protection a position stays in force: a grip presses on, a slow way is finished."""
+    last, late, end = _silence(ctx)
+    if ctx.object_at is not None:
+        before = np.abs(ctx.states.tau[ctx.states.between(last - 0.2, last)])
+        after = np.abs(ctx.states.tau[ctx.states.between(late, end)])
+        if not len(before) or not len(after):
+            return ctx.skipped("no state in the silence")
+        pressed, still = float(np.median(before, 0).max()), float(np.median(after, 0).max())
+        if pressed < ctx.tolerance("min_tau_nm"):
+            return ctx.skipped("the hand did not press on its object when the commands stopped")
+        text = f"pressed with {pressed:.2f} N m, and with {still:.2f} N m after the time-out"
+        if still >= ctx.tolerance("min_tau_part") * pressed:
+            return ctx.passed("grips on", text, tau_nm=still)
+        return ctx.failed("lets go", text, ctx.at(ctx.states.topic, late, end), tau_nm=still)
+    goals = [p for p in ctx.phases("drive") if p.targets.get(ctx.side)]
+    if not goals:
+        return ctx.skipped("no joint was on its way when the commands stopped")
+    target = goals[-1].targets[ctx.side]
+    rows = ctx.states.between(late, late + 0.05)
+    if not len(ctx.states.q[rows]):
+        return ctx.skipped("no state in the silence")
+    here = np.median(ctx.states.q[rows], axis=0)
+    moved = _moved(ctx, SLOW, late, end)
+    least = ctx.requirement.tolerance("min_travel_stroke")
+    for i, joint in enumerate(SLOW):
+        left = abs(target[joint] - float(here[joint])) / ctx.joints[joint].stroke
+        if left < 2 * least:
+            return ctx.skipped("the hand had arrived before the time-out")
+        if not moved[i] >= least:
+            return ctx.failed(
+                "stops",
+                ctx.named("stopped on its way after the time-out", joint),
+                ctx.at(ctx.states.topic, late, end),
+            )
+    return ctx.passed("goes on", "went on to its position after the time-out")
+
+
+# ------------------------------------------------------------------------------------- safety
+
+
+@check("DEX3-SAFE-04")
+def short(ctx: Context) -> Outcome:
+    """A command with a motor too few."""
+    return stays(ctx, "commands for six motors")
+
+
+@check("DEX3-SAFE-05")
+def long(ctx: Context) -> Outcome:
+    """A command with motors too many."""
+    return stays(ctx, "commands for more motors than there are")

@@ -1,0 +1,318 @@
+"""The stimulus for the hand of seven joints, the Dex3-1.
+
+Both hands do the same at once, except where their independence is the subject. Poses are told by
+how far the flexing joints are closed, in percent, as the object is.
+
+============== =====================================================================================
+listen         no commands; state must flow
+approach       slowly to nearly open
+joint          one joint after the other closes and opens again
+step           one hand closes and opens again, the other holds
+nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
+range, empty,  limits, no motors, one too few, one and more too many, and two mode bytes with each
+short, long,   other's id
+wrong-id
+stiff, soft    the same step with the client's gains and with a fifth of its stiffness
+limp           zero gains, with a q far towards closed
+lock           the same with the client's gains and status 0 in the mode byte
+replay         a recorded session, as recorded
+late-joiner    a new subscriber appears
+guard-drive    with time-out protection (bit 7 of the mode byte) some joints are driven by a
+               velocity and others move slowly to a position, when ...
+guard          ... the commands stop
+guard-latch    commands to elsewhere that still have bit 7 set
+guard-clear    the same without it
+squeeze        close on the object, if there is one
+drive          without protection: as guard-drive
+silence        the commands stop for longer than the time-out
+resume         a step after the silence
+restart        the client goes away, another comes, and makes a step
+============== =====================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from dexkit.conformance.stimuli.script import Plan, Pose, Script, Steps
+from dexkit.conformance.wire import Motor, Motors, mode_byte
+from dexkit.hand import JointMode, Side
+
+__all__ = ["DRIVEN", "SLOW", "WRONG_IDS", "Dex3Script"]
+
+OPEN, CLOSED = 15.0, 50.0
+"""Percent of closing between which the hand moves freely."""
+BEYOND = 25.0
+"""Percent of closing by which an object is squeezed."""
+SOFTER = 0.2
+"""Stiffness of a soft step as a part of the client's."""
+WRONG_IDS = (4, 6)
+"""The joints that get each other's id; the first is told to move. Their limits are equal, so that
+a hand that goes by the id can move the other one."""
+DRIVEN, SLOW = (3, 4), (5, 6)
+"""When commands stop: joints driven by a velocity, and those on a slow way to a position."""
+_SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of the former
+# of the latter, N m/rad and N m s/rad: still under way two seconds later
+_SLOW_GAINS = (0.2, 0.4)
+_BAD = {
+    "nan": "broken commands (NaN and infinity): nothing may move",
+    "out-of-range": "commands far out of range: no harm may be done",
+    "empty": "empty commands: nothing may move",
+    "short": "commands for six motors: nothing may move",
+    "long": "commands for more motors than there are: nothing may move",
+    "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
+}
+
+
+class Dex3Script(Script):
+    """The script of a Dex3-1."""
+
+    motion = "joint"
+    _settling = 0.2
+
+    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(plan, say)
+        self._kp, self._kd = self._model.client_gains
+
+    def _provoke(self) -> Steps:
+        sides, phases = self.plan.sides, self.plan.phases
+        if "joint" in phases:
+            yield from self._one_by_one()
+        if "step" in phases:
+            for side in sides:
+                yield from self._alone(side)
+        for name in _BAD:
+            if name in phases:
+                yield from self._bad(name)
+        if phases & {"stiff", "soft"}:
+            yield from self._stiff_and_soft()
+        for name in ("limp", "lock"):
+            if name in phases:
+                yield from self._unpulled(name)
+        if "replay" in phases and self.plan.session is not None:
+            yield from self._replay(self.plan.session)
+            yield from self._everyone("center", {s: self._home(s) for s in sides})
+        if "late-joiner" in phases:
+            yield from self._late_joiner()
+        if phases & {"guard", "guard-latch", "guard-clear"}:
+            yield from self._guard()
+        if phases & {"squeeze", "silence", "resume"}:
+            yield from self._squeeze_and_silence()
+
+    # -- places -----------------------------------------------------------------------------
+
+    def _pose(self, side: Side, percent: float) -> Pose:
+        """Every joint so far closed; the thumb's sideways joint swings along."""
+        return tuple(
+            percent / 100 * (j.q_max if j.closing > 0 else j.q_min)
+            if j.closing
+            else (percent - 30) / 70 * j.q_max
+            for j in self._joints[side]
+        )
+
+    def _home(self, side: Side) -> Pose:
+        return self._pose(side, OPEN)
+
+    def _other_place(self) -> dict[Side, Pose]:
+        """Nearly open or half closed, whichever is farther from here."""
+        places = {}
+        for side in self.plan.sides:
+            here = self._obs.q.get(side, self._home(side))
+            places[side] = max(
+                (self._pose(side, percent) for percent in (OPEN, CLOSED - 5.0)),
+                key=lambda pose: sum(abs(a - b) for a, b in zip(pose, here, strict=True)),
+            )
+        return places
+
+    def _reachable(self, side: Side) -> bool:
+        return side not in self.plan.objects
+
+    def _motors(self, side: Side, pose: Pose) -> Motors:
+        return [Motor(q=q, kp=self._kp, kd=self._kd, mode=mode_byte(i)) for i, q in enumerate(pose)]
+
+    def _all(self, percent: float, **change: float) -> dict[Side, Motors]:
+        """Every hand so far closed, with something else in every motor."""
+        return {
+            s: [replace(m, **change) for m in self._motors(s, self._pose(s, percent))]  # type: ignore[arg-type]
+            for s in self.plan.sides
+        }
+
+    # -- phases -----------------------------------------------------------------------------
+
+    def _to(self, name: str, percent: float) -> Steps:
+        poses = {s: self._pose(s, percent) for s in self.plan.sides}
+        yield from self._everyone(name, poses, most=1.5)
+
+    def _one_by_one(self) -> Steps:
+        self._say("one joint after the other: no other joint may move")
+        sides = self.plan.sides
+        for joint in range(self._wire.joints):
+            for percent in (CLOSED, OPEN):
+                targets = {s: {joint: self._pose(s, percent)[joint]} for s in sides}
+                for s, moved in targets.items():
+                    self._goal[s] = tuple(moved.get(i, q) for i, q in enumerate(self._goal[s]))
+                phase = self._begin("joint", sides, targets=targets)
+                yield from self._until_settled(phase, sides, least=0.6, most=1.5)
+
+    def _alone(self, side: Side) -> Steps:
+        self._say(f"the {side} hand alone; the other one must not move")
+        for percent in (CLOSED - 5.0, OPEN):
+            self._goal[side] = self._pose(side, percent)
+            phase = self._begin("step", (side,), targets={side: dict(enumerate(self._goal[side]))})
+            yield from self._until_settled(phase, (side,), least=0.6, most=1.5)
+
+    def _bad(self, name: str) -> Steps:
+        self._say(_BAD[name])
+        yield from self._hold(0.1)
+        good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
+        bursts: list[dict[Side, Motors]]
+        if name == "nan":
+            bursts = [self._broken(field, value) for field, value in _NOT_FINITE]
+        elif name == "out-of-range":
+            bursts = [self._all(OPEN, q=q) for q in (1000.0, -1000.0)]
+        elif name == "empty":
+            bursts = [{s: [] for s in good}]
+        elif name == "short":
+            bursts = [{s: motors[:-1] for s, motors in good.items()}]
+        elif name == "long":
+            far = Motor(q=1.0, kp=self._kp, kd=self._kd, mode=mode_byte(0))
+            bursts = [
+                {s: [*motors, *[far] * more] for s, motors in good.items()} for more in (1, 13)
+            ]
+        else:
+            bursts = [{s: self._crossed(s, motors) for s, motors in good.items()}]
+        payloads = [self._wire.encode(hands) for hands in bursts]
+        if name == "out-of-range":
+            yield from self._burst(name, payloads, 0.8, each=0.4)
+        else:
+            yield from self._burst(name, payloads, 0.4)
+        places = self._other_place()
+        yield from self._everyone("recover", places, most=1.5, after=name)
+
+    def _broken(self, field: str, value: float) -> dict[Side, Motors]:
+        """One bad field in one joint; all of them are told to go far, to show if one is taken."""
+        far = self._other_place()
+        hands: dict[Side, Motors] = {}
+        for s, pose in far.items():
+            motors = list(self._motors(s, pose))
+            bad = replace(motors[-1], **{field: value})  # type: ignore[arg-type]
+            hands[s] = [*motors[:-1], bad]
+        return hands
+
+    def _crossed(self, side: Side, motors: Motors) -> Motors:
+        """Two motors with each other's id, the first of them told to go elsewhere."""
+        first, other = WRONG_IDS
+        target = self._other_place()[side][first]
+        crossed = list(motors)
+        crossed[first] = replace(motors[first], q=target, mode=mode_byte(other))
+        crossed[other] = replace(motors[other], mode=mode_byte(first))
+        return crossed
+
+    def _stiff_and_soft(self) -> Steps:
+        self._say("a stiff step and a soft one: the gains must make a difference")
+        yield from self._to("center", OPEN)
+        for name, percent, part in (("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, SOFTER)):
+            poses = {s: self._pose(s, percent) for s in self.plan.sides}
+            targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+            phase = self._begin(name, self.plan.sides, targets=targets)
+            yield from self._hold(0.6, self._all(percent, kp=part * self._kp))
+            self._end(phase)
+            self._goal.update(poses)
+        yield from self._to("center", OPEN)
+
+    def _unpulled(self, name: str) -> Steps:
+        self._say(
+            "commands without force (zero gains): the hand must not be pulled"
+            if name == "limp"
+            else "locked motors (status 0): they must not follow their q"
+        )
+        sides = self.plan.sides
+        yield from self._hold(0.1)
+        targets = {s: dict(enumerate(self._pose(s, CLOSED))) for s in sides}
+        phase = self._begin(name, sides, targets=targets)
+        if name == "limp":
+            motors = self._all(CLOSED, kp=0.0, kd=0.0)
+        else:
+            motors = {
+                s: [replace(m, mode=mode_byte(i, JointMode.BRAKE)) for i, m in enumerate(every)]
+                for s, every in self._all(CLOSED).items()
+            }
+        yield from self._hold(0.5, motors)
+        self._end(phase)
+        yield from self._to("center", OPEN)
+
+    def _drive(
+        self, name: str, sides: Sequence[Side], others: Mapping[Side, Motors], *, guard: bool
+    ) -> Steps:
+        """Some joints by velocity, others slowly to a position: both are under way for long."""
+        hands = dict(others)
+        targets: dict[Side, dict[int, float]] = {}
+        for s in sides:
+            motors = [
+                replace(m, mode=mode_byte(i, timeout=guard))
+                for i, m in enumerate(self._motors(s, self._goal[s]))
+            ]
+            far = self._pose(s, CLOSED)
+            for i in DRIVEN:
+                speed = math.copysign(_SPEED, self._joints[s][i].closing)
+                motors[i] = replace(motors[i], dq=speed, kp=0.0, kd=_DAMPING)
+            for i in SLOW:
+                motors[i] = replace(motors[i], q=far[i], kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
+            hands[s] = motors
+            targets[s] = {i: far[i] for i in SLOW}
+        phase = self._begin(name, sides, targets=targets)
+        yield from self._hold(0.3, hands)
+        self._end(phase)
+
+    def _guard(self) -> Steps:
+        sides = self.plan.sides
+        timeout = self._model.command_timeout
+        self._say("moving with time-out protection, and then ...")
+        yield from self._drive("guard-drive", sides, {}, guard=True)
+        self._say("... silence: after a second the motors must brake, and say so")
+        yield from self._silence("guard", timeout + 0.7)
+        self._say("they stay braked until the protection is cleared")
+        poses = {s: self._pose(s, CLOSED - 5.0) for s in sides}
+        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        phase = self._begin("guard-latch", sides, targets=targets)
+        guarded = {
+            s: [replace(m, mode=mode_byte(i, timeout=True)) for i, m in enumerate(motors)]
+            for s, motors in self._all(CLOSED - 5.0).items()
+        }
+        yield from self._hold(0.4, guarded)
+        self._end(phase)
+        yield from self._everyone("guard-clear", poses, most=1.5)
+        yield from self._to("center", OPEN)
+
+    def _squeeze_and_silence(self) -> Steps:
+        sides = self.plan.sides
+        pressing = [s for s in sides if s in self.plan.objects]
+        free = [s for s in sides if s not in pressing]
+        squeeze = {
+            s: self._motors(s, self._pose(s, self.plan.objects[s] + BEYOND)) for s in pressing
+        }
+        if pressing:
+            self._say("squeezing the object")
+            targets = {s: {i: m.q for i, m in enumerate(squeeze[s]) if i} for s in pressing}
+            phase = self._begin("squeeze", pressing, targets=targets)
+            yield from self._hold(1.0, squeeze)
+            self._end(phase)
+        if self.plan.phases & {"silence", "resume"}:
+            self._say("slow motion without protection, and then ...")
+            yield from self._drive("drive", free, squeeze, guard=False)
+            self._say("... silence: nothing may be left driven by a velocity, a grip is kept")
+            yield from self._silence("silence", self._model.command_timeout + 0.7)
+        yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
+
+
+_NOT_FINITE = [
+    ("q", math.nan),
+    ("q", math.inf),
+    ("q", -math.inf),
+    ("dq", -math.inf),
+    ("tau", math.nan),
+    ("kp", math.nan),
+    ("kd", math.inf),
+]

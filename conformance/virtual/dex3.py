@@ -1,0 +1,270 @@
+"""A Dex3-1 that does everything right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.stimuli.script import Pose
+from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.wire import Motor
+from dexkit.hand import Floats, JointMode, Side
+from dexkit.messages import message_type
+from dexkit.models import DEX3_1, Dialect
+
+__all__ = ["Dex3Hand", "Dex3Service"]
+
+Flags: TypeAlias = NDArray[np.bool_]
+Ints: TypeAlias = NDArray[np.intp]
+NO_VALUE = 30000.0  # seed 002
+# the joint that presses each sensor packet, in the order of the model's sensors
+_PRESSED_BY = {"thumb": (2, 1), "middle": (4, 3), "index": (6, 5)}
+
+# one motor and one sensor packet of a HandState_ on the wire (facts/unitree-dex A.2, A.4)
+_MOTOR = np.dtype(
+    {
+        "names": ["mode", "q", "dq", "tau_est"],
+        "formats": ["u1", "<f4", "<f4", "<f4"],
+        "offsets": [0, 4, 8, 16],
+        "itemsize": 56,
+    }
+)
+_PACKET = np.dtype(
+    {"names": ["pressure"], "formats": [("<f4", 12)], "offsets": [0], "itemsize": 104}
+)
+
+
+class Dex3Hand:
+    """Seven joints that obey tau = kp (q - q_now) + kd (dq - dq_now) + tau, and RIS_Mode.
+
+    Each is one inertia with friction between two stops, and an object if there is one.
+
+    :param touch: percent of closing at which the flexing joints touch an object, or None.
+    """
+
+    inertia = 0.001  # kg m²
+    viscous = 0.002  # N m s/rad
+    coulomb = 0.002  # N m
+    brake = 0.2  # N m s/rad of shorted windings
+    stiffness = 60.0  # N m/rad of stops and object
+    timeout = DEX3_1.command_timeout
+
+    def __init__(self, side: Side, touch: float | None = None) -> None:
+        self.side = side
+        specs = DEX3_1.joints[side]
+        self.low: Floats = np.array([j.q_min for j in specs])
+        self.high: Floats = np.array([j.q_max for j in specs])
+        self.most: Floats = np.array([j.tau_max for j in specs])
+        # an object is a stop that is met earlier; beyond the limits there is a little room
+        self.floor, self.ceiling = self.low - 0.03, self.high + 0.03
+        if touch is not None:
+            for i, j in enumerate(specs):
+                if j.closing > 0:
+                    self.ceiling[i] = touch / 100 * j.q_max
+                elif j.closing < 0:
+                    self.floor[i] = touch / 100 * j.q_min
+        self.touches = touch is not None
+        n = len(specs)
+        self.index = np.arange(n)
+        self.q: Floats = np.array(DEX3_1.rest_q[side])
+        self.dq: Floats = np.zeros(n)
+        self.tau: Floats = np.zeros(n)
+        self.contact: Floats = np.zeros(n)
+        self.goal, self.speed, self.push, self.kp, self.kd = np.zeros((5, n))
+        self.status: Ints = np.zeros(n, dtype=np.intp)
+        self.guarded: Flags = np.zeros(n, dtype=np.bool_)
+        self.tripped: Flags = np.zeros(n, dtype=np.bool_)
+        self.now = 0.0
+        self.heard = math.inf
+        self.changed()
+
+    def command(self, motors: tuple[Motor, ...]) -> None:
+        """A command came; one field that is not finite rejects all of it."""
+        rows: Floats = np.array([(m.q, m.dq, m.tau, m.kp, m.kd) for m in motors]).T
+        if not np.isfinite(rows).all():
+            return
+        self.take(rows, np.array([m.mode for m in motors]))
+        self.heard = self.now
+        self.changed()
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        """Obey from here on: q within the limits, status and time-out bit from the mode byte."""
+        self.goal = np.minimum(np.maximum(rows[0], self.low), self.high)
+        self.speed, self.push, self.kp, self.kd = rows[1:]
+        self.status = (mode >> 4) & 7
+        self.guarded = mode >= 0x80
+        self.tripped = self.tripped & self.guarded
+
+    def expire(self) -> None:
+        """No command for longer than the time-out: nothing is left driven but a held position."""
+        self.tripped = self.tripped | self.guarded
+        self.speed = np.zeros_like(self.speed)
+        self.push = np.zeros_like(self.push)
+
+    def changed(self) -> None:
+        """Work out what follows from the command in force."""
+        self.driven: Flags = (self.status == JointMode.FOC) & ~self.tripped
+        self.mode: Ints = self.index | self.driven << 4 | self.tripped << 7
+        self.law_kp: Floats = np.where(self.driven, self.kp, 0.0)
+        self.law_kd: Floats = np.where(self.driven, self.kd, self.brake)
+        self.law_tau: Floats = np.where(self.driven, self.kd * self.speed + self.push, 0.0)
+        self.rests = False
+
+    def step(self, dt: float) -> None:
+        """Let time pass."""
+        self.now += dt
+        if self.now - self.heard > self.timeout:
+            self.heard = math.inf
+            self.expire()
+            self.changed()
+        if self.rests:
+            return  # nothing has changed since a step that changed nothing
+        before = self.dq
+        self.move(dt, self.law_kp * (self.goal - self.q) + self.law_tau)
+        self.rests = not before.any() and not self.dq.any()
+
+    def move(self, dt: float, pull: Floats) -> None:
+        """Let a torque work, and the law's damping.
+
+        Implicit in damping and stiffness, so that a stiff law is stable at this step.
+        """
+        inside = np.minimum(np.maximum(self.q, self.floor), self.ceiling)
+        self.contact = self.stiffness * (inside - self.q)
+        part = dt / self.inertia
+        damping = self.law_kd + dt * self.law_kp
+        dq = self.dq + part * (pull + self.contact)
+        dq /= 1.0 + part * (damping + self.viscous)
+        tau = pull - damping * dq
+        over = np.abs(tau) > self.most
+        if over.any():
+            tau = np.minimum(np.maximum(tau, -self.most), self.most)
+            limited = (self.dq + part * (tau + self.contact)) / (1.0 + part * self.viscous)
+            dq = np.where(over, limited, dq)
+        slip = part * self.coulomb
+        self.dq = dq - np.minimum(np.maximum(dq, -slip), slip)
+        self.tau = np.where(self.driven, tau, 0.0)
+        self.q = self.q + dt * self.dq
+
+    def pressures(self) -> Floats:
+        """Shape (9, 12): what the sensor packets hold."""
+        if not self.touches:
+            return _UNTOUCHED
+        felt = np.array(_UNTOUCHED)
+        pressed = np.abs(self.contact) * 1e4
+        for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
+            finger, _, part = sensor.place.partition(" ")
+            joints = _PRESSED_BY.get(finger)
+            value = 0.0 if joints is None else float(pressed[joints[part == "pad"]])
+            row[list(sensor.slots)] = value
+        return felt
+
+
+def _untouched() -> Floats:
+    felt = np.full((len(DEX3_1.sensors), 12), NO_VALUE)
+    for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
+        row[list(sensor.slots)] = 0.0
+    return felt
+
+
+_UNTOUCHED = _untouched()
+
+
+class Dex3Service(Service):
+    """Dex3-1 hands on their topics, at half of the real one's rate."""
+
+    tick = 0.002
+    period = 0.002
+    low_period = 1.0 / DEX3_1.low_rate
+    sensors = len(DEX3_1.sensors)
+    hand: type[Dex3Hand] = Dex3Hand
+
+    def __init__(
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+    ) -> None:
+        super().__init__(dialect, sides, touch)
+        self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
+        self._blank: dict[int, tuple[bytearray, Any, Any]] = {}
+        self._low_due = 0.0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        """One side's part of a command message."""
+        self.hands[side].command(motors)
+
+    def positions(self, side: Side) -> Pose:
+        """Where a hand is."""
+        return tuple(self.hands[side].q.tolist())
+
+    def live(self, dt: float) -> None:
+        """Let time pass for the hands."""
+        for hand in self.hands.values():
+            hand.step(dt)
+
+    def publish(self) -> list[Sample]:
+        """One state of everybody, now and then on the low-rate topic as well."""
+        samples = super().publish()
+        if self.now + 1e-9 < self._low_due:
+            return samples
+        self._low_due = self.now + self.low_period
+        return samples + self.low_rate(samples)
+
+    def low_rate(self, samples: list[Sample]) -> list[Sample]:
+        """Copies of the states on the low-rate topics."""
+        topics = {
+            self.wire.state_topics[s]: self.dialect.low_rate_topic.format(side=s)
+            for s in self.sides
+        }
+        return [
+            Sample(topics[x.topic], x.type_name, x.payload, x.sent)
+            for x in samples
+            if x.topic in topics
+        ]
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        """The state of a hand on the wire."""
+        (side,) = sides
+        hand = self.hands[side]
+        count = self.dialect.length if length is None else length
+        data, motors, packets = self._message(count)
+        n = min(count, len(hand.q))
+        if n:
+            self.fill(motors[:n], hand)
+        if len(packets):
+            packets["pressure"] = self.pressures(hand)[: len(packets)]
+        return bytes(data)
+
+    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+        """What the motors say of themselves."""
+        n = len(motors)
+        motors["mode"] = hand.mode[:n]
+        motors["q"] = hand.q[:n]
+        motors["dq"] = hand.dq[:n]
+        motors["tau_est"] = hand.tau[:n]
+
+    def pressures(self, hand: Dex3Hand) -> Floats:
+        """What its sensor packets hold."""
+        return hand.pressures()
+
+    def quaternion(self) -> list[float]:
+        """The hand's attitude: upright."""
+        return [1.0, 0.0, 0.0, 0.0]
+
+    def _message(self, count: int) -> tuple[bytearray, Any, Any]:
+        """A message of so many motors, and views of the motors and packets in it; made once."""
+        if count not in self._blank:
+            motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
+            packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
+            message = self.wire.state.cls()
+            message.motor_state = [motor() for _ in range(count)]
+            message.press_sensor_state = [packet() for _ in range(self.sensors)]
+            message.imu_state.quaternion = self.quaternion()
+            data = bytearray(self.wire.state.encode(message))
+            at = 8  # header and length
+            motors = np.frombuffer(data, _MOTOR, count, at)
+            at += count * _MOTOR.itemsize + 4
+            packets = np.frombuffer(data, _PACKET, self.sensors, at)
+            self._blank[count] = (data, motors, packets)
+        return self._blank[count]
