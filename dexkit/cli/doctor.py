@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import click
@@ -16,6 +17,7 @@ from dexkit.models import DIALECTS, MODELS, Dialect
 
 if TYPE_CHECKING:
     from dexkit.doctor import Finding, Observations, Readiness, Verdict
+    from dexkit.doctor.observations import Environment
 
 __all__ = ["command"]
 
@@ -99,12 +101,14 @@ def command(
 
     Exit codes: 0 healthy, 1 problems found, 2 it could not look, 130 interrupted.
     """
-    from dexkit.doctor.rules import Wish, diagnose, readiness, verdict
+    from dexkit.doctor import Wish, diagnose, readiness, verdict
+    from dexkit.doctor.environment import environment
 
     if domain is None and not scan:
         raise UsageError("no domain to look at", hint="give --domain or --scan")
     wish = Wish(domain, _dialects(model, dialect), bool(devices) and domain is None)
-    with stop_on_signals() as stop:
+    with stop_on_signals() as stop, ThreadPoolExecutor(1) as beside:
+        env = beside.submit(environment)  # it starts processes, which takes a second
         first = True
         before = ""
         while True:
@@ -113,6 +117,7 @@ def command(
                 tuple(dict.fromkeys(("lo", *interfaces))),
                 devices,
                 seconds,
+                env.result,
                 stop,
                 _progress(quiet=as_json or not first),
             )
@@ -156,23 +161,19 @@ def _look(
     interfaces: tuple[str, ...],
     devices: tuple[str, ...],
     seconds: float,
+    env: Callable[[], Environment],
     stop: StopRequest,
     progress: Callable[[str], object],
 ) -> Observations:
     from dexkit.cli import doctor_devices
-    from dexkit.doctor import dds, network, usb
-    from dexkit.doctor.environment import environment
-    from dexkit.doctor.observations import Observations
+    from dexkit.doctor import Observations, dds, network, usb
 
     known = network.interfaces()
-    progress("looking at this Python")
-    env = environment()
     ports = [] if devices else doctor_devices.ports()
     hands = list(usb.devices())
-    usb_wanted = False
     for device in devices:
         if device == "usb":
-            usb_wanted = True
+            pass  # looked at in any case; that none is there is a finding if it was asked for
         elif device.startswith("usbip:"):
             hands += doctor_devices.on_server(device)
         else:
@@ -185,10 +186,10 @@ def _look(
         seconds=seconds,
         interfaces=known,
         sockets=network.dds_sockets(domains),
-        environment=env,
+        environment=env(),
         serial=tuple(ports),
         usb=tuple(hands),
-        usb_wanted=usb_wanted,
+        usb_wanted="usb" in devices,
     )
 
 

@@ -1,0 +1,373 @@
+"""Each thing that can be wrong on DDS, made with real participants and looked at.
+
+One look sees all situations, each on a domain of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+from click.testing import CliRunner
+
+from dexkit.cli import cli
+from dexkit.dds import DdsNode, Qos, Writer, type_hash
+from dexkit.doctor import Finding, Observations, Wish, diagnose, readiness
+from dexkit.doctor import dds as doctor_dds
+from dexkit.doctor.rtps import parse_message, unicast_port
+from dexkit.messages import unitree_go as go
+from dexkit.messages import unitree_hg as hg
+from dexkit.models import DIALECTS
+from tests import doctor_packets as packets
+from tests.dds_helpers import free_domain
+
+CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
+HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
+
+
+class _World:
+    """Participants by situation, and a thread that publishes for all of them."""
+
+    def __init__(self, stack: contextlib.ExitStack) -> None:
+        self.stack = stack
+        self.domains: dict[str, int] = {}
+        self._publishing: list[tuple[Writer, list[bytes]]] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._publish, daemon=True)
+
+    def node(self, situation: str) -> DdsNode:
+        domain = self.domains.setdefault(situation, free_domain())
+        return self.stack.enter_context(DdsNode(domain, "lo"))
+
+    def write(self, node: DdsNode, topic: str, type_name: str, *messages: object) -> None:
+        writer = node.writer(topic, type_name)
+        self._publishing.append((writer, [writer.type.encode(m) for m in messages]))
+
+    def start(self) -> None:
+        self._thread.start()
+        self.stack.callback(self._end)  # before the nodes close
+
+    def _publish(self) -> None:
+        turn = 0
+        while not self._stop.wait(0.01):
+            turn += 1
+            for writer, messages in self._publishing:
+                if messages:
+                    writer.write_raw(messages[turn % len(messages)])
+
+    def _end(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def _states(q: float = 2.5) -> go.MotorStates_:
+    return go.MotorStates_([go.MotorState_(q=q)])
+
+
+def _hand(q: float) -> hg.HandState_:
+    return hg.HandState_([hg.MotorState_(q=q) for _ in range(7)])
+
+
+def _gripper(world: _World, node: DdsNode, *sides: str, **more: float) -> None:
+    for side in sides or ("left", "right"):
+        world.write(node, f"rt/dex1/{side}/state", STATES, _states(**more))
+        node.reader(f"rt/dex1/{side}/cmd", CMDS)
+
+
+def _client(node: DdsNode, *sides: str) -> None:
+    for side in sides or ("left", "right"):
+        node.reader(f"rt/dex1/{side}/state", STATES)
+        node.writer(f"rt/dex1/{side}/cmd", CMDS)
+
+
+def _dex3(world: _World, node: DdsNode, q: float) -> None:
+    for side in ("left", "right"):
+        world.write(node, f"rt/dex3/{side}/state", HAND_STATE, _hand(q))
+        node.reader(f"rt/dex3/{side}/cmd", HAND_CMD)
+
+
+def _build(world: _World) -> None:
+    node = world.node("good")
+    _gripper(world, node)
+    _client(world.node("good"))
+
+    _client(world.node("nobody"))
+
+    _gripper(world, world.node("one side"), "left")
+    _client(world.node("one side"))
+
+    node = world.node("other stack")
+    world.write(node, "rt/unitree_actuator/state", STATES, go.MotorStates_([go.MotorState_()] * 2))
+    node.reader("rt/unitree_actuator/cmd", CMDS)
+    _client(world.node("other stack"))
+
+    node = world.node("name")
+    world.write(node, "dex1/left/state", STATES, _states())
+    world.write(node, "/dex1/right/state", STATES, _states())
+    _client(world.node("name"))
+
+    node = world.node("type")
+    world.write(node, "rt/dex1/left/state", HAND_STATE, hg.HandState_([hg.MotorState_(q=1.0)]))
+    _client(world.node("type"), "left")
+
+    node = world.node("qos")
+    node.writer("rt/dex1/left/state", STATES, qos=Qos("best_effort"))
+    world.node("qos").reader("rt/dex1/left/state", STATES, qos=Qos("reliable"))
+
+    node = world.node("silent")
+    for side in ("left", "right"):
+        node.writer(f"rt/dex1/{side}/state", STATES)
+    node.reader("rt/dex1/left/cmd", CMDS)
+
+    _dex3(world, world.node("zero"), 0.0)
+    _dex3(world, world.node("dex3"), 0.3)
+
+    node = world.node("frozen")
+    _gripper(world, node)
+    client = world.node("frozen")
+    for side in ("left", "right"):
+        commands = [go.MotorCmds_([go.MotorCmd_(q=q, kp=5.0)]) for q in (1.0, 2.0, 3.0)]
+        world.write(client, f"rt/dex1/{side}/cmd", CMDS, *commands)
+
+    for q in (1.0, 4.0):
+        _gripper(world, world.node("two publishers"), q=q)
+
+    world.write(world.node("unheard"), "rt/dex3/left/cmd", HAND_CMD, hg.HandCmd_())
+
+
+@dataclass(frozen=True)
+class _Looked:
+    domains: dict[str, int]
+    seen: Observations
+
+    def findings(self, situation: str, *dialects: str) -> dict[str, Finding]:
+        number = self.domains[situation]
+        views = [v for v in self.seen.domains if v.number == number]
+        wish = Wish(number, tuple(DIALECTS[name] for name in dialects))
+        return {f.id: f for f in diagnose(Observations(domains=tuple(views)), wish)}
+
+    def ready(self, situation: str) -> dict[str, str]:
+        views = [v for v in self.seen.domains if v.number == self.domains[situation]]
+        found = readiness(Observations(domains=tuple(views)))
+        return {r.dialect: r.missing for r in found}
+
+
+@pytest.fixture(scope="module")
+def looked() -> Iterator[_Looked]:
+    with contextlib.ExitStack() as stack:
+        world = _World(stack)
+        _build(world)
+        world.start()
+        views = doctor_dds.look(sorted(world.domains.values()), seconds=1.0)
+        yield _Looked(world.domains, Observations(domains=views))
+
+
+def test_a_good_pair_is_found_good(looked: _Looked) -> None:
+    # 100 states a second is what this test publishes: too slow, and nothing else
+    assert set(looked.findings("good")) == {"DDS-RATE"}
+    assert looked.ready("good") == {"unitree_go": ""}
+    assert set(looked.findings("dex3")) == {"DDS-RATE", "DDS-NO-CLIENT"}
+    assert looked.ready("dex3") == {"dex3": ""}
+
+
+def test_what_is_seen_is_what_dds_itself_says(looked: _Looked) -> None:
+    (view,) = [v for v in looked.seen.domains if v.number == looked.domains["good"]]
+    assert len(view.participants) == 2
+    assert {p.version[:5] for p in view.participants} == {"0.10."}
+    assert {p.addresses for p in view.participants} == {("127.0.0.1",)}
+    assert len(view.endpoints) == 8
+    assert {e.type_hash for e in view.endpoints} == {type_hash(CMDS), type_hash(STATES)}
+    qos = {(e.kind, e.qos.reliability) for e in view.endpoints}
+    assert qos == {("writer", "reliable"), ("reader", "best_effort")}
+    (left, right) = [s for s in view.streams if s.topic.endswith("state")]
+    assert left.q == right.q == (2.5,)
+    # 10 ms between states, a little more on a busy machine
+    assert 20 < left.rate < 105
+
+
+@pytest.mark.parametrize(
+    ("situation", "name", "says"),
+    [
+        ("nobody", "DDS-NOBODY", "no hand on any domain"),
+        ("one side", "DDS-ONE-SIDE", "not rt/dex1/right/state"),
+        ("other stack", "DDS-OTHER-STACK", "rt/unitree_actuator/state"),
+        ("name", "DDS-NAME", "rt/"),
+        ("type", "DDS-TYPE", "unitree_hg HandState_"),
+        ("qos", "DDS-QOS", "the reader asks for reliable and the writer is best-effort"),
+        ("silent", "DDS-SILENT", "no sample"),
+        ("silent", "DDS-HAND-DEAF", "rt/dex1/right/cmd"),
+        ("zero", "DDS-ALL-ZERO", "every q is 0.0"),
+        ("frozen", "DDS-FROZEN", "identical states while the commands moved by 2.00 rad"),
+        ("two publishers", "DDS-TWO-PUBLISHERS", " and by "),
+        ("unheard", "DDS-UNHEARD", "rt/dex3/left/cmd"),
+    ],
+)
+def test_what_is_wrong_is_named(looked: _Looked, situation: str, name: str, says: str) -> None:
+    found = looked.findings(situation)
+    assert name in found, sorted(found)
+    assert says in found[name].seen
+    assert found[name].fix
+    if situation not in ("two publishers", "frozen"):
+        assert all(looked.ready(situation).values())
+
+
+def test_what_explains_the_rest_keeps_the_rest_quiet(looked: _Looked) -> None:
+    for situation in ("other stack", "name", "type"):
+        assert "DDS-NOBODY" not in looked.findings(situation)
+
+
+def test_a_hand_on_another_domain(looked: _Looked) -> None:
+    hand, client = looked.domains["good"], looked.domains["nobody"]
+    views = tuple(v for v in looked.seen.domains if v.number in (hand, client))
+    seen = Observations(domains=views)
+    for wish in (Wish(), Wish(domain=client)):
+        (found,) = [f for f in diagnose(seen, wish) if f.id == "DDS-OTHER-DOMAIN"]
+        assert f"on domain {hand}" in found.seen
+        assert "DDS-NOBODY" not in {f.id for f in diagnose(seen, wish)}
+
+
+def test_the_dialect_that_was_asked_for_counts(looked: _Looked) -> None:
+    assert "DDS-TYPE" in looked.findings("good", "unitree_hg")
+    assert "DDS-OTHER-STACK" in looked.findings("good", "unitree_actuator")
+    assert "DDS-OTHER-STACK" in looked.findings("other stack", "unitree_go")
+    assert "DDS-ONE-SIDE" in looked.findings("one side", "unitree_go")
+
+
+def _play_cyclone_11(domain: int, ready: threading.Event, stop: threading.Event) -> None:
+    """Answer announcements with what a real participant of 11.0.1 answered."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", unicast_port(domain, 3)))
+        sock.settimeout(0.05)
+        ready.set()
+        while not stop.is_set():
+            try:
+                data, source = sock.recvfrom(65536)
+            except TimeoutError:
+                continue
+            asker, _ = parse_message(data)
+            owner = packets.CYCLONE_11_PUBLICATION[8:20]
+            for packet in (packets.CYCLONE_11_PARTICIPANT, packets.CYCLONE_11_PUBLICATION):
+                # the two were captured from two participants; here they are one
+                prefix = packet[8:20]
+                sock.sendto(
+                    packet[:24].replace(prefix, owner) + asker + packet[36:].replace(prefix, owner),
+                    source,
+                )
+
+
+def test_a_participant_of_cyclonedds_11() -> None:
+    domain = free_domain()
+    ready, stop = threading.Event(), threading.Event()
+    thread = threading.Thread(target=_play_cyclone_11, args=(domain, ready, stop))
+    thread.start()
+    try:
+        assert ready.wait(10)
+        views = doctor_dds.look([domain], seconds=0.2)
+    finally:
+        stop.set()
+        thread.join()
+    (found,) = [f for f in diagnose(Observations(domains=views)) if f.id == "DDS-CYCLONE-11"]
+    assert "CycloneDDS 11.0.1" in found.seen
+    assert str(found.severity) == "error"
+
+
+def test_a_look_leaves_nothing_behind() -> None:
+    domain = free_domain()
+    with DdsNode(domain, "lo") as node:
+        writer = node.writer("rt/dex1/left/state", STATES)
+        matched = threading.Event()
+
+        def watch() -> None:
+            if writer.wait_matched(5):
+                matched.set()
+
+        thread = threading.Thread(target=watch)
+        thread.start()
+        (view,) = doctor_dds.look([domain], seconds=0.3)
+        thread.join()
+        assert view.streams[0].samples == 0
+        assert matched.is_set()  # it was a reader while it looked
+        deadline = time.monotonic() + 5
+        while writer.matched and time.monotonic() < deadline:
+            time.sleep(0.005)
+        assert writer.matched == 0  # and said good-bye, long before its lease ends
+        assert all(e.own for e in node.endpoints())
+
+
+@pytest.fixture
+def service() -> Iterator[int]:
+    """The domain of a real ``dexkit serve`` in another process."""
+    domain = free_domain()
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "dexkit", "serve", "sim-dex1", "--side", "both"),
+            *("--domain", str(domain), "--quiet"),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        assert process.stdout.readline().startswith("ready: ")
+        yield domain
+        process.terminate()
+
+
+def test_the_command_line(service: int) -> None:
+    base = ["doctor", "--domain", str(service), "--scan", "none", "--seconds", "1"]
+    good = CliRunner().invoke(cli, base, standalone_mode=False)
+    assert good.return_value == 0, good.output
+    assert good.output.startswith("Healthy")
+    assert "a client gets past its wait" in good.output
+    bad = CliRunner().invoke(cli, [*base, "--model", "dex3", "--json"], standalone_mode=False)
+    assert bad.return_value == 1
+    data = json.loads(bad.stdout)
+    assert not data["healthy"]
+    assert "DDS-NOBODY" in {f["id"] for f in data["findings"]}
+    (domain,) = data["observations"]["domains"]
+    assert domain["number"] == service
+    assert "dexkit serve sim-dex1 --side both" in domain["participants"][0]["command"]
+
+
+def test_what_cannot_be_looked_at_is_no_verdict() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "dexkit", "doctor", "--scan", "5", "--interface", "nosuch0"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "there is no network interface 'nosuch0'" in done.stderr
+    assert "lo (127.0.0.1)" in done.stderr
+
+
+def test_watching_says_when_a_client_would_start() -> None:
+    domain = free_domain()
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "dexkit", "doctor", "--watch", "--domain", str(domain)),
+            *("--scan", "none", "--seconds", "0.3"),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        lines = iter(process.stdout.readline, "")
+        assert any("DDS-NOBODY" in line for line in lines)
+        with contextlib.ExitStack() as stack:
+            world = _World(stack)
+            world.domains["watch"] = domain
+            _gripper(world, world.node("watch"))
+            world.start()
+            assert any("a client would now start" in line for line in lines)
+        process.send_signal(2)
+        process.stdout.read()
+        assert process.wait(20) == 0
