@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.clock import RealClock
-from dexkit.conformance.phases import RECORD, Stall, Stimulus
+from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.stimuli import (
     Join,
@@ -41,12 +42,6 @@ __all__ = ["LiveOptions", "free_domain", "record_run"]
 TOOLS = "dexkit.tools"
 """Metadata record with the last lines that each process of the run printed."""
 DISCOVERY_TIMEOUT = 5.0
-_BEAT = 0.01  # seconds between heartbeats
-_LATE = 0.03  # seconds late that show that the machine is too busy
-_PRESSURE = (
-    0.9  # part of the time in which some task waits for a processor; a run alone on two: 0.7
-)
-_PSI = Path("/proc/pressure/cpu")
 
 
 @dataclass(frozen=True)
@@ -125,7 +120,7 @@ def record_run(
         _refuse_company(recorder_node, options)
         plan = options.plan()
         script = script_for(plan, say)
-        heart = stack.enter_context(_Heartbeat())
+        heart = stack.enter_context(Heartbeat())
         driver = stack.enter_context(_Driver(rig_options, plan))
         _meet(recorder_node, plan)
         finished = driver.go_through(script, stop, rig)
@@ -175,53 +170,6 @@ def _meet(node: DdsNode, plan: Plan) -> None:
         lambda endpoints: wanted <= {e.topic for e in endpoints if not e.own},
         timeout=DISCOVERY_TIMEOUT,
     )
-
-
-class _Heartbeat:
-    """Notes when the machine lacked processor time: then it is late, not the hand.
-
-    Shown by this thread being woken late, and by Linux' pressure stall information: the time for
-    which some task could have run but had no processor. Without the latter (no Linux, or a
-    kernel without it) only the former is known.
-    """
-
-    def __init__(self) -> None:
-        self.stalls: list[Stall] = []
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
-
-    def _beat(self) -> None:
-        clock = RealClock()
-        waited = _waited()
-        while not self._stop.is_set():
-            begin, due = time.time_ns(), clock.now() + _BEAT
-            clock.sleep_until(due)
-            late = clock.now() - due
-            before, waited = waited, _waited()
-            end = time.time_ns()
-            short = (waited - before) * 1e9 > _PRESSURE * (end - begin)
-            if late <= _LATE and not short:
-                continue
-            if self.stalls and begin - self.stalls[-1].end_ns < _BEAT * 1e9:
-                begin = self.stalls.pop().begin_ns
-            self.stalls.append(Stall(begin, end))
-
-    def __enter__(self) -> _Heartbeat:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-
-def _waited() -> float:
-    """Seconds, ever, for which some task waited for a processor; 0 where that is not told."""
-    try:
-        text = _PSI.read_text()
-        return float(text.partition("total=")[2].split()[0]) / 1e6
-    except (OSError, IndexError, ValueError):
-        return 0.0
 
 
 @dataclass

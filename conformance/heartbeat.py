@@ -1,0 +1,68 @@
+"""Whether the machine that the kit runs on had the processor time that a fair judgement needs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from dexkit.clock import RealClock
+from dexkit.conformance.phases import Stall
+
+__all__ = ["Heartbeat"]
+
+_BEAT = 0.01  # seconds between heartbeats
+_LATE = 0.03  # seconds late that show that the machine is too busy
+_PRESSURE = (
+    0.9  # part of the time in which some task waits for a processor; a run alone on two: 0.7
+)
+_PSI = Path("/proc/pressure/cpu")
+
+
+class Heartbeat:
+    """Notes when the machine lacked processor time: then it is late, not the hand.
+
+    Shown by this thread being woken late, and by Linux' pressure stall information: the time for
+    which some task could have run but had no processor. Without the latter (no Linux, or a
+    kernel without it) only the former is known.
+
+    :ivar stalls: when the machine lacked processor time.
+    """
+
+    def __init__(self) -> None:
+        self.stalls: list[Stall] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def _beat(self) -> None:
+        clock = RealClock()
+        waited = _waited()
+        while not self._stop.is_set():
+            begin, due = time.time_ns(), clock.now() + _BEAT
+            clock.sleep_until(due)
+            late = clock.now() - due
+            before, waited = waited, _waited()
+            end = time.time_ns()
+            short = (waited - before) * 1e9 > _PRESSURE * (end - begin)
+            if late <= _LATE and not short:
+                continue
+            if self.stalls and begin - self.stalls[-1].end_ns < _BEAT * 1e9:
+                begin = self.stalls.pop().begin_ns
+            self.stalls.append(Stall(begin, end))
+
+    def __enter__(self) -> Heartbeat:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def _waited() -> float:
+    """Seconds, ever, for which some task waited for a processor; 0 where that is not told."""
+    try:
+        text = _PSI.read_text()
+        return float(text.partition("total=")[2].split()[0]) / 1e6
+    except (OSError, IndexError, ValueError):
+        return 0.0
