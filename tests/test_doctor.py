@@ -6,14 +6,18 @@ One look sees all situations, each on a domain of its own.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -33,6 +37,10 @@ CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "Mot
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
 
 
+_FIRST_DOMAIN = 215
+"""Beyond those that free_domain() gives away: thirteen at random would meet somebody."""
+
+
 class _World:
     """Participants by situation, and a thread that publishes for all of them."""
 
@@ -44,7 +52,7 @@ class _World:
         self._thread = threading.Thread(target=self._publish, daemon=True)
 
     def node(self, situation: str) -> DdsNode:
-        domain = self.domains.setdefault(situation, free_domain())
+        domain = self.domains.setdefault(situation, _FIRST_DOMAIN + len(self.domains))
         return self.stack.enter_context(DdsNode(domain, "lo"))
 
     def write(self, node: DdsNode, topic: str, type_name: str, *messages: object) -> None:
@@ -161,13 +169,16 @@ class _Looked:
 
 
 @pytest.fixture(scope="module")
-def looked() -> Iterator[_Looked]:
+def looked() -> _Looked:
+    lock = Path(tempfile.gettempdir()) / f"dexkit-test-doctor-{os.getuid()}"
     with contextlib.ExitStack() as stack:
+        # other workers use the same domains
+        fcntl.flock(stack.enter_context(lock.open("w")), fcntl.LOCK_EX)
         world = _World(stack)
         _build(world)
         world.start()
         views = doctor_dds.look(sorted(world.domains.values()), seconds=1.0)
-        yield _Looked(world.domains, Observations(domains=views))
+    return _Looked(world.domains, Observations(domains=views))
 
 
 def test_a_good_pair_is_found_good(looked: _Looked) -> None:

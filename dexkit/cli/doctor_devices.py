@@ -1,7 +1,7 @@
 """What the doctor needs the drivers for: who answers on a serial port or a USB/IP server.
 
-Serial ports are looked at from outside: who may use them, who does. Only a port that the user names is
-opened and asked.
+Serial ports are looked at from outside: who may use them, who does. Only a port that the user
+names is opened and asked.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["look_at", "on_server", "ports"]
 _IDS = range(1, 4)
 """Servo ids that are asked one by one, at every baud rate, before a broadcast: that takes a
 second each. SAKE ships grippers with id 1, a pair gets 1 and 2."""
-_TIMEOUT = 0.02  # beyond the time of the bytes; an untuned adapter holds them back 16 ms
+_TIMEOUT = 0.05  # beyond the time of the bytes; an untuned adapter holds them back 16 ms
 
 
 def ports() -> list[SerialPort]:

@@ -431,3 +431,7 @@ def table() -> str:
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    print(table(), end="")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 from importlib import metadata
@@ -62,7 +63,8 @@ def _import_problem(module: str) -> str:
     if done.returncode < 0:
         return f"'{code}' dies of signal {-done.returncode}"
     lines = done.stderr.strip().splitlines()
-    return lines[-1] if lines else f"'{code}' fails"
+    # the path at the end says nothing more
+    return re.sub(r" \(/[^()]*\)$", "", lines[-1]) if lines else f"'{code}' fails"
 
 
 def uri_problem(uri: str) -> str:

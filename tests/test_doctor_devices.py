@@ -1,0 +1,223 @@
+"""Devices and surroundings that are wrong, as real as this machine allows."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dexkit.cli import doctor_devices
+from dexkit.clock import RealClock
+from dexkit.doctor import Observations, diagnose
+from dexkit.doctor import usb as doctor_usb
+from dexkit.doctor.environment import environment, uri_problem
+from dexkit.doctor.network import dds_sockets, interfaces
+from dexkit.doctor.observations import SerialPort, UsbDevice
+from dexkit.doctor.processes import command_line, holders, start_time
+from dexkit.doctor.rtps import unicast_port
+from dexkit.emulators.dex3_mcu.hands import emulated_dex3
+from dexkit.emulators.mx64 import Bus, Port, Servo
+from dexkit.emulators.mx64.protocol1 import Protocol1Servo
+from dexkit.errors import DdsSetupError, UsageError
+from dexkit.hand import Side
+from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
+
+
+def _ids(*ports: SerialPort) -> set[str]:
+    return {f.id for f in diagnose(Observations(serial=ports)) if f.id.startswith("SERIAL")}
+
+
+@contextlib.contextmanager
+def _line(
+    *baudrates: int, servo_id: int = 1, old: tuple[Protocol1Servo, ...] = ()
+) -> Iterator[str]:
+    """The path of a line with an emulated servo set to a baud rate."""
+    now = RealClock().now()
+    servos = [Servo(servo_id, baudrate=rate, now=now) for rate in baudrates]
+    with Port(Bus(servos, start=now, protocol_1=old)) as port:
+        port.start()
+        yield port.path
+
+
+def test_a_servo_that_is_well() -> None:
+    with _line(1_000_000) as path:
+        port = doctor_devices.look_at(path)
+    assert [(s.id, s.baudrate, s.protocol) for s in port.servos] == [(1, 1_000_000, 2)]
+    assert _ids(port) == set()
+
+
+def test_a_servo_at_another_baud_rate() -> None:
+    with _line(57_600) as path:
+        port = doctor_devices.look_at(path)
+    assert [s.baudrate for s in port.servos] == [57_600]
+    assert _ids(port) == {"SERIAL-BAUD"}
+
+
+def test_a_servo_of_protocol_1() -> None:
+    with _line(old=(Protocol1Servo(1, baudrate=57_600),)) as path:
+        port = doctor_devices.look_at(path)
+    assert _ids(port) == {"SERIAL-PROTOCOL-1"}
+
+
+def test_nobody_answers() -> None:
+    with _line(57_600, servo_id=200) as path:  # none of the ids that are asked for
+        port = doctor_devices.look_at(path, thorough=False)
+    assert _ids(port) == {"SERIAL-NO-ANSWER"}
+
+
+def test_a_port_that_is_in_use_is_left_alone() -> None:
+    hold = (
+        "import serial, sys; p = serial.Serial(sys.argv[1], exclusive=True); "
+        "print('open', flush=True); sys.stdin.read()"
+    )
+    with _line(1_000_000) as path:
+        with subprocess.Popen(
+            [sys.executable, "-c", hold, path],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as other:
+            assert other.stdin is not None
+            assert other.stdout is not None
+            assert other.stdout.readline() == "open\n"
+            port = doctor_devices.look_at(path)
+            assert not port.asked
+            assert f"(pid {other.pid})" in port.holders[0]
+            assert _ids(port) == {"SERIAL-BUSY"}
+            other.stdin.close()
+        assert not holders(path)
+
+
+def test_no_port_and_no_serial_port(tmp_path: Path) -> None:
+    assert _ids(doctor_devices.look_at(str(tmp_path / "ttyUSB0"))) == {"SERIAL-MISSING"}
+    (tmp_path / "file").touch()
+    assert _ids(doctor_devices.look_at(str(tmp_path / "file"))) == {"SERIAL-NOT-A-PORT"}
+
+
+def test_the_latency_timer(tmp_path: Path) -> None:
+    with _line(1_000_000) as path:
+        folder = tmp_path / "bus/usb-serial/devices" / Path(path).resolve().name
+        folder.mkdir(parents=True)
+        (folder / "latency_timer").write_text("16\n")
+        port = doctor_devices.look_at(path, sysfs=tmp_path)
+    assert port.latency_timer == 16
+    assert _ids(port) == {"SERIAL-LATENCY"}
+
+
+# --- USB
+
+
+def _usb(*devices: UsbDevice) -> set[str]:
+    found = diagnose(Observations(usb=devices, usb_wanted=True))
+    return {f.id for f in found if f.id.startswith("USB")}
+
+
+def test_a_hand_in_sysfs(tmp_path: Path) -> None:
+    folder = tmp_path / "sys/bus/usb/devices/1-4"
+    (tmp_path / "sys/bus/usb/drivers/cdc_acm").mkdir(parents=True)
+    folder.mkdir(parents=True)
+    (folder.parent / "1-4:1.0").mkdir()
+    (folder.parent / "1-4:1.0/driver").symlink_to(tmp_path / "sys/bus/usb/drivers/cdc_acm")
+    for name, text in {
+        "idVendor": f"{VENDOR_ID:04x}",
+        "idProduct": f"{PRODUCT_ID[Side.RIGHT]:04x}",
+        "busnum": "1",
+        "devnum": "12",
+        "serial": "S7",
+    }.items():
+        (folder / name).write_text(text + "\n")
+    node = tmp_path / "dev/bus/usb/001/012"
+    node.parent.mkdir(parents=True)
+    node.touch()
+    (hand,) = doctor_usb.devices(tmp_path / "sys", tmp_path / "dev")
+    assert (hand.where, hand.side, hand.serial) == ("1-4", "right", "S7")
+    assert hand.node == str(node)
+    assert hand.drivers == ("cdc_acm",)
+    assert _usb(hand) == {"USB-DRIVER"}
+    assert doctor_usb.devices(tmp_path / "nowhere") == ()
+    assert _usb() == {"USB-MISSING"}
+
+
+def test_a_usbip_server() -> None:
+    with emulated_dex3([Side.LEFT], serials=["S1"]) as hands:
+        (hand,) = doctor_devices.on_server(hands.url)
+        assert (hand.side, hand.serial) == ("left", "S1")
+        assert _usb(hand) == set()
+        (wrong,) = doctor_devices.on_server(f"{hands.url}/S2")
+        assert "no Dex3-1 with serial number S2" in wrong.error
+        assert _usb(wrong) == {"USB-UNREACHABLE"}
+        gone = hands.url
+    (lost,) = doctor_devices.on_server(gone)
+    assert "no USB/IP server answers" in lost.error
+    with pytest.raises(UsageError):
+        doctor_devices.on_server("usbip://h/a/b")
+
+
+# --- surroundings
+
+
+def test_a_configuration_that_can_be_read(tmp_path: Path) -> None:
+    good = "<CycloneDDS><Domain/></CycloneDDS>"
+    file = tmp_path / "dds.xml"
+    file.write_text('<?xml version="1.0"?>\n' + good)
+    for uri in ("", good, f"file://{file}", str(file), f"file://{file},{file}"):
+        assert uri_problem(uri) == "", uri
+    assert "No such file" in uri_problem(f"file://{tmp_path}/none.xml")
+    assert "Is a directory" in uri_problem(str(tmp_path))
+    assert "not XML" in uri_problem("<CycloneDDS>")
+    file.write_bytes(b"\xff\xfe\x00")
+    assert "not text" in uri_problem(str(file))
+
+
+def test_this_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", "file:///nowhere.xml")
+    env = environment()
+    assert env.python.split(".")[:2] == [str(n) for n in sys.version_info[:2]]
+    if env.cyclonedds:
+        assert env.cyclonedds.startswith("0.10.")
+        assert env.cyclonedds_error == ""
+    names = {f.id for f in diagnose(Observations(environment=env))}
+    assert "ENV-URI" in names
+    if env.sdk:  # the package on PyPI does not import
+        assert env.sdk_error.startswith("ImportError")
+        assert "ENV-SDK" in names
+
+
+def test_this_machines_interfaces() -> None:
+    (lo,) = [i for i in interfaces() if i.loopback]
+    assert lo.up
+    assert lo.addresses[:1] == ("127.0.0.1",)
+    from dexkit.doctor.network import address_of
+
+    with pytest.raises(DdsSetupError, match="no network interface"):
+        address_of("nosuch0")
+
+
+def test_a_process_that_listens_to_a_domain_is_named() -> None:
+    """Without DDS: a socket on the port of a participant is enough."""
+    for domain in range(40, 90):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            try:
+                sock.bind(("127.0.0.1", unicast_port(domain, 0)))
+            except OSError:
+                continue
+            (found,) = dds_sockets([domain])
+            assert (found.domain, found.pid) == (domain, os.getpid())
+            assert found.command == command_line(os.getpid())
+            return
+    pytest.fail("no port is free")
+
+
+def test_a_process_of_this_machine() -> None:
+    assert "pytest" in command_line(os.getpid()) or "-c" in command_line(os.getpid())
+    began = start_time(os.getpid())
+    assert began is not None
+    assert abs(began - os.stat(f"/proc/{os.getpid()}").st_ctime) < 5
+    assert command_line(2**22 + 1) == ""
+    assert start_time(2**22 + 1) is None

@@ -1,0 +1,311 @@
+"""The doctor's rules on made-up observations: each diagnosis, and what must not be one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from dexkit.doctor import DIAGNOSES, Observations, Severity, Wish, diagnose, readiness, verdict
+from dexkit.doctor.catalogue import table
+from dexkit.doctor.observations import (
+    DdsSocket,
+    DomainView,
+    Endpoint,
+    Environment,
+    Interface,
+    Participant,
+    Policies,
+    SerialPort,
+    Servo,
+    Stream,
+    UsbDevice,
+)
+from dexkit.doctor.topics import nearly
+
+CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
+HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
+LO = Interface("lo", up=True, loopback=True, multicast=True, addresses=("127.0.0.1",))
+DEAF = dataclasses.replace(LO, multicast=False)
+
+
+def _who(key: str, **more: object) -> Participant:
+    values: dict[str, object] = {
+        "version": "0.10.5",
+        "process": "python",
+        "pid": int(key, 36),
+        "addresses": ("127.0.0.1",),
+        "command": f"{key}.py",
+    }
+    return Participant(key, **{**values, **more})  # type: ignore[arg-type]
+
+
+def _end(owner: str, kind: str, topic: str, type_name: str, **more: object) -> Endpoint:
+    return Endpoint(topic, type_name, kind, f"{owner}/{kind}/{topic}", owner, **more)  # type: ignore[arg-type]
+
+
+def _flow(endpoint: Endpoint, **more: object) -> Stream:
+    values: dict[str, object] = {
+        "seconds": 2.0,
+        "samples": 1000,
+        "rate": 500.0,
+        "q": (2.5,),
+        "nonzero": True,
+    }
+    return Stream(endpoint.topic, endpoint.key, **{**values, **more})  # type: ignore[arg-type]
+
+
+def _pair(
+    sides: tuple[str, ...] = ("left", "right"),
+    *,
+    hand: Participant | None = None,
+    client: Participant | None = None,
+    model: str = "dex1",
+    number: int = 1,
+    reader: Policies | None = None,
+    state_hash: tuple[str, str] = ("", ""),
+    **flow: object,
+) -> DomainView:
+    """A hand and a client that get on well, but for what is changed."""
+    cmd, state = (HAND_CMD, HAND_STATE) if model == "dex3" else (CMDS, STATES)
+    ends, streams = [], []
+    for side in sides:
+        writer = _end("hand", "writer", f"rt/{model}/{side}/state", state, type_hash=state_hash[0])
+        ends += [
+            writer,
+            _end("hand", "reader", f"rt/{model}/{side}/cmd", cmd),
+            _end("client", "writer", f"rt/{model}/{side}/cmd", cmd),
+            _end(
+                "client",
+                "reader",
+                f"rt/{model}/{side}/state",
+                state,
+                qos=reader or Policies("best_effort"),
+                type_hash=state_hash[1],
+            ),
+        ]
+        streams.append(_flow(writer, **flow))
+    people = (hand or _who("hand"), client or _who("client"))
+    return DomainView(number, people, tuple(ends), tuple(streams))
+
+
+def _seen(*domains: DomainView, **more: object) -> Observations:
+    return Observations(domains=domains, interfaces=(LO,), **more)  # type: ignore[arg-type]
+
+
+GOOD = _pair()
+ENV = Environment(cyclonedds="0.10.5")
+PORT = SerialPort("/dev/ttyUSB0", named=True, asked=True, servos=(Servo(1, 311, 1_000_000),))
+HAND = UsbDevice("1-1", side="left", node="/dev/bus/usb/001/002")
+
+
+def _port(**more: object) -> Observations:
+    return Observations(serial=(dataclasses.replace(PORT, **more),))  # type: ignore[arg-type]
+
+
+def _usb(**more: object) -> Observations:
+    return Observations(usb=(dataclasses.replace(HAND, **more),))  # type: ignore[arg-type]
+
+
+def _without(view: DomainView, owner: str, kind: str = "") -> DomainView:
+    keep = tuple(e for e in view.endpoints if e.participant != owner or kind not in ("", e.kind))
+    return dataclasses.replace(view, endpoints=keep)
+
+
+def _renamed(view: DomainView, owner: str, **more: str) -> DomainView:
+    ends = tuple(
+        dataclasses.replace(e, **{k: v.format(e.topic) for k, v in more.items()})
+        if e.participant == owner
+        else e
+        for e in view.endpoints
+    )
+    return dataclasses.replace(view, endpoints=ends)
+
+
+def _two_publishers() -> DomainView:
+    other = _end("other", "writer", "rt/dex1/left/state", STATES)
+    people = (*GOOD.participants, _who("other"))
+    return DomainView(1, people, (*GOOD.endpoints, other), (*GOOD.streams, _flow(other)))
+
+
+def _frozen() -> DomainView:
+    commands = [e for e in GOOD.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
+    states = tuple(dataclasses.replace(s, identical=True) for s in GOOD.streams)
+    flows = tuple(_flow(e, q_span=1.0) for e in commands)
+    return dataclasses.replace(GOOD, streams=states + flows)
+
+
+def _legacy() -> DomainView:
+    """A hand of another generation beside a client of this one."""
+    hand = _end("hand", "writer", "rt/unitree_actuator/state", STATES)
+    ears = _end("hand", "reader", "rt/unitree_actuator/cmd", CMDS)
+    view = _without(GOOD, "hand")
+    return dataclasses.replace(
+        view, endpoints=(*view.endpoints, hand, ears), streams=(_flow(hand),)
+    )
+
+
+ETH = Interface("eth0", up=True, loopback=False, multicast=False, addresses=("192.168.123.5",))
+CASES: dict[str, Observations] = {
+    "DDS-CYCLONE-11": _seen(_pair(client=_who("client", version="11.0.1"))),
+    "NET-LO-MULTICAST": Observations(domains=(GOOD,), interfaces=(DEAF,)),
+    "NET-INTERFACE": _seen(_pair(client=_who("client", addresses=("192.168.123.5",)))),
+    "NET-MULTICAST": Observations(domains=(GOOD,), interfaces=(LO, ETH), looked_at=("lo", "eth0")),
+    "DDS-NOBODY": _seen(_without(GOOD, "hand")),
+    "DDS-OTHER-DOMAIN": _seen(_without(GOOD, "hand"), _without(_pair(number=7), "client")),
+    "DDS-OTHER-STACK": _seen(_legacy()),
+    "DDS-NAME": _seen(_renamed(GOOD, "hand", topic="x{0}")),
+    "DDS-TYPE": _seen(_renamed(GOOD, "hand", type_name=HAND_STATE)),
+    "DDS-LAYOUT": _seen(_pair(state_hash=("aa", "bb"))),
+    "DDS-QOS": _seen(_pair(reader=Policies("reliable", "transient_local"))),
+    "DDS-ONE-SIDE": _seen(_pair(("left",))),
+    "DDS-SILENT": _seen(_pair(samples=0)),
+    "DDS-UNREADABLE": _seen(_pair(undecodable=1000)),
+    "DDS-ALL-ZERO": _seen(_pair(model="dex3", nonzero=False)),
+    "DDS-TWO-PUBLISHERS": _seen(_two_publishers()),
+    "DDS-HAND-DEAF": _seen(_without(GOOD, "hand", "reader")),
+    "DDS-UNHEARD": _seen(_without(GOOD, "hand", "reader")),
+    "DDS-LATE-JOINER": _seen(
+        _pair(model="dex3", hand=_who("hand", started=9.0), client=_who("client", started=5.0))
+    ),
+    "DDS-FROZEN": _seen(_frozen()),
+    "DDS-RATE": _seen(_pair(rate=50.0)),
+    "DDS-NO-CLIENT": _seen(_without(GOOD, "client")),
+    "ENV-CYCLONEDDS-11": Observations(environment=Environment(cyclonedds="11.0.1")),
+    "ENV-CYCLONEDDS-MISSING": Observations(environment=Environment(python="3.12.1")),
+    "ENV-CYCLONEDDS-BROKEN": Observations(
+        environment=dataclasses.replace(ENV, cyclonedds_error="no libddsc")
+    ),
+    "ENV-URI": Observations(environment=dataclasses.replace(ENV, uri="x", uri_error="no file")),
+    "ENV-SDK": Observations(environment=dataclasses.replace(ENV, sdk="1.0.1", sdk_error="b2")),
+    "SERIAL-MISSING": _port(exists=False),
+    "SERIAL-PERMISSION": _port(readable=False, group="dialout", asked=False),
+    "SERIAL-BUSY": _port(holders=("other (pid 5)",), asked=False),
+    "SERIAL-NOT-A-PORT": _port(error="not a tty", asked=False),
+    "SERIAL-PROTOCOL-1": _port(servos=(Servo(1, 310, 57600, protocol=1),)),
+    "SERIAL-OTHER-SERVO": _port(servos=(Servo(1, 30, 1_000_000),)),
+    "SERIAL-NO-ANSWER": _port(servos=()),
+    "SERIAL-BAUD": _port(servos=(Servo(1, 311, 57600),)),
+    "SERIAL-LATENCY": _port(latency_timer=16),
+    "USB-MISSING": Observations(usb_wanted=True),
+    "USB-PERMISSION": _usb(writable=False),
+    "USB-DRIVER": _usb(drivers=("cdc_acm",)),
+    "USB-BUSY": _usb(holders=("vendor (pid 7)",)),
+    "USB-UNREACHABLE": _usb(error="refused"),
+}
+
+
+def _ids(seen: Observations, wish: Wish | None = None) -> set[str]:
+    return {f.id for f in diagnose(seen, wish)}
+
+
+def test_every_diagnosis_can_be_made() -> None:
+    assert set(CASES) == set(DIAGNOSES)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_a_diagnosis(name: str) -> None:
+    # what concerns devices only: that no hand is on DDS is another matter
+    found = [f for f in diagnose(CASES[name]) if f.id == name]
+    assert found, _ids(CASES[name])
+    assert found[0].seen
+    assert found[0].fix
+    if found[0].severity is not Severity.NOTE:
+        assert not verdict(CASES[name], found).healthy
+
+
+def test_nothing_is_wrong_with_what_is_right() -> None:
+    usual = _seen(GOOD, environment=ENV, serial=(PORT,), usb=(HAND,))
+    assert diagnose(usual) == []
+    said = verdict(usual, [])
+    assert said.healthy
+    assert "a client gets past its wait" in said.text
+    assert _ids(_seen(_pair(model="dex3"))) == set()
+    # a gripper that rests at 0 is closed, and its clients know
+    assert _ids(_seen(_pair(nonzero=False))) == set()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("DDS-NOBODY", "DDS-QOS", "DDS-ONE-SIDE", "DDS-SILENT", "DDS-ALL-ZERO", "DDS-TYPE"),
+        *("NET-LO-MULTICAST", "NET-INTERFACE", "DDS-OTHER-STACK"),
+    ],
+)
+def test_a_client_waits(name: str) -> None:
+    states = readiness(CASES[name])
+    assert states
+    assert not any(s.ready for s in states if s.dialect in ("unitree_go", "dex3"))
+    assert all(s.missing for s in states if not s.ready)
+
+
+def test_dexkit_on_either_side_does_without_multicast() -> None:
+    view = _pair(hand=_who("hand", command="dexkit serve sim-dex1 --side both"))
+    assert _ids(Observations(domains=(view,), interfaces=(DEAF,))) == set()
+    view = _pair(client=_who("client", dds_config="<Peers><Peer address='127.0.0.1'/></Peers>"))
+    assert _ids(Observations(domains=(view,), interfaces=(DEAF,))) == set()
+
+
+def test_a_process_that_does_not_answer_is_on_another_interface() -> None:
+    eth = dataclasses.replace(ETH, discovery=True)
+    seen = Observations(
+        domains=(_without(GOOD, "hand"),),
+        interfaces=(LO, eth),
+        sockets=(DdsSocket(1, 7650, 4242, "dex1_1_service"),),
+    )
+    (found,) = [f for f in diagnose(seen) if f.id == "NET-INTERFACE"]
+    assert "dex1_1_service (pid 4242)" in found.seen
+    assert "--interface eth0" in found.fix
+    known = dataclasses.replace(seen, sockets=(DdsSocket(1, 7650, _who("client").pid),))
+    assert "NET-INTERFACE" not in _ids(known)
+
+
+def test_commands_that_arrive_late_are_no_trap() -> None:
+    """A hand younger than a client whose commands do arrive is a hand that was restarted."""
+    view = _pair(hand=_who("hand", started=9.0), client=_who("client", started=5.0))
+    assert "DDS-LATE-JOINER" not in _ids(_seen(view))
+
+
+def test_a_port_that_a_service_uses_is_in_use_and_well() -> None:
+    (found,) = diagnose(_port(holders=("dexkit serve ezgripper (pid 5)",), asked=False))[-1:]
+    assert (found.id, found.severity) == ("SERIAL-BUSY", Severity.NOTE)
+
+
+def test_a_device_that_is_asked_about_is_not_a_client_that_waits() -> None:
+    (found,) = [
+        f
+        for f in diagnose(Observations(domains=(DomainView(0),)), Wish(devices_only=True))
+        if f.id == "DDS-NOBODY"
+    ]
+    assert found.severity is Severity.NOTE
+
+
+@pytest.mark.parametrize(
+    ("topic", "meant"),
+    [
+        ("dex1/left/state", "rt/dex1/left/state"),
+        ("/dex1/left/state", "rt/dex1/left/state"),
+        ("/rt/dex1/left/cmd", "rt/dex1/left/cmd"),
+        ("rt/Dex3/Left/cmd", "rt/dex3/left/cmd"),
+        ("rt/dex1//left/cmd", "rt/dex1/left/cmd"),
+        ("rt/dex3/left/states", "rt/dex3/left/state"),
+        ("rt/unitree_actuators/cmd", "rt/unitree_actuator/cmd"),
+    ],
+)
+def test_a_slip_of_the_pen(topic: str, meant: str) -> None:
+    found = nearly(topic)
+    assert found is not None
+    assert found[0] == meant
+
+
+@pytest.mark.parametrize(
+    "topic", ["rt/dex1/left/cmd", "rt/dex5/left/state", "rt/lowstate", "rt/inspire/cmd", "rosout"]
+)
+def test_a_name_of_its_own(topic: str) -> None:
+    assert nearly(topic) is None
+
+
+def test_the_docs_have_the_table() -> None:
+    page = Path(__file__).parent.parent / "docs" / "doctor.md"
+    assert table() in page.read_text(), "python -m dexkit.doctor.catalogue prints the table"
