@@ -6,6 +6,7 @@ rooms (drivers, emulators, traces, conformance).
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import sys
 
@@ -42,6 +43,18 @@ class _LazyGroup(click.Group):
         command = importlib.import_module(entry[0]).command
         assert isinstance(command, click.Command)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            if close := difflib.get_close_matches(args[0], _COMMANDS, n=1):
+                raise click.UsageError(
+                    f"{error.message.rstrip('.')}. Did you mean {close[0]!r}?", ctx
+                ) from None
+            raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

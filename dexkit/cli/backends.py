@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
-import click
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+import shutil
 
-from dexkit.backends import list_backends
+import click
+
+from dexkit.backends import BackendInfo, list_backends
+
+_WIDEST = 100  # columns; longer lines are hard to read
 
 
 @click.command("backends")
 def command() -> None:
-    """List the hands that can be served: name, model, origin, and what each needs."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for heading in ("backend", "model", "origin", "needs", "what it is"):
-        table.add_column(heading, overflow="fold")
+    """List the hands that can be served: name, model, origin, what each needs, its settings."""
+    width = min(shutil.get_terminal_size().columns, _WIDEST)
     for row in list_backends():
-        if row.backend is None:
-            problem = f"[red]unusable: {escape(row.error)}[/red]"
-            table.add_row(row.name, "?", row.origin, "", problem)
-            continue
-        b = row.backend
-        table.add_row(row.name, b.model, row.origin, b.needs or "nothing", b.summary)
-        for key, text in b.settings.items():
-            table.add_row("", "", "", f"[dim]--set {key}=...[/dim]", f"[dim]{escape(text)}[/dim]")
-    Console().print(table)
-    click.echo("\nYour own: dexkit serve package.module:Object (docs/backends.md).")
+        click.echo(_describe(row, width))
+    click.echo("Your own: dexkit serve package.module:Object (docs/backends.md).")
+
+
+def _describe(row: BackendInfo, width: int) -> str:
+    model = f", {row.backend.model}" if row.backend is not None and row.backend.model else ""
+    text = f"{click.style(row.name, bold=True)} ({row.origin}{model})\n"
+
+    def paragraph(content: str, first: str = "", indent: str = "  ") -> None:
+        nonlocal text
+        start = f"  {first}"
+        text += click.wrap_text(content, width, start, indent, preserve_paragraphs=False) + "\n"
+
+    if row.backend is None:
+        paragraph(row.error, "unusable: ")
+        return text
+    paragraph(row.backend.summary)
+    if row.backend.needs:
+        paragraph(row.backend.needs, "needs ")
+    column = 2 + max((len(f"--set {key}=...  ") for key in row.backend.settings), default=0)
+    for key, help_text in row.backend.settings.items():
+        paragraph(help_text, f"--set {key}=...".ljust(column - 2), " " * column)
+    return text

@@ -260,6 +260,11 @@ class HandCore:
         return self._resyncs + self._estimator.resyncs
 
     @property
+    def tripped(self) -> tuple[int, ...]:
+        """The joints that the time-out protection has stopped."""
+        return tuple(np.flatnonzero(self._tripped).tolist())
+
+    @property
     def holding(self) -> bool:
         """Whether the hand is driven without fresh commands, its protection being off."""
         return self._holding

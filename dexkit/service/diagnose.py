@@ -33,6 +33,8 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
         cmd, state = dialect.topics(side)
         served[cmd] = dialect.cmd_type
         served[state] = dialect.state_type
+        if dialect.low_rate_topic:
+            served[dialect.low_rate_topic.format(side=side)] = dialect.state_type
     found = []
     for topic, type_name in served.items():
         for foreign_type in sorted(
@@ -44,6 +46,8 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
             )
     foreign_topics = {e.topic for e in foreign}
     for other in DIALECTS.values():
+        if other.model != dialect.model:
+            continue
         pairs = {side: set(other.topics(side)) for side in Side}
         # a client of the other side is somebody else's business, unless the dialect differs
         shared = pairs[Side.LEFT] == pairs[Side.RIGHT]
@@ -56,6 +60,19 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
                 found.append(
                     f"a peer is on {topic}, which is not served here. Try --dialect {other.name}"
                 )
+    written = {e.topic for e in foreign if e.kind == "writer"}
+    read = {e.topic for e in foreign if e.kind == "reader"}
+    others = {
+        other.topics(side)[1]: other.model
+        for other in DIALECTS.values()
+        for side in Side
+        if other.model != dialect.model
+    }
+    for topic in sorted((read - written) & set(others)):
+        found.append(
+            f"a peer waits on {topic}, the state of a {others[topic]}, which nobody publishes; "
+            f"a {dialect.model} is served here"
+        )
     return found
 
 

@@ -333,6 +333,13 @@ class HandService:
         if counters.clamped != clamped:
             for name, text in _beyond(unit.core.spec, command):
                 self._say(name, f"{text}; brought within the limits")
+        if stuck := unit.core.tripped:
+            names = ", ".join(unit.core.spec.joints[i].name for i in stuck)
+            self._say(
+                "tripped",
+                f"{names} stay braked, because their time-out protection has tripped and the mode "
+                "byte asks for it again; send it once with bit 7 = 0",
+            )
         for remark in self._map.remarks(message, unit.side):
             setattr(counters, remark.counter, getattr(counters, remark.counter) + 1)
             self._say(remark.counter, remark.text)
@@ -534,7 +541,7 @@ def _beyond(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:
             if not low <= value <= high:
                 yield (
                     f"{spec.side} {joint.name} {name}",
-                    f"{name} of {joint.name} = {value:.4g} {unit} is outside {low:g} .. {high:g}",
+                    f"{name} of {joint.name} = {value:.6g} {unit} is outside {low:g} .. {high:g}",
                 )
 
 
