@@ -65,7 +65,9 @@ def test_a_servo_of_protocol_1() -> None:
     assert _ids(port) == {"SERIAL-PROTOCOL-1"}
 
 
-def test_nobody_answers() -> None:
+def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    # every baud rate takes half a second in vain
+    monkeypatch.setattr(doctor_devices, "SCAN_BAUD_RATES", (1_000_000, 57_600))
     with _line(57_600, servo_id=200) as path:  # none of the ids that are asked for
         port = doctor_devices.look_at(path, thorough=False)
     assert _ids(port) == {"SERIAL-NO-ANSWER"}

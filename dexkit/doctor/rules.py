@@ -584,10 +584,10 @@ def _absent(
         people = sum(len(v.participants) for v in focus)
         numbers = ", ".join(str(v.number) for v in seen.domains)
         which = " and ".join(str(v.number) for v in focus) or numbers
-        who = f"{people} other DDS process{'es' if people != 1 else ''}" if people else "no process"
+        who = {0: "is no process", 1: "is one other process"}.get(people, f"are {people} others")
         yield _finding(
             "DDS-NOBODY",
-            f"there is {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
+            f"there {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
             f"on {', '.join(seen.looked_at)}",
             fix=_elsewhere(seen),
             severity=Severity.NOTE if wish.devices_only else None,
