@@ -17,6 +17,7 @@ from dexkit.backends import Backend, BackendOptions, backend, list_backends
 from dexkit.cli import cli
 from dexkit.errors import BackendBroken, BackendConflict, UnknownBackend, UsageError
 from dexkit.hand import Hand, Side
+from dexkit.models import MODELS
 from tests.service_helpers import ScriptedHand
 
 LEFT = BackendOptions(Side.LEFT)
@@ -57,11 +58,11 @@ backend = Backend(summary="A hand of mine", model="dex1-1", make=lambda o: Scrip
 class TestByName:
     def test_the_built_in_ones(self) -> None:
         names = {row.name: row for row in list_backends()}
-        assert {"ezgripper", "sim-dex1"} <= names.keys()
+        assert {"ezgripper", "sim-dex1", "sim-dex3", "dex3-usb"} <= names.keys()
         for row in names.values():
             if row.origin.startswith("dexkit "):
                 assert row.backend is not None, row.error
-                assert row.backend.model == "dex1-1"
+                assert row.backend.model in MODELS
                 assert row.backend.summary
 
     def test_a_plug_in(self, plugins: Plugins) -> None:

@@ -51,8 +51,15 @@ def test_one_side_can_be_judged_alone() -> None:
     assert check(sample_path("dex1_hand_dropout"), "--side", "right") == 0
 
 
-def test_what_is_no_dex1_is_not_usable(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check(sample_path("dex3_pinch")) == 2
+def test_a_genuine_dex3_session_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path("dex3_pinch")) == 0
+    out = capsys.readouterr().out
+    assert "DEX3-START-02" in out
+    assert "DEX1" not in out
+
+
+def test_a_dialect_that_is_not_in_the_recording(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(sample_path("dex3_pinch"), "--dialect", "unitree_go") == 2
     assert "rt/dex3/left/state" in capsys.readouterr().err
 
 
