@@ -10,11 +10,19 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable
 
-__all__ = ["dds_topic", "dds_type", "select_topics"]
+__all__ = ["USB", "dds_topic", "dds_type", "select_topics"]
+
+USB = "usb/"
+"""Beginning of the channels that hold USB transfers and no DDS samples."""
 
 
 def dds_topic(name: str) -> str:
-    """``/dex1/left/cmd``, ``dex1/left/cmd`` and ``rt/dex1/left/cmd`` as ``rt/dex1/left/cmd``."""
+    """``/dex1/left/cmd``, ``dex1/left/cmd`` and ``rt/dex1/left/cmd`` as ``rt/dex1/left/cmd``.
+
+    ``usb/...`` is a channel of USB transfers and stays as it is.
+    """
+    if name.startswith(USB):
+        return name
     bare = name.lstrip("/")
     return bare if bare.startswith("rt/") else f"rt/{bare}"
 

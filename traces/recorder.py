@@ -59,10 +59,18 @@ class _Metadata(NamedTuple):
     values: dict[str, str]
 
 
+class _Foreign(NamedTuple):
+    """A type that is no DDS type of dexkit's."""
+
+    name: str
+    ros_name: str
+    ros2msg: str
+
+
 class _Channel:
     """One topic and type; its mcap id once the writer has met it."""
 
-    def __init__(self, topic: str, kind: MessageType, metadata: dict[str, str]) -> None:
+    def __init__(self, topic: str, kind: MessageType | _Foreign, metadata: dict[str, str]) -> None:
         self.topic = topic
         self.kind = kind
         self.metadata = metadata
@@ -222,6 +230,16 @@ class Recorder:
                 (topic, type_name),
                 _Channel(topic, kind, {"dds.type": kind.name, **(metadata or {})}),
             )
+
+    def add_foreign_channel(self, topic: str, ros_name: str, ros2msg: str) -> None:
+        """Announce a topic that is not on DDS; :meth:`put` then takes its type by ``ros_name``.
+
+        :param ros_name: name of the type, ``dexkit_usb/msg/Transfer``.
+        :param ros2msg: its definition. Payloads are CDR, as for every other topic.
+        """
+        with self._lock:
+            kind = _Foreign(ros_name, ros_name, ros2msg)
+            self._channels.setdefault((topic, ros_name), _Channel(topic, kind, {}))
 
     def put(
         self,

@@ -1,0 +1,5 @@
+"""Conformance of a Dex3-1 on its own USB device, below the topics.
+
+The kit is a USB host: :func:`~dexkit.conformance.usb.run.run` plays a script at the hand and
+records every transfer; :func:`~dexkit.conformance.usb.judge.judge_usb` judges that recording.
+"""

@@ -1,0 +1,771 @@
+"""The USB checks: each judges one hand's transfers for one requirement.
+
+As those of :mod:`dexkit.conformance.checks`: a check never passes on missing evidence, and takes
+every figure from its requirement's tolerances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from dexkit.conformance.checks import Outcome
+from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.results import Evidence
+from dexkit.conformance.usb.frames import NO_VALUE, STATE_SIZE, Scale, read_command
+from dexkit.conformance.usb.record import UsbPhase, topic
+from dexkit.conformance.usb.script import BUSES, DRIVEN, FREE
+from dexkit.conformance.usb.view import Answer, Exchange, Floats, UsbRecording, UsbSide
+from dexkit.hand import Side
+from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
+
+__all__ = ["CHECKS", "UsbCheck", "UsbContext"]
+
+_ORDINARY = ("exchange", "burst", "move", "lock", "pause", "drive", "tripped", "clear")
+"""Phases in which every command is a good one, followed by a wait for its answer."""
+_DAMAGED = ("malformed", "broadcast", "short")
+"""Phases that begin with something odd; good commands follow."""
+
+
+@dataclass(frozen=True)
+class UsbContext:
+    """One requirement to be judged for one hand."""
+
+    recording: UsbRecording
+    hand: UsbSide
+    requirement: Requirement
+
+    def tolerance(self, name: str) -> float:
+        """A figure of the requirement."""
+        return self.requirement.tolerance(name)
+
+    def phases(self) -> list[UsbPhase]:
+        """The phases that the requirement needs."""
+        return self.hand.phases(self.requirement.phase or "")
+
+    def at(self, seconds: float, end: float | None = None, *, inward: bool = True) -> Evidence:
+        """A place in the recording."""
+        return Evidence(
+            topic=topic(self.hand.side, inward=inward),
+            time_s=round(seconds, 4),
+            log_time_ns=self.recording.origin_ns + round(seconds * 1e9),
+            end_s=None if end is None else round(end, 4),
+        )
+
+    def over(self, phase: UsbPhase) -> Evidence:
+        """A phase as a place."""
+        return self.at(*self.hand.span(phase))
+
+    def passed(self, figure: str, observed: str = "", **values: float) -> Outcome:
+        """The requirement is met."""
+        return Outcome(True, figure, observed, values={k: float(v) for k, v in values.items()})
+
+    def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
+        """It is not."""
+        plain = {k: float(v) for k, v in values.items()}
+        return Outcome(False, figure, observed, evidence=places[:5], values=plain)
+
+    def skipped(self, reason: str) -> Outcome:
+        """It cannot be judged here."""
+        return Outcome(None, reason=reason)
+
+
+UsbCheck = Callable[[UsbContext], Outcome]
+CHECKS: dict[str, UsbCheck] = {}
+"""Every check, by requirement id."""
+F = TypeVar("F", bound=UsbCheck)
+
+
+def check(name: str) -> Callable[[F], F]:
+    """Register the decorated function as the check of ``DEX3USB-name``."""
+
+    def register(function: F) -> F:
+        assert f"DEX3USB-{name}" not in CHECKS, f"{name} has two checks"
+        CHECKS[f"DEX3USB-{name}"] = function
+        return function
+
+    return register
+
+
+# ------------------------------------------------------------------------------- descriptors
+
+
+@check("DESC-01")
+def _ids(c: UsbContext) -> Outcome:
+    device, wanted = c.hand.device, (VENDOR_ID, PRODUCT_ID[c.hand.side])
+    told = f"{device.vendor:04X}:{device.product:04X}"
+    if (device.vendor, device.product) == wanted:
+        return c.passed(told)
+    other = next(
+        (s for s in Side if (device.vendor, device.product) == (VENDOR_ID, PRODUCT_ID[s])), None
+    )
+    what = f", which is a {other} hand" if other else ""
+    return c.failed(told, f"the {c.hand.side} hand's device is {told}{what}")
+
+
+@check("DESC-02")
+def _release(c: UsbContext) -> Outcome:
+    release = c.hand.device.release
+    told = f"{release >> 8:x}.{release & 0xFF:02x}"
+    return c.passed(told) if release == 0x0100 else c.failed(told, f"bcdDevice is {told}")
+
+
+@check("DESC-03")
+def _strings(c: UsbContext) -> Outcome:
+    device = c.hand.device
+    wanted = (MANUFACTURER, PRODUCT[c.hand.side])
+    told = f"{device.manufacturer!r}, {device.name!r}, serial {device.serial!r}"
+    if (device.manufacturer, device.name) == wanted and device.serial:
+        return c.passed(device.serial, told)
+    return c.failed(device.name or "none", f"the strings are {told}")
+
+
+@check("DESC-04")
+def _speed(c: UsbContext) -> Outcome:
+    speed = c.hand.record.descriptors.speed
+    if not speed:
+        return c.skipped("this host does not tell the speed")
+    name = {1: "low", 2: "full", 3: "high"}.get(speed, "super")
+    return c.passed(name) if speed == 3 else c.failed(name, f"it runs at {name} speed")
+
+
+@check("DESC-05")
+def _endpoints(c: UsbContext) -> Outcome:
+    endpoints = c.hand.device.endpoints
+    bulk = Counter(e.inward for e in endpoints if e.bulk)
+    told = ", ".join(f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'}" for e in endpoints)
+    if bulk == {True: 1, False: 1}:
+        return c.passed(" ".join(f"{e.address:#04x}" for e in endpoints if e.bulk), told)
+    return c.failed(f"{bulk.total()} bulk", f"interface 0 has {told or 'no endpoints'}")
+
+
+@check("DESC-06")
+def _packet_size(c: UsbContext) -> Outcome:
+    sizes = sorted({e.size for e in c.hand.device.endpoints if e.bulk})
+    told = ", ".join(map(str, sizes))
+    if sizes == [c.tolerance("size")]:
+        return c.passed(told)
+    return c.failed(told, f"wMaxPacketSize is {told}")
+
+
+# ---------------------------------------------------------------------------------- exchange
+
+
+def _ordinary(c: UsbContext) -> Iterator[Exchange]:
+    for phase in c.hand.record.phases:
+        if phase.name in _ORDINARY:
+            yield from c.hand.exchanges(phase)
+
+
+@check("XCHG-01")
+def _answered(c: UsbContext) -> Outcome:
+    exchanges = list(_ordinary(c))
+    silent = [x for x in exchanges if x.answer is None]
+    told = f"{len(exchanges) - len(silent)} of {len(exchanges)}"
+    if not silent:
+        return c.passed(told)
+    places = [c.at(x.t, inward=False) for x in silent]
+    return c.failed(told, f"{len(silent)} of {len(exchanges)} commands got no answer", *places)
+
+
+@check("XCHG-02")
+def _once(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    sent = sum(not t.inward for t in c.hand.during(phase))
+    answers = c.hand.answers_in(phase)
+    told = f"{len(answers)} to {sent}"
+    if len(answers) <= sent:
+        return c.passed(told)
+    observed = f"{len(answers)} frames came to {sent} commands"
+    return c.failed(told, observed, *(c.at(a.t) for a in answers[sent:]))
+
+
+@check("XCHG-03")
+def _unasked(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    begin, end = c.hand.span(phase)
+    found = c.hand.answers_in(phase)
+    if not any(t.inward for t in c.hand.during(phase)):
+        return c.skipped("nothing was read while no command was sent")
+    if not found:
+        return c.passed(f"none in {end - begin:.2f} s")
+    observed = f"{len(found)} frames came in {end - begin:.2f} s without a command"
+    return c.failed(f"{len(found)} frames", observed, *(c.at(a.t) for a in found))
+
+
+@check("XCHG-04")
+def _two(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = len(c.hand.answers_in(phase))
+    if 1 <= answers <= 2:
+        return c.passed(f"{answers} answers")
+    return c.failed(f"{answers} answers", f"two commands got {answers} answers", c.over(phase))
+
+
+def _bursts(c: UsbContext) -> list[tuple[UsbPhase, list[float], float]]:
+    """Each burst with its answer times and its rate, the fastest first.
+
+    What else the machine does slows a burst down and never makes one faster.
+    """
+    found = []
+    for phase in c.phases():
+        begin, end = c.hand.span(phase)
+        times = [
+            (x.answer.transfer.done_ns - x.command.submitted_ns) / 1e9
+            for x in c.hand.exchanges(phase)
+            if x.answer is not None
+        ]
+        if times and end > begin:
+            found.append((phase, times, len(times) / (end - begin)))
+    return sorted(found, key=lambda burst: -burst[2])
+
+
+@check("RATE-01")
+def _rate(c: UsbContext) -> Outcome:
+    bursts = _bursts(c)
+    if not bursts:
+        return c.skipped("no exchange in a burst")
+    _, times, rate = bursts[0]
+    told = f"{rate:.0f} Hz"
+    if rate >= c.tolerance("min_rate_hz"):
+        return c.passed(told, rate_hz=rate)
+    observed = f"{told} in the fastest of {len(bursts)} bursts of {len(times)} exchanges"
+    return c.failed(told, observed, *(c.over(phase) for phase, _, _ in bursts), rate_hz=rate)
+
+
+@check("RATE-02")
+def _latency(c: UsbContext) -> Outcome:
+    bursts = _bursts(c)
+    if not bursts:
+        return c.skipped("no exchange in a burst")
+    (p50, p99), phase = min(
+        ((tuple(np.percentile(times, [50, 99])), phase) for phase, times, _ in bursts),
+        key=lambda found: found[0][1],
+    )
+    told = f"{p99 * 1e3:.2f} ms"
+    if p99 <= c.tolerance("max_s"):
+        return c.passed(told, p50_s=p50, p99_s=p99)
+    observed = f"99 of 100 within {told}, the median is {p50 * 1e3:.2f} ms"
+    return c.failed(told, observed, c.over(phase), p50_s=p50, p99_s=p99)
+
+
+# ------------------------------------------------------------------------------------ frames
+
+
+def _all(
+    c: UsbContext, good: Callable[[Answer], bool], what: str, answers: list[Answer] | None = None
+) -> Outcome:
+    """Every frame must be good; ``what`` says what the others have."""
+    answers = c.hand.answers if answers is None else answers
+    if not answers:
+        return c.skipped("no frame came")
+    wrong = [a for a in answers if not good(a)]
+    if not wrong:
+        return c.passed(f"{len(answers)} frames")
+    told = f"{len(wrong)} of {len(answers)}"
+    return c.failed(told, f"{told} frames have {what}", *(c.at(a.t) for a in wrong))
+
+
+@check("SIZE-01")
+def _size(c: UsbContext) -> Outcome:
+    sizes = Counter(a.reading.length for a in c.hand.answers)
+    told = ", ".join(f"{n} bytes ({times})" for n, times in sizes.most_common(4))
+    return _all(c, lambda a: a.reading.length == STATE_SIZE, f"another size: {told}")
+
+
+@check("SIZE-02")
+def _both_sizes(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    joint = phase.params["joint"]
+    part = _part(c.hand, phase, joint, phase.params["begin"], phase.params["target"])
+    size = phase.params["size"]
+    told = f"{size} bytes: {part:.0%} of the way"
+    if part >= c.tolerance("min_part"):
+        return c.passed("both", told)
+    observed = f"a frame of {size} bytes got {phase.params['answers']} answers; {told}"
+    return c.failed(f"not {size}", observed, c.over(phase))
+
+
+@check("HEAD-01")
+def _head(c: UsbContext) -> Outcome:
+    heads = {a.reading.head.hex(" ") for a in c.hand.answers} - {"fc fd"}
+    return _all(c, lambda a: a.reading.head == b"\xfc\xfd", f"the head {', '.join(sorted(heads))}")
+
+
+@check("CRC-01")
+def _frame_crc(c: UsbContext) -> Outcome:
+    return _all(c, lambda a: a.reading.crc_right, "a wrong CRC")
+
+
+@check("CRC-02")
+def _motor_crc(c: UsbContext) -> Outcome:
+    if not any(a.reading.motors for a in c.hand.answers):
+        return c.skipped("no motor packet came")
+    return _all(c, lambda a: all(m.intact for m in a.reading.motors), "a damaged motor packet")
+
+
+@check("CRC-03")
+def _sensor_crc(c: UsbContext) -> Outcome:
+    if not any(a.reading.sensors for a in c.hand.answers):
+        return c.skipped("no sensor packet came")
+    return _all(c, lambda a: all(s.intact for s in a.reading.sensors), "a damaged sensor packet")
+
+
+@check("PACK-01")
+def _whole(c: UsbContext) -> Outcome:
+    odd = next((a.reading.strange[0] for a in c.hand.answers if a.reading.strange), "")
+    return _all(c, lambda a: not a.reading.strange, odd)
+
+
+def _places(answer: Answer) -> list[tuple[int, int]]:
+    return sorted((m.bus, m.id) for m in answer.reading.motors)
+
+
+def _to_all(c: UsbContext) -> list[Answer]:
+    """The answers to commands that addressed every motor by its own id."""
+    return [x.answer for x in _ordinary(c) if x.answer is not None]
+
+
+@check("PACK-02")
+def _seven(c: UsbContext) -> Outcome:
+    def good(answer: Answer) -> bool:
+        places = _places(answer)
+        counted = [(b, i) for b in range(5) for i in range(sum(p[0] == b for p in places))]
+        return len(places) == 7 and places == counted
+
+    answers = _to_all(c)
+    odd = next((_places(a) for a in answers if not good(a)), [])
+    told = " ".join(f"{b}.{i}" for b, i in odd) or "none"
+    return _all(c, good, f"{len(odd)} motors (bus.id): {told}", answers)
+
+
+@check("PACK-03")
+def _map(c: UsbContext) -> Outcome:
+    answers = _to_all(c)
+    odd = next((_places(a) for a in answers if _places(a) != sorted(BUSES)), [])
+    told = " ".join(f"{b}.{i}" for b, i in odd)
+    good = sorted(BUSES)
+    return _all(c, lambda a: _places(a) == good, f"motors at (bus.id) {told}", answers)
+
+
+@check("PACK-04")
+def _nine(c: UsbContext) -> Outcome:
+    def good(answer: Answer) -> bool:
+        places = [(s.bus, s.id) for s in answer.reading.sensors]
+        return len(places) == 9 == len(set(places))
+
+    counts = sorted({len(a.reading.sensors) for a in c.hand.answers})
+    return _all(c, good, f"{', '.join(map(str, counts))} sensor packets, or one twice")
+
+
+@check("SENS-01")
+def _elements(c: UsbContext) -> Outcome:
+    def elements(answer: Answer) -> int:
+        return sum(p != NO_VALUE for s in answer.reading.sensors for p in s.pressure)
+
+    counts = sorted({elements(a) for a in c.hand.answers})
+    told = ", ".join(map(str, counts))
+    return _all(c, lambda a: elements(a) == 33, f"{told} values that are not {NO_VALUE}")
+
+
+@check("VALUE-01")
+def _supply(c: UsbContext) -> Outcome:
+    volts = np.array([a.reading.pin_v for a in c.hand.answers])
+    low, high = c.tolerance("min_v"), c.tolerance("max_v")
+    outcome = _all(
+        c,
+        lambda a: low <= a.reading.pin_v <= high,
+        f"a supply of {np.nanmin(volts):.1f} to {np.nanmax(volts):.1f} V",
+    )
+    return outcome
+
+
+@check("VALUE-02")
+def _errors(c: UsbContext) -> Outcome:
+    (phase,) = c.hand.phases("exchange")
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no frame came while it rested")
+    for answer in answers:
+        faulty = {f"motor {m.bus}.{m.id}": m.error for m in answer.reading.motors if m.error}
+        if answer.reading.error:
+            faulty["hand"] = answer.reading.error
+        if faulty:
+            told = ", ".join(f"{who} {bits:#x}" for who, bits in faulty.items())
+            return c.failed(f"{len(faulty)} faulty", f"error bits: {told}", c.at(answer.t))
+    return c.passed("none")
+
+
+# ------------------------------------------------------------------------------------ motion
+
+
+def _part(hand: UsbSide, phase: UsbPhase, joint: int, begin: float, target: float) -> float:
+    """Part of the way from begin to target that a joint went in a phase; NaN if it is not told."""
+    _, q = hand.positions(phase)
+    known = q[np.isfinite(q[:, joint]), joint]
+    return float((known[-1] - begin) / (target - begin)) if len(known) else math.nan
+
+
+def _travel(hand: UsbSide, phase: UsbPhase, *, before: bool = True) -> Floats:
+    """How far each joint was at most from where it was at the beginning, rad; 0 if untold."""
+    _, q = hand.positions(phase, before=before)
+    if len(q) < 2:
+        return np.zeros(len(hand.joints))
+    travel: Floats = np.nan_to_num(np.nanmax(np.abs(q - q[0]), axis=0))
+    return travel
+
+
+def _quiet_motors(
+    c: UsbContext, phases: list[UsbPhase], name: Callable[[UsbPhase], str]
+) -> Outcome:
+    """No joint may have moved in any of the phases."""
+    limit = c.tolerance("max_q")
+    most = 0.0
+    for phase in phases:
+        if not c.hand.answers_in(phase):
+            return c.skipped(f"no answer came {name(phase)}")
+        travel = _travel(c.hand, phase)
+        most = max(most, float(travel.max()))
+        if travel.max() > limit:
+            joint = c.hand.joints[int(travel.argmax())].name
+            observed = f"{joint} moved by {travel.max():.2f} rad {name(phase)}"
+            return c.failed(f"{travel.max():.2f} rad", observed, c.over(phase), moved=travel.max())
+    return c.passed(f"{most:.3f} rad", moved=most)
+
+
+@check("MODE-01")
+def _mode(c: UsbContext) -> Outcome:
+    judged = 0
+    for phase in c.hand.record.phases:
+        answers = c.hand.answers_in(phase)
+        if "status" not in phase.params or not answers:
+            continue
+        judged += 1
+        wanted = phase.params["status"]
+        last = answers[-1]
+        odd = {f"{m.bus}.{m.id}": m.status for m in last.reading.motors if m.status != wanted}
+        if odd:
+            told = ", ".join(f"motor {who} says {status}" for who, status in odd.items())
+            observed = f"commanded status {wanted}, {told}"
+            return c.failed(f"not {wanted}", observed, c.at(last.t))
+    return c.passed("0 and 1") if judged else c.skipped("no answer to judge by")
+
+
+@check("MODE-02")
+def _lock(c: UsbContext) -> Outcome:
+    return _quiet_motors(c, c.phases(), lambda phase: "although it was to lock")
+
+
+def _moves(c: UsbContext) -> Iterator[tuple[UsbPhase, int, float, float]]:
+    for phase in c.phases():
+        yield phase, phase.params["joint"], phase.params["begin"], phase.params["target"]
+
+
+@check("MOVE-01")
+def _follows(c: UsbContext) -> Outcome:
+    parts: dict[str, float] = {}
+    wrong = []
+    for phase, joint, begin, target in _moves(c):
+        name = c.hand.joints[joint].name
+        parts[name] = _part(c.hand, phase, joint, begin, target)
+        # to overshoot by as much again is no following either
+        if not c.tolerance("min_part") <= parts[name] <= 2 - c.tolerance("min_part"):
+            wrong.append((name, phase))
+    told = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
+    if not wrong:
+        return c.passed(told, f"of the way in 0.2 s: {told}")
+    text = ", ".join(f"{name} {parts[name]:.0%}" for name, _ in wrong)
+    return c.failed(told, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
+
+
+@check("MOVE-02")
+def _others(c: UsbContext) -> Outcome:
+    most = 0.0
+    earlier: set[int] = set()
+    for phase, joint, _, _ in _moves(c):
+        travel = _travel(c.hand, phase)
+        # the one that moved before this one may still be arriving
+        travel[[joint, *earlier]] = 0.0
+        earlier.add(joint)
+        most = max(most, float(travel.max()))
+        if travel.max() > c.tolerance("max_q"):
+            moved, told = (c.hand.joints[i].name for i in (int(travel.argmax()), joint))
+            observed = f"{moved} moved by {travel.max():.2f} rad when {told} was told to"
+            return c.failed(f"{travel.max():.2f} rad", observed, c.over(phase))
+    return c.passed(f"{most:.3f} rad", moved=most)
+
+
+@check("MOVE-03")
+def _limits(c: UsbContext) -> Outcome:
+    margin = c.tolerance("margin")
+    beyond = 0.0
+    for answer in c.hand.answers:
+        for joint, q in zip(c.hand.joints, c.hand.q(answer), strict=True):
+            over = max(joint.q_min - q, q - joint.q_max)
+            beyond = max(beyond, over)  # NaN is never beyond
+            if over > margin:
+                span = f"{joint.q_min:.2f} .. {joint.q_max:.2f}"
+                return c.failed(
+                    f"{q:.2f} rad", f"{joint.name} at {q:.2f} rad of {span}", c.at(answer.t)
+                )
+    return c.passed(f"{beyond:.3f} rad beyond")
+
+
+@check("UNIT-01")
+def _speed_unit(c: UsbContext) -> Outcome:
+    ratios: dict[str, float] = {}
+    for phase, joint, _, _ in _moves(c):
+        points = [
+            (a.t, m) for a in c.hand.answers_in(phase) if (m := c.hand.motor(a, joint)) is not None
+        ]
+        scale = Scale(c.hand.joints[joint].gear_ratio)
+        t = np.array([at for at, _ in points])
+        q = np.array([m.position for _, m in points]) / scale.q
+        dq = np.array([m.speed for _, m in points]) / scale.dq
+        if len(points) > 2 and abs(q[-1] - q[0]) > 0.05:
+            way = float(np.sum((dq[1:] + dq[:-1]) / 2 * np.diff(t)))
+            ratios[c.hand.joints[joint].name] = way / float(q[-1] - q[0])
+    return _ratio(c, ratios, "the integrated speed is {:.2f} of the way of {}")
+
+
+@check("UNIT-02")
+def _torque_unit(c: UsbContext) -> Outcome:
+    ratios: dict[str, float] = {}
+    for phase, joint, _, _ in _moves(c):
+        scale = Scale(c.hand.joints[joint].gear_ratio)
+        law, told = [], []
+        # the first answer may be the state of before the command
+        for x in c.hand.exchanges(phase)[1:]:
+            order = next(
+                (
+                    m
+                    for b, i, m in read_command(x.command.data) or ()
+                    if (b, i) == c.hand.record.buses[joint]
+                ),
+                None,
+            )
+            motor = c.hand.motor(x.answer, joint) if x.answer else None
+            if order is None or motor is None:
+                continue
+            error = (order.q - motor.position) / scale.q
+            slip = (order.dq - motor.speed) / scale.dq
+            law.append(order.kp / scale.kp * error + order.kd / scale.kd * slip)
+            told.append(motor.torque / scale.tau)
+        both = np.array([law, told])
+        if both.size and np.abs(both[0]).max() > c.tolerance("min_tau"):
+            ratios[c.hand.joints[joint].name] = float(both[0] @ both[1] / (both[0] @ both[0]))
+    return _ratio(c, ratios, "the reported torque is {:.2f} of what the gains demand of {}")
+
+
+def _ratio(c: UsbContext, ratios: Mapping[str, float], text: str) -> Outcome:
+    if not ratios:
+        return c.skipped("no motion to judge by")
+    told = f"{min(ratios.values()):.2f} .. {max(ratios.values()):.2f}"
+    for name, ratio in ratios.items():
+        if not c.tolerance("min_ratio") <= ratio <= c.tolerance("max_ratio"):
+            return c.failed(told, text.format(ratio, name), *map(c.over, c.phases()))
+    return c.passed(told)
+
+
+# -------------------------------------------------------------------------------- protection
+
+
+def _flags(c: UsbContext, answer: Answer) -> dict[int, bool]:
+    """The time-out flag by joint."""
+    motors = [c.hand.motor(answer, joint) for joint in range(len(c.hand.joints))]
+    return {i: m.tripped for i, m in enumerate(motors) if m is not None}
+
+
+def _named(c: UsbContext, joints: list[int]) -> str:
+    return ", ".join(c.hand.joints[i].name for i in joints)
+
+
+@check("PROT-01")
+def _trips(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer after the silence")
+    flags = _flags(c, answers[0])
+    silent = [i for i, tripped in flags.items() if not tripped and i != FREE]
+    if not silent:
+        return c.passed(f"{sum(flags.values())} tripped")
+    observed = f"after 1.5 s without a command {_named(c, silent)} show no time-out"
+    return c.failed(f"{len(silent)} not", observed, c.at(answers[0].t))
+
+
+def _driven(c: UsbContext, joint: int) -> float | None:
+    """Seconds for which a joint that was driven at a steady speed went on in the silence.
+
+    :returns: None when it had no such speed before, so that nothing can be told from it.
+    """
+    silences, drives = c.hand.phases("silence"), c.hand.phases("drive")
+    after = [a for s in silences for a in c.hand.answers if a.transfer.submitted_ns >= s.end_ns]
+    if not drives or not after:
+        return None
+    t, q = c.hand.positions(drives[0])
+    late = t > t[-1] - 0.15 if len(t) else t > 0
+    if late.sum() < 3:
+        return None
+    speed = float(np.polyfit(t[late], q[late, joint], 1)[0])
+    if not abs(speed) >= c.tolerance("min_dq"):
+        return None
+    return float(c.hand.q(after[0])[joint] - q[-1, joint]) / speed
+
+
+_NO_SPEED = "the motor was not driven before the silence, so its stop proves nothing"
+
+
+@check("PROT-02")
+def _stops(c: UsbContext) -> Outcome:
+    (silence,) = c.phases()
+    driven = _driven(c, DRIVEN)
+    if driven is None:
+        return c.skipped(_NO_SPEED)
+    told = f"{driven:.2f} s"
+    if driven <= c.tolerance("max_s"):
+        return c.passed(told, driven_s=driven)
+    observed = f"in the silence it went as far as in {told} of driving"
+    return c.failed(told, observed, c.over(silence), driven_s=driven)
+
+
+@check("PROT-03")
+def _stays(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if len(answers) < 2:
+        return c.skipped("too few answers after the silence")
+    for answer in answers[1:]:
+        cleared = [i for i, tripped in _flags(c, answer).items() if not tripped and i != FREE]
+        if cleared:
+            observed = f"{_named(c, cleared)} cleared the flag while bit 7 was set"
+            return c.failed("cleared", observed, c.at(answer.t))
+    moved = abs(float(c.hand.q(answers[-1])[DRIVEN]) - phase.params["begin"][DRIVEN])
+    if moved <= c.tolerance("max_q"):
+        return c.passed(f"{moved:.3f} rad", moved=moved)
+    observed = f"it followed a position command by {moved:.2f} rad while tripped"
+    return c.failed(f"{moved:.2f} rad", observed, c.over(phase), moved=moved)
+
+
+@check("PROT-04")
+def _cleared(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer to a command with bit 7 = 0")
+    tripped = [i for i, flag in _flags(c, answers[-1]).items() if flag]
+    if tripped:
+        observed = f"{_named(c, tripped)} still tripped after 0.25 s of commands with bit 7 = 0"
+        return c.failed(f"{len(tripped)} tripped", observed, c.over(phase))
+    part = _part(c.hand, phase, DRIVEN, phase.params["begin"], phase.params["target"])
+    told = f"{part:.0%} of the way"
+    if part >= c.tolerance("min_part"):
+        return c.passed(told)
+    return c.failed(told, f"after clearing it went {told}", c.over(phase))
+
+
+@check("PROT-05")
+def _disabled(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer after the silence")
+    if any(_flags(c, a).get(FREE) for a in answers):
+        observed = f"{_named(c, [FREE])} reports a time-out although its protection was off"
+        return c.failed("tripped", observed, c.over(phase))
+    driven = _driven(c, FREE)
+    if driven is None:
+        return c.skipped(_NO_SPEED)
+    if driven < c.tolerance("min_s"):
+        observed = f"{_named(c, [FREE])} stopped {driven:.2f} s into the silence"
+        return c.failed(f"{driven:.2f} s", observed, c.over(phase), driven_s=driven)
+    begin, target = (phase.params[name][FREE] for name in ("begin", "targets"))
+    part = _part(c.hand, phase, FREE, begin, target)
+    told = f"{part:.0%} of the way"
+    if part >= c.tolerance("min_part"):
+        return c.passed(told)
+    return c.failed(told, f"after the silence it went {told}", c.over(phase))
+
+
+@check("PROT-06")
+def _early(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer after the pause")
+    tripped = [i for i, flag in _flags(c, answers[0]).items() if flag]
+    if not tripped:
+        return c.passed("none")
+    observed = f"{_named(c, tripped)} tripped within {phase.params['seconds']:g} s"
+    return c.failed(f"{len(tripped)} tripped", observed, c.over(phase))
+
+
+# ----------------------------------------------------------------------------------- damaged
+
+
+def _harmless(name: str, *kinds: str) -> None:
+    @check(name)
+    def judge(c: UsbContext) -> Outcome:
+        phases = [p for p in c.phases() if p.params["kind"] in kinds]
+        if not phases:
+            return c.skipped("such a frame was not sent")
+        return _quiet_motors(c, phases, lambda p: f"on the frame '{p.params['kind']}'")
+
+
+_harmless("BAD-01", "frame-crc")
+_harmless("BAD-02", "packet-crc", "packet-head")
+_harmless("BAD-03", "truncated")
+_harmless("BAD-04", "over-long")
+_harmless("BAD-05", "size-241", "size-huge")
+_harmless("BAD-06", "wrong-id")
+
+
+@check("BAD-07")
+def _goes_on(c: UsbContext) -> Outcome:
+    judged = 0
+    for phase in c.hand.record.phases:
+        if phase.name not in _DAMAGED:
+            continue
+        for x in c.hand.exchanges(phase)[1:]:
+            judged += 1
+            if x.answer is None:
+                kind = phase.params.get("kind", phase.name)
+                observed = f"after the frame '{kind}' a good command got no answer"
+                return c.failed("silent", observed, c.at(x.t, inward=False))
+    return c.passed(f"{judged} answers") if judged else c.skipped("no good command was sent after")
+
+
+@check("BAD-08")
+def _broadcast(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    begin, target = phase.params["begin"], phase.params["target"]
+    parts = {
+        c.hand.joints[i].name: _part(c.hand, phase, i, begin[i], target)
+        for i, (bus, _) in enumerate(c.hand.record.buses)
+        if bus == phase.params["bus"] and abs(target - begin[i]) >= c.tolerance("min_way")
+    }
+    told = ", ".join(f"{name} {part:.0%}" for name, part in parts.items())
+    if min(parts.values()) >= c.tolerance("min_part"):
+        return c.passed("followed", told)
+    return c.failed("ignored", f"part of the way: {told}", c.over(phase))
+
+
+# -------------------------------------------------------------------------------- connection
+
+
+@check("CONN-01")
+def _again(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    exchanges = c.hand.exchanges(phase)
+    silent = [x for x in exchanges if x.answer is None]
+    if silent or not exchanges:
+        observed = f"{len(silent)} of {len(exchanges)} commands after it got no answer"
+        if c.hand.record.trouble:
+            observed += f" ({c.hand.record.trouble})"
+        return c.failed("silent", observed, c.over(phase))
+    return _quiet_motors(c, [phase], lambda p: "when the interface was claimed again")

@@ -1,0 +1,201 @@
+"""How USB transfers stand in a recording.
+
+Each endpoint of each hand is a channel, ``usb/dex3/left/out`` and ``usb/dex3/left/in``; each
+transfer is a message: log time when it was done, publish time when it was submitted. The payload
+is the CDR form of :data:`SCHEMA`, so that common viewers show it. Descriptors, and what the kit
+did when, are in the metadata record :data:`RECORD`, so that the recording alone can be judged.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from dexkit.conformance.phases import Stall
+from dexkit.errors import TraceUnsupported
+from dexkit.hand import Side
+
+__all__ = [
+    "RECORD",
+    "SCHEMA",
+    "SCHEMA_NAME",
+    "STALLED",
+    "TIMED_OUT",
+    "Descriptors",
+    "SideRecord",
+    "Transfer",
+    "UsbPhase",
+    "UsbRecord",
+    "topic",
+]
+
+RECORD = "dexkit.usb"
+"""Metadata record of a USB run."""
+VERSION = 1
+SCHEMA_NAME = "dexkit_usb/msg/Transfer"
+SCHEMA = """\
+# One bulk transfer as the host saw it. Log time: when it was done; publish time: when submitted.
+uint8 endpoint    # address; bit 7 set: from the device to the host
+int32 status      # 0 done, or a negative errno: -110 timed out, -32 stalled, -19 device gone
+uint32 requested  # bytes offered to the device, or room for bytes from it
+uint8[] data      # bytes that were sent, or that came
+"""
+TIMED_OUT = -110
+STALLED = -32
+
+_HEAD = struct.Struct("<4sB3xiII")
+_CDR = b"\0\1\0\0"  # plain CDR, little endian
+
+
+def topic(side: Side, *, inward: bool) -> str:
+    """The channel of one endpoint."""
+    return f"usb/dex3/{side}/{'in' if inward else 'out'}"
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """One bulk transfer.
+
+    :param status: 0, or a negative errno.
+    :param requested: bytes offered or asked for.
+    """
+
+    submitted_ns: int
+    done_ns: int
+    endpoint: int
+    status: int
+    requested: int
+    data: bytes
+
+    @property
+    def inward(self) -> bool:
+        """Whether it came from the device."""
+        return bool(self.endpoint & 0x80)
+
+    def payload(self) -> bytes:
+        """As a message of the recording."""
+        head = _HEAD.pack(_CDR, self.endpoint, self.status, self.requested, len(self.data))
+        return head + self.data
+
+    @classmethod
+    def of(cls, payload: bytes, submitted_ns: int, done_ns: int) -> Transfer:
+        """Read it back.
+
+        :raises TraceUnsupported: the payload is damaged.
+        """
+        if len(payload) >= _HEAD.size:
+            cdr, endpoint, status, requested, length = _HEAD.unpack_from(payload)
+            if cdr == _CDR and length == len(payload) - _HEAD.size:
+                data = payload[_HEAD.size :]
+                return cls(submitted_ns, done_ns, endpoint, status, requested, data)
+        raise TraceUnsupported(f"a USB transfer of {len(payload)} bytes cannot be read")
+
+
+@dataclass(frozen=True)
+class Descriptors:
+    """What the device said of itself.
+
+    :param device: device descriptor, 18 bytes; ``configuration`` with all that belongs to it.
+    :param strings: by index.
+    :param speed: 1 low, 2 full, 3 high, 4 and more super; 0 where the host does not tell.
+    """
+
+    device: bytes
+    configuration: bytes
+    strings: Mapping[int, str] = field(default_factory=dict)
+    speed: int = 0
+
+
+@dataclass
+class UsbPhase:
+    """One stretch of the stimulus.
+
+    :param params: what was commanded, in the checks' terms.
+    """
+
+    name: str
+    begin_ns: int
+    end_ns: int = 0
+    params: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class SideRecord:
+    """One hand's part of the record.
+
+    :param buses: bus and id of each joint's motor that the script assumed.
+    :param trouble: why the script ended early, or empty.
+    """
+
+    descriptors: Descriptors
+    buses: list[tuple[int, int]]
+    phases: list[UsbPhase] = field(default_factory=list)
+    trouble: str = ""
+
+
+@dataclass
+class UsbRecord:
+    """The whole record.
+
+    :param stalls: when the machine lacked processor time.
+    """
+
+    sides: dict[Side, SideRecord] = field(default_factory=dict)
+    stalls: list[Stall] = field(default_factory=list)
+
+    def to_metadata(self) -> dict[str, str]:
+        """The record's content: JSON by side."""
+        record = {"version": str(VERSION)}
+        for side, part in self.sides.items():
+            plain = asdict(part)
+            told = part.descriptors
+            plain["descriptors"] = {
+                "device": told.device.hex(),
+                "configuration": told.configuration.hex(),
+                "strings": {str(i): text for i, text in told.strings.items()},
+                "speed": told.speed,
+            }
+            record[str(side)] = json.dumps(plain)
+        record["stalls"] = json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls])
+        return record
+
+    @classmethod
+    def from_metadata(cls, record: Mapping[str, str]) -> UsbRecord:
+        """Read it back.
+
+        :raises TraceUnsupported: of another version, or damaged.
+        """
+        if record.get("version") != str(VERSION):
+            raise TraceUnsupported(
+                f"USB record of version {record.get('version')!r}",
+                hint="judge it with the dexkit that recorded it, or a newer one",
+            )
+        try:
+            found = cls(stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])])
+            for side in Side:
+                if str(side) in record:
+                    found.sides[side] = _side(json.loads(record[str(side)]))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise TraceUnsupported(f"the USB record is damaged ({error})") from error
+        return found
+
+
+def _side(plain: dict[str, Any]) -> SideRecord:
+    told = plain["descriptors"]
+    return SideRecord(
+        descriptors=Descriptors(
+            device=bytes.fromhex(told["device"]),
+            configuration=bytes.fromhex(told["configuration"]),
+            strings={int(i): str(text) for i, text in told["strings"].items()},
+            speed=int(told["speed"]),
+        ),
+        buses=[(int(bus), int(number)) for bus, number in plain["buses"]],
+        phases=[
+            UsbPhase(p["name"], int(p["begin_ns"]), int(p["end_ns"]), dict(p["params"]))
+            for p in plain["phases"]
+        ],
+        trouble=plain["trouble"],
+    )

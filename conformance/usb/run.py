@@ -1,0 +1,174 @@
+"""A live USB run: the script on real devices, every transfer into the recording."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+from dexkit.clock import RealClock
+from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.usb.access import UsbHost, bulk_pair, open_device
+from dexkit.conformance.usb.record import (
+    RECORD,
+    SCHEMA,
+    SCHEMA_NAME,
+    Descriptors,
+    SideRecord,
+    Transfer,
+    UsbRecord,
+    topic,
+)
+from dexkit.conformance.usb.script import (
+    Action,
+    Alone,
+    In,
+    Observation,
+    Out,
+    Plan,
+    Reopen,
+    UsbScript,
+    Wait,
+)
+from dexkit.conformance.usb.view import Endpoint
+from dexkit.errors import ConformanceError
+from dexkit.hand import Side
+from dexkit.traces.recorder import Recorder
+
+__all__ = ["run"]
+
+
+def run(
+    devices: Mapping[Side, str],
+    recorder: Recorder,
+    *,
+    say: Callable[[str], None] = lambda text: None,
+    stop: threading.Event | None = None,
+) -> bool:
+    """Play the script to every hand, both at once, and record what was transferred.
+
+    :param devices: where each hand is: ``usbip://host:port``, the same with ``/serial``, a serial
+        number, or empty for the only one of its side on this machine.
+    :param say: told what happens, in plain words.
+    :param stop: ends the run early when set; what was recorded is kept.
+    :returns: False when it was ended early.
+    :raises ConformanceError: a hand is not there, or cannot be opened.
+    """
+    stop = stop or threading.Event()
+    hosts: dict[Side, UsbHost] = {}
+    record = UsbRecord()
+    try:
+        for side, where in devices.items():
+            hosts[side] = open_device(where, side)
+        with Heartbeat() as heart, ThreadPoolExecutor(len(hosts)) as pool:
+            turn = threading.Lock()
+            runs = {
+                side: pool.submit(
+                    _play, side, host, recorder, turn, stop, say if i == 0 else lambda text: None
+                )
+                for i, (side, host) in enumerate(hosts.items())
+            }
+            record.sides = {side: future.result() for side, future in runs.items()}
+        record.stalls = heart.stalls
+        recorder.add_metadata(RECORD, record.to_metadata())
+    finally:
+        for host in hosts.values():
+            host.close()
+    return not stop.is_set()
+
+
+def _play(
+    side: Side,
+    host: UsbHost,
+    recorder: Recorder,
+    turn: threading.Lock,
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> SideRecord:
+    told: Descriptors = host.descriptors
+    plan = Plan(side)
+    pair = bulk_pair(told)
+    for inward in (False, True):
+        recorder.add_foreign_channel(topic(side, inward=inward), SCHEMA_NAME, SCHEMA)
+    if pair is None:
+        say("interface 0 has no pair of bulk endpoints: nothing more can be asked of it")
+        return SideRecord(told, list(plan.buses), trouble="there is no pair of bulk endpoints")
+    script = UsbScript(plan, say)
+    player = _Player(side, host, pair, recorder, turn)
+    steps = script.run()
+    action = next(steps)
+    try:
+        while not stop.is_set():
+            action = steps.send(player.carry_out(action))
+        script.trouble = "it was stopped"
+    except StopIteration:
+        pass
+    finally:
+        player.end_turn()
+    phases = [p for p in script.phases if p.end_ns]
+    return SideRecord(told, list(plan.buses), phases, script.trouble)
+
+
+class _Player:
+    """Carries out one script's actions."""
+
+    def __init__(
+        self,
+        side: Side,
+        host: UsbHost,
+        pair: tuple[Endpoint, Endpoint],
+        recorder: Recorder,
+        turn: threading.Lock,
+    ) -> None:
+        self._topics = {inward: topic(side, inward=inward) for inward in (False, True)}
+        self._host = host
+        self._out, self._in = (endpoint.address for endpoint in pair)
+        self._recorder = recorder
+        self._turn, self._has_turn = turn, False
+        self._clock = RealClock()
+        # wall clock, as recordings have it, on a monotonic footing
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() + self._offset_ns
+
+    def carry_out(self, action: Action) -> Observation:
+        """Do it; what came of it."""
+        status, data = 0, b""
+        begin = self._now_ns()
+        match action:
+            case Out(data=sent, timeout=timeout):
+                status = self._host.write(self._out, sent, timeout)
+                self._put(Transfer(begin, self._now_ns(), self._out, status, len(sent), sent))
+            case In(timeout=timeout, length=length):
+                status, data = self._host.read(self._in, length, timeout)
+                self._put(Transfer(begin, self._now_ns(), self._in, status, length, data))
+            case Wait(until_ns=until):
+                self._clock.sleep_until((until - self._offset_ns) / 1e9)
+            case Alone(alone=True):
+                self._turn.acquire()
+                self._has_turn = True
+            case Alone():
+                self.end_turn()
+            case Reopen():
+                try:
+                    self._host.reopen()
+                except ConformanceError:
+                    status = -1  # the next commands get no answer, which is the finding
+        return Observation(self._now_ns(), status, data)
+
+    def end_turn(self) -> None:
+        """Let another hand be alone."""
+        if self._has_turn:
+            self._has_turn = False
+            self._turn.release()
+
+    def _put(self, transfer: Transfer) -> None:
+        self._recorder.put(
+            self._topics[transfer.inward],
+            SCHEMA_NAME,
+            transfer.payload(),
+            transfer.done_ns,
+            transfer.submitted_ns,
+        )

@@ -1,0 +1,280 @@
+"""A USB recording, decoded into what checks ask for."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.phases import Stall
+from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
+from dexkit.conformance.usb.record import (
+    RECORD,
+    Descriptors,
+    SideRecord,
+    Transfer,
+    UsbPhase,
+    UsbRecord,
+    topic,
+)
+from dexkit.hand import JointSpec, Side
+from dexkit.models import DEX3_1
+from dexkit.traces import SampleArray
+
+__all__ = ["Answer", "Device", "Endpoint", "Exchange", "UsbRecording", "UsbSide", "parse_device"]
+
+Floats = NDArray[np.float64]
+
+
+class TraceLike(Protocol):
+    """What is needed of a recording."""
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """Metadata records by name."""
+
+    @property
+    def topics(self) -> Sequence[str]:
+        """All of them."""
+
+    def load(self, topics: Sequence[str]) -> Mapping[str, SampleArray]:
+        """Messages by topic."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """One endpoint of interface 0."""
+
+    address: int
+    kind: int
+    size: int
+
+    @property
+    def bulk(self) -> bool:
+        """Whether it is a bulk endpoint."""
+        return self.kind & 3 == 2
+
+    @property
+    def inward(self) -> bool:
+        """Whether it sends to the host."""
+        return bool(self.address & 0x80)
+
+
+@dataclass(frozen=True)
+class Device:
+    """The descriptors, parsed as far as they go.
+
+    :param endpoints: of interface 0, alternate setting 0.
+    """
+
+    vendor: int = 0
+    product: int = 0
+    release: int = 0
+    manufacturer: str = ""
+    name: str = ""
+    serial: str = ""
+    endpoints: tuple[Endpoint, ...] = ()
+
+
+def parse_device(told: Descriptors) -> Device:
+    """Read the raw descriptors (USB 2.0 specification 9.6)."""
+    if len(told.device) < 18:
+        return Device()
+    vendor, product, release, *indices = struct.unpack_from("<HHHBBB", told.device, 8)
+    maker, name, serial = (told.strings.get(i, "") for i in indices)
+    endpoints = _endpoints(told.configuration)
+    return Device(vendor, product, release, maker, name, serial, endpoints)
+
+
+def _endpoints(raw: bytes) -> tuple[Endpoint, ...]:
+    found: list[Endpoint] = []
+    at, mine = 0, False
+    while at + 2 <= len(raw) and raw[at] >= 2:
+        part = raw[at : at + raw[at]]
+        if part[1] == 4 and len(part) >= 9:
+            mine = part[2] == 0 and part[3] == 0
+        elif part[1] == 5 and len(part) >= 7 and mine:
+            found.append(Endpoint(part[2], part[3], part[4] | part[5] << 8))
+        at += raw[at]
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One frame that came from the device.
+
+    :param t: seconds of the recording at which it was there.
+    """
+
+    t: float
+    transfer: Transfer
+    reading: StateReading
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """A command, and what came next; ``answer`` is None when nothing did."""
+
+    t: float
+    command: Transfer
+    answer: Answer | None
+
+
+@dataclass(eq=False)
+class UsbSide:
+    """One hand's transfers and what was done to it."""
+
+    side: Side
+    record: SideRecord
+    transfers: Sequence[Transfer]
+    origin_ns: int
+
+    @property
+    def joints(self) -> tuple[JointSpec, ...]:
+        """In the order of the IDL."""
+        return DEX3_1.joints[self.side]
+
+    @cached_property
+    def device(self) -> Device:
+        """Its descriptors."""
+        return parse_device(self.record.descriptors)
+
+    def seconds(self, time_ns: int) -> float:
+        """A log time as seconds of the recording."""
+        return (time_ns - self.origin_ns) / 1e9
+
+    def phases(self, name: str) -> list[UsbPhase]:
+        """The phases of that name."""
+        return [p for p in self.record.phases if p.name == name]
+
+    def span(self, phase: UsbPhase) -> tuple[float, float]:
+        """Begin and end of a phase, seconds."""
+        return self.seconds(phase.begin_ns), self.seconds(phase.end_ns)
+
+    def during(self, phase: UsbPhase) -> list[Transfer]:
+        """The transfers that were submitted in it."""
+        return [t for t in self.transfers if phase.begin_ns <= t.submitted_ns < phase.end_ns]
+
+    @cached_property
+    def answers(self) -> list[Answer]:
+        """Every frame that came."""
+        return list(self._answers_in(self.transfers))
+
+    def answers_in(self, phase: UsbPhase) -> list[Answer]:
+        """The frames that came in a phase."""
+        return [a for a in self.answers if phase.begin_ns <= a.transfer.submitted_ns < phase.end_ns]
+
+    def _answers_in(self, transfers: Sequence[Transfer]) -> Iterator[Answer]:
+        for transfer in transfers:
+            if transfer.inward and not transfer.status:
+                reading = read_state(transfer.data)
+                yield Answer(self.seconds(transfer.done_ns), transfer, reading)
+
+    def exchanges(self, phase: UsbPhase) -> list[Exchange]:
+        """Commands of a phase, each with the answer that came before the next."""
+        known = {a.transfer.done_ns: a for a in self.answers}
+        found: list[Exchange] = []
+        for transfer in self.during(phase):
+            t = self.seconds(transfer.submitted_ns)
+            if not transfer.inward:
+                found.append(Exchange(t, transfer, None))
+            elif found and found[-1].answer is None and not transfer.status:
+                last = found[-1]
+                found[-1] = Exchange(last.t, last.command, known[transfer.done_ns])
+        return found
+
+    # -- motion ---------------------------------------------------------------------------------
+
+    def motor(self, answer: Answer, joint: int) -> MotorReading | None:
+        """A joint's motor in an answer."""
+        place = self.record.buses[joint]
+        return next((m for m in answer.reading.motors if (m.bus, m.id) == place), None)
+
+    def q(self, answer: Answer) -> Floats:
+        """Joint positions of an answer, rad, shape (7,); NaN where there is none."""
+        found = np.full(len(self.joints), np.nan)
+        places = {(m.bus, m.id): m.position for m in answer.reading.motors}
+        for i, (place, joint) in enumerate(zip(self.record.buses, self.joints, strict=True)):
+            if place in places:
+                found[i] = places[place] / Scale(joint.gear_ratio).q
+        return found
+
+    def positions(self, phase: UsbPhase, *, before: bool = False) -> tuple[Floats, Floats]:
+        """Times and joint positions of a phase's answers, shapes (n,) and (n, 7).
+
+        :param before: with the last answer before it, where everybody was then.
+        """
+        answers = self.answers_in(phase)
+        if before:
+            earlier = [a for a in self.answers if a.transfer.submitted_ns < phase.begin_ns]
+            answers = earlier[-1:] + answers
+        if not answers:
+            return np.empty(0), np.empty((0, len(self.joints)))
+        return np.array([a.t for a in answers]), np.array([self.q(a) for a in answers])
+
+
+@dataclass(frozen=True, eq=False)
+class UsbRecording:
+    """The USB part of a recording.
+
+    :param origin_ns: log time of second 0.
+    """
+
+    origin_ns: int
+    sides: Mapping[Side, UsbSide]
+    stalls: Sequence[Stall] = field(default_factory=tuple)
+
+    @classmethod
+    def of(cls, trace: TraceLike, *, origin_ns: int | None = None) -> UsbRecording | None:
+        """Decode the USB part of ``trace``, or None when it has none.
+
+        :param origin_ns: None for the first transfer.
+        :raises TraceUnsupported: it cannot be read.
+        """
+        if RECORD not in trace.metadata:
+            return None
+        record = UsbRecord.from_metadata(trace.metadata[RECORD])
+        topics = {s: [topic(s, inward=i) for i in (False, True)] for s in record.sides}
+        present = [t for side in topics.values() for t in side if t in trace.topics]
+        samples = trace.load(present) if present else {}
+        transfers: dict[Side, list[Transfer]] = {}
+        for side, names in topics.items():
+            found = [
+                Transfer.of(payload, int(sent), int(done))
+                for name in names
+                if name in samples
+                for payload, sent, done in zip(
+                    samples[name].payloads,
+                    samples[name].publish_time_ns,
+                    samples[name].log_time_ns,
+                    strict=True,
+                )
+            ]
+            transfers[side] = sorted(found, key=lambda t: (t.submitted_ns, t.done_ns))
+        if origin_ns is None:
+            every = [t.submitted_ns for side in transfers.values() for t in side]
+            origin_ns = min(every, default=0)
+        return cls(
+            origin_ns,
+            {s: UsbSide(s, part, transfers[s], origin_ns) for s, part in record.sides.items()},
+            record.stalls,
+        )
+
+    def starved(self, begin: float, end: float) -> float:
+        """Part of [begin, end], 0 to 1, in which the kit's own machine lacked processor time."""
+        if end <= begin:
+            return 0.0
+        seconds = sum(
+            max(
+                0.0,
+                min(end, (s.end_ns - self.origin_ns) / 1e9)
+                - max(begin, (s.begin_ns - self.origin_ns) / 1e9),
+            )
+            for s in self.stalls
+        )
+        return seconds / (end - begin)
