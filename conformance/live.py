@@ -34,6 +34,7 @@ from dexkit.conformance.wire import Wire
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, TopicConflict, WireError
 from dexkit.hand import Side
+from dexkit.models import DIALECTS
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
 
@@ -115,8 +116,11 @@ def record_run(
         if rig_options.backend != EXTERNAL:
             say(f"starting {rig_options.backend} on domain {rig_options.domain}")
         rig = stack.enter_context(Rig(rig_options, stop))
+        rig.serve()
         if stop.is_set():
             return False
+        if rig_options.backend == EXTERNAL:
+            _expect_somebody(recorder_node, options)
         _refuse_company(recorder_node, options)
         plan = options.plan()
         script = script_for(plan, say)
@@ -161,6 +165,28 @@ def _refuse_company(node: DdsNode, options: LiveOptions) -> None:
             f"{options.rig.domain}",
             hint="stop that client, or choose another --domain",
         )
+
+
+def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
+    """Thirty failures of a hand that is not there would hide the one thing to know."""
+    rig = options.rig
+    topics = {t for s in rig.sides for t in rig.dialect.topics(s)}
+    if node.discovery.wait(
+        lambda endpoints: any(e.topic in topics and not e.own for e in endpoints),
+        timeout=DISCOVERY_TIMEOUT,
+    ):
+        return
+    states = ", ".join(rig.dialect.topics(s)[1] for s in rig.sides)
+    others = sorted({e.topic for e in node.endpoints() if not e.own and e.topic.startswith("rt/")})
+    speaks = [d.name for d in DIALECTS.values() if any(d.topics(s)[1] in others for s in Side)]
+    raise ConformanceError(
+        f"no hand on domain {rig.domain}: nobody publishes {states} or listens for commands",
+        hint=f"there is {', '.join(others)}"
+        + (f": --dialect {' or '.join(speaks)}" if speaks else "")
+        if others
+        else f"is it served on this domain, and on the interface {rig.interface}? "
+        "0 is the robot's domain, 1 that of simulated hands; 'dexkit doctor' looks around",
+    )
 
 
 def _meet(node: DdsNode, plan: Plan) -> None:

@@ -63,9 +63,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     add(
         "dialect",
-        choices=["unitree_go", "unitree_hg", "unitree_actuator"],
-        default="unitree_go",
-        help="how the hand speaks (default: unitree_go)",
+        choices=["unitree_go", "unitree_hg", "unitree_actuator", "dex3"],
+        help="how the hand speaks (default: as its model does; unitree_go with external)",
     )
     add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")
     add("interface", default="lo", help="network interface (default: lo)")
@@ -74,8 +73,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         metavar="PCT",
-        help="something to squeeze, felt at so many percent of opening; left=PCT or right=PCT. "
-        "Default: 37 in the right hand where the kit starts it; 'none' for none",
+        help="something to squeeze, felt at so many percent of opening (Dex3: of closing); "
+        "left=PCT or right=PCT. Default: 37 (Dex3: 60) in the right hand where the kit starts it; "
+        "'none' for none",
     )
     add("set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the backend")
     group.addoption(
@@ -156,8 +156,8 @@ def pytest_terminal_summary(
         text = "Nothing was judged, which is not a pass."
         if config.stash[OPTIONS_KEY] is None:
             text += (
-                " Name the hand: --backend ezgripper (emulated), --backend sim-dex1, "
-                "or --backend external for a service that runs."
+                " Name the hand: --backend ezgripper or dex3-usb (emulated), --backend sim-dex1 "
+                "or sim-dex3, or --backend external for a service that runs."
             )
         terminalreporter.write_line(text, yellow=True)
         return

@@ -23,7 +23,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
 
-__all__ = ["EMULATED", "EXTERNAL", "Emulation", "Rig", "RigOptions", "Tool"]
+__all__ = ["EMULATED", "EXTERNAL", "SIMULATED", "Emulation", "Rig", "RigOptions", "Tool"]
 
 EXTERNAL = "external"
 """The backend's name for a service that somebody else runs."""
@@ -33,19 +33,28 @@ STOP_TIMEOUT = 5.0
 
 @dataclass(frozen=True)
 class Emulation:
-    """How to emulate a backend's device.
+    """How to emulate a backend's device: one process a hand.
 
-    :param arguments: of ``dexkit emulate``, without link and object.
+    :param arguments: of ``dexkit emulate``, without object.
+    :param linked: whether it is reached by a path that it is told (``--link``). Otherwise it says
+        where it is, in the first word after ``ready:``, and is told its side.
     :param settings: that the backend needs to go with it.
     """
 
     arguments: tuple[str, ...]
-    settings: Mapping[str, str]
+    linked: bool
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+    def command(self, side: Side, path: Path) -> tuple[str, ...]:
+        """The arguments for one hand."""
+        place = ("--link", str(path)) if self.linked else ("--side", str(side))
+        return ("emulate", *self.arguments, *place)
 
 
 _CLOSED_AT = "1510"  # encoder tick of the emulated zero: told to both, so nothing has to move
 EMULATED: dict[str, Emulation] = {
-    "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), {"zero": _CLOSED_AT}),
+    "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), True, {"zero": _CLOSED_AT}),
+    "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }
 """Backends whose device the kit can start itself."""
 
@@ -60,7 +69,8 @@ from dexkit.cli import main
 main()
 """
 
-_OBJECT_SETTING = {"sim-dex1": "object"}  # backends that are told of an object by a setting
+SIMULATED = ("sim-dex1", "sim-dex3")
+"""Backends without a device, which are told of an object by the setting ``object``."""
 
 
 class Tool:
@@ -74,6 +84,8 @@ class Tool:
     def __init__(self, *arguments: str) -> None:
         self.arguments = arguments
         self.ready = threading.Event()
+        self.place = ""
+        """The first word after ``ready:``."""
         self._tail: deque[str] = deque(maxlen=40)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _ENTRY, *arguments],
@@ -96,7 +108,8 @@ class Tool:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             self._tail.append(line.rstrip())
-            if line.startswith("ready:"):
+            if line.startswith("ready:") and not self.place:
+                self.place = line.split()[1] if len(line.split()) > 1 else ""
                 self.ready.set()
         self.ready.set()  # nothing more will come
 
@@ -151,8 +164,9 @@ class RigOptions:
 
     :param backend: name, ``module:Class``, or :data:`EXTERNAL`.
     :param devices: path or serial number by side; empty for an emulated one.
-    :param objects: percent of opening at which a side touches an object. Started emulators get
-        such an object; for a device it says what was put between its fingers.
+    :param objects: where a side touches an object, percent of opening of a gripper, of closing of
+        other hands. Started emulators get such an object; for a device it says what was put
+        between its fingers.
     """
 
     backend: str
@@ -192,6 +206,8 @@ class RigOptions:
 class Rig:
     """Everything that runs during a live run, except the kit itself; a context manager.
 
+    Entering it starts the emulated devices, :meth:`serve` the services on them.
+
     :param stop: ends the wait for a process that is starting.
     """
 
@@ -201,10 +217,12 @@ class Rig:
         self._stop = stop
         self._stack = contextlib.ExitStack()
         self.tools: list[Tool] = []
+        self.devices: dict[Side, str] = dict(options.devices)
+        """Where each side's device is, for the backend."""
 
     def __enter__(self) -> Rig:
         try:
-            self._start()
+            self._start_devices()
         except BaseException:
             self._stack.close()
             raise
@@ -222,30 +240,34 @@ class Rig:
         """End all processes. May be called twice."""
         self._stack.close()
 
-    def _start(self) -> None:
+    def _start_devices(self) -> None:
         options = self.options
-        if options.backend == EXTERNAL:
+        if not options.emulated:
             return
-        devices = dict(options.devices)
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="dexkit-")))
+        emulation = EMULATED[options.backend]
+        emulators = {}
+        for s in options.sides:
+            command = emulation.command(s, folder / f"hand-{s}")
+            emulators[s] = self._tool(*command, *_object(options, s))
+        for s, tool in emulators.items():
+            tool.wait_ready(self._stop)
+            self.devices[s] = str(folder / f"hand-{s}") if emulation.linked else tool.place
+
+    def serve(self) -> None:
+        """Start the services, and wait until they are ready.
+
+        :raises ConformanceError: one does not get ready.
+        """
+        options = self.options
+        if options.backend == EXTERNAL or self._stop.is_set():
+            return
         settings = list(options.settings)
         if options.emulated:
-            folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="dexkit-")))
-            emulation = EMULATED[options.backend]
-            devices = {s: str(folder / f"gripper-{s}") for s in options.sides}
-            emulators = [
-                self._tool(
-                    "emulate", *emulation.arguments, "--link", devices[s], *_object(options, s)
-                )
-                for s in options.sides
-            ]
-            for tool in emulators:
-                tool.wait_ready(self._stop)
-            if self._stop.is_set():
-                return
             given = {s.partition("=")[0] for s in settings}
-            settings += [f"{k}={v}" for k, v in emulation.settings.items() if k not in given]
-        services = [self._serve(group, devices, settings) for group in self._groups()]
-        for tool in services:
+            needed = EMULATED[options.backend].settings
+            settings += [f"{k}={v}" for k, v in needed.items() if k not in given]
+        for tool in [self._serve(group, settings) for group in self._groups()]:
             tool.wait_ready(self._stop)
 
     def _groups(self) -> list[tuple[Side, ...]]:
@@ -255,23 +277,20 @@ class Rig:
             return [(s,) for s in self.options.sides]
         return [self.options.sides]
 
-    def _serve(
-        self, sides: Sequence[Side], devices: Mapping[Side, str], settings: Sequence[str]
-    ) -> Tool:
+    def _serve(self, sides: Sequence[Side], settings: Sequence[str]) -> Tool:
         options = self.options
         arguments = ["serve", options.backend, "--side"]
         arguments.append(str(sides[0]) if len(sides) == 1 else "both")
         for side in sides:
-            if side in devices:
+            if side in self.devices:
                 place = f"{side}=" if len(sides) > 1 else ""
-                arguments += ["--device", f"{place}{devices[side]}"]
+                arguments += ["--device", f"{place}{self.devices[side]}"]
         own = list(settings)
-        name = _OBJECT_SETTING.get(options.backend)
-        touch = {options.objects.get(s) for s in sides}
-        if name is not None and touch != {None}:
-            if len(touch) > 1:
-                raise UsageError("hands that share a service share its settings: --object for both")
-            own.append(f"{name}={touch.pop():g}")
+        if options.backend in SIMULATED:
+            for side in sides:
+                if side in options.objects:
+                    place = f"{side}." if len(sides) > 1 else ""
+                    own.append(f"{place}object={options.objects[side]:g}")
         for setting in own:
             arguments += ["--set", setting]
         return self._tool(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.processes import EMULATED, EXTERNAL, RigOptions
+from dexkit.conformance.processes import EMULATED, EXTERNAL, SIMULATED, RigOptions
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.stimuli import phases_for
@@ -19,7 +19,7 @@ from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording, sides_of
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
-from dexkit.models import Dialect, dialect
+from dexkit.models import DEX1_1, Dialect, dialect, model
 
 if TYPE_CHECKING:
     import pytest
@@ -90,7 +90,7 @@ class SuiteOptions:
         *,
         backend: str,
         side: str | None = None,
-        dialect_name: str = "unitree_go",
+        dialect_name: str | None = None,
         domain: int | None = None,
         interface: str = "lo",
         devices: Sequence[str] = (),
@@ -114,19 +114,18 @@ class SuiteOptions:
             raise UsageError(
                 "one --device for two hands", hint="--device left=PATH --device right=PATH"
             )
-        if backend != EXTERNAL:
-            _check_backend(backend, needs_device=not devices and backend not in EMULATED)
+        chosen = _dialect(backend, dialect_name, has_device=bool(devices))
         touch = [o for o in objects if o != "none"]
         by_side = _by_side(touch, sides, float, "--object")
+        low, high, of_what = (5, 60, "opening") if chosen.q_open > 0 else (55, 75, "closing")
         for pct in by_side.values():
-            if not 5 <= pct <= 60:
+            if not low <= pct <= high:
                 raise UsageError(
-                    f"an object at {pct:g} % of opening", hint="5 to 60 % leaves room to move"
+                    f"an object at {pct:g} % of {of_what}",
+                    hint=f"{low} to {high} % leaves room to move",
                 )
-        started = backend in EMULATED or backend == "sim-dex1"
-        chosen = dialect(dialect_name)
-        shared = len({chosen.topics(s) for s in Side}) == 1
-        if not objects and started and not devices and not (shared and backend not in EMULATED):
+        started = backend in EMULATED or backend in SIMULATED
+        if not objects and started and not devices:
             by_side = {s: pct for s, pct in DEFAULT_OBJECTS[chosen.model].items() if s in sides}
         if domain is None and (backend == EXTERNAL or devices):
             domain = 0
@@ -137,7 +136,7 @@ class SuiteOptions:
         for file in (json, report, recording):
             if file is not None and not file.absolute().parent.is_dir():
                 raise UsageError(f"cannot write {file}: there is no such directory")
-        requirements = select(catalogue(), prefixes=require, level=level)
+        requirements = select(catalogue(chosen.model), prefixes=require, level=level)
         if not requirements:
             raise UsageError("no requirement is left by --require and --level together")
         options = cls(
@@ -185,12 +184,26 @@ class SuiteOptions:
         return about
 
 
-def _check_backend(name: str, *, needs_device: bool) -> None:
+def _dialect(name: str, wanted: str | None, *, has_device: bool) -> Dialect:
+    """The dialect to judge in: the one that is wanted, or the first of the backend's model.
+
+    :raises UsageError: the backend needs a device, or its hand does not speak that dialect.
+    """
+    if name == EXTERNAL:
+        return dialect(wanted) if wanted else DEX1_1.dialects[0]
     from dexkit.backends import backend
 
     found = backend(name)
-    if found.needs_device and needs_device:
+    if found.needs_device and not has_device and name not in EMULATED:
         raise UsageError(f"the backend {name} needs a device", hint=f"--device: {found.needs}")
+    spoken = model(found.model).dialects
+    chosen = dialect(wanted) if wanted else spoken[0]
+    if chosen not in spoken:
+        raise UsageError(
+            f"{name} is a {model(found.model).title}, which does not speak {chosen.name}",
+            hint=f"--dialect {' or '.join(d.name for d in spoken)}",
+        )
+    return chosen
 
 
 def _by_side(
@@ -219,7 +232,9 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
     phases = phases_for(options.requirements)
     session = None
     if "replay" in phases:
-        session = Session.load(options.trace) if options.trace else Session.default()
+        session = (
+            Session.load(options.trace) if options.trace else Session.default(options.dialect.model)
+        ).for_hand(options.dialect)
     return LiveOptions(options.rig(domain), phases, session)
 
 

@@ -14,8 +14,8 @@ from dexkit.hand import Side
 pytestmark = pytest.mark.conformance
 
 HOW = (
-    "name the hand to judge: --backend ezgripper (emulated unless --device is given), "
-    "--backend sim-dex1, --backend package.module:Class, or --backend external"
+    "name the hand to judge: --backend ezgripper or dex3-usb (emulated unless --device is given), "
+    "--backend sim-dex1 or sim-dex3, --backend package.module:Class, or --backend external"
 )
 
 

@@ -68,14 +68,14 @@ def command(
     from dexkit.conformance.view import Recording, sides_of
     from dexkit.traces import open_trace
 
-    requirements = select(catalogue(), prefixes=require, level=level)
-    if not requirements:
-        raise ConformanceError("no requirement is left by --require and --level together")
     view = Recording.of(
         open_trace(recording),
         dialect_name=None if dialect == "auto" else dialect,
         sides=sides_of(side) if side else (),
     )
+    requirements = select(catalogue(view.model.name), prefixes=require, level=level)
+    if not requirements:
+        raise ConformanceError("no requirement is left by --require and --level together")
     result = judge(view, requirements=requirements, subject={"recording": recording.name})
     console = Console()
     print_result(result, console, verbose=verbose, more="-v says why")
