@@ -16,7 +16,8 @@ import struct
 import zlib
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 
 from dexkit.hand import JointSpec
 
@@ -210,7 +211,7 @@ class SensorReading:
     intact: bool
 
 
-@dataclass
+@dataclass(frozen=True)
 class StateReading:
     """What could be read in the bytes that the device sent.
 
@@ -222,9 +223,9 @@ class StateReading:
     length: int
     head: bytes
     crc_right: bool = False
-    motors: list[MotorReading] = field(default_factory=list)
-    sensors: list[SensorReading] = field(default_factory=list)
-    strange: list[str] = field(default_factory=list)
+    motors: tuple[MotorReading, ...] = ()
+    sensors: tuple[SensorReading, ...] = ()
+    strange: tuple[str, ...] = ()
     pin_v: float = math.nan
     pin_a: float = math.nan
     error: int = 0
@@ -233,27 +234,39 @@ class StateReading:
 _MOTOR_SIZE, _SENSOR_SIZE = 26, 44
 
 
+@lru_cache(maxsize=2048)
 def read_state(data: bytes) -> StateReading:
     """Read ``McuToLinuxState_t``, or as much of it as there is."""
-    found = StateReading(len(data), data[:2])
     if len(data) < STATE_SIZE:
-        return found
-    data = data[:STATE_SIZE]
-    found.crc_right = crc(data[2:1266]) == _U32.unpack_from(data, 1266)[0]
-    pin_v, _vin_v, _vm_v, pin_a, *rest = _SUPPLY.unpack_from(data, 1226)
-    found.pin_v = pin_v / 65536 * 3.3 * 21.0
-    found.pin_a = pin_a / 65536 * 3.3 * 10.0
-    found.error = rest[6]
-    for bus, size in enumerate(_SIZES.unpack_from(data, 6)):
+        return StateReading(len(data), data[:2])
+    frame = data[:STATE_SIZE]
+    motors: list[MotorReading] = []
+    sensors: list[SensorReading] = []
+    strange: list[str] = []
+    for bus, size in enumerate(_SIZES.unpack_from(frame, 6)):
         if size > STATE_BUS:
-            found.strange.append(f"bus {bus}: state_size {size} of {STATE_BUS}")
+            strange.append(f"bus {bus}: state_size {size} of {STATE_BUS}")
             continue
         start = 26 + bus * STATE_BUS
-        _read_bus(found, bus, data[start : start + size])
-    return found
+        strange += _read_bus(motors, sensors, bus, frame[start : start + size])
+    pin_v, _vin_v, _vm_v, pin_a, *rest = _SUPPLY.unpack_from(frame, 1226)
+    return StateReading(
+        length=len(data),
+        head=data[:2],
+        crc_right=crc(frame[2:1266]) == _U32.unpack_from(frame, 1266)[0],
+        motors=tuple(motors),
+        sensors=tuple(sensors),
+        strange=tuple(strange),
+        pin_v=pin_v / 65536 * 3.3 * 21.0,
+        pin_a=pin_a / 65536 * 3.3 * 10.0,
+        error=rest[6],
+    )
 
 
-def _read_bus(found: StateReading, bus: int, data: bytes) -> None:
+def _read_bus(
+    motors: list[MotorReading], sensors: list[SensorReading], bus: int, data: bytes
+) -> list[str]:
+    """Add what is on a bus; says what is strange there."""
     at = 0
     while at < len(data):
         rest = len(data) - at
@@ -263,7 +276,7 @@ def _read_bus(found: StateReading, bus: int, data: bytes) -> None:
             right = crc(data[at + 2 : at + 22]) == _U32.unpack_from(data, at + 22)[0]
             if head == b"\xfc\xee" or right:
                 v = _MOTOR_STATE.unpack_from(data, at)
-                found.motors.append(
+                motors.append(
                     MotorReading(
                         bus=bus,
                         id=v[1] & 15,
@@ -285,7 +298,7 @@ def _read_bus(found: StateReading, bus: int, data: bytes) -> None:
             right = crc(data[at : at + 40]) == _U32.unpack_from(data, at + 40)[0]
             if head == b"\x7e\xe7" or right:
                 v = _SENSOR.unpack_from(data, at)
-                found.sensors.append(
+                sensors.append(
                     SensorReading(
                         bus=bus,
                         id=v[1] & 15,
@@ -296,8 +309,8 @@ def _read_bus(found: StateReading, bus: int, data: bytes) -> None:
                 )
                 at += _SENSOR_SIZE
                 continue
-        found.strange.append(f"bus {bus}, byte {at}: {head.hex(' ')} begins no packet")
-        return
+        return [f"bus {bus}, byte {at}: {head.hex(' ')} begins no packet"]
+    return []
 
 
 def read_command(data: bytes) -> list[tuple[int, int, Motor]] | None:

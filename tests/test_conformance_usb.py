@@ -1,0 +1,295 @@
+"""The USB conformance: its own reading of the protocol, its teeth, and a run on a real socket."""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.conformance.processes import Tool
+from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.usb import frames
+from dexkit.conformance.usb.access import open_device
+from dexkit.conformance.usb.checks import CHECKS
+from dexkit.conformance.usb.judge import judge_usb
+from dexkit.conformance.usb.mutants import MUTANTS, try_mutant
+from dexkit.conformance.usb.record import (
+    RECORD,
+    SCHEMA,
+    SCHEMA_NAME,
+    TIMED_OUT,
+    Transfer,
+    UsbRecord,
+    topic,
+)
+from dexkit.conformance.usb.run import run
+from dexkit.conformance.usb.script import BUSES, DAMAGES
+from dexkit.conformance.usb.view import UsbRecording
+from dexkit.conformance.usb.virtual import ReferenceDevice, run_virtual
+from dexkit.errors import ConformanceError, TraceUnsupported
+from dexkit.hand import Side
+from dexkit.models import DEX3_1
+from dexkit.traces import open_trace
+from dexkit.traces.recorder import Recorder
+from dexkit.wire import crc32, dex3_usb
+
+BY_NAME = {m.name: m for m in MUTANTS}
+ACCEPTABLE = {Verdict.PASS, Verdict.NOT_APPLICABLE}
+
+
+def usb() -> tuple[Requirement, ...]:
+    return catalogue("dex3-1", "usb")
+
+
+# --------------------------------------------------------------------- its reading of the wire
+
+
+@pytest.mark.parametrize(
+    ("data", "crc"),
+    [
+        (bytes(4), 0xC704DD7B),
+        (b"\xff" * 4, 0x00000000),
+        (b"12345678", 0xFEFC54F9),
+        (bytes(range(16)), 0x081B46CA),
+        (bytes(range(256)) * 4, 0x8ADA4578),
+        (bytes(728), 0xEAC26C88),
+        (bytes(1228), 0x3E3EEF37),
+        (bytes(1264), 0x2768D24E),
+    ],
+)
+def test_its_crc_is_the_fact_sheets(data: bytes, crc: int) -> None:
+    assert frames.crc(data) == crc
+
+
+@given(st.binary(max_size=400))
+def test_its_crc_is_the_codecs(data: bytes) -> None:
+    whole = data[: len(data) // 4 * 4]
+    assert frames.crc(data) == crc32.crc32_words(whole)
+
+
+@pytest.mark.parametrize("size", [1234, 734])
+def test_its_commands_are_what_the_codec_reads(size: int) -> None:
+    joints = DEX3_1.joints[Side.LEFT]
+    buses: dict[int, list[bytes]] = {}
+    for i, (joint, (bus, number)) in enumerate(zip(joints, BUSES, strict=True)):
+        motor = frames.Motor(1, q=0.1 * i - 0.2, dq=-0.5, tau=0.1, kp=1.5, kd=0.2, protect=i == 3)
+        buses.setdefault(bus, []).append(frames.motor_packet(number, motor, joint))
+    data = frames.pack_command(buses, size)
+    theirs = [
+        (bus, m.id, m.status, bool(m.timeout), m.tor_des, m.spd_des, m.pos_des, m.k_pos, m.k_spd)
+        for bus, motors in enumerate(dex3_usb.parse_command(data).buses)
+        for m in motors
+        if isinstance(m, dex3_usb.MotorCmd)
+    ]
+    ours = [
+        (bus, number, m.status, m.protect, m.tau, m.dq, m.q, m.kp, m.kd)
+        for bus, number, m in frames.read_command(data) or ()
+    ]
+    assert len(ours) == 7
+    assert ours == theirs
+
+
+@settings(max_examples=100)
+@given(st.binary(max_size=1400), st.booleans())
+def test_any_bytes_can_be_read(data: bytes, filled: bool) -> None:
+    frame = ReferenceDevice(Side.LEFT).frame()
+    reading = frames.read_state(data + frame[len(data) :] if filled else data)
+    assert reading.length >= len(data)
+    frames.read_command(data)
+
+
+def test_a_damaged_packet_is_seen_and_the_rest_read() -> None:
+    frame = bytearray(ReferenceDevice(Side.LEFT).frame())
+    frame[26 + 10] ^= 1  # in the first motor's position
+    frame[26 + 240] ^= 1  # in the head of bus 1's first motor
+    reading = frames.read_state(bytes(frame))
+    assert not reading.crc_right
+    assert [m.intact for m in reading.motors] == [False, True, True, False, True, True, True]
+    assert len(reading.sensors) == 9
+
+
+# -------------------------------------------------------------------------------- the record
+
+
+@given(st.binary(max_size=100), st.integers(-200, 0), st.integers(0, 2**63))
+def test_a_transfer_comes_back(data: bytes, status: int, when: int) -> None:
+    transfer = Transfer(when, when + 5, 0x81, status, 4096, data)
+    assert Transfer.of(transfer.payload(), when, when + 5) == transfer
+    with pytest.raises(TraceUnsupported):
+        Transfer.of(transfer.payload()[:-1] if data else b"", when, when)
+
+
+def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
+    live = run_virtual(ReferenceDevice(Side.RIGHT))
+    (hand,) = live.sides.values()
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        for transfer in hand.transfers:
+            name = topic(Side.RIGHT, inward=transfer.inward)
+            recorder.add_foreign_channel(name, SCHEMA_NAME, SCHEMA)
+            recorder.put(
+                name, SCHEMA_NAME, transfer.payload(), transfer.done_ns, transfer.submitted_ns
+            )
+        recorder.add_metadata(RECORD, UsbRecord({Side.RIGHT: hand.record}).to_metadata())
+    trace = open_trace(tmp_path / "run.mcap")
+    assert trace.warnings == []
+    assert trace.topics == ["usb/dex3/right/in", "usb/dex3/right/out"]
+    read = UsbRecording.of(trace, origin_ns=live.origin_ns)
+    assert read is not None
+    assert judge_usb(read, usb()) == judge_usb(live, usb())
+
+
+@pytest.mark.parametrize(
+    "record",
+    [{}, {"version": "2"}, {"version": "1"}, {"version": "1", "stalls": "[]", "left": "{}"}],
+)
+def test_a_damaged_record_is_said(record: dict[str, str]) -> None:
+    with pytest.raises(TraceUnsupported):
+        UsbRecord.from_metadata(record)
+
+
+# ------------------------------------------------------------------------------------- teeth
+
+
+def test_every_requirement_has_a_check_and_a_device_that_breaks_it() -> None:
+    ids = {r.id for r in usb()}
+    assert len(ids) >= 40
+    assert set(CHECKS) == ids
+    assert {m.kills for m in MUTANTS} == ids
+    assert all(m.summary for m in MUTANTS)
+    assert len(BY_NAME) == len(MUTANTS)
+    kinds = set(DAMAGES)
+    hand = run_virtual(ReferenceDevice(Side.LEFT)).sides[Side.LEFT]
+    assert {p.params["kind"] for p in hand.phases("malformed")} == kinds
+    assert {r.phase for r in usb()} - {None} <= {p.name for p in hand.record.phases}
+
+
+@pytest.mark.parametrize("side", list(Side))
+def test_a_good_device_passes(side: Side) -> None:
+    results = judge_usb(run_virtual(ReferenceDevice(side)), usb())
+    assert [r.explain() for r in results if r.verdict is not Verdict.PASS] == []
+    assert len(results) == len(usb())
+
+
+def _try(name: str) -> set[str]:
+    return try_mutant(BY_NAME[name].device, usb())[1]
+
+
+@pytest.fixture(scope="module")
+def trials() -> dict[str, set[str]]:
+    """All wrong devices, on all cores."""
+    with ProcessPoolExecutor(min(4, os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
+        return dict(zip(BY_NAME, pool.map(_try, BY_NAME, chunksize=7), strict=True))
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_wrong_device_is_caught_for_the_right_reason(
+    name: str, trials: dict[str, set[str]]
+) -> None:
+    mutant = BY_NAME[name]
+    assert trials[name] == {mutant.kills, *mutant.also}, mutant.summary
+
+
+def test_a_deaf_device_is_not_asked_for_long() -> None:
+    results, _ = try_mutant(BY_NAME["Deaf"].device, usb())
+    assert {r.verdict for r in results if r.requirement.needs != "nothing"} == {
+        Verdict.FAIL,  # no answer
+        Verdict.PASS,  # and nothing unasked
+        Verdict.BLOCKED,
+    }
+
+
+def test_what_failed_is_said_with_its_place() -> None:
+    results, _ = try_mutant(BY_NAME["SlowTrip"].device, usb())
+    (failed,) = [r for r in results if r.verdict is Verdict.FAIL]
+    assert failed.requirement.id == "DEX3USB-PROT-02"
+    assert 1.3 < failed.values["driven_s"] < 1.5
+    (place,) = failed.evidence
+    assert place.topic == "usb/dex3/left/in"
+    assert place.end_s is not None
+    assert 1.4 < place.end_s - place.time_s < 1.6
+
+
+def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
+    from dexkit.conformance.phases import Stall
+
+    recording = run_virtual(BY_NAME["Slow"].device(Side.LEFT))
+    hand = recording.sides[Side.LEFT]
+    stalls = [Stall(p.begin_ns, p.end_ns) for p in hand.phases("burst")]
+    results = judge_usb(replace(recording, stalls=stalls), usb())
+    (rate,) = [r for r in results if r.requirement.id == "DEX3USB-RATE-01"]
+    assert rate.verdict is Verdict.BLOCKED
+    assert "too busy" in rate.reason
+
+
+# ------------------------------------------------------------------------------ on a real socket
+
+
+@pytest.fixture(scope="module")
+def hands() -> object:
+    with Tool("emulate", "dex3-usb", "--side", "both", "--port", "0") as tool:
+        tool.wait_ready(threading.Event())
+        yield next(w for w in tool.last_words.split() if w.startswith("usbip://"))
+
+
+def test_the_emulated_hands_pass(hands: str, tmp_path: Path) -> None:
+    said: list[str] = []
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        assert run(dict.fromkeys(Side, hands), recorder, say=said.append)
+    recording = UsbRecording.of(open_trace(tmp_path / "run.mcap"))
+    assert recording is not None
+    assert set(recording.sides) == set(Side)
+    results = judge_usb(recording, usb())
+    # how fast it is on a test machine says nothing
+    wrong = [
+        r.explain() for r in results if r.verdict not in ACCEPTABLE and not r.requirement.realtime
+    ]
+    assert wrong == []
+    assert said
+
+
+def test_the_host_takes_a_timed_out_transfer_back(hands: str) -> None:
+    host = open_device(hands, Side.LEFT)
+    try:
+        for _ in range(3):
+            assert host.read(0x81, 4096, 0.02) == (TIMED_OUT, b"")
+        frame = frames.pack_command({})
+        assert host.write(0x02, frame, 1.0) == 0
+        status, data = host.read(0x81, 4096, 5.0)
+        assert (status, len(data)) == (0, 1270)
+        assert host.read(0x81, 4096, 0.02) == (TIMED_OUT, b"")
+        host.reopen()
+        assert host.descriptors.device[8:12] == b"\xb7\x34\x10\x10"
+    finally:
+        host.close()
+
+
+def test_a_run_can_be_stopped(hands: str, tmp_path: Path) -> None:
+    stop = threading.Event()
+    stop.set()
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        assert not run({Side.LEFT: hands}, recorder, stop=stop)
+
+
+@pytest.mark.parametrize(
+    ("where", "says"),
+    [
+        ("usbip://127.0.0.1:1", "127.0.0.1:1"),
+        ("usbip://127.0.0.1:x", "127.0.0.1:x"),
+    ],
+)
+def test_a_device_that_is_not_there_is_said(where: str, says: str) -> None:
+    with pytest.raises(ConformanceError, match=says):
+        open_device(where, Side.LEFT)
+
+
+def test_an_unknown_serial_number_is_said(hands: str) -> None:
+    with pytest.raises(ConformanceError, match="no left Dex3-1"):
+        open_device(f"{hands}/0000", Side.LEFT)
