@@ -386,6 +386,20 @@ class TestDiagnose:
         (text,) = diagnose(peers, self.LEGACY, list(Side))
         assert "--dialect unitree_go" in text
 
+    def test_a_client_of_another_hand_that_nobody_serves(self) -> None:
+        waiting = FakeEndpoint("rt/dex3/left/state", self.HG.state_type, "reader")
+        (text,) = diagnose([waiting], self.GO, [Side.LEFT])
+        assert "rt/dex3/left/state, the state of a dex3-1" in text
+        served = FakeEndpoint("rt/dex3/left/state", self.HG.state_type, "writer")
+        assert diagnose([waiting, served], self.GO, [Side.LEFT]) == []
+
+    def test_the_low_rate_topic(self) -> None:
+        topic = "rt/lf/dex3/left/state"
+        peer = FakeEndpoint(topic, self.GO.state_type, "reader")
+        (text,) = diagnose([peer], dialect("dex3"), [Side.LEFT])
+        assert topic in text
+        assert "never match" in text
+
     def test_own_endpoints_are_not_peers(self) -> None:
         peers = [FakeEndpoint(CMD, self.HG.cmd_type, "writer", own=True)]
         assert diagnose(peers, self.GO, [Side.LEFT]) == []

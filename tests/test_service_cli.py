@@ -125,6 +125,40 @@ def test_both_sides_in_one_process(dds_domain: int, dds_node: DdsNode) -> None:
             take_until(reader, bool)
 
 
+def test_a_dex3_is_served_in_its_own_dialect(dds_domain: int, dds_node: DdsNode) -> None:
+    d = dialect("dex3")
+    topics = [d.topics(side)[1] for side in Side] + [
+        d.low_rate_topic.format(side=side) for side in Side
+    ]
+    readers = [dds_node.reader(topic, d.state_type) for topic in topics]
+    settings = ("--set", "supply=30", "--set", "right.supply=48")
+    with serving("sim-dex3", "--side", "both", "--domain", dds_domain, *settings) as process:
+        for side in Side:
+            ready = process.ready()
+            for part in (f"sim-dex3 {side} on rt/dex3/{side}/cmd", "(dex3)", "1000 Hz"):
+                assert part in ready
+        volts = [round(take_until(reader, bool)[-1].message.power_v) for reader in readers]
+        assert volts == [30, 48, 30, 48]
+        assert process.end(signal.SIGTERM)[0] == 0
+
+
+def test_two_grippers_each_with_its_device_and_settings(dds_domain: int, dds_node: DdsNode) -> None:
+    readers = [dds_node.reader(GO.topics(side)[1], GO.state_type) for side in Side]
+    with (
+        emulated_ezgripper(start=20.0, closed_at=1500) as left,
+        emulated_ezgripper(start=80.0, closed_at=1400) as right,
+        serving(
+            *("ezgripper", "--side", "both", "--domain", dds_domain),
+            *("--device", f"left={left.path}", "--set", "left.zero=1500"),
+            *("--device", f"right={right.path}", "--set", "right.zero=1400"),
+        ) as process,
+    ):
+        process.ready()
+        assert "right" in process.ready()
+        q = [take_until(reader, bool)[-1].message.states[0].q for reader in readers]
+        assert q == [pytest.approx(0.2 * 5.4, abs=0.1), pytest.approx(0.8 * 5.4, abs=0.1)]
+
+
 def test_a_client_of_another_dialect_is_told(dds_domain: int, dds_node: DdsNode) -> None:
     dds_node.writer("rt/unitree_actuator/cmd", GO.cmd_type)
     with serving("sim-dex1", "--side", "left", "--domain", dds_domain) as process:
@@ -198,6 +232,10 @@ class TestArguments:
             (["sim-dex1", "--side", "left", "--dialect", "x"], "--dialect"),
             (["sim-dex1", "--side", "left", "--set", "colour=red"], "no setting 'colour'"),
             (["sim-dex1", "--side", "left", "--set", "colour"], "not KEY=VALUE"),
+            (["sim-dex1", "--side", "left", "--set", "right.start=1"], "only the left"),
+            (["sim-dex1", "--side", "left", "--dialect", "dex3"], "does not speak dex3"),
+            (["sim-dex3", "--side", "left", "--dialect", "unitree_go"], "it speaks dex3"),
+            (["sim-dex1", "--side", "left", "--usb", "usbip://x:1"], "no setting 'usb'"),
             (["ezgripper", "--side", "left"], "needs a device"),
             (["ezgripper", "--side", "both", "--device", "/dev/x"], "which hand is /dev/x"),
             (["ezgripper", "--side", "both", "--device", "left=/dev/x"], "needs a device"),
@@ -213,7 +251,8 @@ class TestArguments:
     def test_what_makes_no_sense_is_said(self, arguments: list[str], message: str) -> None:
         result = CliRunner().invoke(cli, ["serve", *arguments])
         assert result.exit_code != 0
-        assert message in result.output + str(result.exception)
+        hint = getattr(result.exception, "hint", "")
+        assert message in f"{result.output} {result.exception} {hint}"
 
     def test_help_says_what_the_defaults_are(self) -> None:
         result = CliRunner().invoke(cli, ["serve", "--help"])
@@ -227,3 +266,17 @@ class TestArguments:
             "SIGUSR1",
         ):
             assert text in result.output
+
+
+def test_a_mistyped_command_gets_a_suggestion() -> None:
+    result = CliRunner().invoke(cli, ["srve"])
+    assert result.exit_code == 2
+    assert "Did you mean 'serve'?" in result.output
+    assert "mean" not in CliRunner().invoke(cli, ["xyzzy"]).output
+
+
+def test_backends_fit_a_narrow_terminal() -> None:
+    result = CliRunner().invoke(cli, ["backends"], env={"COLUMNS": "80"})
+    assert result.exit_code == 0
+    assert max(map(len, result.output.splitlines())) <= 80
+    assert "--set zero=..." in result.output
