@@ -10,7 +10,7 @@ import numpy as np
 from dexkit.conformance.report.plots import Band, Line, histogram, time_plot
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.conformance.view import Recording, SideView
-from dexkit.hand import Side
+from dexkit.hand import JointSpec, Side
 from dexkit.models import MODELS
 
 __all__ = ["render", "write_html"]
@@ -115,9 +115,9 @@ def _facts(result: RunResult) -> str:
 def _what(result: RunResult, view: Recording) -> str:
     emulated = result.subject.get("device") == "emulated"
     text = [
-        "<h2>What was done</h2><p>A Unitree robot talks to its grippers over a network in small "
-        "messages: it sends <em>commands</em> (go to this opening) some 200 times a second and "
-        "gets <em>state</em> back (this is where I am) some 500 times a second. Another gripper "
+        "<h2>What was done</h2><p>A Unitree robot talks to its hands over a network in small "
+        "messages: it sends <em>commands</em> (go there) 100 or 200 times a second and gets "
+        "<em>state</em> back (this is where I am) 500 to 1000 times a second. Another hand "
         "can take the original's place only if it speaks and behaves the same. "
     ]
     if view.stimulus is not None:
@@ -195,52 +195,75 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
         return f"<h3>{hand.side} hand</h3><p>No state of this hand was received.</p>"
     span = (0.0, max(view.duration, 0.1))
     bands = _bands(view, hand.side) + _alarms(result, hand.side)
-    stroke = hand.joints[0].stroke
-    goal = np.clip(commands.q[:, 0], -0.1 * stroke, 1.1 * stroke)  # wild ones would squash the rest
-    lines = [
-        Line("command", "cmd", commands.t, goal),
-        Line("state", "state", states.t, states.q[:, 0]),
-    ]
     touch = view.stimulus.objects.get(hand.side) if view.stimulus else None
-    felt = [(touch, "object")] if touch is not None else []
-    parts = [f"<h3>{str(hand.side).capitalize()} hand: opening (0 closed, {stroke:.2f} open)</h3>"]
-    parts.append(
-        _plot(
-            time_plot(
-                f"{hand.side} hand, position",
-                lines,
-                unit="rad",
-                span=span,
-                bands=bands,
-                include=(0.0, stroke),
-                limits=felt,
-            )
-        )
-    )
+    gripper = len(hand.joints) == 1
+    # of a gripper it is an angle; of a hand with fingers a percentage of closing, at no one angle
+    felt = [(touch, "object")] if touch is not None and gripper else []
+    opening = f": opening (0 closed, {hand.joints[0].stroke:.2f} open)" if gripper else ""
+    parts = [f"<h3>{str(hand.side).capitalize()} hand{opening}</h3>"]
     replay = view.phases("replay", hand.side)
-    if replay:
-        a, b = view.seconds(replay[0].begin_ns), view.seconds(replay[0].end_ns)
-        name = replay[0].params.get("session", "session")
-        parts.append(f"<p>The replayed session <code>{escape(name)}</code>, closer:</p>")
+    for index, joint in enumerate(hand.joints):
+        height = 220 if gripper else 150
+        name = "position" if gripper else joint.name
+        if not gripper:
+            parts.append(f"<p><b>{escape(joint.name)}</b>{_way(joint)}</p>")
+        margin = 0.1 * joint.stroke  # wild commands would squash the rest
+        lines = [
+            Line(
+                "command",
+                "cmd",
+                commands.t,
+                np.clip(commands.q[:, index], joint.q_min - margin, joint.q_max + margin),
+            ),
+            Line("state", "state", states.t, states.q[:, index]),
+        ]
+        include = (0.0, joint.stroke) if gripper else (joint.q_min, joint.q_max)
         parts.append(
             _plot(
                 time_plot(
-                    f"{hand.side} hand, replayed session",
+                    f"{hand.side} hand, {name}",
                     lines,
                     unit="rad",
-                    span=(a, b),
-                    include=(0.0, stroke),
+                    span=span,
+                    bands=bands,
+                    height=height,
+                    include=include,
                     limits=felt,
                 )
             )
         )
-    held = f" There is something between its fingers, felt at {touch:.2f} rad." if felt else ""
-    parts.append(f"<p>Force (tau_est): negative is closing.{held}</p>")
+        if replay and gripper:
+            a, b = view.seconds(replay[0].begin_ns), view.seconds(replay[0].end_ns)
+            session = replay[0].params.get("session", "session")
+            parts.append(f"<p>The replayed session <code>{escape(session)}</code>, closer:</p>")
+            parts.append(
+                _plot(
+                    time_plot(
+                        f"{hand.side} hand, replayed session",
+                        lines,
+                        unit="rad",
+                        span=(a, b),
+                        include=include,
+                        limits=felt,
+                    )
+                )
+            )
+    if gripper:
+        held = f" There is something between its fingers, felt at {touch:.2f} rad." if felt else ""
+        parts.append(f"<p>Force (tau_est): negative is closing.{held}</p>")
+    else:
+        held = (
+            f" There is something between its fingers, at {touch:g} % of closing." if touch else ""
+        )
+        parts.append(f"<p>Torque (tau_est) of each joint.{held}</p>")
     parts.append(
         _plot(
             time_plot(
                 f"{hand.side} hand, force",
-                [Line("force", "force", states.t, states.tau[:, 0])],
+                [
+                    Line("force", "force", states.t, states.tau[:, index])
+                    for index in range(len(hand.joints))
+                ],
                 unit="N m",
                 span=span,
                 bands=_bands(view, hand.side, label=False),
@@ -253,7 +276,7 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
     if len(intervals) > 10 and (intervals > 0).any():
         limits = [(5.0, "5 ms: 200 Hz")]
         parts.append(
-            "<p>Time from each state to the next. A good hand has one tall bar at 2 ms; the count "
+            "<p>Time from each state to the next. A good hand has one tall bar; the count "
             "axis is logarithmic, so that single late ones show.</p>"
         )
         parts.append(
@@ -286,6 +309,11 @@ def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
             )
         )
     return "".join(parts)
+
+
+def _way(joint: JointSpec) -> str:
+    closing = {1: ", closes upwards", -1: ", closes downwards", 0: ""}[joint.closing]
+    return f" ({joint.q_min:.2f} to {joint.q_max:.2f} rad{closing})"
 
 
 def _plot(svg: str) -> str:
