@@ -11,6 +11,7 @@ import numpy as np
 from dexkit.conformance.checks import Check, Context, Outcome, all_checks
 from dexkit.conformance.requirements import Level, Requirement, catalogue
 from dexkit.conformance.results import TOO_BUSY, Result, RunResult, Verdict
+from dexkit.conformance.usb.judge import judge_usb
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
@@ -45,6 +46,14 @@ def judge(
         results += [r for r in found.values() if r.requirement.id in wanted]
     order = {r.id: i for i, r in enumerate(every)}
     results.sort(key=lambda r: order[r.requirement.id])
+    if recording.usb is not None:
+        usb = catalogue(recording.model.name, "usb")
+        judged = {str(side) for side in recording.judged}
+        results += [
+            r
+            for r in judge_usb(recording.usb, usb)
+            if r.side in judged and (requirements is None or r.requirement.id in wanted)
+        ]
     about = {
         "model": recording.model.name,
         "dialect": recording.dialect.name,

@@ -51,12 +51,14 @@ class LiveOptions:
 
     :param phases: of the stimulus.
     :param force: go on although somebody else commands the hand.
+    :param usb: play the USB script at the devices first, before a service takes them.
     """
 
     rig: RigOptions
     phases: frozenset[str]
     session: Session | None = None
     force: bool = False
+    usb: bool = False
 
     def plan(self) -> Plan:
         """What the script is to do."""
@@ -116,6 +118,8 @@ def record_run(
         if rig_options.backend != EXTERNAL:
             say(f"starting {rig_options.backend} on domain {rig_options.domain}")
         rig = stack.enter_context(Rig(rig_options, stop))
+        if options.usb and not _judge_usb(rig, recorder, say, stop):
+            return False
         rig.serve()
         if stop.is_set():
             return False
@@ -140,6 +144,21 @@ def record_run(
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished
+
+
+def _judge_usb(
+    rig: Rig, recorder: Recorder, say: Callable[[str], None], stop: threading.Event
+) -> bool:
+    """The hands on USB, while nobody else has them; False when it was stopped."""
+    from dexkit.conformance.usb.run import run
+
+    server = rig.options.usb_server
+    devices = {
+        side: f"{server}/{where}" if server and "://" not in where else where
+        for side, where in rig.devices.items()
+    }
+    say(f"the {' and the '.join(map(str, devices))} hand on USB")
+    return run(devices, recorder, say=say, stop=stop)
 
 
 def _node(options: RigOptions) -> DdsNode:

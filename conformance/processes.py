@@ -23,7 +23,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
 
-__all__ = ["EMULATED", "EXTERNAL", "SIMULATED", "Emulation", "Rig", "RigOptions", "Tool"]
+__all__ = ["EMULATED", "EXTERNAL", "ON_USB", "SIMULATED", "Emulation", "Rig", "RigOptions", "Tool"]
 
 EXTERNAL = "external"
 """The backend's name for a service that somebody else runs."""
@@ -69,6 +69,8 @@ from dexkit.cli import main
 main()
 """
 
+ON_USB = ("dex3-usb",)
+"""Backends whose device is judged on USB as well."""
 SIMULATED = ("sim-dex1", "sim-dex3")
 """Backends without a device, which are told of an object by the setting ``object``."""
 
@@ -182,6 +184,12 @@ class RigOptions:
     def emulated(self) -> bool:
         """Whether the device is emulated by a process of the kit's."""
         return self.backend in EMULATED and not self.devices
+
+    @property
+    def usb_server(self) -> str:
+        """Where a setting says that USB devices are, or empty."""
+        settings = dict(s.partition("=")[::2] for s in self.settings)
+        return settings.get("usb", "")
 
     def check(self) -> None:
         """Refuse what makes no sense.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.processes import EMULATED, EXTERNAL, SIMULATED, RigOptions
+from dexkit.conformance.processes import EMULATED, EXTERNAL, ON_USB, SIMULATED, RigOptions
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.stimuli import phases_for
@@ -136,7 +136,10 @@ class SuiteOptions:
         for file in (json, report, recording):
             if file is not None and not file.absolute().parent.is_dir():
                 raise UsageError(f"cannot write {file}: there is no such directory")
-        requirements = select(catalogue(chosen.model), prefixes=require, level=level)
+        every = catalogue(chosen.model)
+        if backend in ON_USB:
+            every += catalogue(chosen.model, "usb")
+        requirements = select(every, prefixes=require, level=level)
         if not requirements:
             raise UsageError("no requirement is left by --require and --level together")
         options = cls(
@@ -229,13 +232,14 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
     """
     from dexkit.conformance.live import LiveOptions
 
-    phases = phases_for(options.requirements)
+    phases = phases_for(r for r in options.requirements if r.layer == "dds")
     session = None
     if "replay" in phases:
         session = (
             Session.load(options.trace) if options.trace else Session.default(options.dialect.model)
         ).for_hand(options.dialect)
-    return LiveOptions(options.rig(domain), phases, session)
+    usb = any(r.layer == "usb" for r in options.requirements)
+    return LiveOptions(options.rig(domain), phases, session, usb=usb)
 
 
 def run_suite(

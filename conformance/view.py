@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.phases import RECORD, Phase, Stimulus
+from dexkit.conformance.usb.view import UsbRecording
 from dexkit.conformance.wire import Wire
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side
@@ -131,6 +132,7 @@ class Recording:
     :param duration: seconds.
     :param sides: every side that has a topic; ``judged`` names those to be judged.
     :param stimulus: what the kit did, or None in a recording of somebody else's session.
+    :param usb: what was transferred on USB, where the kit did that.
     """
 
     dialect: Dialect
@@ -142,6 +144,7 @@ class Recording:
     stimulus: Stimulus | None
     judged: tuple[Side, ...]
     notes: Sequence[str] = ()
+    usb: UsbRecording | None = None
 
     @classmethod
     def of(
@@ -156,7 +159,7 @@ class Recording:
         :param dialect_name: None to take the one that the topics and types show.
         :param sides: the sides to judge; none for those that have a topic.
         :raises ConformanceError: it has no topic of the dialect.
-        :raises TraceUnsupported: its stimulus record cannot be read.
+        :raises TraceUnsupported: its stimulus record, or its USB part, cannot be read.
         """
         chosen = dialect(dialect_name) if dialect_name else detect_dialect(trace)
         stimulus = (
@@ -178,6 +181,9 @@ class Recording:
         samples = trace.load(sorted(topics)) if topics else {}
         times = [s.log_time_ns for s in samples.values() if len(s)]
         marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
+        usb = UsbRecording.of(trace)
+        if usb is not None:
+            marks.append(usb.origin_ns)
         origin = min([int(t[0]) for t in times] + marks, default=0)
         end = max([int(t[-1]) for t in times] + marks, default=0)
         wire = Wire(chosen)
@@ -205,6 +211,7 @@ class Recording:
             stimulus=stimulus,
             judged=judged,
             notes=notes,
+            usb=usb.since(origin) if usb is not None else None,
         )
 
     @property

@@ -141,9 +141,9 @@ def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
     trace = open_trace(tmp_path / "run.mcap")
     assert trace.warnings == []
     assert trace.topics == ["usb/dex3/right/in", "usb/dex3/right/out"]
-    read = UsbRecording.of(trace, origin_ns=live.origin_ns)
+    read = UsbRecording.of(trace)
     assert read is not None
-    assert judge_usb(read, usb()) == judge_usb(live, usb())
+    assert judge_usb(read.since(live.origin_ns), usb()) == judge_usb(live, usb())
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -24,7 +24,7 @@ from dexkit.conformance.usb.record import (
 )
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX3_1
-from dexkit.traces import SampleArray
+from dexkit.traces import ChannelInfo, SampleArray
 
 __all__ = ["Answer", "Device", "Endpoint", "Exchange", "UsbRecording", "UsbSide", "parse_device"]
 
@@ -39,7 +39,7 @@ class TraceLike(Protocol):
         """Metadata records by name."""
 
     @property
-    def topics(self) -> Sequence[str]:
+    def channels(self) -> Sequence[ChannelInfo]:
         """All of them."""
 
     def load(self, topics: Sequence[str]) -> Mapping[str, SampleArray]:
@@ -230,17 +230,17 @@ class UsbRecording:
     stalls: Sequence[Stall] = field(default_factory=tuple)
 
     @classmethod
-    def of(cls, trace: TraceLike, *, origin_ns: int | None = None) -> UsbRecording | None:
+    def of(cls, trace: TraceLike) -> UsbRecording | None:
         """Decode the USB part of ``trace``, or None when it has none.
 
-        :param origin_ns: None for the first transfer.
         :raises TraceUnsupported: it cannot be read.
         """
         if RECORD not in trace.metadata:
             return None
         record = UsbRecord.from_metadata(trace.metadata[RECORD])
         topics = {s: [topic(s, inward=i) for i in (False, True)] for s in record.sides}
-        present = [t for side in topics.values() for t in side if t in trace.topics]
+        known = {c.topic for c in trace.channels}
+        present = [t for side in topics.values() for t in side if t in known]
         samples = trace.load(present) if present else {}
         transfers: dict[Side, list[Transfer]] = {}
         for side, names in topics.items():
@@ -256,14 +256,17 @@ class UsbRecording:
                 )
             ]
             transfers[side] = sorted(found, key=lambda t: (t.submitted_ns, t.done_ns))
-        if origin_ns is None:
-            every = [t.submitted_ns for side in transfers.values() for t in side]
-            origin_ns = min(every, default=0)
+        origin_ns = min((t.submitted_ns for side in transfers.values() for t in side), default=0)
         return cls(
             origin_ns,
             {s: UsbSide(s, part, transfers[s], origin_ns) for s, part in record.sides.items()},
             record.stalls,
         )
+
+    def since(self, origin_ns: int) -> UsbRecording:
+        """The same with another second 0."""
+        sides = {s: replace(side, origin_ns=origin_ns) for s, side in self.sides.items()}
+        return UsbRecording(origin_ns, sides, self.stalls)
 
     def starved(self, begin: float, end: float) -> float:
         """Part of [begin, end], 0 to 1, in which the kit's own machine lacked processor time."""

@@ -73,7 +73,10 @@ def command(
         dialect_name=None if dialect == "auto" else dialect,
         sides=sides_of(side) if side else (),
     )
-    requirements = select(catalogue(view.model.name), prefixes=require, level=level)
+    every = catalogue(view.model.name)
+    if view.usb is not None:
+        every += catalogue(view.model.name, "usb")
+    requirements = select(every, prefixes=require, level=level)
     if not requirements:
         raise ConformanceError("no requirement is left by --require and --level together")
     result = judge(view, requirements=requirements, subject={"recording": recording.name})
