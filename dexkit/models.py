@@ -238,15 +238,19 @@ def _dex3_joints(side: Side) -> tuple[JointSpec, ...]:
 _DEX3_REST = (0.05, 0.2, 0.3, -0.3, -0.4, -0.3, -0.4)  # left; half relaxed, clear of all stops
 
 # F B.4, seed 002 "Number of Pressure Sensors": 9 packets, 33 elements: three areas of 2 x 2 on
-# the palm, 2 x 2 on each finger pad, 3 x 1 on each finger tip. Which packet is which, and which
-# of the 12 values are elements, is in a figure that the sources lost: this order is assumed.
+# the palm, 2 x 2 on each finger pad, 3 x 1 on each finger tip. Which packet is which, and which of
+# the 12 values are elements, is in a figure that the sources lost. Two public clients of real
+# hands read these slots, and no others: the Dex3 clients in sakuzeng/xiangyang_g1 and in a fork of
+# xr_teleoperate that names the packets so, too. They agree with each other and with the numbers of
+# elements; a third project names the first six tips before pads and index before middle. Likely,
+# not measured here.
 _DEX3_SENSORS = (
     *(
         PressureSensor(f"{finger} {part}", slots)
         for finger in ("thumb", "middle", "index")
-        for part, slots in (("tip", (0, 1, 2)), ("pad", (0, 1, 2, 3)))
+        for part, slots in (("pad", (0, 2, 9, 11)), ("tip", (3, 6, 8)))
     ),
-    *(PressureSensor(f"palm {i}", (0, 1, 2, 3)) for i in range(3)),
+    *(PressureSensor(f"palm {i}", (0, 2, 9, 11)) for i in range(3)),
 )
 
 DEX3_1 = HandModel(
