@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -233,25 +234,33 @@ def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
 
 
 @pytest.fixture(scope="module")
-def hands() -> object:
+def hands() -> Iterator[str]:
     with Tool("emulate", "dex3-usb", "--side", "both", "--port", "0") as tool:
         tool.wait_ready(threading.Event())
-        yield next(w for w in tool.last_words.split() if w.startswith("usbip://"))
+        yield tool.place
 
 
-def test_the_emulated_hands_pass(hands: str, tmp_path: Path) -> None:
+def test_an_emulated_hand_passes_and_a_faulty_one_beside_it_does_not(
+    hands: str, tmp_path: Path
+) -> None:
     said: list[str] = []
-    with Recorder(tmp_path / "run.mcap") as recorder:
-        assert run(dict.fromkeys(Side, hands), recorder, say=said.append)
+    fault = ("--fault", "silent:id=3")
+    with (
+        Tool("emulate", "dex3-usb", "--side", "right", "--port", "0", *fault) as faulty,
+        Recorder(tmp_path / "run.mcap") as recorder,
+    ):
+        faulty.wait_ready(threading.Event())
+        devices = {Side.LEFT: hands, Side.RIGHT: faulty.place}
+        assert run(devices, recorder, say=said.append)
     recording = UsbRecording.of(open_trace(tmp_path / "run.mcap"))
     assert recording is not None
     assert set(recording.sides) == set(Side)
     results = judge_usb(recording, usb())
     # how fast it is on a test machine says nothing
-    wrong = [
-        r.explain() for r in results if r.verdict not in ACCEPTABLE and not r.requirement.realtime
-    ]
-    assert wrong == []
+    wrong = [r for r in results if r.verdict not in ACCEPTABLE and not r.requirement.realtime]
+    assert [r.explain() for r in wrong if r.side == "left"] == []
+    blamed = {r.requirement.id for r in wrong if r.verdict is not Verdict.BLOCKED}
+    assert blamed == {"DEX3USB-PACK-02"}
     assert said
 
 

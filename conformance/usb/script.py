@@ -78,7 +78,6 @@ DAMAGES: dict[str, str] = {
 DRIVEN, FREE = 3, 5
 """Joints of the time-out test: middle_0 is driven with protection, index_0 without."""
 ANSWER_TIMEOUT = 1.0  # s; IN timeout of the manual's code (seed 002 receiveState)
-_PERIOD = 1 / DEX3_1.command_rate
 _STEP = 0.2  # rad
 _KP, _KD = 1.5, 0.1  # grip of the vendor's C++ example (facts/unitree-dex B.1)
 _SPEED = 0.4  # rad/s
@@ -147,11 +146,13 @@ class Plan:
     """What to do.
 
     :param burst: commands of each phase ``burst``.
+    :param period: s between the commands of the other phases.
     :param buses: (bus, id) of each joint's motor.
     """
 
     side: Side
     burst: int = 200
+    period: float = 1 / DEX3_1.command_rate
     buses: tuple[tuple[int, int], ...] = BUSES
 
 
@@ -205,8 +206,8 @@ class UsbScript:
         yield from self._do(Wait(self._now + round(seconds * 1e9)))
 
     def _pace(self) -> Steps:
-        """Wait for the next tick of 100 Hz; ticks that were missed are gone."""
-        self._next = max(self._next + round(_PERIOD * 1e9), self._now)
+        """Wait for the next tick; ticks that were missed are gone."""
+        self._next = max(self._next + round(self.plan.period * 1e9), self._now)
         yield from self._do(Wait(self._next))
 
     def _exchange(self, frame: bytes) -> Steps:
@@ -293,7 +294,7 @@ class UsbScript:
         phase.end_ns = self._now
 
     def _during(self, seconds: float, frame: bytes) -> Steps:
-        """Send the same command at 100 Hz."""
+        """Send the same command, once a tick."""
         end = self._now + round(seconds * 1e9)
         self._next = self._now
         while self._now < end:
@@ -310,7 +311,7 @@ class UsbScript:
 
         frame = self._frame(Motor())
         phase = self._begin("exchange", status=0, size=self._size)
-        yield from self._during(20 * _PERIOD, frame)
+        yield from self._during(20 * self.plan.period, frame)
         yield from self._silence(0.05)
         self._end(phase)
 

@@ -296,8 +296,11 @@ def _sensor_packet(number: int, elements: int) -> bytes:
 
 
 def run_virtual(device: ReferenceDevice, plan: Plan | None = None) -> UsbRecording:
-    """The whole script on a device in memory."""
-    plan = plan or Plan(device.side, burst=25)
+    """The whole script on a device in memory.
+
+    :param plan: by default one with fewer commands than a live run: there is no noise here.
+    """
+    plan = plan or Plan(device.side, burst=25, period=0.02)
     told = device.descriptors()
     script = UsbScript(plan)
     transfers: list[Transfer] = []
