@@ -10,7 +10,10 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.hand import Floats
 
 # stimuli whose own requirements judge the state's flow
-OWN_GAP_RULE = ("silence", "nan", "out-of-range", "empty")
+OWN_GAP_RULE = (
+    *("silence", "guard"),
+    *("nan", "out-of-range", "empty", "short", "long", "wrong-id"),
+)
 
 
 def gaps(ctx: Context, longer_than: float, begin: float, end: float) -> list[tuple[float, float]]:

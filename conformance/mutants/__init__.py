@@ -8,25 +8,26 @@ requirement may fail or warn: it would be caught for the wrong reason.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import gripper
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.mutants import dex3, gripper, shared
+from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import RunResult, Verdict
-from dexkit.conformance.stimuli import Plan, Session, phases_for
+from dexkit.conformance.stimuli import SCRIPTS, Plan, Session, phases_for
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import Service, run_virtual
 from dexkit.conformance.virtual.dex3 import Dex3Service
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, dialect
+from dexkit.models import DEX1_1, DEX3_1, dialect, model
 
 __all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
 
 SESSION_SECONDS = 4.0
+LEFT = (Side.LEFT,)
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,9 @@ class Mutant:
     :param model: the hand model that it is a bad copy of.
     :param kills: the requirement that must catch it.
     :param also: requirements that fail or warn with it.
+    :param sides: the hands that are needed to see it.
+    :param brief: only the phases that its requirement needs are gone through: it is a wrong hand
+        of any model, and another model's has gone through all of them.
     """
 
     name: str
@@ -43,6 +47,17 @@ class Mutant:
     service: type[Service]
     kills: str
     also: tuple[str, ...] = ()
+    sides: tuple[Side, ...] = tuple(Side)
+    brief: bool = False
+
+    @property
+    def plan(self) -> Plan:
+        """The stimulus that shows it: all of it, or what its requirement needs."""
+        full = plan_for(model(self.model).dialects[0].name, sides=self.sides)
+        if not self.brief:
+            return full
+        wanted = select(catalogue(self.model), prefixes=[self.kills])
+        return replace(full, phases=phases_for(wanted) | {SCRIPTS[self.model].motion})
 
     @property
     def summary(self) -> str:
@@ -51,8 +66,16 @@ class Mutant:
 
 
 MUTANTS: tuple[Mutant, ...] = tuple(
-    Mutant(service.__name__, model, service, kills, also)
-    for model, zoo in ((DEX1_1.name, gripper.ZOO),)
+    Mutant(
+        service.__name__,
+        model_name,
+        service,
+        kills,
+        also,
+        LEFT if model_name == DEX3_1.name and service.__name__ not in dex3.BOTH else tuple(Side),
+        brief=model_name == DEX3_1.name and hasattr(shared, service.__name__),
+    )
+    for model_name, zoo in ((DEX1_1.name, gripper.ZOO), (DEX3_1.name, dex3.ZOO))
     for service, kills, also in zoo
 )
 REFERENCES: dict[str, type[Service]] = {
@@ -63,8 +86,8 @@ REFERENCES: dict[str, type[Service]] = {
 
 
 @cache
-def _session(model: str) -> Session:
-    return Session.default(model).first_seconds(SESSION_SECONDS)
+def _session(model_name: str) -> Session:
+    return Session.default(model_name).first_seconds(SESSION_SECONDS)
 
 
 def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(Side)) -> Plan:

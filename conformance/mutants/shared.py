@@ -218,9 +218,10 @@ class EmptyIsZero(Service):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
+        if getattr(self.wire.command.decode(payload), self.wire.command_sequence):
+            return
         for side in self.sides:
-            mine = self.wire.command_topics[side] == topic
-            if mine and self.wire.read_command(payload, side) is None:
+            if self.wire.command_topics[side] == topic:
                 motors = (Motor(mode=mode_byte(i)) for i in range(self.wire.joints))
                 self.motors(side, tuple(motors))
 
@@ -286,6 +287,9 @@ class WaitsForRest(Service):
         self.taken: dict[tuple[Side, int], float] = {}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(m.q) for m in motors):
+            super().motors(side, motors)
+            return
         for joint, motor in enumerate(motors):
             key = side, joint
             q, since = self.seen.get(key, (math.inf, self.now))

@@ -132,6 +132,7 @@ class Script(ABC):
             s: joints_of(plan.dialect, s) for s in Side
         }
         self._goal: dict[Side, Pose] = {}
+        self._held: tuple[dict[Side, Pose], Payloads] = ({}, [])
         self._next_ns = 0
         self._period_ns = round(1e9 / self._model.command_rate)
         self._obs = Observation(0)
@@ -180,9 +181,14 @@ class Script(ABC):
 
     def _command(self, motors: Mapping[Side, Motors] | None = None) -> Steps:
         """Everybody holds its goal, but for those named."""
-        given = motors or {}
-        every = {s: given.get(s) or self._motors(s, pose) for s, pose in self._goal.items()}
-        yield from self._send(self._wire.encode({**every, **given}))
+        if motors:
+            every = {s: motors.get(s) or self._motors(s, q) for s, q in self._goal.items()}
+            yield from self._send(self._wire.encode({**every, **motors}))
+            return
+        if self._held[0] != self._goal:  # they are held for long, and encoded once
+            hold = {s: self._motors(s, q) for s, q in self._goal.items()}
+            self._held = (dict(self._goal), self._wire.encode(hold))
+        yield from self._send(self._held[1])
 
     def _wait(self, seconds: float) -> Steps:
         """Send nothing."""

@@ -63,6 +63,7 @@ class Service:
         self.state_type = dialect.state_type
         self.now = 0.0
         self._due = 0.0
+        self._heard: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
 
     @property
     def hears(self) -> bool:
@@ -91,10 +92,12 @@ class Service:
         for side in self.sides:
             if self.wire.command_topics[side] != topic:
                 continue
-            try:
-                motors = self.wire.read_command(payload, side)
-            except WireError:
-                continue
+            if self._heard.get(side, (b"", None))[0] != payload:
+                try:
+                    self._heard[side] = (payload, self.wire.read_command(payload, side))
+                except WireError:
+                    continue
+            motors = self._heard[side][1]
             if motors is not None:
                 self.motors(side, motors)
 
@@ -183,6 +186,7 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
     wire = Wire(plan.dialect)
     states = {wire.state_topics[s] for s in plan.sides}
     newest: dict[str, bytes] = {}
+    seen: dict[Side, tuple[bytes, tuple[Pose, Pose] | None]] = {}
     joined: dict[Side, float] = {}
     joined_at: float | None = None
     client = 0
@@ -209,7 +213,11 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
         dq: dict[Side, Pose] = {}
         for side in plan.sides:
             payload = newest.get(wire.state_topics[side])
-            state = None if payload is None else wire.read_state(payload, side)
+            if payload is None:
+                continue
+            if seen.get(side, (b"", None))[0] is not payload:
+                seen[side] = (payload, wire.read_state(payload, side))
+            state = seen[side][1]
             if state is not None:
                 q[side], dq[side] = state
         return Observation(EPOCH_NS + round(now * 1e9), q, dq, dict(joined))

@@ -48,7 +48,7 @@ class Dex3Hand:
 
     inertia = 0.001  # kg m²
     viscous = 0.002  # N m s/rad
-    coulomb = 0.002  # N m
+    coulomb = 0.005  # N m
     brake = 0.2  # N m s/rad of shorted windings
     stiffness = 60.0  # N m/rad of stops and object
     timeout = DEX3_1.command_timeout
@@ -70,25 +70,31 @@ class Dex3Hand:
         self.touches = touch is not None
         n = len(specs)
         self.index = np.arange(n)
-        self.q: Floats = np.array(DEX3_1.rest_q[side])
-        self.dq: Floats = np.zeros(n)
-        self.tau: Floats = np.zeros(n)
-        self.contact: Floats = np.zeros(n)
+        self.q = list(DEX3_1.rest_q[side])
+        self.dq = [0.0] * n
+        self.tau = [0.0] * n
+        self.contact = [0.0] * n
         self.goal, self.speed, self.push, self.kp, self.kd = np.zeros((5, n))
         self.status: Ints = np.zeros(n, dtype=np.intp)
         self.guarded: Flags = np.zeros(n, dtype=np.bool_)
         self.tripped: Flags = np.zeros(n, dtype=np.bool_)
         self.now = 0.0
         self.heard = math.inf
+        self.newest: tuple[Motor, ...] = ()
+        self.version = 0
+        """Counts what has changed in what can be seen."""
         self.changed()
 
     def command(self, motors: tuple[Motor, ...]) -> None:
         """A command came; one field that is not finite rejects all of it."""
+        if motors is self.newest and self.heard != math.inf:
+            self.heard = self.now
+            return  # the same once more changes nothing
         rows: Floats = np.array([(m.q, m.dq, m.tau, m.kp, m.kd) for m in motors]).T
         if not np.isfinite(rows).all():
             return
+        self.newest, self.heard = motors, self.now
         self.take(rows, np.array([m.mode for m in motors]))
-        self.heard = self.now
         self.changed()
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -109,10 +115,14 @@ class Dex3Hand:
         """Work out what follows from the command in force."""
         self.driven: Flags = (self.status == JointMode.FOC) & ~self.tripped
         self.mode: Ints = self.index | self.driven << 4 | self.tripped << 7
-        self.law_kp: Floats = np.where(self.driven, self.kp, 0.0)
-        self.law_kd: Floats = np.where(self.driven, self.kd, self.brake)
-        self.law_tau: Floats = np.where(self.driven, self.kd * self.speed + self.push, 0.0)
+        self.law_on = self.driven.tolist()
+        self.law_q = self.goal.tolist()
+        self.law_kp = np.where(self.driven, self.kp, 0.0).tolist()
+        self.law_kd = np.where(self.driven, self.kd, self.brake).tolist()
+        self.law_tau = np.where(self.driven, self.kd * self.speed + self.push, 0.0).tolist()
+        self.stops = self.floor.tolist(), self.ceiling.tolist(), self.most.tolist()
         self.rests = False
+        self.version += 1
 
     def step(self, dt: float) -> None:
         """Let time pass."""
@@ -123,42 +133,58 @@ class Dex3Hand:
             self.changed()
         if self.rests:
             return  # nothing has changed since a step that changed nothing
+        self.version += 1
         before = self.dq
-        self.move(dt, self.law_kp * (self.goal - self.q) + self.law_tau)
-        self.rests = not before.any() and not self.dq.any()
+        pull = [
+            kp * (goal - q) + tau
+            for kp, goal, q, tau in zip(self.law_kp, self.law_q, self.q, self.law_tau, strict=True)
+        ]
+        self.move(dt, pull)
+        self.rests = not any(before) and not any(self.dq)
 
-    def move(self, dt: float, pull: Floats) -> None:
-        """Let a torque work, and the law's damping.
+    def move(self, dt: float, pull: list[float]) -> None:
+        """Let torques work, and the law's damping.
 
-        Implicit in damping and stiffness, so that a stiff law is stable at this step.
+        Implicit in damping and stiffness, so that a stiff law is stable at this step. Plain
+        numbers: seven are too few for numpy to be quick.
         """
-        inside = np.minimum(np.maximum(self.q, self.floor), self.ceiling)
-        self.contact = self.stiffness * (inside - self.q)
         part = dt / self.inertia
-        damping = self.law_kd + dt * self.law_kp
-        dq = self.dq + part * (pull + self.contact)
-        dq /= 1.0 + part * (damping + self.viscous)
-        tau = pull - damping * dq
-        over = np.abs(tau) > self.most
-        if over.any():
-            tau = np.minimum(np.maximum(tau, -self.most), self.most)
-            limited = (self.dq + part * (tau + self.contact)) / (1.0 + part * self.viscous)
-            dq = np.where(over, limited, dq)
         slip = part * self.coulomb
-        self.dq = dq - np.minimum(np.maximum(dq, -slip), slip)
-        self.tau = np.where(self.driven, tau, 0.0)
-        self.q = self.q + dt * self.dq
+        q_, dq_, tau_, contact_ = [], [], [], []
+        for q, dq, tau, kp, kd, low, high, most in zip(
+            self.q, self.dq, pull, self.law_kp, self.law_kd, *self.stops, strict=True
+        ):
+            contact = self.stiffness * ((low if q < low else high if q > high else q) - q)
+            if dq == 0.0 and -self.coulomb < tau + contact < self.coulomb:
+                q_.append(q)
+                dq_.append(0.0)
+                tau_.append(tau)
+                contact_.append(contact)
+                continue
+            damping = kd + dt * kp
+            new = (dq + part * (tau + contact)) / (1.0 + part * (damping + self.viscous))
+            tau -= damping * new
+            if tau > most or tau < -most:
+                tau = most if tau > most else -most
+                new = (dq + part * (tau + contact)) / (1.0 + part * self.viscous)
+            new = new - slip if new > slip else new + slip if new < -slip else 0.0
+            q_.append(q + dt * new)
+            dq_.append(new)
+            tau_.append(tau)
+            contact_.append(contact)
+        self.q, self.dq, self.contact = q_, dq_, contact_
+        self.tau = [t if on else 0.0 for t, on in zip(tau_, self.law_on, strict=True)]
 
     def pressures(self) -> Floats:
         """Shape (9, 12): what the sensor packets hold."""
         if not self.touches:
             return _UNTOUCHED
         felt = np.array(_UNTOUCHED)
-        pressed = np.abs(self.contact) * 1e4
+        pressed = [1e4 * abs(c) for c in self.contact]
         for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
             finger, _, part = sensor.place.partition(" ")
             joints = _PRESSED_BY.get(finger)
-            value = 0.0 if joints is None else float(pressed[joints[part == "pad"]])
+            value = 0.0 if joints is None else pressed[joints[part == "pad"]]
             row[list(sensor.slots)] = value
         return felt
 
@@ -188,6 +214,7 @@ class Dex3Service(Service):
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
         self._blank: dict[int, tuple[bytearray, Any, Any]] = {}
+        self._sent: dict[Side, tuple[object, bytes]] = {}
         self._low_due = 0.0
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
@@ -196,7 +223,7 @@ class Dex3Service(Service):
 
     def positions(self, side: Side) -> Pose:
         """Where a hand is."""
-        return tuple(self.hands[side].q.tolist())
+        return tuple(self.hands[side].q)
 
     def live(self, dt: float) -> None:
         """Let time pass for the hands."""
@@ -228,13 +255,17 @@ class Dex3Service(Service):
         (side,) = sides
         hand = self.hands[side]
         count = self.dialect.length if length is None else length
+        key = (hand.version, count)
+        if self._sent.get(side, (None, b""))[0] == key:
+            return self._sent[side][1]
         data, motors, packets = self._message(count)
         n = min(count, len(hand.q))
         if n:
             self.fill(motors[:n], hand)
         if len(packets):
             packets["pressure"] = self.pressures(hand)[: len(packets)]
-        return bytes(data)
+        self._sent[side] = (key, bytes(data))
+        return self._sent[side][1]
 
     def fill(self, motors: Any, hand: Dex3Hand) -> None:
         """What the motors say of themselves."""

@@ -92,7 +92,10 @@ class Dex3StateEncoder:
         self._lost = slots["lost"]
         self._floats = np.zeros((7, n))
         self._taxels = np.zeros((2, sensors, _TAXELS))
+        # what the bytes hold now, because much of a state is often that of the one before
         self._flags: tuple[object, ...] = ()
+        self._felt: tuple[object, ...] = ()
+        self._said: tuple[object, ...] = ()
 
     def encode(
         self,
@@ -136,7 +139,7 @@ class Dex3StateEncoder:
     def _put_flags(self, s: HandState, fault: tuple[int, ...], tripped: tuple[bool, ...]) -> None:
         modes = np.asarray(s.mode, dtype=np.uint8).tobytes()
         flags = (modes, fault, tripped, s.measured)
-        if flags == self._flags:  # they seldom change
+        if flags == self._flags:
             return
         self._flags = flags
         self._mode[:] = [
@@ -150,6 +153,13 @@ class Dex3StateEncoder:
             self._predicted[:] = 0 if s.measured else 1
 
     def _put_sensors(self, s: HandState) -> None:
+        felt = tuple(
+            None if values is None else values.tobytes()
+            for values in (s.pressure, s.sensor_temperature, s.sensor_lost)
+        )
+        if felt == self._felt:
+            return
+        self._felt = felt
         pressure, celsius = self._taxels
         pressure[:] = s.pressure if s.pressure is not None else np.nan
         celsius[:] = s.sensor_temperature if s.sensor_temperature is not None else 0.0
@@ -163,6 +173,10 @@ class Dex3StateEncoder:
 
     def _put_rest(self, s: HandState, fault: Sequence[int], missed: int) -> None:
         link = _LINK if all(bits & _LINK for bits in fault) else 0
+        said = (s.imu, s.supply, s.error | link, missed)
+        if said == self._said:
+            return
+        self._said = said
         i = s.imu if s.imu is not None else _NO_IMU
         p = s.supply if s.supply is not None else _NO_SUPPLY
         inertial = (*i.quaternion, *i.gyroscope, *i.accelerometer, *i.rpy)

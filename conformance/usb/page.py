@@ -1,0 +1,45 @@
+"""The USB catalogue as a page: ``python -m dexkit.conformance.usb.page`` brings it up to date in
+docs/conformance-usb.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.requirements.page import BEGIN, END
+from dexkit.conformance.usb.mutants import MUTANTS
+
+__all__ = ["catalogue_page"]
+
+
+def catalogue_page() -> str:
+    """Markdown of all USB requirements, by area."""
+    lines: list[str] = []
+    area = ""
+    for requirement in catalogue(layer="usb"):
+        if requirement.area != area:
+            area = requirement.area
+            lines += ["", f"### {area.removeprefix('USB: ').capitalize()}", ""]
+        killers = ", ".join(f"`{m.name}`" for m in MUTANTS if m.kills == requirement.id)
+        where = f"phase `{requirement.phase}`" if requirement.phase else "the descriptors"
+        lines += [
+            f"**{requirement.id}** ({requirement.level}) {requirement.sentence}  ",
+            f"{requirement.rationale}  ",
+            f"*Source:* {requirement.source} ({requirement.confidence}). "
+            f"*Judged from:* {where}. *Proven by:* {killers}.",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Write it into the documentation."""
+    path = Path(__file__).resolve().parents[2] / "docs" / "conformance-usb.md"
+    text = path.read_text(encoding="utf-8")
+    head, tail = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    path.write_text(f"{head}\n{catalogue_page()}\n{tail}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
