@@ -25,7 +25,7 @@ from dexkit.clock import Rate
 from dexkit.dds import DdsNode, Qos
 from dexkit.emulators.sim_dex3 import SimDex3
 from dexkit.errors import DexkitError
-from dexkit.hand import HandCommand, Side
+from dexkit.hand import Floats, HandCommand, Side
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, dialect
 from dexkit.service.dex3_state import Dex3StateEncoder
@@ -41,7 +41,7 @@ def _processor_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _lateness(times_ns: list[int]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _lateness(times_ns: list[int]) -> Floats:
     """How far each pause between samples is from the period, ms."""
     return np.abs(np.diff(np.array(times_ns)) / 1e6 - 1e3 / DEX3_1.state_rate)
 

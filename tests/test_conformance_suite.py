@@ -27,7 +27,7 @@ from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
 from dexkit.models import dialect
-from dexkit.traces import open_trace, sample_path
+from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import failed
 from tests.dds_helpers import DdsNode, free_domain
 
@@ -148,13 +148,30 @@ def test_a_hand_that_asks_for_history_is_caught_on_dds(tmp_path: Path) -> None:
     assert failed(result) == {("DEX1-QOS-01", "left")}
 
 
-def test_nobody_there_is_a_failure_not_a_success(tmp_path: Path) -> None:
+def test_nobody_there_is_one_clear_error(tmp_path: Path) -> None:
     rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
+    with pytest.raises(ConformanceError, match="nobody publishes rt/dex1/left/state") as caught:
+        record_run(LiveOptions(rig, frozenset({"step"})), tmp_path / "run.mcap")
+    assert "dexkit doctor" in caught.value.hint
+
+
+def test_a_hand_of_another_dialect_is_named(tmp_path: Path) -> None:
+    rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
+    legacy = dialect("unitree_actuator")
+    with DdsNode(rig.domain, "lo") as other:
+        other.writer(legacy.topics(Side.LEFT)[1], legacy.state_type)
+        with pytest.raises(ConformanceError) as caught:
+            record_run(LiveOptions(rig, frozenset({"step"})), tmp_path / "run.mcap")
+    assert "--dialect unitree_actuator" in caught.value.hint
+
+
+def test_a_recording_of_nobody_is_a_failure_not_a_success(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    assert record_run(LiveOptions(rig, frozenset({"step"})), path)
-    result = judge(Recording.of(open_trace(path), dialect_name="unitree_go", sides=rig.sides))
+    with Recorder(path):
+        pass
+    result = judge(Recording.of(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)))
     assert str(result.overall) == "fail"
-    assert failed(result) == {("DEX1-TOPIC-01", "left"), ("DEX1-TOPIC-02", "left")}
+    assert failed(result) == {("DEX1-TOPIC-01", "left")}
     assert result.stage == {"left": "nothing seen"}
 
 

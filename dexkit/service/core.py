@@ -10,6 +10,7 @@ Who calls it: the receiving thread :meth:`HandCore.submit`, the exchange thread
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
@@ -108,8 +109,10 @@ class HandCore:
         self._start_q: Floats | None = None
         self._start_time = 0.0
         self._command: tuple[HandCommand, float] | None = None
-        self._held: tuple[HandCommand, HandCommand] | None = None  # newest command, what is left
-        self._tripped = np.zeros(spec.n_joints, dtype=np.bool_)
+        # the newest command, and what is left of it when it is too old
+        self._held: tuple[tuple[HandCommand, float], HandCommand] | None = None
+        self._tripped: tuple[bool, ...] = ()  # per joint; empty where none has
+        self._late: tuple[HandCommand, float] | None = None  # the command found too old
         self._not_before = clock.now()
         self._driving = False
         self._holding = False
@@ -138,9 +141,11 @@ class HandCore:
         now = self._clock.now()
         with self._lock:
             self._time_out(now)  # before this one hides how long there was none
-            if admitted.timeout is not None:
-                self._tripped &= admitted.timeout  # a command without the bit clears it
-                admitted = _braked(admitted, self._tripped)
+            if admitted.timeout is not None and self._tripped:
+                # a command without the bit clears it
+                still = np.array(self._tripped) & admitted.timeout
+                self._tripped = tuple(still.tolist()) if still.any() else ()
+                admitted = _braked(admitted, still)
             self._command = (admitted, now)
             if self._connected and not self._starting and self._faulted is None:
                 self._follow(admitted, now)
@@ -175,7 +180,7 @@ class HandCore:
             a failed exchange.
         """
         n = self.spec.n_joints
-        if state.q.shape != (n,) or not np.isfinite(state.q).all():
+        if state.q.shape != (n,) or not all(map(math.isfinite, state.q.tolist())):
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")
         now = self._clock.now()
         predicted = self.predicting
@@ -186,13 +191,12 @@ class HandCore:
             self._faulted = None
             self._not_before = now
         self.counters.exchanges += 1
-        with self._lock:
-            if self.predicting:
+        if self.predicting:
+            with self._lock:
                 if not predicted:
                     self._begin_prediction(now)
                 self._estimator.measure(state, now)
-            tripped = tuple(self._tripped.tolist()) if self._tripped.any() else ()
-        self._view = StateView(state, tuple(state.fault.tolist()), tripped=tripped)
+        self._view = StateView(state, tuple(state.fault.tolist()), tripped=self._tripped)
 
     def failed(self, error: Exception) -> bool:
         """An exchange raised ``error``. True when the link should be given up and reopened.
@@ -262,7 +266,7 @@ class HandCore:
     @property
     def tripped(self) -> tuple[int, ...]:
         """The joints that the time-out protection has stopped."""
-        return tuple(np.flatnonzero(self._tripped).tolist())
+        return tuple(i for i, tripped in enumerate(self._tripped) if tripped)
 
     @property
     def holding(self) -> bool:
@@ -284,7 +288,7 @@ class HandCore:
         now = self._clock.now()
         with self._lock:
             command = self._in_force(now)
-            if command.is_brake:
+            if command is self._brake or command.is_brake:
                 if self._driving and command is self._brake:
                     self.counters.brakes += 1
                 self._driving = False
@@ -328,8 +332,8 @@ class HandCore:
             return newest[0]
         if newest[0].timeout is None:
             return self._brake
-        if self._held is None or self._held[0] is not newest[0]:
-            self._held = (newest[0], _at_rest(_braked(newest[0], self._tripped)))
+        if self._held is None or self._held[0] is not newest:
+            self._held = (newest, _at_rest(_braked(newest[0], np.array(self._tripped))))
             self._follow(self._held[1], now)
         if not self._holding and not self._held[1].is_brake:
             self._holding = True
@@ -341,10 +345,13 @@ class HandCore:
         newest = self._command
         if newest is None or now - newest[1] < self._timeout:
             return False
-        if newest[0].timeout is not None:
-            if self._driving and (newest[0].timeout & ~self._tripped & (newest[0].mode > 0)).any():
+        if newest[0].timeout is not None and newest is not self._late:
+            self._late = newest
+            before = np.array(self._tripped or (False,) * self.spec.n_joints)
+            tripped = before | newest[0].timeout
+            if self._driving and (tripped & ~before & (newest[0].mode > 0)).any():
                 self.counters.brakes += 1
-            self._tripped |= newest[0].timeout
+            self._tripped = tuple(tripped.tolist()) if tripped.any() else ()
         return True
 
     def _follow(self, command: HandCommand, now: float) -> None:
