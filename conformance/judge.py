@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
 
 from dexkit.conformance.checks import Check, Context, Outcome, all_checks
-from dexkit.conformance.requirements import Level, Requirement, catalogue
-from dexkit.conformance.results import TOO_BUSY, Result, RunResult, Verdict
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.results import TOO_BUSY, Result, RunResult, Stage
 from dexkit.conformance.usb.judge import judge_usb
+from dexkit.conformance.verdicts import Judgement
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
@@ -19,41 +20,38 @@ __all__ = ["judge"]
 
 STARVED = 0.5
 """Part of a failure's time that must be starved for it not to be blamed on the hand."""
-_OPEN = (Verdict.FAIL, Verdict.BLOCKED, Verdict.ERROR)
 
 
 def judge(
     recording: Recording,
     *,
     requirements: Sequence[Requirement] | None = None,
+    claims: Claims | None = None,
     subject: Mapping[str, str] | None = None,
 ) -> RunResult:
     """Judge ``recording``.
 
     :param requirements: those to report; what they depend on is judged as well. None for all.
+    :param claims: what the vendor claims of the hand.
     :param subject: what to say of what was judged.
     """
-    every = catalogue(recording.model.name)
-    wanted = {r.id for r in (every if requirements is None else requirements)}
+    claims = claims or Claims()
+    every = claims.apply(catalogue(recording.model.name))
+    wanted = None if requirements is None else {r.id for r in requirements}
     checks = all_checks()
     results: list[Result] = []
     for side in recording.judged:
         found: dict[str, Result] = {}
         for requirement in every:
-            found[requirement.id] = _judge_one(
-                recording, recording.sides[side], requirement, found, checks
-            )
-        results += [r for r in found.values() if r.requirement.id in wanted]
+            judgement = Judgement(requirement, side, claims, found)
+            found[requirement.id] = _judge_one(recording, judgement, recording.sides[side], checks)
+        results += found.values()
     order = {r.id: i for i, r in enumerate(every)}
     results.sort(key=lambda r: order[r.requirement.id])
     if recording.usb is not None:
-        usb = catalogue(recording.model.name, "usb")
+        usb = claims.apply(catalogue(recording.model.name, "usb"))
         judged = {str(side) for side in recording.judged}
-        results += [
-            r
-            for r in judge_usb(recording.usb, usb)
-            if r.side in judged and (requirements is None or r.requirement.id in wanted)
-        ]
+        results += [r for r in judge_usb(recording.usb, usb, claims) if r.side in judged]
     about = {
         "model": recording.model.name,
         "dialect": recording.dialect.name,
@@ -61,64 +59,35 @@ def judge(
     }
     when = datetime.fromtimestamp(recording.origin_ns / 1e9, tz=timezone.utc)
     return RunResult(
-        subject={**about, **(subject or {})},
-        results=results,
+        subject={**claims.subject, **about, **(subject or {})},
+        results=[r for r in results if wanted is None or r.requirement.id in wanted],
         stage={str(s): _stage(recording, s) for s in recording.judged},
         duration_s=recording.duration,
         notes=list(recording.notes),
-        starved=recording.starved(0.0, recording.duration),
+        harness=_harness(recording),
+        claims=None if claims.units is None else dict(claims.units),
         recorded_at=when.isoformat(timespec="seconds"),
     )
 
 
 def _judge_one(
-    recording: Recording,
-    hand: SideView,
-    requirement: Requirement,
-    found: Mapping[str, Result],
-    checks: Mapping[str, Check],
+    recording: Recording, judgement: Judgement, hand: SideView, checks: Mapping[str, Check]
 ) -> Result:
-    def result(verdict: Verdict, outcome: Outcome) -> Result:
-        return Result(
-            requirement=requirement,
-            side=str(hand.side),
-            verdict=verdict,
-            figure=outcome.figure,
-            observed=outcome.observed,
-            reason=outcome.reason,
-            evidence=outcome.evidence,
-            values=outcome.values,
-        )
-
-    def unjudged(reason: str) -> Result:
-        return result(Verdict.NOT_APPLICABLE, Outcome(None, reason=reason))
-
-    context = Context(recording, hand, requirement)
+    requirement = judgement.requirement
     dialect = recording.dialect.name
     if dialect not in requirement.dialects:
-        return unjudged(f"does not apply to the dialect {dialect}")
+        return judgement.not_applicable(f"does not apply to the dialect {dialect}")
+    unclaimed = judgement.not_claimed()
+    if unclaimed:
+        return unclaimed
+    context = Context(recording, hand, requirement)
     missing = _missing(context)
     if missing:
-        return unjudged(missing)
-    for before in requirement.after:
-        if found[before].verdict in _OPEN:
-            return result(Verdict.BLOCKED, Outcome(None, reason=f"blocked by {before}"))
-    check = checks.get(requirement.id)
-    if check is None:
-        return result(Verdict.ERROR, Outcome(None, reason="no check judges this requirement"))
-    try:
-        outcome = check(context)
-    except Exception as error:  # a check that breaks must not look like a hand that does
-        text = f"the check itself failed: {type(error).__name__}: {error}"
-        return result(Verdict.ERROR, Outcome(None, reason=text))
-    if outcome.met is None:
-        return result(Verdict.NOT_APPLICABLE, outcome)
-    if outcome.met:
-        return result(Verdict.PASS, outcome)
-    excuse = _excuse(recording, requirement, outcome)
-    if excuse:
-        return result(Verdict.BLOCKED, replace(outcome, reason=excuse))
-    return result(Verdict.FAIL if requirement.level is Level.MUST else Verdict.WARN, outcome)
+        return judgement.not_applicable(missing)
+    return judgement.blocked() or judgement.of(
+        lambda: checks[requirement.id](context),
+        lambda outcome: _excuse(recording, requirement, outcome),
+    )
 
 
 def _excuse(recording: Recording, requirement: Requirement, outcome: Outcome) -> str:
@@ -152,18 +121,32 @@ def _missing(context: Context) -> str:
     return ""
 
 
-def _stage(recording: Recording, side: Side) -> str:
-    """How far a hand got: the first question when it fails."""
+def _harness(recording: Recording) -> dict[str, float]:
+    """How fair the kit's own machine was; empty where somebody else recorded."""
+    if recording.stimulus is None:
+        return {}
+    return {"starved": recording.starved(0.0, recording.duration)}
+
+
+def _stage(recording: Recording, side: Side) -> Stage:
+    """How far a hand got."""
     hand = recording.sides[side]
-    topic = hand.states.topic
+    for q, joint in zip(hand.states.q.T, hand.joints, strict=True):
+        good = q[np.isfinite(q)]
+        if len(good) and float(np.ptp(good)) > 0.05 * joint.stroke:
+            return Stage.MOVING
     if len(hand.states):
-        for q, joint in zip(hand.states.q.T, hand.joints, strict=True):
-            good = q[np.isfinite(q)]
-            if len(good) and float(np.ptp(good)) > 0.05 * joint.stroke:
-                return "moving"
-        return "samples flowing"
-    if any(c.topic == topic for c in recording.channels) or any(
-        e.topic == topic and e.kind == "writer" for e in recording.endpoints
-    ):
-        return "topic seen, no sample of the right type"
-    return "nothing seen"
+        return Stage.SAMPLES_FLOWING
+    # a client's own endpoints, the kit's among them, are no sign of a hand
+    dialect = recording.dialect
+    clients = {(dialect.topics(s)[0], "writer") for s in Side}
+    clients |= {(dialect.topics(s)[1], "reader") for s in Side}
+    present = [(e.topic, e.kind, e.type_name) for e in recording.endpoints]
+    present += [(c.topic, "writer", c.type_name) for c in recording.channels]
+    seen = {(topic, kind) for topic, role, kind in present if (topic, role) not in clients}
+    topic = hand.states.topic
+    if (topic, dialect.state_type) in seen:
+        return Stage.TYPE_MATCHED
+    if topic in {name for name, _ in seen}:
+        return Stage.TOPIC_SEEN
+    return Stage.PARTICIPANT_SEEN if seen else Stage.NO_PARTICIPANT

@@ -6,6 +6,7 @@ Verdicts (h2spec and Autobahn grade theirs likewise; a plain pass or fail hides 
 pass           judged, and met
 fail           a MUST that is not met
 warn           a SHOULD that is not met; does not fail the hand
+not claimed    about a unit that the vendor does not claim (:mod:`~.claims`)
 not applicable cannot be judged here, with the reason; never counts as a pass
 blocked        another requirement failed first, or the kit's own machine was too busy
 error          the kit's own fault
@@ -33,14 +34,17 @@ __all__ = [
     "Overall",
     "Result",
     "RunResult",
+    "Stage",
     "Verdict",
     "environment",
+    "overall_of",
+    "read_json",
     "worst",
 ]
 
 TOO_BUSY = "the machine was too busy"
 FORMAT = "dexkit-conformance-result"
-VERSION = 1
+VERSION = 2
 
 
 class Verdict(str, Enum):
@@ -49,6 +53,7 @@ class Verdict(str, Enum):
     PASS = "pass"
     FAIL = "fail"
     WARN = "warn"
+    NOT_CLAIMED = "not claimed"
     NOT_APPLICABLE = "not applicable"
     BLOCKED = "blocked"
     ERROR = "error"
@@ -68,6 +73,7 @@ _SEVERITY = [
     Verdict.BLOCKED,
     Verdict.WARN,
     Verdict.PASS,
+    Verdict.NOT_CLAIMED,
     Verdict.NOT_APPLICABLE,
 ]
 
@@ -93,6 +99,20 @@ class Overall(str, Enum):
         return {Overall.PASS: 0, Overall.FAIL: 1, Overall.INCONCLUSIVE: 2}[self]
 
 
+class Stage(str, Enum):
+    """How far a hand got: the first question when it fails."""
+
+    NO_PARTICIPANT = "no participant"
+    PARTICIPANT_SEEN = "participant seen"
+    TOPIC_SEEN = "topic seen"
+    TYPE_MATCHED = "type matched"
+    SAMPLES_FLOWING = "samples flowing"
+    MOVING = "moving"
+
+    def __str__(self) -> str:
+        return self.value
+
+
 @dataclass(frozen=True)
 class Evidence:
     """A place in the recording.
@@ -114,9 +134,11 @@ class Result:
     """What was found for one requirement on one side.
 
     :param figure: the measured figure in a few characters, for tables.
-    :param observed: what was seen, in words; ``expected`` is the requirement's sentence.
+    :param observed: what was seen, in words.
     :param reason: why it was not judged, or empty.
     :param values: measured figures by name.
+    :param cause: the likely cause of a failure.
+    :param blocked_by: id of the requirement that failed first, or empty.
     """
 
     requirement: Requirement
@@ -127,11 +149,20 @@ class Result:
     reason: str = ""
     evidence: tuple[Evidence, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
+    cause: str = ""
+    blocked_by: str = ""
+
+    @property
+    def expected(self) -> str:
+        """What would have been right, in a few words."""
+        return self.requirement.expected or self.requirement.sentence
 
     def explain(self) -> str:
         """Everything a person needs to act on it, in lines."""
         lines = [f"{self.requirement.id} ({self.requirement.level}) {self.side}: {self.verdict}"]
         lines.append(f"  required: {self.requirement.sentence}")
+        if self.expected != self.requirement.sentence:
+            lines.append(f"  expected: {self.expected}")
         if self.observed:
             lines.append(f"  observed: {self.observed}")
         if self.reason:
@@ -140,6 +171,8 @@ class Result:
             until = f" .. {place.end_s:.3f} s" if place.end_s is not None else ""
             lines.append(f"  where:    {place.topic} at {place.time_s:.3f} s{until}")
         if self.verdict in (Verdict.FAIL, Verdict.WARN):
+            if self.cause:
+                lines.append(f"  cause:    {self.cause}")
             lines.append(f"  try:      {self.requirement.advice}")
             lines.append(f"  source:   {self.requirement.source}")
         return "\n".join(lines)
@@ -154,25 +187,47 @@ def environment() -> dict[str, str]:
     }
 
 
+def overall_of(results: Iterable[Result]) -> Overall:
+    """Fail if a MUST failed; inconclusive if one is open, or nothing was judged at all."""
+    found = list(results)
+    if any(r.verdict is Verdict.FAIL for r in found):
+        return Overall.FAIL
+    opened = (Verdict.BLOCKED, Verdict.ERROR)
+    if not any(r.verdict.judged for r in found) or any(
+        r.verdict in opened and r.requirement.level is Level.MUST for r in found
+    ):
+        return Overall.INCONCLUSIVE
+    return Overall.PASS
+
+
 @dataclass
 class RunResult:
     """A whole run.
 
     :param subject: what was judged: ``backend``, ``recording``, ``dialect``, ``sides``, ...
-    :param stage: per side how far it got: nothing, discovered, flowing, moving.
+    :param stage: per side how far it got.
     :param duration_s: seconds of the recording.
     :param notes: remarks on the recording.
-    :param starved: part of the run, 0 to 1, in which the kit's own machine lacked processor time.
+    :param harness: how fair the kit's own machine was, where it made the run: ``jitter_p50_ms``
+        and ``jitter_p99_ms``, by which it was late itself, and ``starved``, the part of the run,
+        0 to 1, in which it lacked processor time.
+    :param claims: by unit, whether the vendor claims it; None where nothing is said.
     """
 
     subject: dict[str, str]
     results: list[Result]
-    stage: dict[str, str] = field(default_factory=dict)
+    stage: dict[str, Stage] = field(default_factory=dict)
     duration_s: float = 0.0
     notes: list[str] = field(default_factory=list)
     environment: dict[str, str] = field(default_factory=environment)
     recorded_at: str = ""
-    starved: float = 0.0
+    harness: dict[str, float] = field(default_factory=dict)
+    claims: dict[str, bool] | None = None
+
+    @property
+    def starved(self) -> float:
+        """Part of the run, 0 to 1, in which the kit's own machine lacked processor time."""
+        return self.harness.get("starved", 0.0)
 
     def counts(self) -> dict[Verdict, int]:
         """Requirements by verdict, sides taken together."""
@@ -200,15 +255,8 @@ class RunResult:
 
     @property
     def overall(self) -> Overall:
-        """Fail if a MUST failed; inconclusive if one is open, or nothing was judged at all."""
-        if any(r.verdict is Verdict.FAIL for r in self.results):
-            return Overall.FAIL
-        opened = (Verdict.BLOCKED, Verdict.ERROR)
-        if self.judged == 0 or any(
-            r.verdict in opened and r.requirement.level is Level.MUST for r in self.results
-        ):
-            return Overall.INCONCLUSIVE
-        return Overall.PASS
+        """The verdict on the whole run; see :func:`overall_of`."""
+        return overall_of(self.results)
 
     def sentence(self) -> str:
         """The verdict in one sentence."""
@@ -232,11 +280,12 @@ class RunResult:
             "overall": str(self.overall),
             "sentence": self.sentence(),
             "subject": dict(self.subject),
-            "stage": dict(self.stage),
+            "claims": None if self.claims is None else dict(self.claims),
+            "stage": {side: str(stage) for side, stage in self.stage.items()},
             "recorded_at": self.recorded_at,
             "duration_s": round(self.duration_s, 3),
             "counts": {str(v): n for v, n in self.counts().items()},
-            "starved": round(self.starved, 4),
+            "harness": {name: round(value, 4) for name, value in self.harness.items()},
             "environment": dict(self.environment),
             "notes": list(self.notes),
             "results": [_result_dict(r) for r in self.results],
@@ -255,8 +304,11 @@ def _result_dict(result: Result) -> dict[str, Any]:
         "side": result.side,
         "verdict": str(result.verdict),
         "figure": result.figure,
+        "expected": result.expected,
         "observed": result.observed,
         "reason": result.reason,
+        "cause": result.cause,
+        "blocked_by": result.blocked_by,
         "evidence": [asdict(e) for e in result.evidence],
         "values": dict(result.values),
         "requirement": requirement,
@@ -274,11 +326,12 @@ def read_json(path: Path) -> RunResult:
             raise UsageError(f"{path} is version {data['version']} of {data['format']}")
         return RunResult(
             subject=data["subject"],
-            stage=data["stage"],
+            stage={side: Stage(stage) for side, stage in data["stage"].items()},
             duration_s=data["duration_s"],
             notes=data["notes"],
             environment=data["environment"],
-            starved=data["starved"],
+            harness=data["harness"],
+            claims=data["claims"],
             recorded_at=data["recorded_at"],
             results=[_result_of(entry) for entry in data["results"]],
         )
@@ -300,6 +353,8 @@ def _result_of(entry: dict[str, Any]) -> Result:
         figure=entry["figure"],
         observed=entry["observed"],
         reason=entry["reason"],
+        cause=entry["cause"],
+        blocked_by=entry["blocked_by"],
         evidence=tuple(Evidence(**e) for e in entry["evidence"]),
         values=entry["values"],
     )

@@ -172,7 +172,7 @@ def test_a_recording_of_nobody_is_a_failure_not_a_success(tmp_path: Path) -> Non
     result = judge(Recording.of(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)))
     assert str(result.overall) == "fail"
     assert failed(result) == {("DEX1-TOPIC-01", "left")}
-    assert result.stage == {"left": "nothing seen"}
+    assert result.stage == {"left": "no participant"}
 
 
 def test_it_refuses_to_start_beside_another_client(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 from dexkit.conformance.phases import Phase
@@ -40,6 +40,9 @@ class Outcome:
     """What a check found.
 
     :param met: whether the requirement is met; None when it could not be judged.
+    :param cause: the likely cause, where the check saw enough to tell; else the requirement's.
+    :param absent: not judged because the hand does not do this at all: a failure of who claims
+        the unit.
     """
 
     met: bool | None
@@ -48,6 +51,12 @@ class Outcome:
     reason: str = ""
     evidence: tuple[Evidence, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
+    cause: str = ""
+    absent: bool = False
+
+    def because(self, cause: str) -> Outcome:
+        """The same, with a cause that the check could tell from what it saw."""
+        return replace(self, cause=cause)
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,10 @@ class Context:
     def skipped(self, reason: str) -> Outcome:
         """It cannot be judged here."""
         return Outcome(None, reason=reason)
+
+    def absent(self, reason: str) -> Outcome:
+        """The hand does not do this at all, which only who claims it has to answer for."""
+        return Outcome(None, reason=reason, absent=True)
 
 
 def _plain(values: Mapping[str, float]) -> dict[str, float]:

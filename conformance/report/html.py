@@ -19,6 +19,7 @@ _NAMES = {
     Verdict.PASS: ("pass", "ok"),
     Verdict.FAIL: ("fail", "bad"),
     Verdict.WARN: ("warn", "warn"),
+    Verdict.NOT_CLAIMED: ("not claimed", "na"),
     Verdict.NOT_APPLICABLE: ("not judged", "na"),
     Verdict.BLOCKED: ("blocked", "open"),
     Verdict.ERROR: ("kit error", "open"),
@@ -102,7 +103,7 @@ def _facts(result: RunResult) -> str:
     rows = {
         **result.subject,
         "recorded": f"{result.recorded_at}, {result.duration_s:.1f} s",
-        **{f"{side} hand": stage for side, stage in result.stage.items()},
+        **{f"{side} hand": str(stage) for side, stage in result.stage.items()},
         "machine": f"short of processor time for {result.starved:.0%} of the run",
     }
     return (

@@ -19,7 +19,7 @@ def write_junit(result: RunResult, path: Path) -> None:
         tests=str(len(verdicts)),
         failures=str(verdicts.count(Verdict.FAIL)),
         errors=str(verdicts.count(Verdict.ERROR) + verdicts.count(Verdict.BLOCKED)),
-        skipped=str(verdicts.count(Verdict.NOT_APPLICABLE)),
+        skipped=str(sum(v in (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED) for v in verdicts)),
         time=f"{result.duration_s:.3f}",
         timestamp=result.recorded_at,
     )
@@ -44,7 +44,7 @@ def write_junit(result: RunResult, path: Path) -> None:
         elif entry.verdict in (Verdict.ERROR, Verdict.BLOCKED):
             error = ElementTree.SubElement(case, "error", message=entry.reason)
             error.text = entry.explain()
-        elif entry.verdict is Verdict.NOT_APPLICABLE:
+        elif entry.verdict in (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED):
             ElementTree.SubElement(case, "skipped", message=entry.reason)
         else:
             out = ElementTree.SubElement(case, "system-out")

@@ -14,6 +14,7 @@ MARKS = {
     Verdict.PASS: ("pass", "green"),
     Verdict.FAIL: ("FAIL", "bold red"),
     Verdict.WARN: ("warn", "yellow"),
+    Verdict.NOT_CLAIMED: ("not claimed", "dim"),
     Verdict.NOT_APPLICABLE: ("n/a", "dim"),
     Verdict.BLOCKED: ("blocked", "magenta"),
     Verdict.ERROR: ("ERROR", "bold magenta"),

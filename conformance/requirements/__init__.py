@@ -24,6 +24,7 @@ else:
     import tomli as tomllib
 
 __all__ = [
+    "CAPABILITIES",
     "CONFIDENCE",
     "LAYERS",
     "Level",
@@ -37,6 +38,20 @@ __all__ = [
 
 CONFIDENCE = ("vendor document", "vendor code", "measured", "inferred")
 """How sure the source of a requirement is, from best to least."""
+
+CAPABILITIES: Mapping[str, str] = {
+    "force": "tau_est tells what the hand presses with",
+    "velocity": "dq is measured",
+    "acceleration": "ddq is measured",
+    "temperature": "temperatures are measured",
+    "voltage": "the supply voltage is measured",
+    "pressure": "fingers and palm feel pressure",
+    "imu": "the hand knows its attitude",
+    "low_rate": "a second, slow topic with the state",
+    "timeout": "motors that ask for it brake when commands end (bit 7 of the mode byte)",
+}
+"""Units that a hand may have or not, and what who claims them says; see
+:mod:`dexkit.conformance.claims`."""
 
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
@@ -58,8 +73,21 @@ _KEYS = {
     "tolerances",
     "advice",
     "realtime",
+    "capability",
+    "cause",
+    "expected",
+    "repeat",
 }
-_OPTIONAL = {"after", "dialects", "tolerances", "realtime"}
+_OPTIONAL = {
+    "after",
+    "dialects",
+    "tolerances",
+    "realtime",
+    "capability",
+    "cause",
+    "expected",
+    "repeat",
+}
 
 
 class Level(str, Enum):
@@ -91,7 +119,12 @@ class Requirement:
     :param layer: one of :data:`LAYERS`; a file's ``layer``, ``dds`` where it says nothing.
     :param realtime: a machine that is short of processor time can make a good hand fail it; a
         failure is then not blamed on the hand.
-    :param advice: likely cause and what to try, printed with a failure.
+    :param cause: likely cause of a failure: the mistake that makers make.
+    :param advice: what to try then.
+    :param expected: the norm in a few words for reports, tolerances filled in; the sentence
+        where nothing shorter says it.
+    :param capability: one of :data:`CAPABILITIES`, where it is about a unit that a hand may lack.
+    :param repeat: how often its stimulus is applied.
     """
 
     id: str
@@ -110,6 +143,10 @@ class Requirement:
     tolerances: Mapping[str, float] = field(default_factory=dict)
     realtime: bool = False
     layer: str = "dds"
+    cause: str = ""
+    expected: str = ""
+    capability: str = ""
+    repeat: int = 1
 
     @property
     def phase(self) -> str | None:
@@ -142,9 +179,13 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
     """Requirements of one TOML text.
 
     :raises UsageError: a key is unknown or missing, a value is not one of those allowed, an id
-        occurs twice, or ``after`` names what does not come before.
+        occurs twice or is retired, or ``after`` names what does not come before.
     """
     document = tomllib.loads(text)
+    unknown = set(document) - {"model", "layer", "retired", "requirement"}
+    if unknown:
+        raise UsageError(f"{origin}: unknown keys {sorted(unknown)}")
+    retired = set(document.get("retired", ()))
     hand = model(str(document.get("model", "")))
     layer = str(document.get("layer", "dds"))
     if layer not in LAYERS:
@@ -159,12 +200,18 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
             raise UsageError(f"{where}: unknown keys {sorted(unknown)}, missing {sorted(missing)}")
         if not _ID.match(entry["id"]) or entry["id"] in found:
             raise UsageError(f"{where}: an id is like DEX1-RATE-01 and occurs once")
+        if entry["id"] in retired:
+            raise UsageError(f"{where}: is retired, and an id is never used again")
         if entry["confidence"] not in CONFIDENCE:
             raise UsageError(f"{where}: confidence is one of {', '.join(CONFIDENCE)}")
         if entry["level"] not in Level.__members__:
             raise UsageError(f"{where}: level is one of {', '.join(Level.__members__)}")
         if entry["needs"] not in _NEEDS and not entry["needs"].startswith(_PHASES):
             raise UsageError(f"{where}: needs is one of {', '.join(_NEEDS)} or phase:NAME")
+        if entry.get("capability", "") not in ("", *CAPABILITIES):
+            raise UsageError(f"{where}: capability is one of {', '.join(CAPABILITIES)}")
+        if entry.get("repeat", 1) not in range(1, 100):
+            raise UsageError(f"{where}: repeat is a number from 1 on")
         for before in entry.get("after", []):
             if before not in found:
                 raise UsageError(f"{where}: {before} does not come before it")
@@ -192,6 +239,10 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
             tolerances=tolerances,
             realtime=bool(entry.get("realtime", False)),
             layer=layer,
+            cause=entry.get("cause", ""),
+            expected=entry.get("expected", entry["sentence"]).format(**tolerances),
+            capability=entry.get("capability", ""),
+            repeat=entry.get("repeat", 1),
         )
     return tuple(found.values())
 

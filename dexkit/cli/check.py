@@ -61,8 +61,6 @@ def command(
     usable or nothing in it could be judged.
     """
     from dexkit.conformance.judge import judge
-    from dexkit.conformance.report.html import write_html
-    from dexkit.conformance.report.junit import write_junit
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import catalogue, select
     from dexkit.conformance.view import Recording, sides_of
@@ -85,8 +83,12 @@ def command(
     if json_path:
         result.write_json(json_path)
     if junit_path:
+        from dexkit.conformance.report.junit import write_junit
+
         write_junit(result, junit_path)
     if html_path:
+        from dexkit.conformance.report.html import write_html
+
         write_html(result, view, html_path)
         console.print(f"report: {html_path}", highlight=False)
     if result.judged == 0:
