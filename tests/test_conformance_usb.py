@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -321,6 +322,58 @@ def test_a_run_can_be_stopped(hands: str, tmp_path: Path) -> None:
     stop.set()
     with Recorder(tmp_path / "run.mcap") as recorder:
         assert not run({Side.LEFT: hands}, recorder, stop=stop)
+
+
+class _Watched:
+    """A good device as a host sees it, until a motor is driven for the first time."""
+
+    def __init__(self, driven: Callable[[], None]) -> None:
+        self.device = ReferenceDevice(Side.LEFT)
+        self.descriptors = self.device.descriptors()
+        self.deaf = False
+        self.sent: list[bytes] = []
+        self._driven = driven
+
+    def write(self, endpoint: int, data: bytes, timeout: float) -> int:
+        self.sent.append(data)
+        if any(motor.status for _, _, motor in frames.read_command(data) or ()):
+            self._driven()
+        if not self.deaf:
+            self.device.write(data)
+        return 0
+
+    def read(self, endpoint: int, length: int, timeout: float) -> tuple[int, bytes]:
+        return (TIMED_OUT, b"") if self.deaf else self.device.read(timeout)
+
+    def reopen(self) -> None: ...
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("why", ["stopped", "deaf", "broken"])
+def test_a_run_that_ends_early_leaves_no_motor_driven(
+    why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = threading.Event()
+
+    def driven() -> None:
+        if why == "stopped":
+            stop.set()
+        elif why == "deaf":
+            host.deaf = True
+        elif not stop.is_set():
+            stop.set()
+            raise RuntimeError("broken")
+
+    host = _Watched(driven)
+    monkeypatch.setattr("dexkit.conformance.usb.run.open_device", lambda where, side: host)
+    with (
+        Recorder(tmp_path / "run.mcap") as recorder,
+        pytest.raises(RuntimeError) if why == "broken" else nullcontext(),
+    ):
+        assert run({Side.LEFT: ""}, recorder, stop=stop) == (why == "deaf")
+    assert len(host.sent) > 200
+    last = frames.read_command(host.sent[-1]) or []
+    assert [(motor.status, motor.protect) for _, _, motor in last] == [(0, False)] * 7
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,8 @@ from dexkit.traces.recorder import Recorder
 
 __all__ = ["run"]
 
+_LAST_ANSWER = 0.1  # s that a run which ends early waits for the answer to its last command
+
 
 def run(
     devices: Mapping[Side, str],
@@ -69,7 +71,11 @@ def run(
                 )
                 for i, (side, host) in enumerate(hosts.items())
             }
-            record.sides = {side: future.result() for side, future in runs.items()}
+            try:
+                record.sides = {side: future.result() for side, future in runs.items()}
+            except BaseException:
+                stop.set()  # the other hand's script is not to go on alone
+                raise
         record.stalls = heart.stalls
         recorder.add_metadata(RECORD, record.to_metadata())
     finally:
@@ -106,6 +112,9 @@ def _play(
         pass
     finally:
         player.end_turn()
+        if not script.finished:  # stopped, deaf or broken: leave no motor driven
+            player.carry_out(Out(script.lock()))
+            player.carry_out(In(_LAST_ANSWER))
     phases = [p for p in script.phases if p.end_ns]
     return SideRecord(told, list(plan.buses), phases, script.trouble)
 

@@ -4,9 +4,10 @@
 real device or on a virtual one, and sends back an :class:`Observation`. What was done when is in
 :attr:`UsbScript.phases` and travels with the recording.
 
-Order of the phases: what may disturb a hand comes after what needs it undisturbed. Every command
-that can move something enables the time-out protection, so that a killed kit leaves no motor
-driven for more than a second.
+Order of the phases: what may disturb a hand comes after what needs it undisturbed. Commands that
+move something enable the time-out protection, except where its absence is what is tried. A runner
+that ends the script early sends :meth:`UsbScript.lock`; one that is killed cannot
+(docs/conformance-usb.md says what it leaves).
 
 ============== =====================================================================================
 quiet          no command is sent; nothing may come
@@ -164,12 +165,14 @@ class UsbScript:
     """The stimulus for one hand.
 
     :ivar trouble: why it ended early, or empty.
+    :ivar finished: it went through to its last command, which locks every motor.
     """
 
     def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
         self.plan = plan
         self.phases: list[UsbPhase] = []
         self.trouble = ""
+        self.finished = False
         self._say = say
         self._joints = DEX3_1.joints[plan.side]
         self._size = 1234
@@ -189,11 +192,16 @@ class UsbScript:
                 yield from self._protection()
                 yield from self._burst()
                 yield from self._reopen()
-            yield from self._exchange(self._frame(Motor()))
+            yield from self._exchange(self.lock())
+            self.finished = True
         except _NoAnswer:
             self.trouble = f"{_GIVE_UP} commands in a row were not answered"
         for phase in self.phases:
             phase.end_ns = phase.end_ns or self._now
+
+    def lock(self) -> bytes:
+        """A frame that locks every motor, whatever the script was about."""
+        return self._frame(Motor())
 
     # -- one transfer ---------------------------------------------------------------------------
 
