@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -10,6 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -391,3 +393,24 @@ def test_a_device_that_is_not_there_is_said(where: str, says: str) -> None:
 def test_an_unknown_serial_number_is_said(hands: str) -> None:
     with pytest.raises(ConformanceError, match="no left Dex3-1"):
         open_device(f"{hands}/0000", Side.LEFT)
+
+
+def test_a_hand_that_somebody_has_is_said_and_nothing_stays_open(
+    hands: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = open_device(hands, Side.LEFT)
+    connections = []
+    connect = socket.create_connection
+
+    def noting(*arguments: Any) -> socket.socket:
+        connections.append(connect(*arguments))
+        return connections[-1]
+
+    monkeypatch.setattr(socket, "create_connection", noting)
+    try:
+        with pytest.raises(ConformanceError, match="refused") as caught:
+            open_device(hands, Side.LEFT)
+    finally:
+        host.close()
+    assert "attached" in (caught.value.hint or "")
+    assert [connection.fileno() for connection in connections] == [-1, -1]

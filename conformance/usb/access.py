@@ -109,7 +109,11 @@ class _LibUsb:
                     mine = device.idProduct == PRODUCT_ID[self._side]
                 found += [device] if mine else []
             self._device = _first(found, self._serial, self._side, "no such device on USB")
-            self._claim()
+            try:
+                self._claim()
+            except BaseException:
+                self.close()
+                raise
         except core.NoBackendError as error:
             raise ConformanceError(
                 "there is no libusb on this machine", hint="install libusb-1.0"
@@ -213,6 +217,7 @@ class _UsbIp:
             raise ConformanceError(f"{url}: {error}") from error
         self._url, self._side = url, side
         self._serial = parts.path.strip("/")
+        self._socket = socket.socket()  # until there is a connection
         self._open()
 
     def _open(self) -> None:
@@ -230,7 +235,11 @@ class _UsbIp:
                     return
                 self._socket.close()
             _first([], self._url, self._side, told)
+        except ConformanceError:
+            self.close()
+            raise
         except (OSError, _Gone, struct.error) as error:
+            self.close()
             raise ConformanceError(
                 f"{self._url}: {error or 'the server has closed the connection'}",
                 hint="is the server running, and is the hand not attached elsewhere?",
