@@ -1,0 +1,45 @@
+"""A model of Unitree's teleoperation clients, and of the operator in front of them.
+
+It closes the loop that a recording cannot: what xr_teleoperate commands depends on what the hand
+reports. :mod:`~dexkit.teleop.client` is the client, :mod:`~dexkit.teleop.profiles` the operator,
+:mod:`~dexkit.teleop.feel` the figures, all sans-IO; :mod:`~dexkit.teleop.live` puts them on DDS.
+See docs/teleop.md.
+"""
+
+from __future__ import annotations
+
+from dexkit.teleop.client import (
+    Dex1Client,
+    Dex3Client,
+    Inputs,
+    JointCommand,
+    Pose,
+    Release,
+    StateReceiver,
+    StickyFilter,
+    TeleopClient,
+    client_for,
+)
+from dexkit.teleop.feel import Feel, feel
+from dexkit.teleop.profiles import PROFILES, Operator, Profile, profile, profiles_for, recorded
+
+__all__ = [
+    "PROFILES",
+    "Dex1Client",
+    "Dex3Client",
+    "Feel",
+    "Inputs",
+    "JointCommand",
+    "Operator",
+    "Pose",
+    "Profile",
+    "Release",
+    "StateReceiver",
+    "StickyFilter",
+    "TeleopClient",
+    "client_for",
+    "feel",
+    "profile",
+    "profiles_for",
+    "recorded",
+]

@@ -1,0 +1,389 @@
+"""Unitree's teleoperation clients, sans-IO: states and the operator's input in, commands out.
+
+What xr_teleoperate does to a hand between the hand tracking and the topics, with all of its
+quirks (facts/unitree-dex B.1 and B.7; read in its ``robot_hand_unitree.py`` and
+``weighted_moving_filter.py``, releases 1.1, 1.4 and the newest one of the fact sheet):
+
+- States are received by one thread that reads left, then right, each time waiting for a sample
+  that it has not had, and pauses for 2 ms: :class:`StateReceiver`. A side that falls silent stops
+  the other one too.
+- No command before a state of both sides; for a Dex3-1 (and a Dex1-1 before 1.4) not before some
+  q is other than exactly 0.
+- The Dex1-1's target is clipped to 0.18 rad of the last state and smoothed over three values, but
+  a pair of values equal to the one before is not counted: :class:`StickyFilter`.
+- Before any input the Dex1-1 goes to mid stroke, the Dex3-1 to 0.
+
+The caller steps a client :attr:`TeleopClient.rate` times a second. The genuine ones sleep the rest
+of each period, so they come out some 2 % below it.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import NamedTuple, TypeAlias
+
+from dexkit.errors import UsageError
+from dexkit.hand import JointMode, Side
+from dexkit.models import DEX1_1, DEX3_1, Dialect, dialect, model
+
+__all__ = [
+    "LEAD",
+    "PINCH_MAX",
+    "PINCH_MIN",
+    "POLL_PAUSE",
+    "Dex1Client",
+    "Dex3Client",
+    "Inputs",
+    "JointCommand",
+    "Pose",
+    "Release",
+    "StateReceiver",
+    "StickyFilter",
+    "TeleopClient",
+    "client_for",
+]
+
+POLL_PAUSE = 0.002
+"""Seconds that the receiving thread pauses after each pair of states (B.1, "polls every >= 2 ms").
+"""
+LEAD = 0.18
+"""Rad by which a Dex1-1 command may be ahead of the last state: 3 mm of jaw travel (B.3)."""
+LEAD_SIMULATED_1_1 = 1.0
+"""The same in simulation, release 1.1; later ones do not clip there (B.3)."""
+WEIGHTS = (0.5, 0.3, 0.2)
+"""Of the three last values, newest first (B.3)."""
+PINCH_MIN, PINCH_MAX = 5.0, 7.0
+"""Pinch distance or trigger that means closed, and open (B.3)."""
+
+Pose: TypeAlias = tuple[float, ...]
+"""q of every joint of a hand, rad."""
+Inputs: TypeAlias = Mapping[Side, Pose | None]
+"""What hand tracking gives: the pinch value of a Dex1-1, the seven joint targets of a Dex3-1;
+None, or no entry, while it has nothing."""
+
+
+class JointCommand(NamedTuple):
+    """One motor's part of a command: mode byte, rad, rad/s, N m, N m/rad, N m s/rad."""
+
+    mode: int
+    q: float
+    dq: float
+    tau: float
+    kp: float
+    kd: float
+
+
+class Release(str, Enum):
+    """The release of xr_teleoperate that is modelled, where they differ for the Dex1-1.
+
+    1.1 has both grippers in one message and waits for a q that is not exactly 0. 1.4 is what the
+    shipped recordings were made with. The newest asks the tracker whether it has data, and holds
+    the gripper where it is until then, instead of moving to mid stroke.
+    """
+
+    V1_1 = "1.1"
+    V1_4 = "1.4"
+    NEWEST = "newest"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+class StateReceiver:
+    """The client's receiving thread: blocking reads one after the other, then a pause.
+
+    Each reader keeps one sample. A pass that waits for one side holds what it has already read of
+    the other; so after a silence of the right side the left one's value is an old one at first.
+
+    :param reads: the sides that come with each read, in the order of the reads.
+    :param pause: seconds between two passes.
+    :ivar latest: state of each side after the last complete pass; empty before the first.
+    """
+
+    def __init__(self, reads: Sequence[tuple[Side, ...]], *, pause: float = POLL_PAUSE) -> None:
+        self._reads = tuple(reads)
+        self._pause = pause
+        self._kept: dict[tuple[Side, ...], tuple[float, dict[Side, Pose]]] = {}
+        self._seen: dict[Side, Pose] = {}
+        self._held: dict[Side, Pose] = {}
+        self._at = 0
+        self._time = -math.inf
+        self.latest: dict[Side, Pose] = {}
+
+    @property
+    def seen(self) -> Mapping[Side, Pose]:
+        """The last state that came of each side, read or not."""
+        return self._seen
+
+    @property
+    def wakes_at(self) -> float:
+        """When the pause ends; a read waits from then on."""
+        return self._time
+
+    @property
+    def waits_for(self) -> tuple[Side, ...]:
+        """The sides that the next read brings."""
+        return self._reads[self._at]
+
+    def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
+        """A message came, of one side or of both.
+
+        :param now: seconds on any monotonic clock; not before the last call.
+        """
+        self.advance(now)
+        for sides in self._reads:
+            if all(s in states for s in sides):
+                poses = {s: tuple(states[s]) for s in sides}
+                self._seen.update(poses)
+                self._kept[sides] = (now, poses)
+        self.advance(now)
+
+    def advance(self, now: float) -> None:
+        """Let the thread run up to ``now``."""
+        while self._time <= now:
+            found = self._kept.pop(self._reads[self._at], None)
+            if found is None:
+                return
+            came, states = found
+            self._time = max(self._time, came)
+            self._held.update(states)
+            self._at += 1
+            if self._at == len(self._reads):
+                self.latest = dict(self._held)
+                self._at = 0
+                self._time += self._pause
+
+
+class StickyFilter:
+    """Weighted mean of the last three values; one equal to the last is not counted.
+
+    So a value that no longer changes is never reached: the output stays a mixture of the last
+    three different ones (B.7, "the smoothing filter sticks"). The values of both hands are one:
+    while either changes, both are counted.
+    """
+
+    def __init__(self, weights: Sequence[float] = WEIGHTS) -> None:
+        self._weights = tuple(reversed(weights))  # oldest first, as the values
+        self._recent: deque[Pose] = deque(maxlen=len(self._weights))
+        self._output: Pose = ()
+
+    def __call__(self, values: Pose) -> Pose:
+        """Put values in, and take the smoothed ones."""
+        if self._recent and all(a == b for a, b in zip(values, self._recent[-1], strict=True)):
+            return self._output
+        self._recent.append(values)
+        if len(self._recent) < len(self._weights):
+            self._output = values
+        else:
+            self._output = tuple(
+                sum(w * x for w, x in zip(self._weights, column, strict=True))
+                for column in zip(*self._recent, strict=True)
+            )
+        return self._output
+
+
+class TeleopClient(ABC):
+    """A client of one hand model.
+
+    :param spoken: the dialect of the hands.
+    :param sides: the hands that it drives. The genuine client always drives both, and waits for
+        both; with one side it is what the same program would do if the other did not exist.
+    :ivar rate: steps a second.
+    """
+
+    def __init__(self, spoken: Dialect, sides: Sequence[Side] = tuple(Side)) -> None:
+        if not sides:
+            raise UsageError("a client needs a side")
+        self.dialect = spoken
+        self.sides = tuple(s for s in (Side.LEFT, Side.RIGHT) if s in sides)
+        self.rate = model(spoken.model).command_rate
+        self._kp, self._kd = model(spoken.model).client_gains
+        shared = len({spoken.topics(s)[1] for s in self.sides}) < len(self.sides)
+        self.receiver = StateReceiver([self.sides] if shared else [(s,) for s in self.sides])
+        self._ready = False
+
+    @property
+    def period(self) -> float:
+        """Seconds from step to step."""
+        return 1.0 / self.rate
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has seen the states that it waits for, and sends commands."""
+        if not self._ready and len(self.receiver.latest) == len(self.sides):
+            self._ready = self._may_start(self.receiver.latest)
+        return self._ready
+
+    @property
+    def missing(self) -> dict[Side, str]:
+        """The sides that it still waits for, and what is wrong with each."""
+        if self.ready:
+            return {}
+        latest = self.receiver.seen
+        found = {s: "no state" for s in self.sides if s not in latest}
+        if found:
+            return found
+        return {s: "every q is exactly 0" for s in self.sides if not any(latest[s])}
+
+    def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
+        """A state message came: q of the joints of the side, or sides, that are in it.
+
+        :param now: seconds on any monotonic clock; not before the last call.
+        """
+        self.receiver.receive(now, states)
+
+    def step(
+        self, now: float, states: Mapping[Side, Sequence[float]], inputs: Inputs
+    ) -> dict[Side, tuple[JointCommand, ...]]:
+        """One turn of the control loop.
+
+        :param states: what came just now and was not given to :meth:`receive`.
+        :param inputs: what the operator wants.
+        :returns: the command to each side; none before it is :attr:`ready`.
+        """
+        for side, q in states.items():
+            self.receiver.receive(now, {side: q})
+        self.receiver.advance(now)
+        if not self.ready:
+            return {}
+        return self._control(self.receiver.latest, inputs)
+
+    def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
+        return all(any(latest[s]) for s in self.sides)
+
+    @abstractmethod
+    def _control(
+        self, latest: Mapping[Side, Pose], inputs: Inputs
+    ) -> dict[Side, tuple[JointCommand, ...]]:
+        """The commands of this turn."""
+
+
+class Dex1Client(TeleopClient):
+    """xr_teleoperate's ``Dex1_1_Gripper_Controller``; its input is a pinch value.
+
+    In a dialect of another stroke (unitree_hg), which it does not speak, lead and stroke are
+    scaled alike.
+
+    :param release: which one; None takes 1.1 where both grippers share a message, 1.4 elsewhere.
+    :param simulated: what it does with ``--sim``: no clipping and no smoothing (1.1: clipping to
+        1 rad, smoothing as ever).
+    """
+
+    def __init__(
+        self,
+        spoken: Dialect | None = None,
+        sides: Sequence[Side] = tuple(Side),
+        *,
+        release: Release | None = None,
+        simulated: bool = False,
+    ) -> None:
+        spoken = spoken or DEX1_1.dialects[0]
+        if spoken.model != DEX1_1.name:
+            raise UsageError(f"the dialect {spoken.name} is not of a {DEX1_1.title}")
+        super().__init__(spoken, sides)
+        shared = spoken.length > 1
+        self.release = release or (Release.V1_1 if shared else Release.V1_4)
+        self._scale = spoken.q_open / DEX1_1.joints[Side.LEFT][0].q_max
+        lead, smooth = LEAD, True
+        if simulated and self.release is Release.V1_1:
+            lead = LEAD_SIMULATED_1_1
+        elif simulated:
+            lead, smooth = math.inf, False
+        self._lead = lead * self._scale
+        self._filter = StickyFilter() if smooth else None
+        self._targets = dict.fromkeys(self.sides, spoken.q_open / 2)
+
+    @property
+    def targets(self) -> Mapping[Side, float]:
+        """Where the operator wants each gripper, before clipping and smoothing, rad."""
+        return self._targets
+
+    def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
+        if self.release is Release.V1_1:
+            return any(any(latest[s]) for s in self.sides)
+        return True
+
+    def target_of(self, pinch: float) -> float:
+        """Where a pinch value wants the gripper, rad."""
+        part = (pinch - PINCH_MIN) / (PINCH_MAX - PINCH_MIN)
+        return self.dialect.q_open * min(max(part, 0.0), 1.0)
+
+    def _control(
+        self, latest: Mapping[Side, Pose], inputs: Inputs
+    ) -> dict[Side, tuple[JointCommand, ...]]:
+        given = {s: inputs.get(s) for s in self.sides}
+        if self.release is Release.NEWEST:
+            tracked = all(value is not None for value in given.values())
+            self._targets = {
+                s: self.target_of(value[0]) if tracked and value else latest[s][0]
+                for s, value in given.items()
+            }
+        else:
+            # exactly 0 means no data, of both hands; with one alone the other is told to close
+            pinches = {s: value[0] if value else 0.0 for s, value in given.items()}
+            if any(pinch != 0.0 for pinch in pinches.values()):
+                self._targets = {s: self.target_of(pinch) for s, pinch in pinches.items()}
+        goals = tuple(
+            min(max(self._targets[s], latest[s][0] - self._lead), latest[s][0] + self._lead)
+            for s in self.sides
+        )
+        if self._filter is not None:
+            goals = self._filter(goals)
+        return {
+            s: (JointCommand(0, q, 0.0, 0.0, self._kp, self._kd),)
+            for s, q in zip(self.sides, goals, strict=True)
+        }
+
+
+class Dex3Client(TeleopClient):
+    """xr_teleoperate's ``Dex3_1_Controller``; its input are the joint targets.
+
+    The genuine one gets hand skeletons, and a retargeting library makes joint targets of them;
+    that library is not modelled. States are only waited for: nothing is clipped or smoothed, and
+    the hand hears no more of where it is. One more quirk cannot be had without a process that
+    forks: the genuine client's commands reach only readers that were there before it (B.7).
+    """
+
+    def __init__(self, spoken: Dialect | None = None, sides: Sequence[Side] = tuple(Side)) -> None:
+        spoken = spoken or DEX3_1.dialects[0]
+        if spoken.model != DEX3_1.name:
+            raise UsageError(f"the dialect {spoken.name} is not of a {DEX3_1.title}")
+        super().__init__(spoken, sides)
+        self._targets: dict[Side, Pose] = dict.fromkeys(self.sides, (0.0,) * spoken.length)
+
+    def _control(
+        self, latest: Mapping[Side, Pose], inputs: Inputs
+    ) -> dict[Side, tuple[JointCommand, ...]]:
+        given = {s: inputs.get(s) for s in self.sides}
+        if all(value is not None for value in given.values()):
+            self._targets = {s: value for s, value in given.items() if value is not None}
+        return {
+            s: tuple(
+                JointCommand(i | JointMode.FOC << 4, q, 0.0, 0.0, self._kp, self._kd)
+                for i, q in enumerate(self._targets[s])
+            )
+            for s in self.sides
+        }
+
+
+def client_for(
+    spoken: Dialect | str,
+    sides: Sequence[Side] = tuple(Side),
+    *,
+    release: Release | None = None,
+    simulated: bool = False,
+) -> TeleopClient:
+    """The client that drives hands of this dialect.
+
+    :raises UsageError: no such dialect, or a release or simulation of a client that has none.
+    """
+    chosen = dialect(spoken) if isinstance(spoken, str) else spoken
+    if chosen.model == DEX1_1.name:
+        return Dex1Client(chosen, sides, release=release, simulated=simulated)
+    if release is not None or simulated:
+        raise UsageError(f"the client of a {DEX3_1.title} is the same in all releases")
+    return Dex3Client(chosen, sides)

@@ -1,0 +1,71 @@
+"""The client's half of the topics: commands to bytes, bytes to the states' positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from dexkit.hand import Side
+from dexkit.messages import message_type
+from dexkit.models import Dialect, model
+from dexkit.teleop.client import JointCommand, Pose
+
+__all__ = ["ClientWire"]
+
+# the sequence of motors in a command and in a state, and the class of a command's motor, by type
+_COMMANDS = {
+    "unitree_go::msg::dds_::MotorCmds_": ("cmds", "unitree_go::msg::dds_::MotorCmd_"),
+    "unitree_hg::msg::dds_::HandCmd_": ("motor_cmd", "unitree_hg::msg::dds_::MotorCmd_"),
+}
+_STATES = {
+    "unitree_go::msg::dds_::MotorStates_": "states",
+    "unitree_hg::msg::dds_::HandState_": "motor_state",
+}
+_LIMP = JointCommand(0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class ClientWire:
+    """Encodes commands and reads states of one dialect.
+
+    :ivar command_topics: by side; ``state_topics`` likewise.
+    """
+
+    def __init__(self, spoken: Dialect) -> None:
+        self._dialect = spoken
+        self._joints = len(model(spoken.model).joints[Side.LEFT])
+        self._command = message_type(spoken.cmd_type)
+        self._state = message_type(spoken.state_type)
+        self._sequence, motor = _COMMANDS[spoken.cmd_type]
+        self._motor = message_type(motor).cls
+        self._states = _STATES[spoken.state_type]
+        self.command_topics = {s: spoken.topics(s)[0] for s in Side}
+        self.state_topics = {s: spoken.topics(s)[1] for s in Side}
+
+    def encode(self, commands: Mapping[Side, Sequence[JointCommand]]) -> list[tuple[str, bytes]]:
+        """(topic, payload), left before right; one message where both share a topic.
+
+        There the place of a side that is not given is sent without force.
+        """
+        if len(set(self.command_topics.values())) == len(Side):
+            return [(self.command_topics[s], self._payload(c)) for s, c in commands.items()]
+        places = [_LIMP] * self._dialect.length
+        for side, motors in commands.items():
+            places[self._dialect.index[side]] = motors[0]
+        return [(self._dialect.cmd_topic, self._payload(places))] if commands else []
+
+    def _payload(self, motors: Sequence[JointCommand]) -> bytes:
+        message = self._command.cls()
+        setattr(message, self._sequence, [self._motor(**m._asdict()) for m in motors])
+        return self._command.encode(message)
+
+    def positions(self, topic: str, data: bytes) -> dict[Side, Pose]:
+        """Where the sides in a state message are, but for those that it is too short for.
+
+        :raises WireError: it is not of the dialect's state type.
+        """
+        motors = getattr(self._state.decode(data), self._states)
+        found: dict[Side, Pose] = {}
+        for side, its_topic in self.state_topics.items():
+            first = self._dialect.index[side]
+            if its_topic == topic and len(motors) >= first + self._joints:
+                found[side] = tuple(m.q for m in motors[first : first + self._joints])
+        return found
