@@ -148,7 +148,7 @@ class FakeBackend(usb.backend.IBackend):  # type: ignore[misc]
 
     def __init__(self, script: Callable[[bytes], Answer]) -> None:
         self.script = script
-        self.fail: dict[str, Exception] = {}
+        self.fail: dict[str, BaseException] = {}
         self.calls: list[str] = []
         self.kernel_driver = False
         self.configuration = 1

@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,14 @@ from dexkit.errors import (
 )
 from dexkit.hand import HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
-from dexkit.wire.dex3_usb import COMMAND_734, COMMAND_1234, PRODUCT_ID, VENDOR_ID, HandCodec
+from dexkit.wire.dex3_usb import (
+    COMMAND_734,
+    COMMAND_1234,
+    PRODUCT_ID,
+    VENDOR_ID,
+    HandCodec,
+    parse_command,
+)
 from tests.dex3_driver_helpers import (
     Answer,
     FakeBackend,
@@ -751,6 +759,61 @@ class TestTroubleOnTheWay:
             monkeypatch.setattr(fake, "bulk_write", lambda *args: 512)
             with pytest.raises(HandTimeout, match="took 512 of the 1234"):
                 hand.exchange(GO)
+
+    def test_an_interrupted_exchange_leaves_no_answer_for_the_next_command(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        script = FakeHand()
+        fake = FakeBackend(script)
+        with fake_hand(fake, monkeypatch) as hand:
+            hand.exchange(GO)
+            fake.fail["bulk_read"] = KeyboardInterrupt()
+            with pytest.raises(KeyboardInterrupt):
+                hand.exchange(GO)
+            fake.fail.clear()
+            for _ in range(3):
+                state = hand.exchange(GO)
+                assert state.q[0] == pytest.approx(script.q(script.count), abs=1e-4)
+
+    @pytest.mark.parametrize("protect", [True, False])
+    def test_closing_brakes_a_hand_whose_endpoint_has_stalled(
+        self, protect: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        received: list[bytes] = []
+        script = FakeHand()
+
+        def noting(data: bytes) -> Answer:
+            received.append(data)
+            return script(data)
+
+        fake = FakeBackend(noting)
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: fake)
+        hand = Dex3Usb(Side.LEFT, replace(QUICK, protect=protect))
+        hand.open()
+        hand.exchange(GO)
+        fake.fail["bulk_write"] = usb_error(errno.EPIPE)
+        monkeypatch.setattr(fake, "clear_halt", lambda *args: fake.fail.clear())
+        hand.close()
+        assert {m.status for _, m in parse_command(received[-1]).motors} == {0}
+
+    @pytest.mark.parametrize(
+        ("protect", "says"), [(True, "within a second"), (False, "cut their power")]
+    )
+    def test_motors_that_could_not_be_braked_are_said(
+        self,
+        protect: bool,
+        says: str,
+        monkeypatch: pytest.MonkeyPatch,
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        fake = FakeBackend(FakeHand())
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: fake)
+        hand = Dex3Usb(Side.LEFT, replace(QUICK, protect=protect))
+        hand.open()
+        fake.fail["bulk_write"] = usb_error(errno.ENODEV)
+        hand.close()
+        assert "could not brake" in caplog.text
+        assert says in caplog.text
 
     def test_closing_a_hand_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())

@@ -29,6 +29,8 @@ _MISSED = 10
 second, which no flipped bit lasts."""
 _GREETINGS = 5
 """Exchanges that opening does at most to hear of every motor."""
+_GOODBYES = 2
+"""Times that closing tries to brake a hand which is there and does not answer."""
 
 
 @dataclass
@@ -193,18 +195,31 @@ class Dex3Usb:
         link, self._link = self._link, None
         if link is None:
             return
-        configuration = self.configuration
         try:
             if self._last is not None:
-                # bit 7 = 0: a brake needs no protection, and trips would only be left behind
-                frame = self._codec.encode(self._brake, False)
-                link.exchange(frame, configuration.send_timeout, configuration.timeout)
+                self._let_go(link)
         except HandError as error:
-            rest = "; its motors stop by themselves within a second"
-            log.warning("could not brake: %s%s", error, rest if configuration.protect else "")
+            rest = (
+                "its motors stop by themselves within a second"
+                if self.configuration.protect
+                else "its motors are without protection and may go on: cut their power"
+            )
+            log.warning("could not brake: %s; %s", error, rest)
         finally:
             link.close()
             log.info("%s closed: %s", link.name, self.statistics)
+
+    def _let_go(self, link: UsbLink) -> None:
+        # bit 7 = 0: a brake needs no protection, and trips would only be left behind
+        frame = self._codec.encode(self._brake, False)
+        configuration = self.configuration
+        for left in reversed(range(_GOODBYES)):
+            try:
+                link.exchange(frame, configuration.send_timeout, configuration.timeout)
+                return
+            except HandTimeout:  # a stalled endpoint, for one: it has not heard the command
+                if not left:
+                    raise
 
     def __enter__(self) -> Dex3Usb:
         self.open()

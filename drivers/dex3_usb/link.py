@@ -195,7 +195,13 @@ class UsbLink:
             raise HandLost(f"{self.name} is not open")
         if self._drain:
             self._wait_for_late()
-        answer = self._transfer(data, send_timeout, timeout)
+        try:
+            answer = self._transfer(data, send_timeout, timeout)
+        except HandError:
+            raise
+        except BaseException:  # Ctrl-C, perhaps between the command and its answer
+            self._expect_late()
+            raise
         if self._owed:
             answer = self._newest(answer)
         self.statistics.exchanges += 1
