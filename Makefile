@@ -34,7 +34,7 @@ demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; wri
 	@$(RUN) dexkit demo --out demo-out
 
 test: $(STAMP) ## the tests, on all cores (ARGS="-k name" is passed on)
-	$(RUN) pytest -n auto -m "not soak" $(ARGS)
+	$(RUN) pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
 soak: $(STAMP) ## the long tests
 	$(RUN) pytest -m soak $(ARGS)
