@@ -153,6 +153,21 @@ class Script(ABC):
             yield from self._everyone("restart", self._other_place())
         yield from self._hold(0.2)
 
+    def length(self) -> float:
+        """Seconds that :meth:`run` takes with hands that are where they should at once."""
+        now = 0
+        steps = self.run()
+        action = next(steps)
+        still = {s: (0.0,) * len(self._joints[s]) for s in self.plan.sides}
+        while True:
+            if isinstance(action, Send):
+                now = max(now, action.until_ns)
+            joined = dict.fromkeys(self.plan.sides, 0.0)
+            try:
+                action = steps.send(Observation(now, {**still, **self._goal}, still, joined))
+            except StopIteration:
+                return now / 1e9
+
     @abstractmethod
     def _provoke(self) -> Steps:
         """Everything between the first motion and the restart."""
