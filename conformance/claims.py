@@ -85,8 +85,10 @@ class Claims:
         return cls({unit: units.get(unit, False) for unit in CAPABILITIES}, hand)
 
     @classmethod
-    def load(cls, path: Path | None, model_name: str) -> Claims:
-        """Claims of a file about a hand of that model; None for none.
+    def load(cls, path: Path | None, model_name: str | None) -> Claims:
+        """Claims of a file; none without one.
+
+        :param model_name: the model that it must be about; None for any.
 
         :raises UsageError: as :meth:`parse`, or the file is about another model, or unreadable.
         """
@@ -96,8 +98,8 @@ class Claims:
             claims = cls.parse(path.read_text(encoding="utf-8"), path.name)
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"cannot read {path}: {error}") from error
-        about = claims.hand.get("model", model_name)
-        if about != model_name:
+        about = claims.hand.get("model")
+        if about and model_name and about != model_name:
             raise UsageError(
                 f"{path.name} is about a {about}, and a {model_name} is to be judged",
                 hint="--backend or --dialect of that model, or another file",

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from dexkit.clock import RealClock
-from dexkit.conformance.phases import Stall
+from dexkit.conformance.phases import Beats, Stall
 
 __all__ = ["Heartbeat"]
 
@@ -27,10 +27,12 @@ class Heartbeat:
     kernel without it) only the former is known.
 
     :ivar stalls: when the machine lacked processor time.
+    :ivar beats: by how much this thread was woken late, all along: the jitter of the kit itself.
     """
 
     def __init__(self) -> None:
         self.stalls: list[Stall] = []
+        self.beats = Beats(time.time_ns())
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
@@ -41,8 +43,10 @@ class Heartbeat:
             begin, due = time.time_ns(), clock.now() + _BEAT
             clock.sleep_until(due)
             late = clock.now() - due
-            before, waited = waited, _waited()
             end = time.time_ns()
+            self.beats.t_us.append((end - self.beats.begin_ns) // 1000)
+            self.beats.late_us.append(round(late * 1e6))
+            before, waited = waited, _waited()
             short = (waited - before) * 1e9 > _PRESSURE * (end - begin)
             if late <= _LATE and not short:
                 continue

@@ -7,19 +7,16 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from dexkit.conformance.checks import Check, Context, Outcome, all_checks
+from dexkit.conformance.checks import Check, Context, all_checks
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import TOO_BUSY, Result, RunResult, Stage
+from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.usb.judge import judge_usb
-from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
 __all__ = ["judge"]
-
-STARVED = 0.5
-"""Part of a failure's time that must be starved for it not to be blamed on the hand."""
 
 
 def judge(
@@ -86,21 +83,8 @@ def _judge_one(
         return judgement.not_applicable(missing)
     return judgement.blocked() or judgement.of(
         lambda: checks[requirement.id](context),
-        lambda outcome: _excuse(recording, requirement, outcome),
+        lambda outcome: excuse(recording, requirement, outcome, (0.0, recording.duration)),
     )
-
-
-def _excuse(recording: Recording, requirement: Requirement, outcome: Outcome) -> str:
-    """Why a failure is not blamed on the hand: every place of it, or the run, was starved."""
-    if not requirement.realtime:
-        return ""
-    spans = [(e.time_s, e.end_s) for e in outcome.evidence if e.end_s is not None]
-    shares = [recording.starved(a, b) for a, b in spans] or [
-        recording.starved(0.0, recording.duration)
-    ]
-    if min(shares) < STARVED:
-        return ""
-    return f"{TOO_BUSY} to tell: it lacked processor time for {min(shares):.0%} of it; run again"
 
 
 def _missing(context: Context) -> str:
@@ -125,7 +109,11 @@ def _harness(recording: Recording) -> dict[str, float]:
     """How fair the kit's own machine was; empty where somebody else recorded."""
     if recording.stimulus is None:
         return {}
-    return {"starved": recording.starved(0.0, recording.duration)}
+    figures = {"starved": recording.starved(0.0, recording.duration)}
+    late = recording.lateness(0.0, recording.duration)
+    if late is not None:
+        figures |= {"jitter_p50_ms": late[0] * 1e3, "jitter_p99_ms": late[1] * 1e3}
+    return figures
 
 
 def _stage(recording: Recording, side: Side) -> Stage:

@@ -19,14 +19,18 @@ from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.stimuli import (
+    Action,
     Join,
     Leave,
     Observation,
     Plan,
     Restart,
+    Role,
     Script,
     Send,
     Session,
+    StartService,
+    StopService,
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
@@ -43,6 +47,8 @@ __all__ = ["LiveOptions", "free_domain", "record_run"]
 TOOLS = "dexkit.tools"
 """Metadata record with the last lines that each process of the run printed."""
 DISCOVERY_TIMEOUT = 5.0
+GONE_TIMEOUT = 3.0
+"""Seconds that the publishers of a service that has ended are given to vanish."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +135,9 @@ def record_run(
         plan = options.plan()
         script = script_for(plan, say)
         heart = stack.enter_context(Heartbeat())
-        driver = stack.enter_context(_Driver(rig_options, plan))
+        driver = stack.enter_context(_Driver(rig, plan))
         _meet(recorder_node, plan)
-        finished = driver.go_through(script, stop, rig)
+        finished = driver.go_through(script, stop)
         recording.stop()
         driver.close()
         rig.stop()
@@ -141,6 +147,7 @@ def record_run(
             phases=[p for p in script.phases if p.end_ns],
             objects={s: plan.objects.get(s) for s in plan.sides},
             stalls=heart.stalls,
+            beats=heart.beats,
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished
@@ -221,18 +228,18 @@ def _meet(node: DdsNode, plan: Plan) -> None:
 class _Driver:
     """Carries out the script's actions on DDS."""
 
-    rig: RigOptions
+    rig: Rig
     plan: Plan
     _newest: dict[str, bytes] = field(default_factory=dict)
+    _others: dict[Role, _Client | _Monitor] = field(default_factory=dict)
+    _stopped: dict[str, float | None] = field(default_factory=dict)
 
     def __enter__(self) -> _Driver:
         self._wire = Wire(self.plan.dialect)
-        self._states = {self._wire.state_topics[s] for s in self.plan.sides}
         self._clock = RealClock()
         # wall clock, as recordings have it, on a monotonic footing
         self._offset = time.time_ns() - round(self._clock.now() * 1e9)
-        self._client: _Client | None = _Client(self.rig, self._wire, self.plan.sides)
-        self._monitor: _Monitor | None = None
+        self._client: _Client | None = self._new_client()
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -240,23 +247,24 @@ class _Driver:
 
     def close(self) -> None:
         """Leave the domain. May be called twice."""
-        for part in (self._client, self._monitor):
+        for part in (self._client, *self._others.values()):
             if part is not None:
                 part.close()
-        self._client = self._monitor = None
+        self._client = None
+        self._others.clear()
 
     @property
     def now_ns(self) -> int:
         """Now, on the recording's clock."""
         return round(self._clock.now() * 1e9) + self._offset
 
-    def go_through(self, script: Script, stop: threading.Event, rig: Rig) -> bool:
+    def go_through(self, script: Script, stop: threading.Event) -> bool:
         """Run the script; False when it was stopped."""
         steps = script.run()
         action = next(steps)
         while not stop.is_set():
             self._do(action)
-            dead = rig.dead()
+            dead = self.rig.dead()
             if dead is not None:
                 raise ConformanceError(f"{dead!r} has ended", hint=dead.last_words)
             try:
@@ -265,24 +273,60 @@ class _Driver:
                 return True
         return False
 
-    def _do(self, action: Send | Join | Leave | Restart) -> None:
+    def _do(self, action: Action) -> None:
         if isinstance(action, Send):
-            assert self._client is not None
-            for topic, payload in action.payloads:
-                self._client.send(topic, payload)
-            self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
+            self._send(action)
         elif isinstance(action, Join):
-            self._monitor = _Monitor(self.rig, self._wire, self.plan.sides)
-        elif isinstance(action, Leave) and self._monitor is not None:
-            self._monitor.close()
-            self._monitor = None
+            self._others[action.role] = self._joining(action.role)
+        elif isinstance(action, Leave):
+            self._others.pop(action.role).close()
         elif isinstance(action, Restart):
             assert self._client is not None
             self._client.close()
             self._client = None
             time.sleep(0.1)  # a new process takes longer; the hand must see the old one go
-            self._client = _Client(self.rig, self._wire, self.plan.sides)
+            self._client = self._new_client()
             self._client.wait_matched(1.0)
+        elif isinstance(action, StopService):
+            self._stop_service()
+        elif isinstance(action, StartService):
+            self._newest.clear()
+            self.rig.serve()
+
+    def _send(self, action: Send) -> None:
+        sender = self._client if action.by is None else self._others[action.by]
+        assert isinstance(sender, _Client)
+        stamp = None if not action.age_s else time.time_ns() - round(action.age_s * 1e9)
+        for topic, payload in action.payloads:
+            sender.send(topic, payload, stamp)
+        self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
+
+    def _new_client(self, type_name: str | None = None) -> _Client:
+        return _Client(self.rig.options, self._wire, self.plan.sides, type_name)
+
+    def _joining(self, role: Role) -> _Client | _Monitor:
+        if role is Role.RIVAL:
+            rival = self._new_client()
+            rival.wait_matched(1.0)
+            return rival
+        if role is Role.STRANGER:
+            return self._new_client(self._wire.foreign.name)
+        qos = Qos("reliable", depth=None) if role is Role.LAGGARD else Qos.reader_default()
+        return _Monitor(self.rig.options, self._wire, self.plan.sides, qos)
+
+    def _stop_service(self) -> None:
+        """End the services; how long that took, and until nobody publishes any more."""
+        assert self._client is not None
+        begin = time.monotonic()
+        polite = self.rig.end_services()
+        if polite is None:
+            return
+        ended = time.monotonic()
+        gone = self._client.wait_alone(GONE_TIMEOUT)
+        self._stopped = {
+            "exit_s": ended - begin if polite else None,
+            "gone_s": time.monotonic() - ended if gone else None,
+        }
 
     def _observe(self) -> Observation:
         q: dict[Side, Pose] = {}
@@ -297,33 +341,55 @@ class _Driver:
                 state = self._wire.read_state(payload, side)
                 if state is not None:
                     q[side], dq[side] = state
-        joined = self._monitor.first_states() if self._monitor else {}
-        return Observation(self.now_ns, q, dq, joined)
+        joined: dict[Side, float] = {}
+        for role, other in self._others.items():
+            if isinstance(other, _Monitor):
+                if role is Role.MONITOR:
+                    joined = other.first_states()
+                else:
+                    other.look()
+        return Observation(self.now_ns, q, dq, joined, self._stopped)
 
 
 class _Client:
-    """The kit as the commanding program, with the official clients' quality of service."""
+    """The kit as the commanding program, with the official clients' quality of service.
 
-    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...]) -> None:
+    :param type_name: the type of its commands, if it is a stranger.
+    """
+
+    def __init__(
+        self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...], type_name: str | None = None
+    ) -> None:
         self._node = _node(rig)
         commands = {wire.command_topics[s] for s in sides}
-        states = {wire.state_topics[s] for s in sides}
+        states = {wire.state_topics[s] for s in sides} if type_name is None else set()
+        self._states = states
+        kind = type_name or wire.command
         self._writers: dict[str, Writer] = {
-            t: self._node.writer(t, wire.command, qos=Qos.writer_default()) for t in commands
+            t: self._node.writer(t, kind, qos=Qos.writer_default()) for t in commands
         }
         self._readers: dict[str, Reader] = {
             t: self._node.reader(t, wire.state, qos=Qos.reader_default()) for t in states
         }
 
-    def send(self, topic: str, payload: bytes) -> None:
-        """Publish a command."""
-        self._writers[topic].write_raw(payload)
+    def send(self, topic: str, payload: bytes, stamp_ns: int | None = None) -> None:
+        """Publish a command, with a source timestamp if it is not to be now."""
+        self._writers[topic].write_raw(payload, stamp_ns)
 
     def wait_matched(self, timeout: float) -> None:
         """Wait until the hands listen to this client."""
         end = time.monotonic() + timeout
         for writer in self._writers.values():
             writer.wait_matched(max(0.0, end - time.monotonic()))
+
+    def wait_alone(self, timeout: float) -> bool:
+        """Wait until nobody publishes state any more; False when somebody still does."""
+        return self._node.discovery.wait(
+            lambda endpoints: (
+                not any(e.kind == "writer" and e.topic in self._states for e in endpoints)
+            ),
+            timeout=timeout,
+        )
 
     def newest(self) -> Mapping[str, bytes]:
         """The newest state on each topic that has got a new one."""
@@ -340,18 +406,27 @@ class _Client:
 
 
 class _Monitor:
-    """The late joiner."""
+    """Another listener: the late joiner, or a slow reader."""
 
-    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...]) -> None:
+    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...], qos: Qos) -> None:
         self._node = _node(rig)
         self._sides = sides
         self._wire = wire
         self._readers = {
-            t: self._node.reader(t, wire.state) for t in {wire.state_topics[s] for s in sides}
+            t: self._node.reader(t, wire.state, qos=qos)
+            for t in {wire.state_topics[s] for s in sides}
         }
         self._begin = time.monotonic()
         self._matched: dict[str, float] = {}
         self._first: dict[str, float] = {}
+        self._looked = self._begin
+
+    def look(self) -> None:
+        """Read what has come, but no more than twice a second."""
+        if time.monotonic() - self._looked >= 0.5:
+            self._looked = time.monotonic()
+            for reader in self._readers.values():
+                reader.take()
 
     def first_states(self) -> dict[Side, float]:
         """Seconds from being matched to the first state, for the sides that have sent one."""

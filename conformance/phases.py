@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
+
+import numpy as np
 
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
 
-__all__ = ["RECORD", "Phase", "Stall", "Stimulus"]
+__all__ = ["RECORD", "Beats", "Phase", "Stall", "Stimulus"]
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
@@ -50,6 +52,30 @@ class Stall:
 
 
 @dataclass
+class Beats:
+    """By how much a timer of the kit's own was late, all along the run: the harness's jitter.
+
+    :param begin_ns: log time of offset 0.
+    :param t_us: when it fired, microseconds from there.
+    :param late_us: by how much too late.
+    """
+
+    begin_ns: int = 0
+    t_us: list[int] = field(default_factory=list)
+    late_us: list[int] = field(default_factory=list)
+
+    def lateness(self, begin_ns: int, end_ns: int) -> tuple[float, float] | None:
+        """Median and 99th percentile of it in [begin, end], seconds; None if it is not known."""
+        t, late = np.array(self.t_us), np.array(self.late_us)
+        begin, end = (begin_ns - self.begin_ns) / 1e3, (end_ns - self.begin_ns) / 1e3
+        there = late[(t >= begin) & (t - late <= end)] / 1e6  # due before its end, fired in it
+        if not len(there):
+            return None
+        median, high = np.percentile(there, [50, 99])
+        return float(median), float(high)
+
+
+@dataclass
 class Stimulus:
     """The whole record.
 
@@ -57,11 +83,13 @@ class Stimulus:
     :param objects: where each side touches its object, or None where there is none: rad for a
         hand of one joint, percent of closing for others.
     :param stalls: when the machine lacked processor time, so that the hand is not blamed for it.
+    :param beats: how late the kit's own timer was.
     """
 
     phases: list[Phase] = field(default_factory=list)
     objects: dict[Side, float | None] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
+    beats: Beats = field(default_factory=Beats)
 
     def to_metadata(self) -> dict[str, str]:
         """The record's content."""
@@ -86,6 +114,7 @@ class Stimulus:
             ),
             "objects": json.dumps({str(s): q for s, q in self.objects.items()}),
             "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
+            "beats": json.dumps(asdict(self.beats)),
         }
 
     @classmethod
@@ -116,6 +145,7 @@ class Stimulus:
                 ],
                 objects={Side(s): q for s, q in json.loads(record["objects"]).items()},
                 stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])],
+                beats=Beats(**json.loads(record.get("beats", "{}"))),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error

@@ -14,13 +14,16 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from dexkit.conformance.results import RunResult
+    from dexkit.conformance.results import Result, RunResult
     from dexkit.conformance.session import SuiteOptions
+    from dexkit.errors import DexkitError
 
-__all__ = ["OPTIONS_KEY", "RESULT_KEY"]
+__all__ = ["OPTIONS_KEY", "REPORTED_KEY", "RESULT_KEY"]
 
 OPTIONS_KEY: pytest.StashKey[SuiteOptions | None] = pytest.StashKey()
 RESULT_KEY: pytest.StashKey[RunResult] = pytest.StashKey()
+REPORTED_KEY: pytest.StashKey[list[Result]] = pytest.StashKey()
+"""What the tests that ran have reported; ``-k`` can leave some out."""
 
 _MARK = "conformance"
 _TRACE = "--dexkit-trace"
@@ -90,6 +93,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="PREFIX",
         help="only requirements whose id begins so (DEX1-RATE)",
     )
+    add(
+        "quick",
+        action="store_true",
+        help="only the MUSTs that need no long observation",
+    )
+    add("list", action="store_true", help="print the requirements that are selected, and end")
+    add(
+        "capabilities",
+        metavar="FILE.toml",
+        help="what the vendor claims; the rest is reported as not claimed (docs/capabilities.md)",
+    )
     add("level", choices=["must", "should", "info"], help="only requirements at least this binding")
     add("json", metavar="FILE", help="write the result file")
     add("report", metavar="FILE.html", help="write the report page")
@@ -109,6 +123,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Check the options, before anything is started."""
     config.addinivalue_line("markers", f"{_MARK}: a requirement of the conformance suite")
     config.stash[OPTIONS_KEY] = None
+    config.stash[REPORTED_KEY] = []
     names = ("device", "side", "object", "set", "domain", "trace", "json", "report", "recording")
     if not config.getoption("dexkit_backend"):
         given = [f"--{name}" for name in names if config.getoption(f"dexkit_{name}")]
@@ -122,8 +137,30 @@ def pytest_configure(config: pytest.Config) -> None:
     try:
         config.stash[OPTIONS_KEY] = SuiteOptions.from_pytest(config)
     except DexkitError as error:
-        hint = f"\n  {error.hint}" if error.hint else ""
-        raise pytest.UsageError(f"{error.message}{hint}") from error
+        raise _usage(error) from error
+    if config.getoption("numprocesses", None):
+        raise pytest.UsageError("one hand, one run: the suite does not work with pytest-xdist's -n")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> int | None:
+    """``--list``: no hand is needed."""
+    if not config.getoption("dexkit_list"):
+        return None
+    from dexkit.conformance.selection import print_selection
+    from dexkit.conformance.session import selection
+    from dexkit.errors import DexkitError
+
+    try:
+        print_selection(selection(config))
+    except DexkitError as error:
+        raise _usage(error) from error
+    return 0
+
+
+def _usage(error: DexkitError) -> pytest.UsageError:
+    hint = f"\n  {error.hint}" if error.hint else ""
+    return pytest.UsageError(f"{error.message}{hint}")
 
 
 def _items(session: pytest.Session) -> list[pytest.Item]:
@@ -132,13 +169,21 @@ def _items(session: pytest.Session) -> list[pytest.Item]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """Nothing judged is never a success."""
+    """Nothing judged is never a success, and a MUST that is left open is no failure of the hand.
+
+    The suite's exit codes are those of ``dexkit check``: 0 pass, 1 fail, 2 not usable.
+    """
     config = session.config
-    if config.option.collectonly or not _items(session):
+    usual = (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.NO_TESTS_COLLECTED)
+    if config.option.collectonly or exitstatus not in usual:
         return
-    result = config.stash.get(RESULT_KEY, None)
-    if (result is None or result.judged == 0) and exitstatus == pytest.ExitCode.OK:
-        session.exitstatus = pytest.ExitCode.NO_TESTS_COLLECTED
+    if not _items(session) and config.stash[OPTIONS_KEY] is None:
+        return  # somebody's own tests
+    from dexkit.conformance.results import Overall, overall_of
+
+    reported: list[Result] = config.stash[REPORTED_KEY]
+    if overall_of(reported) is Overall.INCONCLUSIVE:
+        session.exitstatus = Overall.INCONCLUSIVE.exit_code
 
 
 @pytest.hookimpl(wrapper=True)
@@ -148,13 +193,17 @@ def pytest_terminal_summary(
     """The table that a person reads."""
     session = terminalreporter._session
     yield
-    if session is None or config.option.collectonly or not _items(session):
+    if session is None or config.option.collectonly:
+        return
+    if not _items(session) and config.stash[OPTIONS_KEY] is None:
         return
     result = config.stash.get(RESULT_KEY, None)
     terminalreporter.section("conformance")
     if result is None:
         text = "Nothing was judged, which is not a pass."
-        if config.stash[OPTIONS_KEY] is None:
+        if config.stash[OPTIONS_KEY] is not None:
+            text += " No requirement was left to be judged."
+        else:
             text += (
                 " Name the hand: --backend ezgripper or dex3-usb (emulated), --backend sim-dex1 "
                 "or sim-dex3, or --backend external for a service that runs."

@@ -5,14 +5,16 @@ from __future__ import annotations
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.processes import EMULATED, EXTERNAL, ON_USB, SIMULATED, RigOptions
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
+from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
 from dexkit.conformance.stimuli.session import Session
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
     from dexkit.conformance.live import LiveOptions
 
-__all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite"]
+__all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "selection"]
 
 T = TypeVar("T")
 
@@ -48,6 +50,7 @@ class SuiteOptions:
     settings: tuple[str, ...]
     trace: Path | None
     requirements: tuple[Requirement, ...]
+    claims: Claims = field(default_factory=Claims)
     json: Path | None = None
     report: Path | None = None
     recording: Path | None = None
@@ -79,6 +82,8 @@ class SuiteOptions:
             trace=path("trace"),
             require=get("require"),
             level=get("level"),
+            quick=get("quick"),
+            capabilities=path("capabilities"),
             json=path("json"),
             report=path("report"),
             recording=path("recording"),
@@ -99,6 +104,8 @@ class SuiteOptions:
         trace: Path | None = None,
         require: Sequence[str] = (),
         level: str | None = None,
+        quick: bool = False,
+        capabilities: Path | None = None,
         json: Path | None = None,
         report: Path | None = None,
         recording: Path | None = None,
@@ -139,9 +146,12 @@ class SuiteOptions:
         every = catalogue(chosen.model)
         if backend in ON_USB:
             every += catalogue(chosen.model, "usb")
-        requirements = select(every, prefixes=require, level=level)
+        claims = Claims.load(capabilities, chosen.model)
+        requirements = select(claims.apply(every), prefixes=require, level=level)
+        if quick:
+            requirements = quick_ones(requirements)
         if not requirements:
-            raise UsageError("no requirement is left by --require and --level together")
+            raise UsageError("no requirement is left by --require, --level and --quick together")
         options = cls(
             backend=backend,
             sides=sides,
@@ -153,6 +163,7 @@ class SuiteOptions:
             settings=tuple(settings),
             trace=trace,
             requirements=requirements,
+            claims=claims,
             json=json,
             report=report,
             recording=recording,
@@ -185,6 +196,25 @@ class SuiteOptions:
         if self.objects:
             about["object"] = ", ".join(f"{s} at {p:g} %" for s, p in self.objects.items())
         return about
+
+
+def selection(config: pytest.Config) -> tuple[Requirement, ...]:
+    """The requirements that the command line selects; of every model where it names no hand.
+
+    :raises UsageError: options that make no sense together.
+    """
+    if config.getoption("dexkit_backend"):
+        return SuiteOptions.from_pytest(config).requirements
+    name = config.getoption("dexkit_dialect")
+    model_name = dialect(name).model if name else None
+    path = config.getoption("dexkit_capabilities")
+    claims = Claims.load(Path(path) if path else None, model_name)
+    found = select(
+        claims.apply(catalogue(model_name or claims.hand.get("model"), None)),
+        prefixes=config.getoption("dexkit_require"),
+        level=config.getoption("dexkit_level"),
+    )
+    return quick_ones(found) if config.getoption("dexkit_quick") else found
 
 
 def _dialect(name: str, wanted: str | None, *, has_device: bool) -> Dialect:
@@ -284,7 +314,7 @@ def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
     subject = dict(options.subject)
     if options.recording:
         subject["recording"] = options.recording.name
-    result = judge(view, requirements=options.requirements, subject=subject)
+    result = judge(view, requirements=options.requirements, claims=options.claims, subject=subject)
     if options.json:
         result.write_json(options.json)
     if options.report:

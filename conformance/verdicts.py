@@ -4,16 +4,78 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Protocol
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Level, Requirement
-from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.results import TOO_BUSY, Result, Verdict
 from dexkit.hand import Side
 
-__all__ = ["Judgement"]
+__all__ = ["Judgement", "Machine", "excuse"]
+
+STARVED = 0.5
+"""Part of a failure's time that must be starved for it not to be blamed on the hand."""
+LATE = 0.5
+"""Part of the time that a requirement allows by which the kit may be late itself."""
 
 _OPEN = (Verdict.FAIL, Verdict.BLOCKED, Verdict.ERROR)
+
+
+class Machine(Protocol):
+    """What a recording says of the machine that the kit ran on."""
+
+    def starved(self, begin: float, end: float) -> float:
+        """Part of [begin, end], 0 to 1, in which it lacked processor time."""
+        ...
+
+    def lateness(self, begin: float, end: float) -> tuple[float, float] | None:
+        """Median and 99th percentile, seconds, by which the kit was late; None if not known."""
+        ...
+
+
+def excuse(
+    machine: Machine,
+    requirement: Requirement,
+    outcome: Outcome,
+    whole: tuple[float, float] | None = None,
+) -> str:
+    """Why a failure is not blamed on the hand, or nothing: at every place of it the machine was
+    starved, or the kit's own timers were as late as the hand is blamed for.
+
+    :param whole: the run, for failures that have no place.
+    """
+    if not requirement.realtime:
+        return ""
+    spans = [(e.time_s, e.end_s) for e in outcome.evidence if e.end_s is not None]
+    if whole is not None and not spans:
+        spans = [whole]
+    reasons = [_excuse(machine, requirement, *span) for span in spans]
+    if not reasons or not all(reasons):
+        return ""
+    return f"{TOO_BUSY} to tell: {reasons[0]}; run again"
+
+
+def _excuse(machine: Machine, requirement: Requirement, begin: float, end: float) -> str:
+    share = machine.starved(begin, end)
+    if share >= STARVED:
+        return f"it lacked processor time for {share:.0%} of it"
+    late = machine.lateness(begin, end)
+    if late is None:
+        return ""
+    # what is late now and then moves the extremes; a mean rate suffers only from what is typical
+    for name, limit in requirement.tolerances.items():
+        extreme = name.startswith("max_") and name.endswith("_s")
+        if not extreme and name != "min_rate_hz":
+            continue
+        allowed, by = (limit, late[1]) if extreme else (1 / limit, late[0])
+        if by > LATE * allowed:
+            which = "99th percentile" if extreme else "median"
+            return (
+                f"the kit was itself late by {by * 1e3:.1f} ms ({which}), where "
+                f"{allowed * 1e3:.1f} ms are allowed"
+            )
+    return ""
 
 
 class Judgement:

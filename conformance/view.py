@@ -245,6 +245,14 @@ class Recording:
         )
         return seconds / (end - begin)
 
+    def lateness(self, begin: float, end: float) -> tuple[float, float] | None:
+        """Median and 99th percentile, seconds, by which the kit itself was late in [begin, end];
+        None if that is not known.
+        """
+        if self.stimulus is None:
+            return None
+        return self.stimulus.beats.lateness(self.log_time(begin), self.log_time(end))
+
 
 def detect_dialect(trace: TraceLike) -> Dialect:
     """The dialect whose topics and types are in the recording.

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import TOO_BUSY, Result
+from dexkit.conformance.results import Result
 from dexkit.conformance.usb.checks import CHECKS, UsbContext
 from dexkit.conformance.usb.view import UsbRecording, UsbSide
-from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.verdicts import Judgement, excuse
 
 __all__ = ["judge_usb"]
-
-STARVED = 0.5
-"""Part of a failure's time that must be starved for it not to be blamed on the hand."""
 
 
 def judge_usb(
@@ -49,16 +45,5 @@ def _judge_one(recording: UsbRecording, hand: UsbSide, judgement: Judgement) -> 
         return judgement.not_applicable(f"{reason}: {trouble}" if trouble else reason)
     return judgement.of(
         lambda: CHECKS[requirement.id](UsbContext(recording, hand, requirement)),
-        lambda outcome: _excuse(recording, requirement, outcome),
+        lambda outcome: excuse(recording, requirement, outcome),
     )
-
-
-def _excuse(recording: UsbRecording, requirement: Requirement, outcome: Outcome) -> str:
-    """Why a failure is not blamed on the hand: the machine was starved at each place of it."""
-    spans = [(e.time_s, e.end_s) for e in outcome.evidence if e.end_s is not None]
-    if not requirement.realtime or not spans:
-        return ""
-    share = min(recording.starved(a, b) for a, b in spans)
-    if share < STARVED:
-        return ""
-    return f"{TOO_BUSY} to tell: it lacked processor time for {share:.0%} of it; run again"

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from dexkit.conformance.phases import Stall
+from dexkit.conformance.phases import Beats, Stall
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
 
@@ -141,10 +141,12 @@ class UsbRecord:
     """The whole record.
 
     :param stalls: when the machine lacked processor time.
+    :param beats: how late the kit's own timer was.
     """
 
     sides: dict[Side, SideRecord] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
+    beats: Beats = field(default_factory=Beats)
 
     def to_metadata(self) -> dict[str, str]:
         """The record's content: JSON by side."""
@@ -160,6 +162,7 @@ class UsbRecord:
             }
             record[str(side)] = json.dumps(plain)
         record["stalls"] = json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls])
+        record["beats"] = json.dumps(asdict(self.beats))
         return record
 
     @classmethod
@@ -174,7 +177,10 @@ class UsbRecord:
                 hint="judge it with the dexkit that recorded it, or a newer one",
             )
         try:
-            found = cls(stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])])
+            found = cls(
+                stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])],
+                beats=Beats(**json.loads(record.get("beats", "{}"))),
+            )
             for side in Side:
                 if str(side) in record:
                     found.sides[side] = _side(json.loads(record[str(side)]))

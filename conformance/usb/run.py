@@ -76,7 +76,7 @@ def run(
             except BaseException:
                 stop.set()  # the other hand's script is not to go on alone
                 raise
-        record.stalls = heart.stalls
+        record.stalls, record.beats = heart.stalls, heart.beats
         recorder.add_metadata(RECORD, record.to_metadata())
     finally:
         for host in hosts.values():

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.phases import Stall
+from dexkit.conformance.phases import Beats, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -228,6 +228,7 @@ class UsbRecording:
     origin_ns: int
     sides: Mapping[Side, UsbSide]
     stalls: Sequence[Stall] = field(default_factory=tuple)
+    beats: Beats = field(default_factory=Beats)
 
     @classmethod
     def of(cls, trace: TraceLike) -> UsbRecording | None:
@@ -261,12 +262,13 @@ class UsbRecording:
             origin_ns,
             {s: UsbSide(s, part, transfers[s], origin_ns) for s, part in record.sides.items()},
             record.stalls,
+            record.beats,
         )
 
     def since(self, origin_ns: int) -> UsbRecording:
         """The same with another second 0."""
         sides = {s: replace(side, origin_ns=origin_ns) for s, side in self.sides.items()}
-        return UsbRecording(origin_ns, sides, self.stalls)
+        return UsbRecording(origin_ns, sides, self.stalls, self.beats)
 
     def starved(self, begin: float, end: float) -> float:
         """Part of [begin, end], 0 to 1, in which the kit's own machine lacked processor time."""
@@ -281,3 +283,10 @@ class UsbRecording:
             for s in self.stalls
         )
         return seconds / (end - begin)
+
+    def lateness(self, begin: float, end: float) -> tuple[float, float] | None:
+        """Median and 99th percentile, seconds, by which the kit itself was late in [begin, end];
+        None if that is not known.
+        """
+        times = (self.origin_ns + round(t * 1e9) for t in (begin, end))
+        return self.beats.lateness(*times)

@@ -8,12 +8,17 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from dexkit.errors import ConformanceError
+from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS
 
 
 @click.command("check")
-@click.argument("recording", type=click.Path(exists=True, path_type=Path), metavar="IN.mcap")
+@click.argument(
+    "recording",
+    type=click.Path(exists=True, path_type=Path),
+    metavar="IN.mcap",
+    required=False,
+)
 @click.option(
     "--side",
     type=click.Choice(["left", "right", "both"]),
@@ -37,16 +42,27 @@ from dexkit.models import DIALECTS
     type=click.Choice(["must", "should", "info"], case_sensitive=False),
     help="Only requirements at least this binding.",
 )
+@click.option(
+    "--capabilities",
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="What the vendor claims; the rest is reported as not claimed.",
+)
+@click.option(
+    "--list", "list_only", is_flag=True, help="Print the requirements that are selected, and end."
+)
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the result file.")
 @click.option("--junit", "junit_path", type=click.Path(path_type=Path), help="Write JUnit XML.")
 @click.option("--html", "html_path", type=click.Path(path_type=Path), help="Write a report page.")
 @click.option("-v", "--verbose", is_flag=True, help="Also say what could not be judged, and why.")
 def command(
-    recording: Path,
+    recording: Path | None,
     side: str | None,
     dialect: str,
     require: tuple[str, ...],
     level: str | None,
+    capabilities: Path | None,
+    list_only: bool,
     json_path: Path | None,
     junit_path: Path | None,
     html_path: Path | None,
@@ -60,24 +76,39 @@ def command(
     Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
     usable or nothing in it could be judged.
     """
+    from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import catalogue, select
     from dexkit.conformance.view import Recording, sides_of
     from dexkit.traces import open_trace
 
-    view = Recording.of(
-        open_trace(recording),
-        dialect_name=None if dialect == "auto" else dialect,
-        sides=sides_of(side) if side else (),
-    )
-    every = catalogue(view.model.name)
-    if view.usb is not None:
-        every += catalogue(view.model.name, "usb")
-    requirements = select(every, prefixes=require, level=level)
+    view, model_name = None, None if dialect == "auto" else DIALECTS[dialect].model
+    if recording is not None:
+        view = Recording.of(
+            open_trace(recording),
+            dialect_name=None if dialect == "auto" else dialect,
+            sides=sides_of(side) if side else (),
+        )
+        model_name = view.model.name
+    claims = Claims.load(capabilities, model_name)
+    model_name = model_name or claims.hand.get("model")
+    every = catalogue(model_name)
+    if view is None or view.usb is not None:
+        every += catalogue(model_name, "usb")
+    requirements = select(claims.apply(every), prefixes=require, level=level)
     if not requirements:
         raise ConformanceError("no requirement is left by --require and --level together")
-    result = judge(view, requirements=requirements, subject={"recording": recording.name})
+    if list_only:
+        from dexkit.conformance.selection import print_selection
+
+        print_selection(requirements)
+        return
+    if view is None or recording is None:
+        raise UsageError("which recording is to be judged?", hint="dexkit check RECORDING.mcap")
+    result = judge(
+        view, requirements=requirements, claims=claims, subject={"recording": recording.name}
+    )
     console = Console()
     print_result(result, console, verbose=verbose, more="-v says why")
     if json_path:
