@@ -29,6 +29,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),
     "serve": ("dexkit.cli.serve", "Put a hand on Unitree's topics."),
+    "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
 }
 
 

@@ -220,11 +220,11 @@ class TeleopClient(ABC):
 
     @property
     def missing(self) -> dict[Side, str]:
-        """The sides that it still waits for, and what is wrong with each."""
+        """The sides that it still waits for, and why; "" where no state came."""
         if self.ready:
             return {}
         latest = self.receiver.seen
-        found = {s: "no state" for s in self.sides if s not in latest}
+        found = {s: "" for s in self.sides if s not in latest}
         if found:
             return found
         return {s: "every q is exactly 0" for s in self.sides if not any(latest[s])}

@@ -1,0 +1,318 @@
+"""``dexkit teleop``: drive a hand as xr_teleoperate does, and say what an operator would feel."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dexkit.cli.common import dds_options, stop_on_signals
+from dexkit.errors import DexkitError, UsageError
+from dexkit.hand import Side
+from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
+from dexkit.models import dialect as dialect_by_name
+from dexkit.models import model as model_by_name
+from dexkit.teleop import (
+    Operator,
+    Pose,
+    Profile,
+    Release,
+    client_for,
+    profile,
+    profiles_for,
+    recorded,
+)
+
+if TYPE_CHECKING:
+    from dexkit.dds import DdsNode
+    from dexkit.teleop.live import Session
+
+__all__ = ["command"]
+
+_HINT_AFTER = 5.0  # seconds of waiting
+_SILENT = 0.5  # seconds without state at the end
+_MS = 1e3
+
+
+@click.command("teleop")
+@click.argument("profile_name", metavar="PROFILE", required=False)
+@click.option("--list", "list_profiles", is_flag=True, help="List the profiles and exit.")
+@click.option(
+    "--dialect",
+    "dialect_name",
+    type=click.Choice(list(DIALECTS)),
+    default="unitree_go",
+    show_default=True,
+    help="How the hands speak; dex3 is the Dex3-1's.",
+)
+@dds_options(default_domain=1)
+@click.option(
+    "--side",
+    "side_name",
+    type=click.Choice(["left", "right", "both"]),
+    default="both",
+    show_default=True,
+    help="Hands to drive. The genuine client drives both, and waits for both.",
+)
+@click.option(
+    "--duration",
+    type=click.FloatRange(min=0.5),
+    metavar="S",
+    help="Go on for so long; the profile repeats.  [default: once]",
+)
+@click.option(
+    "--wait",
+    "patience",
+    type=click.FloatRange(min=0),
+    metavar="S",
+    help="Give up waiting for state after so long.  [default: never, as the genuine client]",
+)
+@click.option(
+    "--release",
+    "release_name",
+    type=click.Choice([str(r) for r in Release]),
+    help="Of xr_teleoperate, for a Dex1-1.  [default: 1.4; 1.1 for unitree_actuator]",
+)
+@click.option(
+    "--sim",
+    "simulated",
+    is_flag=True,
+    help="As xr_teleoperate --sim: a Dex1-1's commands are not clipped.",
+)
+@click.option(
+    "--record",
+    "record_path",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="F.mcap",
+    help="Record the hands' topics meanwhile; 'dexkit check' judges them.",
+)
+@click.option("--force", is_flag=True, help="Go on although somebody else commands the hand.")
+@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON (docs/teleop.md).")
+def command(
+    profile_name: str | None,
+    list_profiles: bool,
+    dialect_name: str,
+    domain: int,
+    interface: str,
+    side_name: str,
+    duration: float | None,
+    patience: float | None,
+    release_name: str | None,
+    simulated: bool,
+    record_path: Path | None,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Drive a hand as xr_teleoperate does, and say what an operator would feel.
+
+    PROFILE is what the operator does ('dexkit teleop --list'), or a recording: FILE.mcap, whose
+    commands are then what the operator wants. The client waits for the state of both hands,
+    clips each Dex1-1 command to 0.18 rad of the last state and smooths it, as the genuine one
+    does; how the hand feels is measured meanwhile. The default domain is 1, the simulation's:
+    --domain 0 with a robot's interface moves real hands.
+
+    At the end, on Ctrl-C too, the hands are told to stay where they are.
+
+    Exit codes: 0 done, 1 the hand gave no state or fell silent, 2 wrong usage or nothing that can
+    be driven, 130 interrupted.
+    """
+    if list_profiles:
+        _list()
+        return 0
+    if profile_name is None:
+        raise UsageError("no profile", hint="'dexkit teleop --list' names them")
+    spoken = dialect_by_name(dialect_name)
+    sides = tuple(Side) if side_name == "both" else (Side(side_name),)
+    chosen = _profile(profile_name, spoken)
+    client = client_for(
+        spoken,
+        sides,
+        release=Release(release_name) if release_name else None,
+        simulated=simulated,
+    )
+    operator = Operator(chosen, spoken)
+    seconds = duration or chosen.duration
+
+    from dexkit.dds import DdsNode
+    from dexkit.teleop.live import LiveClient
+
+    with stop_on_signals() as stop, ExitStack() as stack:
+        if record_path is not None:
+            _record(stack, record_path, spoken, domain, interface)
+        node = stack.enter_context(DdsNode(domain=domain, interface=interface))
+        if not force:
+            LiveClient.refuse_company(node, spoken, sides)
+        live = LiveClient(node, client)
+        waiting = _Waiting(node, patience)
+        if not live.wait_ready(stop.event, waiting):
+            return 130
+        _say(f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s")
+        show = _Progress(seconds)
+        try:
+            session = live.perform(operator, seconds, stop.event, show)
+        finally:
+            show.clear()
+            live.leave()
+        stopped = bool(stop)
+    _report(session, operator, as_json=as_json)
+    silent = [] if stopped else _silent(session, seconds)
+    for side in silent:
+        _say(f"{side}: no state in the end; the genuine client goes on with what it last read")
+    return 130 if stopped else int(bool(silent))
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _list() -> None:
+    for hand in MODELS.values():
+        click.echo(f"{hand.title} (--dialect {', '.join(d.name for d in hand.dialects)})")
+        for each in profiles_for(hand.name):
+            click.echo(f"  {each.name:12} {each.duration:4.1f} s  {each.summary}")
+
+
+def _profile(name: str, spoken: Dialect) -> Profile:
+    """A profile by name, or the commands of a recording.
+
+    :raises UsageError: no such profile.
+    :raises DexkitError: the recording cannot be used.
+    """
+    if not name.endswith(".mcap"):
+        return profile(name, spoken.model)
+    from dexkit.conformance.stimuli import Session as Recorded
+
+    found = Recorded.load(Path(name)).for_hand(spoken)
+    scale = 1.0 if found.dialect.name == spoken.name else spoken.q_open / found.dialect.q_open
+    series: dict[Side, tuple[list[float], list[Pose]]] = {
+        side: (
+            [float(t) for t in commands.t],
+            [tuple(float(x) * scale for x in row) for row in commands.q],
+        )
+        for side, commands in found.commands.items()
+    }
+    return recorded(Path(name).stem, spoken, series)
+
+
+def _record(stack: ExitStack, path: Path, spoken: Dialect, domain: int, interface: str) -> None:
+    """Record the hands' topics until the stack is closed."""
+    from dexkit.dds import DdsNode
+    from dexkit.traces.dds_recording import DdsRecording
+    from dexkit.traces.recorder import Recorder
+
+    recorder = stack.enter_context(Recorder(path))
+    node = stack.enter_context(DdsNode(domain=domain, interface=interface))
+    topics = {
+        topic: kind
+        for s in Side
+        for topic, kind in zip(spoken.topics(s), (spoken.cmd_type, spoken.state_type), strict=True)
+    }
+    stack.enter_context(DdsRecording(node, recorder, list(topics), types=topics))
+
+
+class _Waiting:
+    """Says what the client waits for, as the genuine one does, and where to look for help."""
+
+    def __init__(self, node: DdsNode, patience: float | None) -> None:
+        self._node = node
+        self._patience = patience
+        self._said: Mapping[Side, str] | None = None
+        self._helped = False
+
+    def __call__(self, missing: Mapping[Side, str], seconds: float) -> None:
+        """Still waiting.
+
+        :raises DexkitError: for longer than the user wants to.
+        """
+        what = ", ".join(f"{s} ({why})" if why else str(s) for s, why in missing.items())
+        if self._patience is not None and seconds >= self._patience:
+            error = DexkitError(
+                f"no usable state of {what} after {seconds:.0f} s on domain {self._node.domain}",
+                hint=self._doctor,
+            )
+            error.exit_code = 1
+            raise error
+        if missing and missing != self._said:
+            _say(f"waiting for state of {what} ...")
+            self._said = dict(missing)
+        if seconds >= _HINT_AFTER and not self._helped:
+            self._helped = True
+            _say(f"  {self._doctor}")
+
+    @property
+    def _doctor(self) -> str:
+        where = "" if self._node.interface == "lo" else f" --interface {self._node.interface}"
+        return f"'dexkit doctor --domain {self._node.domain}{where}' says what is wrong"
+
+
+class _Progress:
+    """One line that tells how far it is, on a terminal."""
+
+    def __init__(self, duration: float) -> None:
+        self._duration = duration
+        self._tty = sys.stderr.isatty()
+
+    def __call__(self, seconds: float, session: Session) -> None:
+        if self._tty:
+            rates = ", ".join(f"{s} {session.command_rate(s):.0f} Hz" for s in session.sides)
+            click.echo(
+                f"\r\033[K{seconds:5.1f} of {self._duration:g} s  {rates}", nl=False, err=True
+            )
+
+    def clear(self) -> None:
+        """Remove the line."""
+        if self._tty:
+            click.echo("\r\033[K", nl=False, err=True)
+
+
+def _silent(session: Session, end: float) -> list[Side]:
+    last = {s: rows[-1][0] for s, rows in session.states.items() if rows}
+    return [s for s in session.sides if last.get(s, -math.inf) < end - _SILENT]
+
+
+def _report(session: Session, operator: Operator, *, as_json: bool) -> None:
+    model = model_by_name(operator.dialect.model)
+    found: dict[str, Any] = {}
+    for side in session.sides:
+        figures = session.feel(operator, side)
+        joints = {model.joints[side][i].name: f.figures() for i, f in figures.items()}
+        found[str(side)] = {"client_hz": session.command_rate(side), "joints": joints}
+    if as_json:
+        data = {
+            "profile": operator.profile.name,
+            "dialect": operator.dialect.name,
+            "seconds": session.duration,
+            "sides": found,
+        }
+        click.echo(json.dumps(_finite(data), indent=2))
+        return
+    for name_of_side, measured in found.items():
+        click.echo(f"{name_of_side}: the client ran at {measured['client_hz']:.0f} Hz")
+        for name, values in measured["joints"].items():
+            text = sentence(values) or "no occasion to measure anything"
+            click.echo(f"  {text}" if model.name == DEX1_1.name else f"  {name}: {text}")
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no infinity: null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def sentence(values: Mapping[str, float]) -> str:
+    """The figures of a joint in a line."""
+    says: dict[str, Callable[[float], str]] = {
+        "stroke_s": lambda x: f"full stroke {x:.2f} s",
+        "reaction_s": lambda x: f"reacts after {x * _MS:.0f} ms",
+        "overshoot": lambda x: f"overshoots by {x:.3f} rad",
+        "stuck": lambda x: f"rests {x:.3f} rad off",
+        "lag_s": lambda x: f"lags {x * _MS:.0f} ms",
+    }
+    return ", ".join(say(values[name]) for name, say in says.items() if name in values)

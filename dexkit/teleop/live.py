@@ -1,0 +1,246 @@
+"""The teleoperation client on DDS, against any hand that is served there.
+
+It takes the genuine client's place: its quality of service, its rate (each period's rest is slept,
+so the mean is some 2 % below the nominal one), its order of reading and writing. It differs where
+the genuine one would be a nuisance: it waits until the hand listens before its first command, and
+it leaves the hand at rest (:meth:`LiveClient.leave`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexkit.dds import DdsNode, Qos
+from dexkit.errors import TopicConflict, WireError
+from dexkit.hand import Floats, JointMode, Side
+from dexkit.models import DEX1_1, Dialect, model
+from dexkit.teleop.client import JointCommand, Pose, TeleopClient
+from dexkit.teleop.feel import Feel, feel
+from dexkit.teleop.profiles import Operator
+from dexkit.teleop.wire import ClientWire
+
+__all__ = ["LOOK", "LiveClient", "Session"]
+
+LOOK = 0.5
+"""Seconds in which other writers of the command topics are looked for."""
+_LEAVING = 0.25  # seconds of commands to stay where it is, at the end
+_NAP = 0.1
+
+
+@dataclass
+class Session:
+    """What was sent and seen, in seconds from the operator's beginning."""
+
+    sides: tuple[Side, ...]
+    commands: dict[Side, list[tuple[float, Pose]]] = field(default_factory=dict)
+    states: dict[Side, list[tuple[float, Pose]]] = field(default_factory=dict)
+
+    def note(
+        self, kind: dict[Side, list[tuple[float, Pose]]], at: float, poses: Mapping[Side, Pose]
+    ) -> None:
+        """Note poses of one moment."""
+        for side, pose in poses.items():
+            kind.setdefault(side, []).append((at, pose))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first command to the last."""
+        times = [t for rows in self.commands.values() for t, _ in (rows[:1] + rows[-1:])]
+        return max(times) - min(times) if times else 0.0
+
+    def command_rate(self, side: Side) -> float:
+        """Hz of the client, 0 without commands."""
+        rows = self.commands.get(side, [])
+        return (len(rows) - 1) / (rows[-1][0] - rows[0][0]) if len(rows) > 1 else 0.0
+
+    def feel(self, operator: Operator, side: Side) -> dict[int, Feel]:
+        """The figures of each joint that the operator moves."""
+        rows = self.states.get(side, [])
+        if len(rows) < 2:
+            return {}
+        t: Floats = np.array([at for at, _ in rows])
+        q: Floats = np.array([pose for _, pose in rows])
+        spoken = operator.dialect
+        found = {}
+        for i, joint in enumerate(model(spoken.model).joints[side]):
+            stroke = spoken.q_open if spoken.model == DEX1_1.name else joint.stroke
+            figures = feel(t, q[:, i], lambda at, i=i: _of(operator.intent(at, side), i), stroke)  # type: ignore[misc]
+            if figures.figures():
+                found[i] = figures
+        return found
+
+
+def _of(pose: Pose | None, joint: int) -> float | None:
+    return None if pose is None else pose[joint]
+
+
+class LiveClient:
+    """A client's endpoints on a node, and its loops.
+
+    :param client: fresh, for the sides that it is to drive.
+    """
+
+    def __init__(self, node: DdsNode, client: TeleopClient) -> None:
+        self._node = node
+        self._client = client
+        self._wire = ClientWire(client.dialect)
+        self._arrived = threading.Event()
+        dialect: Dialect = client.dialect
+        commands = dict.fromkeys(self._wire.command_topics[s] for s in client.sides)
+        states = dict.fromkeys(self._wire.state_topics[s] for s in client.sides)
+        self._writers = {
+            topic: node.writer(topic, dialect.cmd_type, qos=Qos.writer_default())
+            for topic in commands
+        }
+        self._readers = {
+            topic: node.reader(
+                topic, dialect.state_type, qos=Qos.reader_default(), on_data=self._arrived.set
+            )
+            for topic in states
+        }
+
+    @staticmethod
+    def refuse_company(node: DdsNode, spoken: Dialect, sides: Sequence[Side]) -> None:
+        """Two clients on one hand would fight, and a real one may carry something.
+
+        :raises TopicConflict: somebody else publishes commands to one of these hands.
+        """
+        topics = {spoken.topics(s)[0] for s in sides}
+
+        def strangers() -> list[str]:
+            return sorted(
+                f"{e.topic} ({e.process or 'unknown process'})"
+                for e in node.endpoints()
+                if e.kind == "writer" and not e.own and e.topic in topics
+            )
+
+        node.discovery.wait(lambda _: strangers(), timeout=LOOK)
+        if found := strangers():
+            raise TopicConflict(
+                f"somebody else commands this hand on domain {node.domain}: {', '.join(found)}",
+                hint="stop that client, choose another --domain, or go on with --force",
+            )
+
+    def wait_ready(
+        self, stop: threading.Event, say: Callable[[Mapping[Side, str], float], object]
+    ) -> bool:
+        """Wait until the client has the states that it wants, and the hands listen.
+
+        :param say: told once a second what is missing of which side, and how long it has been.
+        :returns: False when it was stopped.
+        """
+        begin = time.monotonic()
+        told = 0.0
+        while not stop.is_set():
+            now = time.monotonic()
+            self._read(now)
+            if self._client.ready and all(w.matched for w in self._writers.values()):
+                return True
+            if now - told >= 1.0:
+                told = now
+                say(self._missing(), now - begin)
+            self._arrived.wait(_NAP)
+            self._arrived.clear()
+        return False
+
+    def _missing(self) -> dict[Side, str]:
+        found = self._client.missing
+        for side in self._client.sides:
+            if side not in found and not self._writers[self._wire.command_topics[side]].matched:
+                found[side] = "nobody listens for commands"
+        return found
+
+    def perform(
+        self,
+        operator: Operator,
+        duration: float,
+        stop: threading.Event,
+        progress: Callable[[float, Session], object] = lambda seconds, session: None,
+    ) -> Session:
+        """Let the operator perform for so many seconds, or until stopped.
+
+        :param progress: told about twice a second.
+        """
+        session = Session(self._client.sides)
+        period = self._client.period
+        start = time.monotonic()
+        told = start
+        while not stop.is_set():
+            now = time.monotonic()
+            if now - start >= duration:
+                break
+            session.note(session.states, now - start, self._read(now))
+            inputs = operator.inputs(now - start, self._client.sides)
+            commands = self._client.step(now, {}, inputs)
+            self._send(commands)
+            session.note(
+                session.commands,
+                now - start,
+                {s: tuple(m.q for m in motors) for s, motors in commands.items()},
+            )
+            if now - told >= 0.5:
+                told = now
+                progress(now - start, session)
+            self._sleep(now + period, start, session)
+        return session
+
+    def leave(self) -> None:
+        """Leave the hands at rest: what the genuine client does not do.
+
+        The genuine one just stops sending. A Dex1-1's service then brakes within a second; a
+        Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
+        to stay where it is, a Dex3-1 with its motors locked (status 0 of the mode byte).
+        """
+        poses = self._client.receiver.seen
+        locks = self._client.dialect.model != DEX1_1.name
+        kp, kd = model(self._client.dialect.model).client_gains
+        stay = {
+            s: tuple(
+                JointCommand(i | JointMode.BRAKE << 4 if locks else 0, q, 0.0, 0.0, kp, kd)
+                for i, q in enumerate(pose)
+            )
+            for s, pose in poses.items()
+            if s in self._client.sides
+        }
+        end = time.monotonic() + _LEAVING
+        while stay and time.monotonic() < end:
+            self._send(stay)
+            time.sleep(self._client.period)
+
+    def _send(self, commands: Mapping[Side, Sequence[JointCommand]]) -> None:
+        for topic, payload in self._wire.encode(commands):
+            self._writers[topic].write_raw(payload)
+
+    def _read(self, now: float) -> dict[Side, Pose]:
+        """What has come; it is handed to the client."""
+        found: dict[Side, Pose] = {}
+        for topic, reader in self._readers.items():
+            for sample in reader.take()[-1:]:
+                with contextlib.suppress(WireError):
+                    states = self._wire.positions(topic, sample.data)
+                    self._client.receive(now, states)
+                    found.update((s, q) for s, q in states.items() if s in self._client.sides)
+        return found
+
+    def _sleep(self, until: float, start: float, session: Session) -> None:
+        """Sleep until the next turn, while the receiving thread does its work."""
+        while True:
+            now = time.monotonic()
+            left = until - now
+            if left <= 0:
+                return
+            pause = self._client.receiver.wakes_at - now
+            if pause > 0:
+                time.sleep(min(pause, left))
+            elif self._arrived.wait(left):
+                self._arrived.clear()
+            else:
+                return
+            now = time.monotonic()
+            session.note(session.states, now - start, self._read(now))
