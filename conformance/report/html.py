@@ -1,414 +1,457 @@
-"""The result as one self-contained page: no network, no script; light, dark, phone and print."""
+"""The result as one self-contained page: no network, no script; light, dark, phone and print.
+
+The page needs the result only. With the recording that was judged it also shows the evidence of
+each failure, and what the hands did, as plots.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
+from datetime import datetime, timezone
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
-import numpy as np
+from dexkit.conformance.report.evidence import evidence
+from dexkit.conformance.report.overview import overview
+from dexkit.conformance.report.wording import (
+    ANSWERS,
+    VERDICTS,
+    about_harness,
+    causes,
+    hand_name,
+    model_title,
+    nature,
+    quantity,
+)
+from dexkit.conformance.requirements import CAPABILITIES, Requirement
+from dexkit.conformance.results import (
+    Evidence,
+    Overall,
+    Result,
+    RunResult,
+    Stage,
+    Verdict,
+    worst,
+)
+from dexkit.conformance.view import Recording
 
-from dexkit.conformance.report.plots import Band, Line, histogram, time_plot
-from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
-from dexkit.conformance.view import Recording, SideView
-from dexkit.hand import JointSpec, Side
-from dexkit.models import MODELS
-
-__all__ = ["render", "write_html"]
-
-_NAMES = {
-    Verdict.PASS: ("pass", "ok"),
-    Verdict.FAIL: ("fail", "bad"),
-    Verdict.WARN: ("warn", "warn"),
-    Verdict.NOT_CLAIMED: ("not claimed", "na"),
-    Verdict.NOT_APPLICABLE: ("not judged", "na"),
-    Verdict.BLOCKED: ("blocked", "open"),
-    Verdict.ERROR: ("kit error", "open"),
-}
-_HEADS = {
-    Overall.PASS: ("Pass", "ok", "This hand did everything that could be tested here."),
-    Overall.FAIL: ("Fail", "bad", "This hand broke at least one rule that it must keep."),
-    Overall.INCONCLUSIVE: (
-        "Inconclusive",
-        "open",
-        "A rule that must be kept could not be tested: this is not a pass.",
-    ),
-}
-_PHASES = {
-    "listen": "listen",
-    "approach": "to mid",
-    "step": "steps",
-    "nan": "NaN",
-    "out-of-range": "out of range",
-    "empty": "empty",
-    "recover": "recover",
-    "limp": "zero gains",
-    "replay": "replayed session",
-    "late-joiner": "late joiner",
-    "squeeze": "squeeze",
-    "drive": "velocity",
-    "silence": "silence",
-    "resume": "resume",
-    "restart": "restart",
-}
+__all__ = ["document", "render", "write_html"]
 
 _STYLE = Path(__file__).with_name("report.css")
+_PLOT_BUDGET = 1_000_000
+"""Bytes of plots on a page; beyond, failures are told in words only."""
+_TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
+_REALITY = {
+    "emulated": "No real hand was involved: the device was an emulator at the far end of a wire. "
+    "What an emulator does not show: wear, heat, backlash, the noise of real sensors.",
+    "simulated": "No real hand was involved: it was a simulation in software.",
+    "recorded": "A recording was judged, not a hand that could be provoked: what only a "
+    "provocation shows was left out, and who made the recording vouches for it.",
+}
 
 
-def write_html(result: RunResult, view: Recording, path: Path) -> None:
-    """Write the page."""
-    path.write_text(render(result, view), encoding="utf-8")
+def write_html(
+    result: RunResult, view: Recording | None, path: Path, *, recording: Path | None = None
+) -> None:
+    """Write the page.
+
+    :param view: the recording that was judged, or None: no plots then.
+    :param recording: its file, which the page links to; None for the name that the result has.
+    """
+    link = result.subject.get("recording", "")
+    if recording is not None:
+        link = Path(os.path.relpath(recording.absolute(), path.absolute().parent)).as_posix()
+    path.write_text(render(result, view, link=link), encoding="utf-8")
 
 
-def render(result: RunResult, view: Recording) -> str:
-    """The page as text."""
-    head, css, sentence = _HEADS[result.overall]
-    about = result.subject.get("backend") or result.subject.get("recording", "recording")
-    body = [
-        f"<h1>Is this a drop-in for Unitree's {escape(_title(result))}?</h1>",
-        f'<div class="verdict {css}"><b>{head}</b><p>{escape(sentence)}</p></div>',
-        _chips(result),
-        _facts(result),
-        _what(result, view),
-        _troubles(result),
-        _pictures(result, view),
-        _table(result),
-        _glossary(),
-        _environment(result),
-    ]
+def document(title: str, body: str) -> str:
+    """A page with the reports' style. It can load nothing: its content policy forbids it."""
+    policy = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f"<title>{head}: {escape(about)} as {escape(_title(result))}</title>"
-        f"<style>{_STYLE.read_text(encoding='utf-8')}</style></head><body><main>{''.join(body)}</main></body></html>\n"
+        '<meta name="referrer" content="no-referrer">'
+        f"<title>{escape(title)}</title><style>{_STYLE.read_text(encoding='utf-8')}</style></head>"
+        f"<body><main>{body}</main></body></html>\n"
     )
 
 
-def _title(result: RunResult) -> str:
-    known = MODELS.get(result.subject.get("model", ""))
-    return known.title if known else "hand"
+def render(result: RunResult, view: Recording | None = None, *, link: str = "") -> str:
+    """The page as text.
+
+    :param link: where the recording is, relative to the page; empty where it is not kept.
+    """
+    body = [
+        _verdict(result),
+        _facts(result),
+        _areas(result),
+        _troubles(result, view, link),
+        overview(result, view) if view is not None else "",
+        _requirements(result, link),
+        _what(result),
+        _glossary(result),
+        _environment(result),
+    ]
+    answer = ANSWERS[result.overall].text
+    return document(f"{answer}: {hand_name(result)} as {model_title(result)}", "".join(body))
 
 
-def _chips(result: RunResult) -> str:
+# ------------------------------------------------------------------------------- the verdict
+
+
+def _verdict(result: RunResult) -> str:
+    answer = ANSWERS[result.overall]
     counts = result.counts()
-    chips = [
-        f'<span class="chip {_NAMES[v][1]}">{n} {_NAMES[v][0]}</span>'
+    sentence = {
+        Overall.PASS: "This hand did everything that it must and that could be tested here.",
+        Overall.FAIL: "This hand broke at least one rule that it must keep.",
+        Overall.INCONCLUSIVE: "A rule that must be kept could not be tested: this is not a pass."
+        if result.judged
+        else "Nothing could be tested, so nothing can be said of the hand: this is not a pass.",
+    }[result.overall]
+    if result.overall is Overall.PASS and counts[Verdict.WARN]:
+        sentence += f" {counts[Verdict.WARN]} recommendation(s) are not met."
+    real = nature(result)
+    badge = f' <span class="chip real">{real}</span>' if real else ""
+    chips = "".join(
+        f'<span class="chip {VERDICTS[v].css}">{n} {VERDICTS[v].text}</span>'
         for v, n in counts.items()
         if n
-    ]
-    return f'<div class="chips">{"".join(chips)}</div>'
+    )
+    stages = "".join(_stage(side, stage) for side, stage in result.stage.items())
+    return (
+        f'<header class="verdict {answer.css}">'
+        f"<p class='question'>Is this a drop-in for Unitree's {escape(model_title(result))}?</p>"
+        f"<h1>{answer.text}<small>{escape(hand_name(result))}{badge}</small></h1>"
+        f"<p>{escape(sentence)}</p></header>"
+        f'<div class="chips">{chips}</div><div class="stages">{stages}</div>'
+    )
+
+
+def _stage(side: str, stage: Stage) -> str:
+    """How far a hand got, as a row of steps."""
+    steps = list(Stage)
+    reached = steps.index(stage)
+    marks = "".join(
+        f'<i class="{"done" if i <= reached else ""}" title="{step}"></i>'
+        for i, step in enumerate(steps)
+        if i
+    )
+    css = "ok" if stage is Stage.MOVING else "open" if reached >= 4 else "bad"
+    return (
+        f'<p class="stage {css}"><span><b>{escape(side)} hand</b> reached: <b>{stage}</b> '
+        f'({reached} of {len(steps) - 1})</span><span class="steps" aria-hidden="true">{marks}'
+        "</span></p>"
+    )
 
 
 def _facts(result: RunResult) -> str:
-    rows = {
-        **result.subject,
-        "recorded": f"{result.recorded_at}, {result.duration_s:.1f} s",
-        **{f"{side} hand": str(stage) for side, stage in result.stage.items()},
-        "machine": f"short of processor time for {result.starved:.0%} of the run",
-    }
+    about = dict(result.subject)
+    rows = [(k.replace("_", " "), v) for k, v in about.items() if v]
+    rows.append(("recorded", f"{_utc(result.recorded_at)}, {result.duration_s:.1f} s"))
+    if result.claims is not None:
+        has = [name for name, claimed in result.claims.items() if claimed]
+        lacks = [name for name in CAPABILITIES if name not in has]
+        rows.append(("claimed units", ", ".join(has) or "none"))
+        rows.append(("not claimed", ", ".join(lacks) or "none"))
+    if harness := about_harness(result):
+        rows.append(("test machine", harness))
+    return _definitions(rows)
+
+
+def _utc(text: str) -> str:
+    try:
+        return datetime.fromisoformat(text).strftime("%Y-%m-%d %H:%M:%S UTC")
+    except ValueError:
+        return text or "at an unknown time"
+
+
+def _definitions(rows: Sequence[tuple[str, str]]) -> str:
     return (
-        '<dl class="facts">'
-        + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in rows.items())
+        '<dl class="facts short">'
+        + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in rows)
         + "</dl>"
     )
 
 
-def _what(result: RunResult, view: Recording) -> str:
-    emulated = result.subject.get("device") == "emulated"
+def _areas(result: RunResult) -> str:
+    """What came of each area, as a table with bars."""
+    if not result.results:
+        return ""
+    groups: dict[str, list[Verdict]] = {}
+    for requirement, group in result.by_requirement():
+        groups.setdefault(requirement.area, []).append(worst(r.verdict for r in group))
+    most = max(len(v) for v in groups.values())
+    rows = []
+    for area, verdicts in groups.items():
+        counts = [(v, verdicts.count(v)) for v in _ORDER if v in verdicts]
+        bar = "".join(
+            f'<i class="{VERDICTS[v].css}" style="width:{100 * n / most:.1f}%"></i>'
+            for v, n in counts
+        )
+        told = ", ".join(
+            f'<span class="{VERDICTS[v].css}">{n} {VERDICTS[v].text}</span>' for v, n in counts
+        )
+        rows.append(
+            f'<tr><th scope="row"><a href="#{_anchor(area)}">{escape(area)}</a></th>'
+            f'<td><span class="bar" aria-hidden="true">{bar}</span>{told}</td></tr>'
+        )
+    return (
+        '<h2>By area</h2><table class="areas"><thead class="hidden"><tr><th scope="col">area</th>'
+        f'<th scope="col">requirements</th></tr></thead><tbody>{"".join(rows)}</tbody></table>'
+    )
+
+
+_ORDER = (
+    Verdict.FAIL,
+    Verdict.ERROR,
+    Verdict.BLOCKED,
+    Verdict.WARN,
+    Verdict.PASS,
+    Verdict.NOT_APPLICABLE,
+    Verdict.NOT_CLAIMED,
+)
+
+
+def _anchor(text: str) -> str:
+    return "area-" + "".join(c if c.isalnum() else "-" for c in text.lower())
+
+
+# -------------------------------------------------------------------------------- the cards
+
+
+def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
+    """A card for each requirement that is not met, then what that kept from being judged."""
+    groups = [
+        (need, [r for r in group if r.verdict in _TROUBLE])
+        for need, group in result.by_requirement()
+    ]
+    full = [(n, [r for r in g if not r.blocked_by]) for n, g in groups]
+    full = [(need, group) for need, group in full if group]
+    full.sort(key=lambda item: _ORDER.index(worst(r.verdict for r in item[1])))
+    blocked = [r for _, group in groups for r in group if r.blocked_by]
+    if not full and not blocked:
+        return ""
+    plots = _Plots(view)
+    cards = [_card(need, group, plots, link) for need, group in full]
+    worst_of_all = worst(r.verdict for _, group in full for r in group) if full else None
+    head = {
+        Verdict.WARN: "What could be better, and what to try",
+        Verdict.BLOCKED: "What could not be judged",
+    }.get(worst_of_all or Verdict.BLOCKED, "What is wrong, and what to try")
+    parts = [f"<h2>{head}</h2>{''.join(cards)}"]
+    if blocked:
+        parts.append(_blocked(blocked))
+    if view is None and full:
+        parts.append(
+            '<p class="dim">Plots of the evidence need the recording: '
+            "<code>dexkit report RESULT.json --recording RUN.mcap --html REPORT.html</code></p>"
+        )
+    return "".join(parts)
+
+
+class _Plots:
+    """Draws evidence until the page is as large as a page should be."""
+
+    def __init__(self, view: Recording | None) -> None:
+        self._view = view
+        self._left = _PLOT_BUDGET
+
+    def of(self, result: Result) -> str:
+        if self._view is None:
+            return ""
+        if self._left <= 0:
+            return '<p class="dim">No plot: this page has as many as it can hold.</p>'
+        figures = "".join(evidence(result, self._view))
+        self._left -= len(figures)
+        return figures
+
+
+def _card(need: Requirement, group: list[Result], plots: _Plots, link: str) -> str:
+    word = VERDICTS[worst(r.verdict for r in group)]
+    sides = " and ".join(r.side for r in group)
+    rows = [("required", f"{escape(need.sentence)} <span class='dim'>{need.level}</span>")]
+    if group[0].expected != need.sentence:
+        rows.append(("expected", escape(group[0].expected)))
+    for entry in group:
+        seen = escape(entry.observed or entry.reason)
+        if entry.observed and entry.reason:
+            seen += f"<br><span class='dim'>{escape(entry.reason)}</span>"
+        name = "observed" if len(group) == 1 else f"observed, {escape(entry.side)}"
+        rows.append((name, seen))
+        if entry.evidence:
+            name = "where" if len(group) == 1 else f"where, {escape(entry.side)}"
+            rows.append((name, "".join(_place(e, link) for e in entry.evidence)))
+    found = causes(group)
+    for who, cause in found:
+        name = "likely cause" if len(found) == 1 else f"likely cause, {escape(who)}"
+        rows.append((name, escape(cause)))
+    rows.append(("what to try", escape(need.advice)))
+    rows.append(("source", f"{escape(need.source)} (confidence: {escape(need.confidence)})"))
+    facts = "".join(f"<dt>{k}</dt><dd>{v}</dd>" for k, v in rows)
+    figures = "".join(plots.of(entry) for entry in group)
+    return (
+        f'<article class="card {word.css}" id="card-{escape(need.id)}">'
+        f'<h3><b class="{word.css}">{word.text}</b> {escape(need.title)} '
+        f'<code>{escape(need.id)}</code> <span class="dim">{escape(sides)}</span></h3>'
+        f'<dl class="facts">{facts}</dl>{figures}</article>'
+    )
+
+
+def _place(place: Evidence, link: str) -> str:
+    """Where in the recording, in a form that can be copied."""
+    until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
+    moment = datetime.fromtimestamp(place.log_time_ns / 1e9, tz=timezone.utc)
+    file = f' in <a href="{escape(quote(link))}">{escape(Path(link).name)}</a>' if link else ""
+    return (
+        f'<div class="place"><code>{escape(place.topic)}</code> at {place.time_s:.3f} s{until}'
+        f'{file}, log time <code class="copy" title="{moment.isoformat(timespec="milliseconds")}">'
+        f"{place.log_time_ns}</code></div>"
+    )
+
+
+def _blocked(blocked: list[Result]) -> str:
+    groups: dict[str, list[Result]] = {}
+    for entry in blocked:
+        groups.setdefault(entry.blocked_by, []).append(entry)
+    parts = []
+    for before, group in groups.items():
+        names: dict[str, list[Result]] = {}
+        for entry in group:
+            names.setdefault(entry.requirement.id, []).append(entry)
+        rows = "".join(
+            f"<li><a href='#{escape(name)}'><code>{escape(name)}</code></a> "
+            f"{escape(entries[0].requirement.title)} "
+            f'<span class="dim">{escape(", ".join(e.side for e in entries))}</span></li>'
+            for name, entries in names.items()
+        )
+        parts.append(
+            f'<article class="card open"><h3><b class="open">blocked</b> by '
+            f"<a href='#{escape(before)}'><code>{escape(before)}</code></a></h3>"
+            "<p>Not judged, because that has to be right first:</p>"
+            f"<ul>{rows}</ul></article>"
+        )
+    return "".join(parts)
+
+
+# ------------------------------------------------------------------------ every requirement
+
+
+def _requirements(result: RunResult, link: str) -> str:
+    choices = [
+        ("all", "all"),
+        ("attention", "not met"),
+        ("passed", "passed"),
+        ("open", "not judged"),
+    ]
+    radios = "".join(
+        f'<input type="radio" name="show" id="show-{key}"{" checked" if key == "all" else ""}>'
+        f'<label for="show-{key}">{text}</label>'
+        for key, text in choices
+    )
+    parts = [
+        "<h2>Every requirement</h2><p class='dim'>MUST decides the verdict; SHOULD only warns. "
+        "Open a row for what was seen, the reason behind it, and who says so.</p>"
+        f'<div class="filter" role="radiogroup" aria-label="requirements to show">{radios}</div>'
+    ]
+    area = ""
+    for need, group in result.by_requirement():
+        if need.area != area:
+            area = need.area
+            parts.append(f'<h3 class="area-head" id="{_anchor(area)}">{escape(area)}</h3>')
+        parts.append(_requirement(need, group, link))
+    return f'<section class="every">{"".join(parts)}</section>'
+
+
+def _requirement(need: Requirement, group: list[Result], link: str) -> str:
+    verdict = worst(r.verdict for r in group)
+    css = VERDICTS[verdict].css
+    cells = "".join(_cell(r) for r in group)
+    seen = "".join(_seen(r, link) for r in group)
+    card = (
+        f'<p><a href="#card-{escape(need.id)}">What is wrong, and what to try</a></p>'
+        if any(r.verdict in _TROUBLE and not r.blocked_by for r in group)
+        else ""
+    )
+    return (
+        f'<details class="req {css}" id="{escape(need.id)}"><summary>'
+        f'<span class="id {css}">{escape(need.id)}</span>'
+        f'<span class="title">{escape(need.title)} <span class="dim">{need.level}</span></span>'
+        f"{cells}</summary>"
+        f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
+        f"<p>{escape(need.rationale)}</p>"
+        f'<p class="dim">Source: {escape(need.source)} (confidence: {escape(need.confidence)})</p>'
+        "</div></details>"
+    )
+
+
+def _cell(result: Result) -> str:
+    word = VERDICTS[result.verdict]
+    figure = f"<span>{escape(result.figure)}</span>" if result.figure else ""
+    return (
+        f'<span class="v {word.css}"><i>{escape(result.side)}</i> <b>{word.text}</b>{figure}</span>'
+    )
+
+
+def _seen(result: Result, link: str) -> str:
+    told = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
+    figures = "".join(
+        f"<span>{escape(name)} <b>{escape(text)}</b></span>"
+        for name, text in (quantity(k, v) for k, v in result.values.items())
+    )
+    return (
+        f"<p><b>{escape(result.side)}:</b> {escape(told)}</p>"
+        + (f'<p class="figures">{figures}</p>' if figures else "")
+        + "".join(_place(e, link) for e in result.evidence)
+    )
+
+
+# ---------------------------------------------------------------------------- at the end
+
+
+def _what(result: RunResult) -> str:
     text = [
         "<h2>What was done</h2><p>A Unitree robot talks to its hands over a network in small "
         "messages: it sends <em>commands</em> (go there) 100 or 200 times a second and gets "
         "<em>state</em> back (this is where I am) 500 to 1000 times a second. Another hand "
         "can take the original's place only if it speaks and behaves the same. "
     ]
-    if view.stimulus is not None:
+    if "backend" in result.subject:
         text.append(
             "Here a test program took the robot's role: it listened, moved each hand, sent "
             "broken commands, fell silent, came back, and replayed a recorded teleoperation "
-            "session. Everything was recorded, and the verdicts below were read off the "
-            "recording."
+            "session. Everything was recorded, and the verdicts were read off the recording.</p>"
         )
     else:
-        text.append(
-            "Here a recording of a session was judged. What can only be seen by provoking the "
-            "hand was left out."
-        )
-    text.append("</p>")
-    if emulated:
-        text.append(
-            '<p class="dim">No real gripper was involved: the device was an emulator at the far '
-            "end of a serial line. What an emulator does not show: wear, heat, backlash, the "
-            "noise of real sensors.</p>"
-        )
+        text.append("Here the recording of a session was judged.</p>")
+    if real := _REALITY.get(nature(result)):
+        text.append(f'<p class="reality">{real}</p>')
     return "".join(text)
 
 
-def _troubles(result: RunResult) -> str:
-    bad = [r for r in result.results if r.verdict in (Verdict.FAIL, Verdict.ERROR)]
-    warned = [r for r in result.results if r.verdict is Verdict.WARN]
-    blocked = [r for r in result.results if r.verdict is Verdict.BLOCKED]
-    if not (bad or warned or blocked):
-        return ""
-    cards = [_card(r) for r in bad + warned]
-    if blocked:
-        names = ", ".join(
-            f"<code>{escape(r.requirement.id)}</code> {escape(r.side)} ({escape(r.reason)})"
-            for r in blocked
-        )
-        cards.append(f'<div class="card open"><b>Not judged because of this:</b> {names}</div>')
-    return f"<h2>What is wrong, and what to try</h2>{''.join(cards)}"
-
-
-def _card(result: Result) -> str:
-    need = result.requirement
-    name, css = _NAMES[result.verdict]
-    where = "".join(
-        f"<dt>where</dt><dd><code>{escape(e.topic)}</code> at {e.time_s:.3f} s"
-        + (f" to {e.end_s:.3f} s" if e.end_s is not None else "")
-        + f" (log time {e.log_time_ns})</dd>"
-        for e in result.evidence
-    )
-    return (
-        f'<div class="card {css}"><b class="{css}">{name}</b> <code>{escape(need.id)}</code> '
-        f"{escape(result.side)} hand: {escape(need.title)}"
-        f'<dl class="facts"><dt>required</dt><dd>{escape(need.sentence)}</dd>'
-        f"<dt>observed</dt><dd>{escape(result.observed or result.reason)}</dd>{where}"
-        f"<dt>try</dt><dd>{escape(need.advice)}</dd>"
-        f"<dt>source</dt><dd>{escape(need.source)} ({escape(need.confidence)})</dd></dl></div>"
-    )
-
-
-def _pictures(result: RunResult, view: Recording) -> str:
-    parts = [
-        "<h2>What the hands did</h2>",
-        '<p class="key"><i class="cmd"></i>command: where the hand is told to go'
-        '<i class="state"></i>state: where it says it is'
-        '<i class="force"></i>the force that it feels</p>',
+def _glossary(result: RunResult) -> str:
+    terms = [
+        ("topic", "a named channel on the network (DDS); who uses another name is not heard."),
+        ("q, rad", "position of a joint as the angle of its motor, in radians."),
+        ("tau_est, N m", "torque that the motor feels: what the hand knows of touch."),
+        ("not judged", "this recording or hand gave no occasion for it; the row says why."),
+        ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]
-    for side in view.judged:
-        parts.append(_pictures_of(result, view, view.sides[side]))
-    return "".join(parts)
-
-
-def _pictures_of(result: RunResult, view: Recording, hand: SideView) -> str:
-    states, commands = hand.states, hand.commands
-    if not len(states):
-        return f"<h3>{hand.side} hand</h3><p>No state of this hand was received.</p>"
-    span = (0.0, max(view.duration, 0.1))
-    bands = _bands(view, hand.side) + _alarms(result, hand.side)
-    touch = view.stimulus.objects.get(hand.side) if view.stimulus else None
-    gripper = len(hand.joints) == 1
-    # of a gripper it is an angle; of a hand with fingers a percentage of closing, at no one angle
-    felt = [(touch, "object")] if touch is not None and gripper else []
-    opening = f": opening (0 closed, {hand.joints[0].stroke:.2f} open)" if gripper else ""
-    parts = [f"<h3>{str(hand.side).capitalize()} hand{opening}</h3>"]
-    replay = view.phases("replay", hand.side)
-    for index, joint in enumerate(hand.joints):
-        height = 220 if gripper else 150
-        name = "position" if gripper else joint.name
-        if not gripper:
-            parts.append(f"<p><b>{escape(joint.name)}</b>{_way(joint)}</p>")
-        margin = 0.1 * joint.stroke  # wild commands would squash the rest
-        lines = [
-            Line(
-                "command",
-                "cmd",
-                commands.t,
-                np.clip(commands.q[:, index], joint.q_min - margin, joint.q_max + margin),
-            ),
-            Line("state", "state", states.t, states.q[:, index]),
-        ]
-        include = (0.0, joint.stroke) if gripper else (joint.q_min, joint.q_max)
-        parts.append(
-            _plot(
-                time_plot(
-                    f"{hand.side} hand, {name}",
-                    lines,
-                    unit="rad",
-                    span=span,
-                    bands=bands,
-                    height=height,
-                    include=include,
-                    limits=felt,
-                )
-            )
-        )
-        if replay and gripper:
-            a, b = view.seconds(replay[0].begin_ns), view.seconds(replay[0].end_ns)
-            session = replay[0].params.get("session", "session")
-            parts.append(f"<p>The replayed session <code>{escape(session)}</code>, closer:</p>")
-            parts.append(
-                _plot(
-                    time_plot(
-                        f"{hand.side} hand, replayed session",
-                        lines,
-                        unit="rad",
-                        span=(a, b),
-                        include=include,
-                        limits=felt,
-                    )
-                )
-            )
-    if gripper:
-        held = f" There is something between its fingers, felt at {touch:.2f} rad." if felt else ""
-        parts.append(f"<p>Force (tau_est): negative is closing.{held}</p>")
-    else:
-        held = (
-            f" There is something between its fingers, at {touch:g} % of closing." if touch else ""
-        )
-        parts.append(f"<p>Torque (tau_est) of each joint.{held}</p>")
-    parts.append(
-        _plot(
-            time_plot(
-                f"{hand.side} hand, force",
-                [
-                    Line("force", "force", states.t, states.tau[:, index])
-                    for index in range(len(hand.joints))
-                ],
-                unit="N m",
-                span=span,
-                bands=_bands(view, hand.side, label=False),
-                height=150,
-                include=(0.0,),
-            )
-        )
-    )
-    intervals = np.diff(states.clock) * 1e3
-    if len(intervals) > 10 and (intervals > 0).any():
-        limits = [(5.0, "5 ms: 200 Hz")]
-        parts.append(
-            "<p>Time from each state to the next. A good hand has one tall bar; the count "
-            "axis is logarithmic, so that single late ones show.</p>"
-        )
-        parts.append(
-            _plot(
-                histogram(
-                    f"{hand.side} hand, intervals",
-                    intervals[intervals > 0],
-                    unit="ms",
-                    limits=limits,
-                )
-            )
-        )
-        parts.append(
-            _plot(
-                time_plot(
-                    f"{hand.side} hand, intervals over time",
-                    [
-                        Line(
-                            "interval",
-                            "state",
-                            states.clock[1:],
-                            np.where(intervals > 0, intervals, np.nan),
-                        )
-                    ],
-                    unit="ms",
-                    span=span,
-                    height=130,
-                    include=(0.0, 5.0),
-                )
-            )
-        )
-    return "".join(parts)
-
-
-def _way(joint: JointSpec) -> str:
-    closing = {1: ", closes upwards", -1: ", closes downwards", 0: ""}[joint.closing]
-    return f" ({joint.q_min:.2f} to {joint.q_max:.2f} rad{closing})"
-
-
-def _plot(svg: str) -> str:
-    return f'<div class="card scroll">{svg}</div>'
-
-
-def _bands(view: Recording, side: Side, *, label: bool = True) -> list[Band]:
-    if view.stimulus is None:
-        return []
-    merged: list[Band] = []
-    for phase in view.stimulus.phases:
-        name = _PHASES.get(phase.name)
-        if name is None or side not in phase.sides:
-            continue
-        a, b = view.seconds(phase.begin_ns), view.seconds(phase.end_ns)
-        if merged and merged[-1].label == name and a - merged[-1].end < 0.05:
-            merged[-1] = Band(name, merged[-1].begin, b)
-        else:
-            merged.append(Band(name, a, b))
-    return merged if label else [Band("", b.begin, b.end) for b in merged]
-
-
-def _alarms(result: RunResult, side: Side) -> list[Band]:
-    """Where something went wrong, in red."""
-    return [
-        Band(r.requirement.id, e.time_s, e.end_s, "alarm")
-        for r in result.results
-        if r.side == str(side) and r.verdict is Verdict.FAIL
-        for e in r.evidence
-        if e.end_s is not None
-    ]
-
-
-def _table(result: RunResult) -> str:
-    sides = list(dict.fromkeys(r.side for r in result.results))
-    parts = [
-        "<h2>Every requirement</h2><p class='dim'>MUST decides the verdict; SHOULD only warns. "
-        "Open a row for the reason behind it, what was seen, and who says so.</p>"
-    ]
-    area = ""
-    for requirement, group in result.by_requirement():
-        if requirement.area != area:
-            if area:
-                parts.append("</tbody></table></div>")
-            area = requirement.area
-            heads = "".join(f"<th>{escape(s)}</th>" for s in sides)
-            parts.append(
-                f"<h3>{escape(area)}</h3><div class='card'><table><thead><tr><th>id</th>"
-                f"<th>requirement</th>{heads}</tr></thead><tbody>"
-            )
-        css = _NAMES[worst(r.verdict for r in group)][1]
-        seen = "".join(
-            f"<p><b>{escape(r.side)}:</b> {escape(r.observed or r.reason)}</p>" for r in group
-        )
-        cells = "".join(_verdict_cell(r) for r in group)
-        parts.append(
-            f'<tr><td class="id {css}">{escape(requirement.id)}</td>'
-            f"<td><details><summary>{escape(requirement.sentence)} "
-            f'<span class="dim">{requirement.level}</span></summary>{seen}'
-            f"<p>{escape(requirement.rationale)}</p>"
-            f'<p class="dim">{escape(requirement.source)} ({escape(requirement.confidence)})</p>'
-            f"</details></td>{cells}</tr>"
-        )
-    parts.append("</tbody></table></div>" if area else "")
-    return "".join(parts)
-
-
-def _verdict_cell(result: Result) -> str:
-    name, css = _NAMES[result.verdict]
-    figure = f"<span>{escape(result.figure)}</span>" if result.figure else ""
-    return f'<td class="v {css}" data-side="{escape(result.side)}"><b>{name}</b>{figure}</td>'
-
-
-def _glossary() -> str:
-    terms = {
-        "Dex1-1": "Unitree's two-finger gripper for its humanoid robots.",
-        "topic": "a named channel on the network (DDS); who uses another name is not heard.",
-        "q, rad": "opening of the gripper as the angle of its motor, in radians.",
-        "tau_est, N m": "torque that the motor feels: what the gripper knows of touch.",
-        "not judged": "this recording or hand gave no occasion for it; the row says why.",
-        "blocked": "something more basic failed first, or the testing machine itself was late.",
-    }
-    rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in terms.items())
-    return f'<h2>Words</h2><dl class="facts">{rows}</dl>'
+    if result.claims is not None:
+        terms.append(("not claimed", "the vendor does not say that the hand has this unit."))
+    return f"<h2>Words</h2>{_definitions(terms)}"
 
 
 def _environment(result: RunResult) -> str:
-    rows = "".join(
-        f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in result.environment.items()
-    )
     notes = "".join(f"<li>{escape(n)}</li>" for n in result.notes)
     return (
-        f'<h2>Made with</h2><dl class="facts">{rows}</dl>'
+        f"<h2>Made with</h2>{_definitions(list(result.environment.items()))}"
         + (f"<p>Notes on the recording:</p><ul>{notes}</ul>" if notes else "")
-        + '<p class="dim">The times above are seconds of the recording; the recording opens in '
-        "Foxglove and PlotJuggler, and <code>dexkit check</code> judges it again.</p>"
+        + '<p class="dim">Times are seconds of the recording; log times are nanoseconds since '
+        "1970, as the recording has them. It opens in Foxglove and PlotJuggler, and "
+        "<code>dexkit check</code> judges it again.</p>"
     )

@@ -1,10 +1,16 @@
-"""Plots as inline SVG, drawn from a recording's columns; colours come from the page's CSS."""
+"""Plots for the report page: curves as SVG, text as HTML beside them.
+
+The curves stretch with the page (``preserveAspectRatio="none"``) while labels keep their size, so
+one plot is readable on a phone, on a desk and on paper without a script. Colours come from the
+page's CSS. Points are whole numbers on a grid of :data:`GRID`, written relative to each other:
+a plot is a few kilobytes whatever the recording's length.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 
@@ -12,11 +18,26 @@ import numpy as np
 
 from dexkit.hand import Floats
 
-__all__ = ["Band", "Line", "histogram", "nice_ticks", "thin", "time_plot"]
+__all__ = [
+    "Band",
+    "Level",
+    "Line",
+    "Range",
+    "chart",
+    "histogram",
+    "nice_ticks",
+    "pieces",
+    "thin",
+]
 
-WIDTH = 960
-LEFT, RIGHT, TOP, BOTTOM = 52, 12, 26, 26
-_MAX_POINTS = 1400
+GRID = (2000, 500)
+"""Units across and down; finer than a page's pixels."""
+MAX_POINTS = 900
+"""Points of a plot, all its curves together."""
+_DESK, _PHONE = 680, 290
+"""Pixels across a plot for which labels are placed: paper or desk, and phone."""
+_LETTER = 6.6
+"""Pixels of a letter of a label."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,17 +45,19 @@ class Line:
     """One curve.
 
     :param css: class that colours it.
+    :param draw: ``line``; ``dots``, each sample by itself; ``stems``, each as a line from 0.
     """
 
     label: str
     css: str
     x: Floats
     y: Floats
+    draw: str = "line"
 
 
 @dataclass(frozen=True)
 class Band:
-    """A stretch of time with a name."""
+    """A stretch along the horizontal axis with a name."""
 
     label: str
     begin: float
@@ -42,7 +65,24 @@ class Band:
     css: str = "band"
 
 
-def thin(x: Floats, y: Floats, points: int = _MAX_POINTS) -> tuple[Floats, Floats]:
+@dataclass(frozen=True)
+class Level:
+    """A limit: a line across the plot."""
+
+    value: float
+    label: str
+
+
+@dataclass(frozen=True)
+class Range:
+    """A tolerance: a strip across the plot."""
+
+    low: float
+    high: float
+    label: str
+
+
+def thin(x: Floats, y: Floats, points: int = MAX_POINTS) -> tuple[Floats, Floats]:
     """Fewer points of the same look: each bin keeps its smallest and largest value, in order."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good], y[good]
@@ -80,160 +120,223 @@ def nice_ticks(low: float, high: float, count: int = 6) -> list[float]:
     return [round(i * step, 10) for i in range(first, last + 1)]
 
 
-@dataclass
-class _Frame:
-    """Axes of one plot."""
+@dataclass(frozen=True)
+class _Axes:
+    """Values to places: per cent for labels, units of :data:`GRID` for curves."""
 
-    height: int
     x_range: tuple[float, float]
     y_range: tuple[float, float]
-    parts: list[str] = field(default_factory=list)
 
-    def x(self, value: float) -> float:
+    def across(self, value: float) -> float:
         low, high = self.x_range
-        return LEFT + (value - low) / (high - low or 1.0) * (WIDTH - LEFT - RIGHT)
+        return 100 * (value - low) / (high - low or 1.0)
 
-    def y(self, value: float) -> float:
+    def up(self, value: float) -> float:
         low, high = self.y_range
-        share = (value - low) / (high - low or 1.0)
-        return self.height - BOTTOM - share * (self.height - TOP - BOTTOM)
+        return 100 * (value - low) / (high - low or 1.0)
 
-    def axes(self, x_unit: str, y_unit: str) -> None:
-        for tick in nice_ticks(*self.y_range, 5):
-            at = self.y(tick)
-            self.parts.append(
-                f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
-                f'<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{tick:g}'
-                "</text>"
-            )
-        for tick in nice_ticks(*self.x_range, 10):
-            at = self.x(tick)
-            self.parts.append(
-                f'<text class="tick" x="{at:.1f}" y="{self.height - 8}" text-anchor="middle">'
-                f"{tick:g}</text>"
-            )
-        self.parts.append(
-            f'<text class="unit" x="4" y="14">{escape(y_unit)}</text>'
-            f'<text class="unit" x="{WIDTH - RIGHT}" y="{self.height - 8}" text-anchor="end">'
-            f"{escape(x_unit)}</text>"
-        )
+    def x(self, value: float) -> int:
+        return round(self.across(value) / 100 * GRID[0])
 
-    def svg(self, title: str) -> str:
+    def y(self, value: float) -> int:
+        return round((1 - self.up(value) / 100) * GRID[1])
+
+    def path(self, x: Floats, y: Floats, draw: str) -> str:
+        """The ``d`` of a path, in relative whole numbers."""
+        places = [(self.x(float(a)), self.y(float(b))) for a, b in zip(x, y, strict=True)]
+        if draw == "stems":
+            return "".join(f"M{a},{self.y(0.0)}V{b}" for a, b in dict.fromkeys(places))
+        if draw == "dots":
+            # a line of no length with round ends: it stays round when the plot is stretched
+            return "".join(f"M{a},{b}h0" for a, b in dict.fromkeys(places))
+        out = [f"M{places[0][0]},{places[0][1]}l"]
+        steps = [(c - a, d - b) for (a, b), (c, d) in pairwise(places)] or [(0, 0)]
+        out.append(" ".join(f"{dx},{dy}" for dx, dy in steps if dx or dy) or "0,0")
+        return "".join(out)
+
+    def rect(self, css: str, a: float, b: float, low: float, high: float, title: str = "") -> str:
+        x0, x1, y0, y1 = self.x(a), self.x(b), self.y(high), self.y(low)
+        text = f"<title>{escape(title)}</title>" if title else ""
         return (
-            f'<svg viewBox="0 0 {WIDTH} {self.height}" role="img" aria-label="{escape(title)}">'
-            f"<title>{escape(title)}</title>{''.join(self.parts)}</svg>"
+            f'<rect class="{css}" x="{x0}" y="{y0}" width="{max(x1 - x0, 3)}" '
+            f'height="{max(y1 - y0, 3)}">{text}</rect>'
         )
 
+    def grid(self, levels: Sequence[float]) -> str:
+        marks = "".join(f"M0,{self.y(v)}h{GRID[0]}" for v in levels)
+        return f'<path class="grid" d="{marks}"/>'
 
-def time_plot(
+
+def _label(css: str, where: str, text: str) -> str:
+    return f'<span class="{css}" style="{where}">{escape(text)}</span>'
+
+
+def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str) -> list[str]:
+    """Labels below; every other one is for wide pages only."""
+    found = []
+    for i, tick in enumerate(ticks):
+        at = axes.across(tick)
+        text = f"{tick:g}"
+        if at > 93 and len(ticks) > 1:  # there stands the unit
+            continue
+        found.append(_label("x wide" if i % 2 else "x", f"left:{at:.2f}%", text))
+    found.append(_label("x unit", "left:100%", unit))
+    return found
+
+
+def _y_ticks(axes: _Axes, ticks: Sequence[tuple[float, str]], unit: str) -> list[str]:
+    found = [_label("y", f"bottom:{axes.up(v):.2f}%", text) for v, text in ticks]
+    return [*found, _label("y unit", "bottom:100%", unit)]
+
+
+def _band_labels(bands: Sequence[Band], axes: _Axes) -> list[str]:
+    """Names above the bands, where there is room for them on a desk and on a phone."""
+
+    def placed(width: float) -> dict[int, float]:
+        chosen: dict[int, float] = {}
+        free_from = 0.0
+        for i, band in order:
+            a, b = (axes.across(v) / 100 * width for v in (band.begin, band.end))
+            room = _LETTER * len(band.label)
+            at = max(a, free_from)
+            if band.label and at <= max(b, a + 12) and at + room <= width:
+                chosen[i] = 100 * at / width
+                free_from = at + room + 5
+        return chosen
+
+    order = sorted(enumerate(bands), key=lambda item: (item[1].css == "band", item[1].begin))
+    order = sorted(order, key=lambda item: item[1].begin)
+    desk, phone = placed(_DESK), placed(_PHONE)
+    return [
+        _label("b" if i in phone else "b wide", f"left:{at:.2f}%", bands[i].label)
+        for i, at in desk.items()
+    ]
+
+
+def _legend(entries: Sequence[tuple[str, str]]) -> str:
+    parts = [
+        f'<span><i class="{css}"></i>{escape(label)}</span>'
+        for label, css in dict.fromkeys(entries)
+        if label
+    ]
+    return f"<figcaption>{''.join(parts)}</figcaption>" if parts else ""
+
+
+def _figure(
+    title: str, height: int, svg: str, labels: Sequence[str], legend: str, *, titled: bool
+) -> str:
+    text = escape(title)
+    head = f'<div class="t" aria-hidden="true">{text}</div>' if titled else ""
+    named = any(label.startswith('<span class="b') for label in labels)
+    return (
+        f'<figure class="plot">{head}<div class="chart{" named" if named else ""}" role="img" '
+        f'aria-label="{text}" style="height:{height + 15 * named}px"><div class="area">'
+        f'<svg viewBox="0 0 {GRID[0]} {GRID[1]}" preserveAspectRatio="none" '
+        f'focusable="false"><title>{text}</title>{svg}</svg>'
+        f"{''.join(labels)}</div></div>{legend}</figure>"
+    )
+
+
+def _inside(value: float, span: tuple[float, float]) -> bool:
+    return span[0] <= value <= span[1]
+
+
+def chart(
     title: str,
     lines: Sequence[Line],
     *,
-    unit: str,
+    y_unit: str,
     span: tuple[float, float],
+    x_unit: str = "s",
     bands: Sequence[Band] = (),
-    height: int = 220,
+    levels: Sequence[Level] = (),
+    ranges: Sequence[Range] = (),
+    height: int = 210,
     include: Sequence[float] = (),
-    limits: Sequence[tuple[float, str]] = (),
+    legend: bool = True,
+    titled: bool = True,
 ) -> str:
-    """Curves over time.
+    """Curves over time, or over ``x_unit``.
 
+    :param title: what it shows; read out where the plot is not seen.
+    :param titled: whether the title is shown above it as well.
+    :param span: of the horizontal axis.
     :param include: values that the vertical axis must reach.
-    :param limits: (value, label) of horizontal lines.
     """
-    curves = []
-    values: list[float] = [*include, *(v for v, _ in limits)]
-    for line in lines:
-        inside = (line.x >= span[0]) & (line.x <= span[1])
-        for piece in pieces(line.x[inside], line.y[inside]):
-            share = len(piece[0]) / max(int(inside.sum()), 1)
-            x, y = thin(*piece, points=max(20, round(_MAX_POINTS * share)))
-            curves.append((line, x, y))
-            values += [float(y.min()), float(y.max())]
+    curves: list[tuple[Line, Floats, Floats]] = []
+    values = [*include, *(v.value for v in levels)]
+    values += [v for r in ranges for v in (r.low, r.high) if math.isfinite(v)]
+    inside = [(line.x >= span[0]) & (line.x <= span[1]) for line in lines]
+    total = max(sum(int(i.sum()) for i in inside), 1)
+    for line, there in zip(lines, inside, strict=True):
+        parts = [(line.x[there], line.y[there])] if line.draw != "line" else []
+        for piece in parts or pieces(line.x[there], line.y[there]):
+            share = len(piece[0]) / total
+            x, y = thin(*piece, points=max(16, round(MAX_POINTS * share)))
+            if len(x):
+                curves.append((line, x, y))
+                values += [float(y.min()), float(y.max())]
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     pad = 0.06 * (high - low) or 0.5
-    frame = _Frame(height, span, (low - pad, high + pad))
-    for band in bands:
-        a, b = max(band.begin, span[0]), min(band.end, span[1])
-        if b <= a:
-            continue
-        xa, xb = frame.x(a), frame.x(b)
-        frame.parts.append(
-            f'<rect class="{band.css}" x="{xa:.1f}" y="{TOP}" width="{max(xb - xa, 1):.1f}" '
-            f'height="{height - TOP - BOTTOM}"><title>{escape(band.label)}, {a:.2f} to {b:.2f} s'
-            "</title></rect>"
-        )
-    _band_labels(frame, bands, span)
-    frame.axes("s", unit)
-    for value, label in limits:
-        at = frame.y(value)
-        frame.parts.append(
-            f'<line class="limit" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
-            f'<text class="tick" x="{WIDTH - RIGHT - 4}" y="{at - 4:.1f}" text-anchor="end">'
-            f"{escape(label)}</text>"
-        )
-    for line, x, y in curves:
-        points = " ".join(
-            f"{frame.x(float(a)):.1f},{frame.y(float(b)):.1f}" for a, b in zip(x, y, strict=True)
-        )
-        frame.parts.append(f'<polyline class="{line.css}" points="{points}"/>')
-    return frame.svg(title)
-
-
-def _band_labels(frame: _Frame, bands: Sequence[Band], span: tuple[float, float]) -> None:
-    """Names above the bands, where there is room for them."""
-    free_from = 0.0
-    for band in sorted(bands, key=lambda b: b.begin):
-        a, b = max(band.begin, span[0]), min(band.end, span[1])
-        if b <= a:
-            continue
-        width = 6.3 * len(band.label)
-        at = max(frame.x(a), free_from)
-        if at > frame.x(b) or at + width > WIDTH - RIGHT:
-            continue
-        frame.parts.append(
-            f'<text class="phase" x="{at:.1f}" y="{TOP - 6}">{escape(band.label)}</text>'
-        )
-        free_from = at + width + 6
-
-
-def histogram(title: str, values: Floats, *, unit: str, limits: Sequence[tuple[float, str]]) -> str:
-    """How often which value occurs, on a logarithmic count axis: the rare ones matter."""
-    top = max([float(np.percentile(values, 99.9)), *(v for v, _ in limits)]) * 1.15
-    counts, edges = np.histogram(np.minimum(values, top), bins=80, range=(0.0, top))
-    high = math.log10(max(int(counts.max()), 10))
-    frame = _Frame(180, (0.0, top), (0.0, high * 1.05))
-    for power in range(math.ceil(high) + 1):
-        if power <= high * 1.05:
-            at = frame.y(power)
-            frame.parts.append(
-                f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
-                f'<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">'
-                f"{10**power:g}</text>"
+    axes = _Axes(span, (low - pad, high + pad))
+    shown = [
+        Band(b.label, max(b.begin, span[0]), min(b.end, span[1]), b.css)
+        for b in bands
+        if min(b.end, span[1]) >= max(b.begin, span[0])
+    ]
+    svg = [
+        axes.rect(b.css, b.begin, b.end, *axes.y_range, f"{b.label} {b.begin:.2f}-{b.end:.2f}")
+        for b in shown
+    ]
+    for r in ranges:
+        svg.append(
+            axes.rect(
+                "range", *span, max(r.low, axes.y_range[0]), min(r.high, axes.y_range[1]), r.label
             )
-    for tick in nice_ticks(0.0, top, 10):
-        frame.parts.append(
-            f'<text class="tick" x="{frame.x(tick):.1f}" y="{frame.height - 8}" '
-            f'text-anchor="middle">{tick:g}</text>'
         )
+    ticks = nice_ticks(*axes.y_range, max(3, height // 40))
+    svg.append(axes.grid(ticks))
+    for v in levels:
+        svg.append(f'<path class="limit" d="M0,{axes.y(v.value)}h{GRID[0]}"/>')
+    for line, x, y in curves:
+        svg.append(f'<path class="{line.css} {line.draw}" d="{axes.path(x, y, line.draw)}"/>')
+    labels = [
+        *_band_labels(shown, axes),
+        *_y_ticks(axes, [(t, f"{t:g}") for t in ticks], y_unit),
+        *_x_ticks(axes, nice_ticks(*span, 8), x_unit),
+    ]
+    keys = [(line.label, line.css) for line in lines] if legend else []
+    keys += [(r.label, "range") for r in ranges] + [(v.label, "limit") for v in levels]
+    return _figure(title, height, "".join(svg), labels, _legend(keys), titled=titled)
+
+
+def histogram(
+    title: str,
+    values: Floats,
+    *,
+    unit: str,
+    levels: Sequence[Level] = (),
+    height: int = 170,
+    titled: bool = True,
+) -> str:
+    """How often which value occurs, on a logarithmic count axis: the rare ones matter."""
+    top = max([float(np.percentile(values, 99.9)), *(v.value for v in levels)]) * 1.15 or 1.0
+    counts, edges = np.histogram(np.minimum(values, top), bins=80, range=(0.0, top))
+    high = math.log10(max(int(counts.max()), 10)) * 1.05
+    axes = _Axes((0.0, top), (0.0, high))
+    powers = [p for p in range(math.ceil(high) + 1) if p <= high]
+    svg = [axes.grid(powers)]
     for count, a, b in zip(counts, edges[:-1], edges[1:], strict=True):
         if count:
-            y = frame.y(max(math.log10(int(count)), 0.04))
-            frame.parts.append(
-                f'<rect class="bar" x="{frame.x(float(a)) + 0.5:.1f}" y="{y:.1f}" '
-                f'width="{frame.x(float(b)) - frame.x(float(a)) - 1:.1f}" '
-                f'height="{frame.height - BOTTOM - y:.1f}"><title>{count} intervals of '
-                f"{a:.1f} to {b:.1f} {escape(unit)}</title></rect>"
-            )
-    for value, label in limits:
-        at = frame.x(value)
-        frame.parts.append(
-            f'<line class="limit" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
-            f'y2="{frame.height - BOTTOM}"/>'
-            f'<text class="tick" x="{at + 4:.1f}" y="{TOP + 10}">{escape(label)}</text>'
-        )
-    frame.parts.append(
-        f'<text class="unit" x="4" y="14">count</text><text class="unit" x="{WIDTH - RIGHT}" '
-        f'y="{frame.height - 8}" text-anchor="end">{escape(unit)}</text>'
-    )
-    return frame.svg(title)
+            up = max(math.log10(int(count)), 0.04)
+            gap = 0.1 * (b - a)
+            text = f"{count} of {a:.2g} to {b:.2g} {unit}"
+            svg.append(axes.rect("bar", float(a + gap), float(b - gap), 0.0, up, text))
+    for v in levels:
+        svg.append(f'<path class="limit" d="M{axes.x(v.value)},0v{GRID[1]}"/>')
+    labels = [
+        *_y_ticks(axes, [(p, f"{10**p:g}") for p in powers], "count"),
+        *_x_ticks(axes, nice_ticks(0.0, top, 8), unit),
+    ]
+    legend = _legend([(v.label, "limit") for v in levels])
+    return _figure(title, height, "".join(svg), labels, legend, titled=titled)

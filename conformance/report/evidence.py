@@ -1,0 +1,648 @@
+"""The evidence of a result as plots: chosen by what its requirement is about.
+
+No list of ids decides: the requirement's layer, the stimulus it needs and the names of its
+tolerances say what a person wants to see. Every figure is drawn from the recording that was
+judged; :func:`evidence` returns none where it shows nothing of it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from dexkit.conformance.phases import Phase
+from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, histogram
+from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.results import Evidence, Result
+from dexkit.conformance.usb.record import Transfer
+from dexkit.conformance.usb.view import UsbRecording, UsbSide
+from dexkit.conformance.view import Recording, SideView
+from dexkit.hand import Floats, JointSpec, Side
+
+__all__ = ["PHASES", "command_and_state", "evidence", "phase_bands"]
+
+PHASES = {
+    "listen": "listen",
+    "approach": "to mid",
+    "step": "steps",
+    "joint": "joint by joint",
+    "nan": "NaN",
+    "out-of-range": "out of range",
+    "empty": "empty",
+    "short": "too short",
+    "long": "too long",
+    "wrong-id": "wrong id",
+    "recover": "recover",
+    "limp": "zero gains",
+    "soft": "low gains",
+    "lock": "locked",
+    "replay": "replayed session",
+    "operator": "operator",
+    "late-joiner": "late joiner",
+    "squeeze": "squeeze",
+    "drive": "velocity",
+    "silence": "silence",
+    "resume": "resume",
+    "restart": "restart",
+    "guard": "time-out",
+    "guard-latch": "latched",
+    "guard-clear": "cleared",
+}
+"""What reports call the phases of the stimulus; any other is called by its own name."""
+_LONGEST = 8.0
+"""Seconds of a plot about a place in the recording."""
+_MOST_ROWS = 24
+_FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m", "mode": "", "q": "rad"}
+
+
+def evidence(result: Result, view: Recording) -> list[str]:
+    """Figures for one result, as HTML."""
+    need = result.requirement
+    if need.layer == "usb":
+        return _usb(result, view.usb) if view.usb is not None else []
+    side = next((s for s in view.sides if str(s) == result.side), None)
+    if side is None:
+        return []
+    scene = _Scene(result, view, view.sides[side])
+    if need.needs in ("nothing", "endpoints") or not len(scene.hand.states):
+        return [_endpoints(scene)]
+    return [figure for figure in _by_kind(scene) if figure]
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A result, the recording, and the hand that it is about."""
+
+    result: Result
+    view: Recording
+    hand: SideView
+
+    @property
+    def need(self) -> Requirement:
+        return self.result.requirement
+
+    @property
+    def places(self) -> list[tuple[float, float]]:
+        """Where the check points."""
+        return [(e.time_s, e.end_s or e.time_s) for e in self.result.evidence]
+
+    @property
+    def alarms(self) -> list[Band]:
+        return [Band("here", a, b, "alarm") for a, b in self.places]
+
+    @property
+    def phases(self) -> list[Phase]:
+        return self.view.phases(self.need.phase or "", self.hand.side)
+
+    def span_of(self, phase: Phase) -> tuple[float, float]:
+        return self.view.seconds(phase.begin_ns), self.view.seconds(phase.end_ns)
+
+    def window(self, *, pad: float = 0.6) -> tuple[float, float]:
+        """Time to show: about the first place, or the phases, or everything."""
+        spans = self.places[:1] or [self.span_of(p) for p in self.phases]
+        if not spans:
+            return 0.0, max(self.view.duration, 0.1)
+        begin, end = min(a for a, _ in spans), max(b for _, b in spans)
+        begin, end = max(0.0, begin - pad), min(self.view.duration, end + pad)
+        if not self.places and end - begin > 4 * _LONGEST:
+            end = begin + 4 * _LONGEST
+        return begin, max(end, begin + 0.1)
+
+    def joints(self, span: tuple[float, float], most: int = 2) -> list[int]:
+        """The joints that the finding names, or those that move most in ``span``."""
+        joints = self.hand.joints
+        if len(joints) == 1:
+            return [0]
+        text = f"{self.result.observed} {self.result.reason}"
+        named = [i for i, j in enumerate(joints) if re.search(rf"\b{re.escape(j.name)}\b", text)]
+        worst = {
+            name.removeprefix("rms_rad_"): value
+            for name, value in self.result.values.items()
+            if name.startswith("rms_rad_")
+        }
+        if worst:
+            names = [j.name for j in joints]
+            named = sorted(
+                (names.index(n) for n in worst if n in names), key=lambda i: -worst[names[i]]
+            )
+        if named:
+            return named[:most]
+        q = self.hand.states.q[self.hand.states.between(*span)]
+        if not len(q):
+            return [0]
+        filled = np.where(np.isfinite(q), q, 0.0)
+        moved = np.ptp(filled, axis=0) / np.array([j.stroke for j in joints])
+        return [int(i) for i in np.argsort(-moved, kind="stable")[:most]]
+
+
+def _by_kind(scene: _Scene) -> list[str]:
+    need, values = scene.need, scene.result.values
+    limits = need.tolerances
+    if need.needs.startswith("other-"):
+        return _both_sides(scene)
+    if "max_gap_s" in values or (need.area == "Rate" and "max_gap_s" in limits):
+        return [_intervals(scene, scene.window(pad=1.0)), _follow(scene)]
+    if {"min_rate_hz", "max_rate_hz", "max_p99_s"} & set(limits):
+        return [_rates(scene), _interval_histogram(scene), _intervals(scene, None)]
+    if "hold_s" in values:
+        return _samples(scene)
+    if need.area == "Rate":
+        return [_intervals(scene, None)]
+    if need.needs == "session":
+        return _session(scene)
+    if any("tau" in name for name in (*limits, *values)):
+        return [_follow(scene), _torque(scene), _torque_by_position(scene)]
+    if any(p.targets.get(scene.hand.side) for p in scene.phases):
+        return [_steps(scene), _follow(scene)]
+    if need.area in ("Fields", "Sensors", "Mode byte"):
+        return [_field(scene), _follow(scene)]
+    return [_follow(scene)]
+
+
+# ------------------------------------------------------------------------------- curves
+
+
+def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band]:
+    """What the kit did when, neighbours of one name joined."""
+    if view.stimulus is None:
+        return []
+    merged: list[Band] = []
+    for phase in view.stimulus.phases:
+        if side not in phase.sides:
+            continue
+        name = PHASES.get(phase.name, phase.name)
+        a, b = view.seconds(phase.begin_ns), view.seconds(phase.end_ns)
+        if merged and merged[-1].label == name and a - merged[-1].end < 0.05:
+            merged[-1] = Band(name, merged[-1].begin, b)
+        else:
+            merged.append(Band(name, a, b))
+    return merged if label else [Band("", b.begin, b.end) for b in merged]
+
+
+def _clipped(values: Floats, joint: JointSpec) -> Floats:
+    """Wild commands would squash the rest of a plot."""
+    margin = 0.1 * joint.stroke
+    return np.asarray(np.clip(values, joint.q_min - margin, joint.q_max + margin))
+
+
+def command_and_state(hand: SideView, joint: int) -> list[Line]:
+    """Two curves: where it is told to go, and where it says that it is."""
+    commands, states = hand.commands, hand.states
+    return [
+        Line("command", "cmd", commands.t, _clipped(commands.q[:, joint], hand.joints[joint])),
+        Line("state", "state", states.t, states.q[:, joint]),
+    ]
+
+
+def _called(hand: SideView, joint: int) -> str:
+    return "position" if len(hand.joints) == 1 else hand.joints[joint].name
+
+
+def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
+    """Command and state about the place."""
+    if span is None:
+        span = scene.window()
+    hand = scene.hand
+    bands = phase_bands(scene.view, hand.side) + scene.alarms
+    return "".join(
+        chart(
+            f"{hand.side} hand, {_called(hand, joint)}: command and state, "
+            f"{span[0]:.1f} to {span[1]:.1f} s",
+            command_and_state(hand, joint),
+            y_unit="rad",
+            span=span,
+            bands=bands,
+            height=180,
+            include=_room(hand, joint, span),
+        )
+        for joint in scene.joints(span)
+    )
+
+
+def _room(hand: SideView, joint: int, span: tuple[float, float]) -> list[float]:
+    """Values that make a plot at least a tenth of the stroke high: noise is not to fill it."""
+    q = hand.states.q[hand.states.between(*span), joint]
+    q = q[np.isfinite(q)]
+    middle = float(np.median(q)) if len(q) else 0.0
+    return [middle - 0.05 * hand.joints[joint].stroke, middle + 0.05 * hand.joints[joint].stroke]
+
+
+def _both_sides(scene: _Scene) -> list[str]:
+    """Both hands, while only the other one is to move."""
+    hand = scene.hand
+    phases = [p for p in scene.view.phases(scene.need.phase or "") if hand.side not in p.sides]
+    spans = scene.places[:1] or [scene.span_of(p) for p in phases[:1]]
+    if not spans:
+        return [_follow(scene)]
+    span = (max(0.0, spans[0][0] - 0.6), spans[0][1] + 0.6)
+    lines = []
+    joint = scene.joints(span)[0]
+    for view in scene.view.sides.values():
+        mine = view.side is hand.side
+        t, q = view.states.t, view.states.q
+        if len(t):
+            lines.append(Line(f"{view.side} hand", "state" if mine else "other", t, q[:, joint]))
+        if not mine and len(view.commands):
+            goal = _clipped(view.commands.q[:, joint], view.joints[joint])
+            lines.insert(0, Line(f"command to the {view.side} hand", "cmd", view.commands.t, goal))
+    return [
+        chart(
+            f"both hands, {_called(hand, joint)}, while only the other one is to move",
+            lines,
+            y_unit="rad",
+            span=span,
+            bands=scene.alarms,
+            include=_room(hand, joint, span),
+        )
+    ]
+
+
+def _steps(scene: _Scene) -> str:
+    """Every step on top of each other, as what is left of the way to its target."""
+    hand, limits = scene.hand, scene.need.tolerances
+    pairs = []
+    longest = 0.1
+    for phase in scene.phases:
+        begin, end = scene.span_of(phase)
+        rows = hand.states.between(begin, end)
+        before = hand.states.q[hand.states.between(begin - 0.1, begin)]
+        longest = max(longest, end - begin)
+        guilty = any(a < end and b > begin for a, b in scene.places)
+        named = scene.joints((begin, end), 1)[0] if guilty else -1
+        for joint, target in phase.targets.get(hand.side, {}).items():
+            t, q = hand.states.t[rows], hand.states.q[rows, joint]
+            if len(t) < 2 or not np.isfinite(q).any():
+                continue
+            start = float(np.nanmedian(before[:, joint])) if len(before) else float(q[0])
+            stroke = hand.joints[joint].stroke
+            if not abs(target - start) > 0.02 * stroke:
+                continue
+            left = 100 * (q - target) * np.sign(target - start) / stroke
+            pairs.append((guilty and joint == named, Line("", "", t - begin, left)))
+    if not pairs:
+        return ""
+    lines = [
+        Line("the step in question" if bad else "other steps", "bad" if bad else "faint", s.x, s.y)
+        for bad, s in sorted(pairs, key=lambda p: p[0])
+    ]
+    ranges = []
+    for name, text in (("max_error_stroke", "tolerance"), ("max_ripple_stroke", "ripple allowed")):
+        if name in limits:
+            half = 100 * limits[name] / (1 if name == "max_error_stroke" else 2)
+            ranges.append(Range(-half, half, text))
+    if "max_overshoot_stroke" in limits:
+        ranges.append(Range(-np.inf, 100 * limits["max_overshoot_stroke"], "overshoot allowed"))
+    return chart(
+        f"{hand.side} hand, {len(lines)} steps laid over each other: distance to the target, "
+        "in % of the stroke (above 0: beyond it), over seconds after the step",
+        lines,
+        y_unit="%",
+        span=(0.0, longest),
+        ranges=[r for r in ranges if np.isfinite(r.low)],
+        levels=[Level(r.high, r.label) for r in ranges if not np.isfinite(r.low)],
+        include=(0.0,),
+        height=230,
+    )
+
+
+def _session(scene: _Scene) -> list[str]:
+    """The whole replayed session, and the worst moment closer."""
+    spans = [scene.span_of(p) for p in scene.view.phases("replay", scene.hand.side)]
+    t = scene.hand.commands.t
+    span = spans[0] if spans else (float(t[0]), float(t[-1])) if len(t) else scene.window()
+    figures = [_follow(scene, span)]
+    for a, b in scene.places[:1]:
+        if b - a < 0.5 * (span[1] - span[0]):
+            figures.append(_follow(scene, (max(span[0], a - 1.5), min(span[1], b + 1.5))))
+    return figures
+
+
+# ---------------------------------------------------------------------------- timing
+
+
+def _milliseconds(scene: _Scene) -> tuple[Floats, Floats]:
+    clock = scene.hand.states.clock
+    return clock[1:], np.diff(clock) * 1e3
+
+
+def _interval_levels(need: Requirement) -> list[Level]:
+    limits = need.tolerances
+    found = [
+        Level(1e3 / limits[n], f"{limits[n]:g} Hz: {1e3 / limits[n]:.2g} ms")
+        for n in ("min_rate_hz", "max_rate_hz")
+        if n in limits
+    ]
+    found += [
+        Level(1e3 * limits[n], f"{text}: {1e3 * limits[n]:g} ms")
+        for n, text in (("max_p99_s", "99 % below"), ("max_gap_s", "longest gap allowed"))
+        if n in limits
+    ]
+    return found
+
+
+def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
+    """Time from each state to the next, over time."""
+    t, steps = _milliseconds(scene)
+    if not len(t):
+        return ""
+    return chart(
+        f"{scene.hand.side} hand: time from each state to the next",
+        [Line("each state", "state", t, steps, "stems")],
+        y_unit="ms",
+        span=span or (0.0, max(scene.view.duration, 0.1)),
+        bands=scene.alarms,
+        levels=_interval_levels(scene.need),
+        include=(0.0,),
+        height=150,
+    )
+
+
+def _interval_histogram(scene: _Scene) -> str:
+    _, steps = _milliseconds(scene)
+    steps = steps[steps > 0]
+    if len(steps) < 10:
+        return ""
+    return histogram(
+        f"{scene.hand.side} hand: how often which interval between states",
+        steps,
+        unit="ms",
+        levels=_interval_levels(scene.need),
+    )
+
+
+def _rates(scene: _Scene) -> str:
+    """Rate in windows of half a second, with what is asked for."""
+    clock, limits = scene.hand.states.clock, scene.need.tolerances
+    if len(clock) < 2 or "max_p99_s" in limits:
+        return ""
+    edges = np.arange(float(clock[0]), float(clock[-1]), 0.5)
+    if len(edges) < 3:
+        return ""
+    counts, _ = np.histogram(clock, edges)
+    line = Line("rate, each half second", "state", (edges[1:] + edges[:-1]) / 2, counts / 0.5)
+    levels = [
+        Level(limits[n], f"{text} {limits[n]:g} Hz")
+        for n, text in (("min_rate_hz", "at least"), ("max_rate_hz", "at most"))
+        if n in limits
+    ]
+    return chart(
+        f"{scene.hand.side} hand: rate of the state over time",
+        [line],
+        y_unit="Hz",
+        span=(0.0, max(scene.view.duration, 0.1)),
+        levels=levels,
+        include=(0.0,),
+        height=150,
+    )
+
+
+def _samples(scene: _Scene) -> list[str]:
+    """The single samples: a value that is sent again stands beside the one before."""
+    hand = scene.hand
+    middle = scene.places[0] if scene.places else (_fastest(hand),) * 2
+    span = (max(0.0, middle[0] - 0.05), middle[1] + 0.25)
+    return [
+        chart(
+            f"{hand.side} hand, {_called(hand, joint)}: each sample of the state while it moves",
+            [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
+            y_unit="rad",
+            span=span,
+            bands=scene.alarms,
+        )
+        for joint in scene.joints(span, 1)
+    ]
+
+
+def _fastest(hand: SideView) -> float:
+    """When the first joint is fastest."""
+    dq = hand.states.dq[:, 0]
+    return float(hand.states.t[int(np.argmax(np.abs(np.where(np.isfinite(dq), dq, 0.0))))])
+
+
+# ----------------------------------------------------------------------- force and fields
+
+
+def _torque(scene: _Scene) -> str:
+    hand, span = scene.hand, scene.window()
+    levels = [
+        Level(sign * value, f"{name.removeprefix('min_').removeprefix('max_')} {value:g}")
+        for name, value in scene.need.tolerances.items()
+        if name in ("min_tau_nm", "max_tau_nm")
+        for sign in (1, -1)
+    ]
+    return chart(
+        f"{hand.side} hand: torque that it reports",
+        [
+            Line("tau_est", "force", hand.states.t, hand.states.tau[:, j])
+            for j in scene.joints(span)
+        ],
+        y_unit="N m",
+        span=span,
+        bands=phase_bands(scene.view, hand.side) + scene.alarms,
+        levels=levels,
+        include=(0.0,),
+        height=150,
+    )
+
+
+def _torque_by_position(scene: _Scene) -> str:
+    hand, span = scene.hand, scene.window()
+    rows = hand.states.between(*span)
+    joint = scene.joints(span, 1)[0]
+    q, tau = hand.states.q[rows, joint], hand.states.tau[rows, joint]
+    good = np.isfinite(q) & np.isfinite(tau)
+    if good.sum() < 5:
+        return ""
+    spec = hand.joints[joint]
+    touch = scene.view.stimulus.objects.get(hand.side) if scene.view.stimulus else None
+    held = touch is not None and len(hand.joints) == 1
+    return chart(
+        f"{hand.side} hand, {_called(hand, joint)}: torque over position",
+        [Line("each state", "force", q[good], tau[good], "dots")],
+        y_unit="N m",
+        x_unit="rad",
+        span=(spec.q_min - 0.05 * spec.stroke, spec.q_max + 0.05 * spec.stroke),
+        bands=[Band("object", spec.q_min, touch)] if held and touch is not None else [],
+        include=(0.0,),
+        height=150,
+    )
+
+
+def _field(scene: _Scene) -> str:
+    """The member that the requirement speaks of, about the place."""
+    hand, need = scene.hand, scene.need
+    text = f"{scene.result.observed} {need.title} {need.sentence}"
+    name = next((f for f in _FIELDS if re.search(rf"\b{f}\b", text)), None)
+    if name in (None, "q"):
+        return ""
+    states, span = hand.states, scene.window(pad=0.3)
+    column = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}[name]
+    joints = scene.joints(span, 1)
+    return chart(
+        f"{hand.side} hand: {name}",
+        [Line(name, "force", states.t, column[:, j]) for j in joints],
+        y_unit=_FIELDS[name],
+        span=span,
+        bands=scene.alarms,
+        include=(0.0,),
+        height=150,
+    )
+
+
+# -------------------------------------------------------------------------------- network
+
+
+def _endpoints(scene: _Scene) -> str:
+    """Who was there: a table is the picture of what discovery saw."""
+    dialect, side = scene.view.dialect, scene.hand.side
+    wanted = [
+        (dialect.topics(side)[1], dialect.state_type, "writer"),
+        (dialect.topics(side)[0], dialect.cmd_type, "reader"),
+    ]
+    rows = [
+        f"<tr><td>wanted</td><td>{kind}</td><td><code>{escape(topic)}</code></td>"
+        f"<td><code>{escape(name)}</code></td><td></td></tr>"
+        for topic, name, kind in wanted
+    ]
+    seen = dict.fromkeys(
+        (e.kind, e.topic, e.type_name, f"{e.reliability} {e.durability}".strip())
+        for e in scene.view.endpoints
+    )
+    rows += [
+        f"<tr><td>seen</td><td>{escape(kind)}</td><td><code>{escape(topic)}</code></td>"
+        f"<td><code>{escape(name)}</code></td><td>{escape(qos)}</td></tr>"
+        for kind, topic, name, qos in sorted(seen)[:_MOST_ROWS]
+    ]
+    if not seen:
+        rows.append('<tr><td>seen</td><td colspan="4">discovery saw nobody</td></tr>')
+    return _table(
+        "On the network: what a client needs, and who was there (the kit's own among them)",
+        ("", "kind", "topic", "type", "QoS"),
+        rows,
+    )
+
+
+def _table(caption: str, heads: Sequence[str], rows: Sequence[str]) -> str:
+    head = "".join(f"<th>{escape(h)}</th>" for h in heads)
+    return (
+        f'<div class="seen"><table><caption>{escape(caption)}</caption><thead><tr>{head}</tr>'
+        f"</thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+# ------------------------------------------------------------------------------------ USB
+
+
+def _usb(result: Result, usb: UsbRecording) -> list[str]:
+    """Transfers about the place: when, what bytes, and how the joints moved."""
+    hand = next((h for s, h in usb.sides.items() if str(s) == result.side), None)
+    if hand is None:
+        return []
+    if not result.evidence:
+        return [_descriptors(hand)] if result.requirement.needs == "nothing" else []
+    place = result.evidence[0]
+    span = (max(0.0, place.time_s - 0.3), (place.end_s or place.time_s) + 0.3)
+    figures = [_bytes_at(hand, place)]
+    if {"min_rate_hz", "max_s"} & set(result.requirement.tolerances):
+        return [_latency(result, hand)]
+    if place.end_s is not None:
+        figures = [_joints(result, hand, span)]
+    return [figure for figure in figures if figure]
+
+
+def _descriptors(hand: UsbSide) -> str:
+    told = hand.device
+    rows = {
+        "idVendor:idProduct": f"{told.vendor:04X}:{told.product:04X}",
+        "bcdDevice": f"{told.release >> 8:x}.{told.release & 0xFF:02x}",
+        "strings": f"{told.manufacturer!r}, {told.name!r}, serial {told.serial!r}",
+        "endpoints of interface 0": ", ".join(
+            f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'} {e.size} bytes"
+            for e in told.endpoints
+        )
+        or "none",
+    }
+    return _table(
+        f"{hand.side} hand: what the device says of itself",
+        ("", ""),
+        [f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows.items()],
+    )
+
+
+def _bytes_at(hand: UsbSide, place: Evidence) -> str:
+    """The beginning of the transfer that the place is about."""
+    inward = place.topic.endswith("/in")
+
+    def distance(transfer: Transfer) -> int:
+        time = transfer.done_ns if inward else transfer.submitted_ns
+        return abs(time - hand.origin_ns - round(place.time_s * 1e9))
+
+    there = [t for t in hand.transfers if t.inward is inward]
+    if not there:
+        return ""
+    transfer = min(there, key=distance)
+    rows = [
+        f"{i:04x}  {transfer.data[i : i + 8].hex(' ')}"
+        for i in range(0, min(len(transfer.data), 96), 8)
+    ]
+    more = f"\n... {len(transfer.data)} bytes in all" if len(transfer.data) > 96 else ""
+    way = "from the hand" if inward else "to the hand"
+    return (
+        f'<figure class="plot"><pre class="bytes">{chr(10).join(rows) or "no bytes"}{more}</pre>'
+        f"<figcaption>transfer {way} at {hand.seconds(transfer.done_ns):.4f} s"
+        f"</figcaption></figure>"
+    )
+
+
+def _joints(result: Result, hand: UsbSide, span: tuple[float, float]) -> str:
+    """Positions in the answers about the place; those that move most, or are named."""
+    answers = [a for a in hand.answers if span[0] <= a.t <= span[1]]
+    if len(answers) < 2:
+        return ""
+    t = np.array([a.t for a in answers])
+    q = np.array([hand.q(a) for a in answers])
+    names = [j.name for j in hand.joints]
+    wanted = [i for i, n in enumerate(names) if re.search(rf"\b{n}\b", result.observed)]
+    moved = np.ptp(np.where(np.isfinite(q), q, 0.0), axis=0)
+    shown = wanted or np.argsort(-moved, kind="stable")[:2].tolist()
+    bands = [Band(p.name, *hand.span(p)) for p in hand.record.phases if hand.span(p)[1] > span[0]]
+    marks = [Band("here", e.time_s, e.end_s or e.time_s, "alarm") for e in result.evidence]
+    return chart(
+        f"{hand.side} hand: joint positions in the answers",
+        [
+            Line(names[i], css, t, q[:, i])
+            for i, css in zip(shown[:3], ("state", "force", "cmd"), strict=False)
+        ],
+        y_unit="rad",
+        span=span,
+        bands=bands + marks,
+        height=170,
+    )
+
+
+def _latency(result: Result, hand: UsbSide) -> str:
+    """From each command to its answer."""
+    found = [
+        (x.t, (x.answer.transfer.done_ns - x.command.submitted_ns) / 1e6)
+        for phase in hand.phases(result.requirement.phase or "")
+        for x in hand.exchanges(phase)
+        if x.answer is not None
+    ]
+    if len(found) < 10:
+        return ""
+    limits = result.requirement.tolerances
+    levels = []
+    if "max_s" in limits:
+        levels.append(Level(1e3 * limits["max_s"], f"at most {1e3 * limits['max_s']:g} ms"))
+    if "min_rate_hz" in limits:
+        levels.append(Level(1e3 / limits["min_rate_hz"], f"{limits['min_rate_hz']:g} Hz"))
+    return histogram(
+        f"{hand.side} hand: from command to answer",
+        np.array([ms for _, ms in found]),
+        unit="ms",
+        levels=levels,
+    )

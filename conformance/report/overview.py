@@ -1,0 +1,167 @@
+"""What the hands did in a run: position, force and timing of each, over all of it."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from dexkit.conformance.report.evidence import command_and_state, phase_bands
+from dexkit.conformance.report.plots import Band, Level, Line, chart, histogram
+from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.view import Recording, SideView
+from dexkit.hand import JointSpec
+
+__all__ = ["overview"]
+
+
+def overview(result: RunResult, view: Recording) -> str:
+    """Plots of every judged hand, as HTML."""
+    parts = [
+        "<h2>What the hands did</h2>",
+        '<p class="key"><span><i class="cmd"></i>command: where the hand is told to go</span>'
+        '<span><i class="state"></i>state: where it says it is</span>'
+        '<span><i class="force"></i>the force that it feels</span></p>',
+    ]
+    for side in view.judged:
+        parts.append(_hand(result, view, view.sides[side]))
+    return "".join(parts)
+
+
+def _hand(result: RunResult, view: Recording, hand: SideView) -> str:
+    name = f"{str(hand.side).capitalize()} hand"
+    if not len(hand.states):
+        return f"<h3>{name}</h3><p>No state of this hand was received.</p>"
+    gripper = len(hand.joints) == 1
+    opening = f": opening (0 closed, {hand.joints[0].stroke:.2f} open)" if gripper else ""
+    return "".join(
+        [
+            f"<h3>{name}{opening}</h3>",
+            *(_joint(result, view, hand, index) for index in range(len(hand.joints))),
+            _session(view, hand) if gripper else "",
+            _force(view, hand),
+            _timing(view, hand),
+        ]
+    )
+
+
+def _touch(view: Recording, hand: SideView) -> float | None:
+    return view.stimulus.objects.get(hand.side) if view.stimulus else None
+
+
+def _span(view: Recording) -> tuple[float, float]:
+    return 0.0, max(view.duration, 0.1)
+
+
+def _joint(result: RunResult, view: Recording, hand: SideView, index: int) -> str:
+    joint, gripper = hand.joints[index], len(hand.joints) == 1
+    name = "position" if gripper else joint.name
+    figure = chart(
+        f"{hand.side} hand, {name}: command and state over the whole run",
+        command_and_state(hand, index),
+        y_unit="rad" if gripper else f"{joint.name}, rad",
+        span=_span(view),
+        bands=phase_bands(view, hand.side, label=gripper or index == 0) + _alarms(result, hand),
+        levels=_felt(view, hand),
+        height=220 if gripper else 130,
+        include=(0.0, joint.stroke) if gripper else (joint.q_min, joint.q_max),
+        legend=False,
+        titled=False,
+    )
+    return figure if gripper else f'<p class="joint"><b>{escape(name)}</b>{_way(joint)}</p>{figure}'
+
+
+def _way(joint: JointSpec) -> str:
+    closing = {1: ", closes upwards", -1: ", closes downwards", 0: ""}[joint.closing]
+    return f" ({joint.q_min:.2f} to {joint.q_max:.2f} rad{closing})"
+
+
+def _felt(view: Recording, hand: SideView) -> list[Level]:
+    """Where a gripper's object is; of other hands it is at no one angle."""
+    touch = _touch(view, hand)
+    return [Level(touch, "object")] if touch is not None and len(hand.joints) == 1 else []
+
+
+def _session(view: Recording, hand: SideView) -> str:
+    replay = view.phases("replay", hand.side)
+    if not replay:
+        return ""
+    span = view.seconds(replay[0].begin_ns), view.seconds(replay[0].end_ns)
+    session = replay[0].params.get("session", "session")
+    return f"<p>The replayed session <code>{escape(session)}</code>, closer:</p>" + chart(
+        f"{hand.side} hand, replayed session: command and state",
+        command_and_state(hand, 0),
+        y_unit="rad",
+        span=span,
+        levels=_felt(view, hand),
+        include=(0.0, hand.joints[0].stroke),
+        legend=False,
+        titled=False,
+    )
+
+
+def _force(view: Recording, hand: SideView) -> str:
+    states, touch, gripper = hand.states, _touch(view, hand), len(hand.joints) == 1
+    if gripper:
+        held = "" if touch is None else f" Something is between its fingers at {touch:.2f} rad."
+        text = f"Force (tau_est): negative is closing.{held}"
+    else:
+        held = (
+            ""
+            if touch is None
+            else f" Something is between its fingers, at {touch:g} % of closing."
+        )
+        text = f"Torque (tau_est) of each joint.{held}"
+    return f"<p>{text}</p>" + chart(
+        f"{hand.side} hand: torque over the whole run",
+        [Line("force", "force", states.t, states.tau[:, i]) for i in range(len(hand.joints))],
+        y_unit="N m",
+        span=_span(view),
+        bands=phase_bands(view, hand.side, label=False),
+        height=130,
+        include=(0.0,),
+        legend=False,
+        titled=False,
+    )
+
+
+def _timing(view: Recording, hand: SideView) -> str:
+    clock = hand.states.clock
+    intervals = np.diff(clock) * 1e3
+    good = intervals > 0
+    if len(intervals) <= 10 or not good.any():
+        return ""
+    slowest = 1e3 / view.model.min_state_rate
+    levels = [Level(slowest, f"{slowest:g} ms: {view.model.min_state_rate:g} Hz")]
+    return (
+        "<p>Time from each state to the next. A good hand has one tall bar; the count axis is "
+        "logarithmic, so that single late ones show.</p>"
+        + histogram(
+            f"{hand.side} hand: how often which interval between states",
+            intervals[good],
+            unit="ms",
+            levels=levels,
+            titled=False,
+        )
+        + chart(
+            f"{hand.side} hand: intervals between states over the whole run",
+            [Line("interval", "state", clock[1:][good], intervals[good])],
+            y_unit="ms",
+            span=_span(view),
+            height=110,
+            include=(0.0, slowest),
+            legend=False,
+            titled=False,
+        )
+    )
+
+
+def _alarms(result: RunResult, hand: SideView) -> list[Band]:
+    """Where something went wrong, in red."""
+    return [
+        Band("", e.time_s, e.end_s, "alarm")
+        for r in result.results
+        if r.side == str(hand.side) and r.verdict is Verdict.FAIL
+        for e in r.evidence
+        if e.end_s is not None and e.topic == hand.states.topic
+    ]

@@ -1,0 +1,157 @@
+"""What all reports say in the same words: verdicts, the hand's name, how real it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
+from dexkit.models import MODELS
+
+__all__ = [
+    "ANSWERS",
+    "VERDICTS",
+    "Tally",
+    "Word",
+    "about_harness",
+    "causes",
+    "hand_name",
+    "model_title",
+    "nature",
+    "quantity",
+    "tally",
+]
+
+
+@dataclass(frozen=True)
+class Word:
+    """How a verdict is written.
+
+    :param css: class of the page that colours it.
+    :param mark: one sign, for tables in Markdown.
+    """
+
+    text: str
+    css: str
+    mark: str
+
+
+VERDICTS = {
+    Verdict.PASS: Word("pass", "ok", "✅"),
+    Verdict.FAIL: Word("fail", "bad", "❌"),
+    Verdict.WARN: Word("warn", "warn", "⚠️"),
+    Verdict.NOT_CLAIMED: Word("not claimed", "na", "➖"),
+    Verdict.NOT_APPLICABLE: Word("not judged", "na", "➖"),
+    Verdict.BLOCKED: Word("blocked", "open", "⛔"),
+    Verdict.ERROR: Word("kit error", "open", "💥"),
+}
+ANSWERS = {
+    Overall.PASS: Word("Pass", "ok", "✅"),
+    Overall.FAIL: Word("Fail", "bad", "❌"),
+    Overall.INCONCLUSIVE: Word("Inconclusive", "open", "❔"),
+}
+_UNITS = {
+    "s": "s",
+    "ms": "ms",
+    "hz": "Hz",
+    "rad": "rad",
+    "nm": "N m",
+    "stroke": "of the stroke",
+    "part": "",
+    "v": "V",
+}
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Requirements by verdict, sides together, those of other dialects left out.
+
+    :param applicable: all that are about a hand that speaks and claims what this one does.
+    """
+
+    passed: int
+    failed: int
+    warned: int
+    open: int
+    not_judged: int
+    not_claimed: int
+
+    @property
+    def applicable(self) -> int:
+        """Requirements that the hand has to answer for."""
+        return self.passed + self.failed + self.warned + self.open + self.not_judged
+
+
+def tally(result: RunResult) -> Tally:
+    """Count the requirements of a run."""
+    spoken = result.subject.get("dialect")
+    found = [
+        worst(r.verdict for r in group)
+        for requirement, group in result.by_requirement()
+        if not spoken or spoken in requirement.dialects
+    ]
+    return Tally(
+        passed=found.count(Verdict.PASS),
+        failed=found.count(Verdict.FAIL),
+        warned=found.count(Verdict.WARN),
+        open=found.count(Verdict.BLOCKED) + found.count(Verdict.ERROR),
+        not_judged=found.count(Verdict.NOT_APPLICABLE),
+        not_claimed=found.count(Verdict.NOT_CLAIMED),
+    )
+
+
+def model_title(result: RunResult) -> str:
+    """``Dex1-1``, or ``hand`` where the model is not known."""
+    known = MODELS.get(result.subject.get("model", ""))
+    return known.title if known else "hand"
+
+
+def hand_name(result: RunResult) -> str:
+    """What the hand is called: its vendor's name for it, the backend, or the recording."""
+    about = result.subject
+    name = about.get("name") or about.get("backend") or about.get("recording") or "unnamed hand"
+    if about.get("name") and about.get("firmware"):
+        name += f" {about['firmware']}"
+    return name
+
+
+def nature(result: RunResult) -> str:
+    """``emulated``, ``simulated``, ``recorded``, or empty: how real the hand was."""
+    from dexkit.conformance.processes import SIMULATED
+
+    name = result.subject.get("backend", "")
+    if result.subject.get("device") == "emulated":
+        return "emulated"
+    if name in SIMULATED or name.startswith("virtual "):
+        return "simulated"
+    return "" if name else "recorded"
+
+
+def about_harness(result: RunResult) -> str:
+    """How fair the kit's own machine was, or empty where the kit made no run."""
+    told = []
+    figures = result.harness
+    if "jitter_p50_ms" in figures and "jitter_p99_ms" in figures:
+        told.append(
+            f"itself late by {figures['jitter_p50_ms']:.2f} ms (median), "
+            f"{figures['jitter_p99_ms']:.2f} ms (99 of 100)"
+        )
+    if "starved" in figures:
+        told.append(f"short of processor time for {figures['starved']:.1%} of the run")
+    return "; ".join(told)
+
+
+def quantity(name: str, value: float) -> tuple[str, str]:
+    """A measured figure as (name, value with unit), from a key such as ``max_gap_s``."""
+    head, _, tail = name.rpartition("_")
+    if head and tail in _UNITS:
+        return head.replace("_", " "), f"{value:.4g} {_UNITS[tail]}".strip()
+    return name.replace("_", " "), f"{value:.4g}"
+
+
+def causes(group: list[Result]) -> list[tuple[str, str]]:
+    """(sides, likely cause) of a requirement's failures, one entry for each cause."""
+    found: dict[str, list[str]] = {}
+    for entry in group:
+        if entry.cause:
+            found.setdefault(entry.cause, []).append(entry.side)
+    return [(", ".join(sides), cause) for cause, sides in found.items()]
