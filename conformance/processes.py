@@ -15,6 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -135,18 +136,23 @@ class Tool:
             what = "is not ready" if came is False else "ended before it was ready"
             raise ConformanceError(f"{self!r} {what}", hint=self.last_words)
 
-    def stop(self) -> None:
-        """End it, politely at first. May be called twice."""
+    def stop(self) -> bool:
+        """End it, politely at first. May be called twice.
+
+        :returns: whether it ended when it was asked to.
+        """
         if self.running:
             self._process.send_signal(signal.SIGTERM)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(STOP_TIMEOUT)
-        if self.running:
+        polite = not self.running
+        if not polite:
             self._process.kill()
             self._process.wait()
         self._thread.join(STOP_TIMEOUT)
         if self._process.stdout is not None:
             self._process.stdout.close()
+        return polite
 
     def __enter__(self) -> Tool:
         return self
@@ -225,6 +231,8 @@ class Rig:
         self._stop = stop
         self._stack = contextlib.ExitStack()
         self.tools: list[Tool] = []
+        self._services: list[Tool] = []
+        self._ended: set[Tool] = set()
         self.devices: dict[Side, str] = dict(options.devices)
         """Where each side's device is, for the backend."""
 
@@ -275,8 +283,20 @@ class Rig:
             given = {s.partition("=")[0] for s in settings}
             needed = EMULATED[options.backend].settings
             settings += [f"{k}={v}" for k, v in needed.items() if k not in given]
-        for tool in [self._serve(group, settings) for group in self._groups()]:
+        self._services = [self._serve(group, settings) for group in self._groups()]
+        for tool in self._services:
             tool.wait_ready(self._stop)
+
+    def end_services(self) -> bool | None:
+        """Ask all services to end, at once.
+
+        :returns: whether they did; None where there are none of the kit's.
+        """
+        if not self._services:
+            return None
+        self._ended.update(self._services)
+        with ThreadPoolExecutor(len(self._services)) as pool:
+            return all(pool.map(Tool.stop, self._services))
 
     def _groups(self) -> list[tuple[Side, ...]]:
         """The sides that one service serves: one each, unless they share their topics."""
@@ -316,7 +336,7 @@ class Rig:
 
     def dead(self) -> Tool | None:
         """A process that has ended although it should not."""
-        return next((t for t in self.tools if not t.running), None)
+        return next((t for t in self.tools if not t.running and t not in self._ended), None)
 
 
 def _object(options: RigOptions, side: Side) -> tuple[str, ...]:

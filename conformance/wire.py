@@ -11,7 +11,7 @@ from typing import Any
 
 from dexkit.hand import JointMode, Side
 from dexkit.messages import MessageType, message_type
-from dexkit.models import DEX1_1, Dialect, model
+from dexkit.models import DEX1_1, DEX3_1, Dialect, model
 
 __all__ = ["Motor", "Motors", "Wire", "mode_byte"]
 
@@ -59,6 +59,8 @@ class Wire:
         self.command_sequence, motor = _SEQUENCE[dialect.cmd_type]
         self.state_sequence, self._state_motor = _SEQUENCE[dialect.state_type]
         self._motor = message_type(motor).cls
+        others = (DEX1_1.dialects[0].cmd_type, DEX3_1.dialects[0].cmd_type)
+        self.foreign: MessageType = message_type(next(t for t in others if t != dialect.cmd_type))
         self._states: dict[int, Any] = {}
         self.command_topics = {s: dialect.topics(s)[0] for s in Side}
         self.state_topics = {s: dialect.topics(s)[1] for s in Side}
@@ -69,14 +71,39 @@ class Wire:
 
         On a topic of its own a hand is sent as many motors as are given, however wrong.
         """
+        return [(t, self._payload(motors)) for t, motors in self._by_topic(hands).items()]
+
+    def encode_longer(
+        self, hands: Mapping[Side, Motors], surplus: Motors
+    ) -> list[tuple[str, bytes]]:
+        """The same with more motors behind those that there are."""
+        return [
+            (topic, self._payload([*motors, *surplus]))
+            for topic, motors in self._by_topic(hands).items()
+        ]
+
+    def encode_foreign(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
+        """The same in :attr:`foreign`, the command type of the family's other branch."""
+        sequence, motor = _SEQUENCE[self.foreign.name]
+        kind = message_type(motor).cls
+        found = []
+        for topic, group in self._by_topic(hands).items():
+            message = self.foreign.cls()
+            setattr(
+                message,
+                sequence,
+                [kind(mode=m.mode, q=m.q, dq=m.dq, tau=m.tau, kp=m.kp, kd=m.kd) for m in group],
+            )
+            found.append((topic, self.foreign.encode(message)))
+        return found
+
+    def _by_topic(self, hands: Mapping[Side, Motors]) -> dict[str, Motors]:
         if not self.shared:
-            return [
-                (self.command_topics[side], self._payload(motors)) for side, motors in hands.items()
-            ]
+            return {self.command_topics[side]: motors for side, motors in hands.items()}
         places = [LIMP] * self.dialect.length
         for side, motors in hands.items():
             places[self.dialect.index[side]] = motors[0]
-        return [(self.dialect.cmd_topic, self._payload(places))]
+        return {self.dialect.cmd_topic: places}
 
     def encode_empty(self, sides: tuple[Side, ...]) -> list[tuple[str, bytes]]:
         """The same with no motor in the sequence."""

@@ -3,8 +3,8 @@
 A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes on
 missing evidence, and takes every figure from its requirement's tolerances, so that several hand
 models share it. Modules, by what they look at: :mod:`~dexkit.conformance.checks.discovery`,
-:mod:`~.timing`, :mod:`~.fields`, :mod:`~.motion`, :mod:`~.force`, :mod:`~.safety`,
-:mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.dex3` for what only that hand has.
+:mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.motion`, :mod:`~.force`,
+:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.dex3` for what only that hand has.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _MODULES = (
     "discovery",
     "timing",
     "fields",
+    "members",
     "motion",
     "force",
     "safety",
@@ -41,8 +42,8 @@ class Outcome:
 
     :param met: whether the requirement is met; None when it could not be judged.
     :param cause: the likely cause, where the check saw enough to tell; else the requirement's.
-    :param absent: not judged because the hand does not do this at all: a failure of who claims
-        the unit.
+    :param absent: the hand does not do this at all: a failure of who claims the unit, whatever
+        ``met`` is for others.
     """
 
     met: bool | None
@@ -133,7 +134,7 @@ class Context:
         return Outcome(None, reason=reason)
 
     def absent(self, reason: str) -> Outcome:
-        """The hand does not do this at all, which only who claims it has to answer for."""
+        """Not judged: the hand does not do this, for which only who claims it has to answer."""
         return Outcome(None, reason=reason, absent=True)
 
 

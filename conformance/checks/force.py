@@ -96,3 +96,36 @@ def sign(ctx: Context) -> Outcome:
     if tau < 0:
         return ctx.passed("negative", text, tau_nm=tau)
     return ctx.failed("positive", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
+
+
+@check("DEX1-FORCE-04", "DEX3-FORCE-02")
+def unit(ctx: Context) -> Outcome:
+    """The largest tau_est, as a part of what the joint can do."""
+    worst: tuple[float, float, int, float] = (0.0, 0.0, 0, 0.0)
+    for joint, spec in enumerate(ctx.joints):
+        tau = np.abs(ctx.states.tau[:, joint])
+        if not np.isfinite(tau).any():
+            continue
+        i = int(np.nanargmax(tau))
+        worst = max(worst, (float(tau[i]) / spec.tau_max, float(tau[i]), joint, ctx.states.t[i]))
+    part, tau_nm, joint, at = worst
+    text = ctx.named(f"|tau_est| of at most {tau_nm:.2f} N m", joint)
+    if part <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{tau_nm:.2f} N m", text, tau_nm=tau_nm)
+    return ctx.failed(f"{tau_nm:.3g} N m", text, ctx.at(ctx.states.topic, float(at)), tau_nm=tau_nm)
+
+
+@check("DEX1-FORCE-05")
+def unsigned(ctx: Context) -> Outcome:
+    """The least tau_est in a dialect where it is a strength."""
+    tau = ctx.states.tau[:, 0]
+    if not np.isfinite(tau).any():
+        return ctx.skipped("no state with a tau_est")
+    i = int(np.nanargmin(tau))
+    least = float(tau[i])
+    text = f"tau_est from {least:.2f} to {float(np.nanmax(tau)):.2f} N m"
+    if least >= -ctx.tolerance("min_tau_nm"):
+        return ctx.passed(f"{least:.2f} N m", text, tau_nm=least)
+    return ctx.failed(
+        f"{least:.2f} N m", text, ctx.at(ctx.states.topic, float(ctx.states.t[i])), tau_nm=least
+    )

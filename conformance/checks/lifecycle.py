@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
+from dexkit.models import DEX3_1
 
 
 @check("DEX1-START-01", "DEX3-START-01")
@@ -56,3 +59,63 @@ def late_joiner(ctx: Context) -> Outcome:
 def restarted_client(ctx: Context) -> Outcome:
     """The step of the client that took over."""
     return arrival(ctx, "commanded by a restarted client")
+
+
+@check("DEX1-LIFE-03", "DEX3-LIFE-03")
+def restarted_service(ctx: Context) -> Outcome:
+    """State and the step after the service came up again, with a client that stayed."""
+    begin, _ = ctx.span(ctx.phases()[-1])
+    later = ctx.states.t[ctx.states.t > begin]
+    waited = float(later[0]) - begin if len(later) else np.inf
+    if waited > ctx.tolerance("max_wait_s"):
+        what = "no state" if not len(later) else f"no state for {waited:.2f} s"
+        return ctx.failed(
+            "no state",
+            f"{what} after the service was ready again",
+            ctx.at(ctx.states.topic, begin),
+        )
+    return arrival(ctx, "after a restart of its service")
+
+
+@check("DEX1-LIFE-04", "DEX3-LIFE-04")
+def leaves(ctx: Context) -> Outcome:
+    """How long the service takes to end, and its publisher to vanish."""
+    phase = ctx.phases()[-1]
+    begin, end = ctx.span(phase)
+    ended, gone = phase.observed.get("exit_s"), phase.observed.get("gone_s")
+    place = ctx.at(ctx.states.topic, begin, end)
+    if ended is None or ended > ctx.tolerance("max_exit_s"):
+        seen = "had to be killed" if ended is None else f"took {ended:.1f} s to end"
+        return ctx.failed("does not end", f"told to end (SIGTERM) the service {seen}", place)
+    if gone is None or gone > ctx.tolerance("max_gone_s"):
+        seen = "is still announced" if gone is None else f"was announced for {gone:.1f} s"
+        return ctx.failed(
+            "leaves no word", f"the state's publisher {seen} after the service had ended", place
+        ).because(
+            "the process ends without deleting its participant, so that its peers wait for the "
+            "lease to run out"
+        )
+    return ctx.passed(
+        f"{ended:.2f} s",
+        f"ended after {ended:.2f} s, and vanished {gone:.2f} s later",
+        exit_s=ended,
+    )
+
+
+@check("DEX1-LIFE-05", "DEX3-LIFE-05")
+def last_word(ctx: Context) -> Outcome:
+    """The mode of the last state before the service ended."""
+    begin, end = ctx.span(ctx.phases()[-1])
+    modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]
+    modes = modes[np.isfinite(modes).all(axis=1)].astype(np.intp)
+    if ctx.recording.model.name == DEX3_1.name:
+        modes = modes >> 4 & 7
+    if len(modes) < 2 or not (modes[0] > 0).all():
+        return ctx.absent("the mode of this hand does not tell whether it is driven")
+    if not modes[-1].any():
+        return ctx.passed("brakes", "its last state says that it is not driven any more")
+    return ctx.failed(
+        "driven",
+        f"its last state says mode {int(modes[-1].max())}: driven",
+        ctx.at(ctx.states.topic, float(ctx.states.t[ctx.states.between(begin - 0.2, end)][-1])),
+    )

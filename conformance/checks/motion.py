@@ -214,6 +214,83 @@ def overshoot(ctx: Context) -> Outcome:
     )
 
 
+@check("DEX1-MOVE-06", "DEX3-MOVE-06")
+def monotonous(ctx: Context) -> Outcome:
+    """How far q turns back on its way to the target."""
+    found = []
+    for step in steps(ctx):
+        if abs(step.size) < 0.1 * step.stroke:
+            continue
+        way = (step.q - step.start) * np.sign(step.size)
+        there = np.flatnonzero(way >= 0.97 * abs(step.size))
+        way = way[: int(there[0]) + 1] if len(there) else way
+        back = np.maximum.accumulate(np.maximum(way, 0.0)) - way
+        i = int(np.argmax(back))
+        found.append((float(back[i]), float(step.t[i]), step))
+    if not found:
+        return ctx.skipped("no step of that size")
+    back_by, at, step = max(found, key=lambda f: f[0] / f[2].stroke)
+    text = f"{step.name}turned back by at most {back_by:.3f} rad in {len(found)} steps"
+    if back_by <= ctx.tolerance("max_back_stroke", step.joint):
+        return ctx.passed(f"{back_by:.3f} rad", text, back_rad=back_by)
+    return ctx.failed(
+        f"{back_by:.2f} rad",
+        f"{step.name}on its way from {step.start:.2f} to {step.target:.2f} rad q went back by "
+        f"{back_by:.2f} rad",
+        ctx.at(ctx.states.topic, at, step.end),
+        back_rad=back_by,
+    )
+
+
+@check("DEX1-MOVE-07", "DEX3-MOVE-07")
+def settling(ctx: Context) -> Outcome:
+    """Time from the command until q stays near the target."""
+    found = []
+    for step in steps(ctx):
+        if abs(step.size) < 0.1 * step.stroke:
+            continue
+        away = np.abs(step.q - step.target) > ctx.tolerance("max_error_stroke", step.joint)
+        last = np.flatnonzero(away)
+        seconds = float(step.t[last[-1]]) - step.begin if len(last) else 0.0
+        found.append((seconds, step))
+    if not found:
+        return ctx.skipped("no step of that size")
+    longest, step = max(found, key=lambda f: f[0])
+    text = f"{step.name}{longest:.2f} s in the slowest of {len(found)} steps"
+    if longest <= ctx.tolerance("max_settle_s"):
+        return ctx.passed(f"{longest:.2f} s", text, settle_s=longest)
+    return ctx.failed(
+        f"{longest:.2f} s",
+        f"{step}: after {longest:.2f} s it was still away from its target",
+        ctx.at(ctx.states.topic, step.begin, step.begin + longest),
+        settle_s=longest,
+    )
+
+
+@check("DEX1-MOVE-08")
+def ends(ctx: Context) -> Outcome:
+    """Distance from fully open and fully closed."""
+    found = steps(ctx)
+    if not found:
+        return ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
+    worst = max(found, key=lambda s: s.error)
+    text = "; ".join(f"commanded to {s.target:.2f} rad, q went to {s.final:.2f}" for s in found)
+    if worst.error <= ctx.tolerance("max_error_stroke"):
+        return ctx.passed(f"{worst.error:.3f} rad", text, error_rad=worst.error)
+    outcome = ctx.failed(
+        f"{worst.error:.2f} rad",
+        text,
+        ctx.at(ctx.states.topic, worst.begin, worst.end),
+        error_rad=worst.error,
+    )
+    reached = max(s.final for s in found) / max(s.target for s in found)
+    if abs(reached - 5.4 / (2 * np.pi)) < 0.02 or abs(reached - 2 * np.pi / 5.4) < 0.02:
+        return outcome.because(
+            "the stroke of another dialect is used: 5.4 rad in unitree_go, 2 pi in unitree_hg"
+        )
+    return outcome
+
+
 @check("DEX1-SIDE-01", "DEX3-SIDE-01")
 def independent(ctx: Context) -> Outcome:
     """Motion of this hand while only the other one's target changes."""

@@ -269,3 +269,125 @@ def arrival(ctx: Context, when: str) -> Outcome:
         ctx.at(ctx.states.topic, worst.begin, worst.end),
         error_rad=worst.error,
     )
+
+
+# ------------------------------------------------------------------------------ crowded topics
+
+
+@check("DEX1-SAFE-04")
+def long(ctx: Context) -> Outcome:
+    """A command with motors too many."""
+    return stays(ctx, "commands for more motors than there are")
+
+
+@check("DEX1-SAFE-05", "DEX3-SAFE-06")
+def negative_gains(ctx: Context) -> Outcome:
+    """A spring and a damper that push away."""
+    return stays(ctx, "commands with negative gains")
+
+
+@check("DEX1-SAFE-06", "DEX3-SAFE-07")
+def foreign_type(ctx: Context) -> Outcome:
+    """Somebody else's type on the command topic."""
+    return stays(ctx, "messages of another type on its command topic")
+
+
+@check("DEX1-SAFE-07", "DEX3-SAFE-08")
+def burst(ctx: Context) -> Outcome:
+    """Where a hand is a while after hundreds of commands whose last one said to stay."""
+    topic = ctx.states.topic
+    wait = ctx.tolerance("settle_s")
+    far: tuple[float, float, int] = (0.0, 0.0, 0)
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        silent = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end)
+        if silent:
+            a, b = silent[0]
+            return ctx.failed("state stops", f"no state from {a:.3f} s on", ctx.at(topic, a, b))
+        before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
+        q = ctx.states.q[ctx.states.between(begin + wait, end)]
+        if not len(before) or not len(q):
+            return ctx.skipped("no state around the burst")
+        away = np.abs(q - np.median(before, axis=0)).max(axis=0)
+        for joint, spec in enumerate(ctx.joints):
+            far = max(far, (float(away[joint]) / spec.stroke, float(away[joint]), joint))
+            if away[joint] > ctx.tolerance("max_motion_stroke", joint):
+                return ctx.failed(
+                    f"{away[joint]:.2f} rad",
+                    ctx.named(
+                        f"{wait:g} s after the last command of the burst it was still up to "
+                        f"{away[joint]:.2f} rad away",
+                        joint,
+                    ),
+                    ctx.at(topic, begin + wait, end),
+                    motion_rad=float(away[joint]),
+                )
+    return ctx.passed(
+        f"{far[1]:.3f} rad",
+        ctx.named(f"within {far[1]:.3f} rad {wait:g} s after the burst", far[2]),
+        motion_rad=far[1],
+    )
+
+
+@check("DEX1-SAFE-08", "DEX3-SAFE-09")
+def two_writers(ctx: Context) -> Outcome:
+    """Where q is while two clients command two places, and after one has gone."""
+    margin = ctx.tolerance
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
+        rows = ctx.states.between(begin, end)
+        if not len(before):
+            return ctx.skipped("no state before the second client")
+        here = np.median(before, axis=0)
+        for joint, there in phase.targets.get(ctx.side, {}).items():
+            low, high = sorted((float(here[joint]), there))
+            room = margin("max_beyond_stroke", joint)
+            q = ctx.states.q[rows, joint]
+            outside = ~((q >= low - room) & (q <= high + room))
+            if outside.any():
+                i = int(np.argmax(outside))
+                return ctx.failed(
+                    f"{q[i]:.2f} rad",
+                    ctx.named(
+                        f"commanded to {low:.2f} and {high:.2f} rad it went to {q[i]:.2f} rad",
+                        joint,
+                    ),
+                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                )
+    outcome = unharmed(ctx, "two clients at once")
+    if outcome.met is False:
+        return outcome
+    return ctx.passed("between", "stayed between the two places, and obeyed who remained")
+
+
+@check("DEX1-ORDER-02", "DEX3-ORDER-02")
+def old_stamps(ctx: Context) -> Outcome:
+    """The step of a client whose clock is wrong."""
+    return arrival(ctx, "commanded by a client whose clock is an hour behind")
+
+
+@check("DEX1-LOAD-01", "DEX3-LOAD-01")
+def load(ctx: Context) -> Outcome:
+    """Rate and gaps of the state under load."""
+    limit = ctx.tolerance("max_gap_s")
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        clock = ctx.states.clock
+        inside = clock[(clock >= begin) & (clock <= end)]
+        rate = len(inside) / (end - begin)
+        found = gaps(ctx, limit, begin, end)
+        text = f"{rate:.1f} Hz under load"
+        if found:
+            a, b = found[0]
+            return ctx.failed(
+                f"{b - a:.2f} s",
+                f"{text}; silent from {a:.3f} to {b:.3f} s",
+                ctx.at(ctx.states.topic, a, b),
+                rate_hz=rate,
+            )
+        if rate < ctx.tolerance("min_rate_hz"):
+            return ctx.failed(
+                f"{rate:.1f} Hz", text, ctx.at(ctx.states.topic, begin, end), rate_hz=rate
+            )
+    return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)

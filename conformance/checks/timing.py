@@ -11,8 +11,9 @@ from dexkit.hand import Floats
 
 # stimuli whose own requirements judge the state's flow
 OWN_GAP_RULE = (
-    *("silence", "guard"),
+    *("silence", "guard", "shutdown"),
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id"),
+    *("negative", "foreign", "burst", "two-writers", "load"),
 )
 
 
@@ -140,6 +141,50 @@ def order(ctx: Context) -> Outcome:
         f"{back} samples older than the one before, {len(wrong) - back} with the same timestamp",
         *(ctx.at(ctx.states.topic, float(ctx.states.t[i + 1])) for i in wrong[:5]),
         out_of_order=len(wrong),
+    )
+
+
+@check("DEX1-FRESH-02", "DEX3-FRESH-02")
+def not_frozen(ctx: Context) -> Outcome:
+    """The longest stretch of equal positions that ends in a jump no joint can make."""
+    limit = ctx.tolerance("max_frozen_s")
+    worst = 0.0
+    for joint in range(len(ctx.joints)):
+        t, q = ctx.states.t, ctx.states.q[:, joint]
+        good = np.isfinite(q)
+        t, q = t[good], q[good]
+        changes = np.flatnonzero(np.diff(q) != 0) + 1
+        if len(changes) < 2:
+            continue
+        jump = np.abs(np.diff(q)[changes - 1])[1:]
+        # what was sent, not what was missed: a gap in the state is RATE-03's finding
+        sent = np.diff(changes)
+        held = t[changes[1:] - 1] - t[changes[:-1]]
+        frozen = (jump >= ctx.tolerance("min_jump_stroke", joint)) & (
+            sent >= ctx.tolerance("min_samples")
+        )
+        if not frozen.any():
+            continue
+        i = int(np.argmax(np.where(frozen, held, 0.0)))
+        worst = max(worst, float(held[i]))
+        if held[i] > limit:
+            at = float(t[changes[i]])
+            return ctx.failed(
+                f"{held[i]:.2f} s",
+                ctx.named(
+                    f"{int(sent[i])} states in a row with q = {q[changes[i]]:.3f} rad over "
+                    f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} rad",
+                    joint,
+                ),
+                ctx.at(ctx.states.topic, at, at + float(held[i])),
+                frozen_s=float(held[i]),
+            )
+    if not any(len(np.unique(c)) > 3 for c in ctx.states.q.T):
+        return ctx.skipped("the hand does not move in this recording")
+    return ctx.passed(
+        f"{worst * 1e3:.0f} ms",
+        f"no position was held for more than {worst:.3f} s and then jumped",
+        frozen_s=worst,
     )
 
 

@@ -21,8 +21,11 @@ from dexkit.conformance.stimuli.script import (
     Observation,
     Plan,
     Restart,
+    Role,
     Script,
     Send,
+    StartService,
+    StopService,
 )
 from dexkit.conformance.stimuli.session import Session
 from dexkit.models import DEX1_1, DEX3_1
@@ -35,9 +38,12 @@ __all__ = [
     "Observation",
     "Plan",
     "Restart",
+    "Role",
     "Script",
     "Send",
     "Session",
+    "StartService",
+    "StopService",
     "phases_for",
     "script_for",
 ]

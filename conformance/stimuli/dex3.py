@@ -9,13 +9,18 @@ approach       slowly to nearly open
 joint          one joint after the other closes and opens again
 step           one hand closes and opens again, the other holds
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
-range, empty,  limits, no motors, one too few, one and more too many, and two mode bytes with each
-short, long,   other's id
-wrong-id
+range, empty,  limits, no motors, one too few, one and more too many, two mode bytes with each
+short, long,   other's id, negative gains; and a client of another type on the topic
+wrong-id,
+negative,
+foreign
+burst          hundreds of commands at once, of which the last one counts
 stiff, soft    the same step with the client's gains and with a fifth of its stiffness
 limp           zero gains, with a q far towards closed
 lock           the same with the client's gains and status 0 in the mode byte
 replay         a recorded session, as recorded
+load           many commands a second, and a reader that is slow
+old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 guard-drive    with time-out protection (bit 7 of the mode byte) some joints are driven by a
                velocity and others move slowly to a position, when ...
@@ -26,7 +31,11 @@ squeeze        close on the object, if there is one
 drive          without protection: as guard-drive
 silence        the commands stop for longer than the time-out
 resume         a step after the silence
+two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
+shutdown       the service is told to end, and started again
+service-       a step after that
+restart
 ============== =====================================================================================
 """
 
@@ -63,6 +72,7 @@ _BAD = {
     "short": "commands for six motors: nothing may move",
     "long": "commands for more motors than there are: nothing may move",
     "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
+    "negative": "negative gains: no joint may run away",
 }
 
 
@@ -86,6 +96,10 @@ class Dex3Script(Script):
         for name in _BAD:
             if name in phases:
                 yield from self._bad(name)
+        if "foreign" in phases:
+            yield from self._foreign()
+        if "burst" in phases:
+            yield from self._flood()
         if phases & {"stiff", "soft"}:
             yield from self._stiff_and_soft()
         for name in ("limp", "lock"):
@@ -94,6 +108,10 @@ class Dex3Script(Script):
         if "replay" in phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
+        if "load" in phases:
+            yield from self._load()
+        if "old-stamps" in phases:
+            yield from self._old_stamps()
         if "late-joiner" in phases:
             yield from self._late_joiner()
         if phases & {"guard", "guard-latch", "guard-clear"}:
@@ -181,6 +199,11 @@ class Dex3Script(Script):
             bursts = [
                 {s: [*motors, *[far] * more] for s, motors in good.items()} for more in (1, 13)
             ]
+        elif name == "negative":
+            near = {s: self._motors(s, self._aside(s)) for s in good}
+            bursts = [
+                {s: [replace(m, kp=-m.kp, kd=-m.kd) for m in motors] for s, motors in near.items()}
+            ]
         else:
             bursts = [{s: self._crossed(s, motors) for s, motors in good.items()}]
         payloads = [self._wire.encode(hands) for hands in bursts]
@@ -190,6 +213,13 @@ class Dex3Script(Script):
             yield from self._burst(name, payloads, 0.4)
         places = self._other_place()
         yield from self._everyone("recover", places, most=1.5, after=name)
+
+    def _aside(self, side: Side) -> Pose:
+        """A tenth of each joint's range from its goal, away from the nearer end."""
+        return tuple(
+            q + math.copysign(0.1 * j.stroke, 0.5 * (j.q_min + j.q_max) - q)
+            for q, j in zip(self._goal[side], self._joints[side], strict=True)
+        )
 
     def _broken(self, field: str, value: float) -> dict[Side, Motors]:
         """One bad field in one joint; all of them are told to go far, to show if one is taken."""

@@ -6,16 +6,27 @@ Order of the phases: what may disturb a hand comes after what needs it undisturb
 listen         no commands; state must flow
 approach       slowly to mid stroke
 step           large steps of one side, the others hold
-nan, out-of-   bad commands, each followed by ``recover``, a good step
-range, empty
+ends           fully open, and fully closed where there is no object
+nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
+range, empty,  stroke, no motor, motors too many, negative gains; and a client of another type on
+long,          the topic
+negative,
+foreign
+burst          hundreds of commands at once, of which the last one counts
 limp           zero gains, with a q far towards closed
 replay         a recorded session, as recorded
+load           many commands a second, and a reader that is slow
+old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 squeeze        close on the object, if there is one, by xr_teleoperate's lead
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
 silence        ... the commands stop for two command time-outs
 resume         a step after the silence
+two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
+shutdown       the service is told to end, and started again
+service-       a step after that
+restart
 ============== =====================================================================================
 """
 
@@ -35,6 +46,8 @@ _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
     "empty": "empty commands: nothing may move",
+    "long": "commands for more motors than there are: nothing may move",
+    "negative": "negative gains: the hand must not run away",
 }
 
 
@@ -52,14 +65,24 @@ class GripperScript(Script):
         if "step" in self.plan.phases:
             for side in sides:
                 yield from self._steps(side)
-        for name in ("nan", "out-of-range", "empty"):
-            if name in self.plan.phases:
+        if "ends" in self.plan.phases:
+            yield from self._ends()
+        for name in _BAD:
+            if name in self.plan.phases and (name != "negative" or self._gains_used):
                 yield from self._bad(name)
+        if "foreign" in self.plan.phases:
+            yield from self._foreign()
+        if "burst" in self.plan.phases:
+            yield from self._flood()
         if "limp" in self.plan.phases and self._gains_used:
             yield from self._limp()
         if "replay" in self.plan.phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
+        if "load" in self.plan.phases:
+            yield from self._load()
+        if "old-stamps" in self.plan.phases:
+            yield from self._old_stamps()
         if "late-joiner" in self.plan.phases:
             yield from self._late_joiner()
         if self.plan.phases & {"squeeze", "silence", "resume"}:
@@ -105,6 +128,17 @@ class GripperScript(Script):
             phase = self._begin("step", (side,), targets={side: {0: target}})
             yield from self._until_settled(phase, (side,), least=0.6, most=2.5)
 
+    def _ends(self) -> Steps:
+        self._say("fully open and fully closed")
+        sides = self.plan.sides
+        yield from self._everyone("ends", dict.fromkeys(sides, (self._stroke,)), most=1.5)
+        free = [s for s in sides if s not in self.plan.objects]
+        if free:
+            self._goal.update(dict.fromkeys(free, (0.0,)))
+            phase = self._begin("ends", free, targets={s: {0: 0.0} for s in free})
+            yield from self._until_settled(phase, free, least=0.6, most=2.0)
+        yield from self._everyone("center", {s: self._home(s) for s in sides})
+
     def _bad(self, name: str) -> Steps:
         self._say(_BAD[name])
         sides = self.plan.sides
@@ -114,6 +148,17 @@ class GripperScript(Script):
         elif name == "out-of-range":
             far = [self._all(Motor(q=q)) for q in (1000.0, -1000.0)]
             yield from self._burst(name, far, 1.0, each=0.5)
+        elif name == "long":
+            good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
+            far = [
+                self._wire.encode_longer(good, [Motor(q=self._high())] * more) for more in (1, 19)
+            ]
+            yield from self._burst(name, far, 0.5)
+        elif name == "negative":
+            gains = {"kp": -self._model.client_gains[0], "kd": -self._model.client_gains[1]}
+            aside = [(self._middle(s) + 0.1 * self._stroke) for s in sides]
+            wrong = {s: (Motor(q=q, **gains),) for s, q in zip(sides, aside, strict=True)}
+            yield from self._burst(name, [self._wire.encode(wrong)], 0.4)
         else:
             yield from self._burst(name, [self._wire.encode_empty(sides)], 0.5)
         yield from self._everyone("recover", self._other_place(), after=name)

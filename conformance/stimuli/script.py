@@ -8,6 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 
 from dexkit.conformance.phases import Phase
 from dexkit.conformance.stimuli.session import Session
@@ -26,9 +27,12 @@ __all__ = [
     "Plan",
     "Pose",
     "Restart",
+    "Role",
     "Script",
     "Send",
+    "StartService",
     "Steps",
+    "StopService",
     "default_objects",
     "object_places",
 ]
@@ -39,9 +43,22 @@ DEFAULT_OBJECTS = {DEX1_1.name: {Side.RIGHT: 37.0}, DEX3_1.name: {Side.RIGHT: 60
 the shipped session closes."""
 SETTLED = 0.02
 """Part of a joint's range within which it counts as being where it should."""
+FLOOD = 500
+"""Commands of a burst."""
+LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
+"""Commands a second under load, twice and more what official clients send, and for how long."""
 Payloads = list[tuple[str, bytes]]
 Pose = tuple[float, ...]
 """q of every joint of a hand, rad."""
+
+
+class Role(Enum):
+    """Who else is on the topics, beside the commanding client."""
+
+    MONITOR = "a second listener"
+    LAGGARD = "a reliable listener that looks only twice a second"
+    RIVAL = "a second commanding client"
+    STRANGER = "somebody who publishes another type on the command topics"
 
 
 @dataclass(frozen=True)
@@ -50,31 +67,45 @@ class Observation:
 
     :param now_ns: the recording's clock.
     :param q: newest pose of each side that has published one; dq likewise.
-    :param joined: after :class:`Join`, seconds until each side's first state arrived there.
+    :param joined: of a :attr:`Role.MONITOR`, seconds until each side's first state arrived there.
+    :param stopped: after :class:`StopService`: ``exit_s``, the seconds until the services had
+        ended, and ``gone_s``, until their publishers had vanished from the domain after that;
+        None is never. Nothing at all where the kit has not started the services.
     """
 
     now_ns: int
     q: Mapping[Side, Pose] = field(default_factory=dict)
     dq: Mapping[Side, Pose] = field(default_factory=dict)
     joined: Mapping[Side, float] = field(default_factory=dict)
+    stopped: Mapping[str, float | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Send:
-    """Publish these (topic, payload), then wait until a time."""
+    """Publish these (topic, payload), then wait until a time.
+
+    :param by: who publishes them, if not the client.
+    :param age_s: how long ago their source timestamps say that they were written.
+    """
 
     payloads: Payloads
     until_ns: int
+    by: Role | None = None
+    age_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class Join:
-    """Create a second participant with a reader on every state topic."""
+    """Somebody else comes."""
+
+    role: Role = Role.MONITOR
 
 
 @dataclass(frozen=True)
 class Leave:
-    """Remove it."""
+    """And goes."""
+
+    role: Role = Role.MONITOR
 
 
 @dataclass(frozen=True)
@@ -82,7 +113,17 @@ class Restart:
     """Remove the commanding client, and create a new one."""
 
 
-Action = Send | Join | Leave | Restart
+@dataclass(frozen=True)
+class StopService:
+    """Ask the hands' services to end (SIGTERM), if the kit has started them."""
+
+
+@dataclass(frozen=True)
+class StartService:
+    """Start them again."""
+
+
+Action = Send | Join | Leave | Restart | StopService | StartService
 Steps = Generator[Action, Observation, None]
 
 
@@ -134,6 +175,7 @@ class Script(ABC):
         self._goal: dict[Side, Pose] = {}
         self._held: tuple[dict[Side, Pose], Payloads] = ({}, [])
         self._next_ns = 0
+        self._age_s = 0.0
         self._period_ns = round(1e9 / self._model.command_rate)
         self._obs = Observation(0)
 
@@ -147,11 +189,15 @@ class Script(ABC):
             self._say("no state on any topic: nothing more can be asked of this hand")
             return
         yield from self._provoke()
+        if "two-writers" in self.plan.phases:
+            yield from self._two_writers()
         if "restart" in self.plan.phases:
             self._say("the commanding program is restarted: the new one must be obeyed")
             yield Restart()
             yield from self._everyone("restart", self._other_place())
         yield from self._hold(0.2)
+        if self.plan.phases & {"shutdown", "service-restart"}:
+            yield from self._service_restart()
 
     def length(self) -> float:
         """Seconds that :meth:`run` takes with hands that are where they should at once."""
@@ -192,7 +238,7 @@ class Script(ABC):
         if late > self._period_ns:
             self._next_ns += late
         self._next_ns += self._period_ns
-        self._obs = yield Send(payloads, self._next_ns)
+        self._obs = yield Send(payloads, self._next_ns, age_s=self._age_s)
 
     def _command(self, motors: Mapping[Side, Motors] | None = None) -> Steps:
         """Everybody holds its goal, but for those named."""
@@ -370,6 +416,99 @@ class Script(ABC):
         phase.observed = {f"first_state_s_{s}": self._obs.joined.get(s) for s in self.plan.sides}
         self._end(phase)
         self._obs = yield Leave()
+
+    def _foreign(self) -> Steps:
+        """Somebody sends another type of the family on the command topics, with far targets."""
+        self._say("another type on the command topics: it must not reach the hand")
+        yield from self._hold(0.2)
+        far = self._wire.encode_foreign(
+            {s: self._motors(s, pose) for s, pose in self._other_place().items()}
+        )
+        self._obs = yield Join(Role.STRANGER)
+        phase = self._begin("foreign", self.plan.sides)
+        while self._elapsed(phase) < 0.5:
+            self._obs = yield Send(far, 0, by=Role.STRANGER)
+            yield from self._command()
+        self._end(phase)
+        self._obs = yield Leave(Role.STRANGER)
+        yield from self._everyone("recover", self._other_place(), most=1.5, after="foreign")
+
+    def _flood(self) -> Steps:
+        """Hundreds of commands at once to another place, the last of them back to this one."""
+        self._say(f"{FLOOD} commands at once: only the last one counts")
+        yield from self._hold(0.2)
+        far = self._wire.encode(
+            {s: self._motors(s, pose) for s, pose in self._other_place().items()}
+        )
+        phase = self._begin("burst", self.plan.sides)
+        self._obs = yield Send(far * (FLOOD - 1), 0)
+        yield from self._hold(0.8)
+        self._end(phase)
+
+    def _old_stamps(self) -> Steps:
+        self._say("a client whose clock is an hour behind: it must be obeyed")
+        self._age_s = 3600.0
+        yield from self._everyone("old-stamps", self._other_place(), most=1.5)
+        self._age_s = 0.0
+        yield from self._hold(0.1)
+
+    def _load(self) -> Steps:
+        """Many commands, and a reliable subscriber that hardly ever reads."""
+        self._say(f"{LOAD_RATE:g} commands a second and a slow reader: state must keep its rate")
+        here, there = dict(self._goal), self._other_place()
+        count = 40  # points of the way there and back
+        parts = [0.3 * (1 - abs(2 * i / count - 1)) for i in range(count + 1)]
+        points = [
+            self._wire.encode(
+                {
+                    s: self._motors(
+                        s, tuple(a + part * (b - a) for a, b in zip(here[s], there[s], strict=True))
+                    )
+                    for s in self.plan.sides
+                }
+            )
+            for part in parts
+        ]
+        self._obs = yield Join(Role.LAGGARD)
+        period, self._period_ns = self._period_ns, round(1e9 / LOAD_RATE)
+        phase = self._begin("load", self.plan.sides)
+        while (at := self._elapsed(phase) / LOAD_SECONDS) < 1.0:
+            yield from self._send(points[int(at * count)])
+        self._end(phase)
+        self._period_ns = period
+        self._obs = yield Leave(Role.LAGGARD)
+
+    def _two_writers(self) -> Steps:
+        self._say("a second client commands another place, and goes again")
+        yield from self._hold(0.2)
+        there = self._other_place()
+        rival = self._wire.encode({s: self._motors(s, pose) for s, pose in there.items()})
+        targets = {s: dict(enumerate(pose)) for s, pose in there.items()}
+        self._obs = yield Join(Role.RIVAL)
+        phase = self._begin("two-writers", self.plan.sides, targets=targets)
+        while self._elapsed(phase) < 0.6:
+            self._obs = yield Send(rival, 0, by=Role.RIVAL)
+            yield from self._command()
+        self._end(phase)
+        self._obs = yield Leave(Role.RIVAL)
+        yield from self._everyone("recover", there, most=1.5, after="two-writers")
+
+    def _service_restart(self) -> Steps:
+        """End the service and start it again, where the kit can."""
+        self._say("the service is told to end, and started again")
+        phase = self._begin("shutdown", self.plan.sides)
+        self._obs = yield StopService()
+        if not self._obs.stopped:
+            self.phases.remove(phase)
+            self._say("it is not the kit's to restart: left out")
+            return
+        phase.observed = dict(self._obs.stopped)
+        self._obs = yield StartService()
+        self._end(phase)
+        self._next_ns = self._obs.now_ns
+        yield from self._everyone(
+            "service-restart", {s: self._home(s) for s in self.plan.sides}, most=4.0
+        )
 
     def _silence(self, name: str, seconds: float) -> Steps:
         """No command at all, as a phase."""

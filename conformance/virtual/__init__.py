@@ -14,7 +14,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.conformance.phases import RECORD, Stimulus
-from dexkit.conformance.stimuli import Join, Leave, Observation, Plan, Restart, Send, script_for
+from dexkit.conformance.stimuli import (
+    Join,
+    Leave,
+    Observation,
+    Plan,
+    Restart,
+    Role,
+    Send,
+    StartService,
+    StopService,
+    script_for,
+)
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.wire import Motor, Wire
 from dexkit.errors import WireError
@@ -25,6 +36,8 @@ from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 __all__ = ["MemoryTrace", "Sample", "Service", "run_virtual"]
 
 EPOCH_NS = 1_700_000_000_000_000_000
+RIVAL = 1000
+"""The second client's number."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +65,14 @@ class Service:
     serves_late_readers = True
     reader_durability = "Volatile"
     writer_reliability = "reliable"
+    exit_s: float | None = 0.2
+    """Seconds that it takes to end when it is told to; None is for ever."""
+    gone_s: float | None = 0.05
+    """Seconds until its publishers have vanished from the domain after that, or None."""
+    restarted = False
+    """Whether there was a service before this one."""
+    loaded = False
+    """Whether a slow reliable reader listens."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -62,6 +83,8 @@ class Service:
         self.command_type = dialect.cmd_type
         self.state_type = dialect.state_type
         self.now = 0.0
+        self.stamp = 0.0
+        """Source timestamp of the command that is received, in its own time."""
         self._due = 0.0
         self._heard: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
 
@@ -101,9 +124,29 @@ class Service:
             if motors is not None:
                 self.motors(side, motors)
 
+    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
+        """A message of another type was published on a command topic: DDS keeps it away."""
+        return
+
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         """One side's part of it."""
         return
+
+    def begin(self, now: float) -> None:
+        """It comes up at that time, after a service before it has ended."""
+        self.restarted = True
+        self.now = self._due = now
+
+    def brake(self) -> None:
+        """Let go of the hands: the service ends."""
+        return
+
+    def end(self) -> list[Sample]:
+        """It is told to end: brake, and say so a last time."""
+        self.brake()
+        self.now += self.tick
+        self.live(self.tick)
+        return self.publish()
 
     def advance(self, dt: float) -> list[Sample]:
         """Let time pass; what was published meanwhile."""
@@ -189,6 +232,7 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
     seen: dict[Side, tuple[bytes, tuple[Pose, Pose] | None]] = {}
     joined: dict[Side, float] = {}
     joined_at: float | None = None
+    stopped: dict[str, float | None] = {}
     client = 0
     now = 0.0
 
@@ -196,17 +240,20 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
         nonlocal now
         while now + 1e-9 < until:
             now += service.tick
-            for sample in service.advance(service.tick):
-                sent = EPOCH_NS + round(sample.sent * 1e9)
-                log = EPOCH_NS + round(now * 1e9) + 100_000
-                trace.put(sample.topic, sample.type_name, log, sent, sample.payload)
-                if sample.type_name != plan.dialect.state_type or sample.topic not in states:
-                    continue
-                newest[sample.topic] = sample.payload
-                if joined_at is not None and service.serves_late_readers:
-                    for side in plan.sides:
-                        if wire.state_topics[side] == sample.topic:
-                            joined.setdefault(side, now - joined_at)
+            take(service.advance(service.tick))
+
+    def take(samples: Iterable[Sample]) -> None:
+        for sample in samples:
+            sent = EPOCH_NS + round(sample.sent * 1e9)
+            log = EPOCH_NS + round(now * 1e9) + 100_000
+            trace.put(sample.topic, sample.type_name, log, sent, sample.payload)
+            if sample.type_name != plan.dialect.state_type or sample.topic not in states:
+                continue
+            newest[sample.topic] = sample.payload
+            if joined_at is not None and service.serves_late_readers:
+                for side in plan.sides:
+                    if wire.state_topics[side] == sample.topic:
+                        joined.setdefault(side, now - joined_at)
 
     def observe() -> Observation:
         q: dict[Side, Pose] = {}
@@ -220,25 +267,44 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
             state = seen[side][1]
             if state is not None:
                 q[side], dq[side] = state
-        return Observation(EPOCH_NS + round(now * 1e9), q, dq, dict(joined))
+        return Observation(EPOCH_NS + round(now * 1e9), q, dq, dict(joined), dict(stopped))
+
+    def send(action: Send) -> None:
+        sent = EPOCH_NS + round((now - action.age_s) * 1e9)
+        service.stamp = now - action.age_s
+        for topic, payload in action.payloads:
+            if action.by is Role.STRANGER:
+                service.foreign(topic, wire.foreign.name, payload)
+                continue
+            log = EPOCH_NS + round(now * 1e9) + 50_000
+            trace.put(topic, plan.dialect.cmd_type, log, sent, payload)
+            if service.hears:
+                service.receive(topic, payload, RIVAL if action.by is Role.RIVAL else client)
 
     steps = script.run()
     action = next(steps)
     while True:
         if isinstance(action, Send):
-            for topic, payload in action.payloads:
-                sent = EPOCH_NS + round(now * 1e9)
-                trace.put(topic, plan.dialect.cmd_type, sent + 50_000, sent, payload)
-                if service.hears:
-                    service.receive(topic, payload, client)
+            send(action)
             advance((action.until_ns - EPOCH_NS) / 1e9)
-        elif isinstance(action, Join):
-            joined_at = now
-        elif isinstance(action, Leave):
-            joined_at = None
+        elif isinstance(action, (Join, Leave)):
+            comes = isinstance(action, Join)
+            if action.role is Role.MONITOR:
+                joined_at = now if comes else None
+            elif action.role is Role.LAGGARD:
+                service.loaded = comes
         elif isinstance(action, Restart):
             client += 1
             advance(now + 0.3)
+        elif isinstance(action, StopService):
+            now += service.tick
+            take(service.end())
+            stopped = {"exit_s": service.exit_s, "gone_s": service.gone_s}
+        elif isinstance(action, StartService):
+            now += 0.5
+            service = service_class(plan.dialect, plan.sides, plan.objects)
+            service.begin(now)
+            newest.clear()
         try:
             action = steps.send(observe())
         except StopIteration:

@@ -100,7 +100,8 @@ class Dex3Hand:
     def take(self, rows: Floats, mode: Ints) -> None:
         """Obey from here on: q within the limits, status and time-out bit from the mode byte."""
         self.goal = np.minimum(np.maximum(rows[0], self.low), self.high)
-        self.speed, self.push, self.kp, self.kd = rows[1:]
+        self.speed, self.push = rows[1:3]
+        self.kp, self.kd = np.maximum(rows[3:], 0.0)
         self.status = (mode >> 4) & 7
         self.guarded = mode >= 0x80
         self.tripped = self.tripped & self.guarded
@@ -110,6 +111,11 @@ class Dex3Hand:
         self.tripped = self.tripped | self.guarded
         self.speed = np.zeros_like(self.speed)
         self.push = np.zeros_like(self.push)
+
+    def release(self) -> None:
+        """Forget the command: brake."""
+        self.status = np.zeros_like(self.status)
+        self.changed()
 
     def changed(self) -> None:
         """Work out what follows from the command in force."""
@@ -224,6 +230,11 @@ class Dex3Service(Service):
     def positions(self, side: Side) -> Pose:
         """Where a hand is."""
         return tuple(self.hands[side].q)
+
+    def brake(self) -> None:
+        """Let go of the hands."""
+        for hand in self.hands.values():
+            hand.release()
 
     def live(self, dt: float) -> None:
         """Let time pass for the hands."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual import Service
@@ -52,7 +53,7 @@ class ReferenceHand:
     def accept(self, motor: Motor) -> Motor:
         """Within the limits."""
         q = min(max(motor.q, 0.0), self.stroke)
-        return Motor(q, motor.dq, motor.tau, motor.kp, motor.kd)
+        return Motor(q, motor.dq, motor.tau, max(motor.kp, 0.0), max(motor.kd, 0.0))
 
     @property
     def braking(self) -> bool:
@@ -79,6 +80,10 @@ class ReferenceHand:
         self.dq = 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
         self.q += dt * self.dq
 
+    def release(self) -> None:
+        """Forget the command: brake."""
+        self.goal = None
+
     def contact(self) -> float:
         """Force of stops and object."""
         floor = 0.0 if self.touch is None else self.touch
@@ -90,7 +95,7 @@ class ReferenceHand:
 
     def fields(self) -> dict[str, float]:
         """The state's fields."""
-        return {"q": self.q, "dq": self.dq, "tau_est": self.tau}
+        return {"mode": int(not self.braking), "q": self.q, "dq": self.dq, "tau_est": self.tau}
 
 
 class ReferenceService(Service):
@@ -128,10 +133,23 @@ class ReferenceService(Service):
         for hand in self.hands.values():
             hand.step(dt)
 
-    def fields(self, side: Side) -> dict[str, float]:
+    def brake(self) -> None:
+        """Let go of the grippers."""
+        for hand in self.hands.values():
+            hand.release()
+
+    def fields(self, side: Side) -> dict[str, Any]:
         """What a side's motor says of itself."""
-        return self.hands[side].fields()
+        found: dict[str, Any] = self.hands[side].fields()
+        if self.dialect.name == "unitree_hg":  # seed 000: mode 0, 25 degrees, 12 V, no sign
+            grip = abs(found["tau_est"])
+            found |= {"mode": 0, "tau_est": grip, "temperature": (25, 25), "vol": 12.0}
+        return found
+
+    def rest(self) -> dict[str, Any]:
+        """The other members of the message."""
+        return {}
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of these grippers on the wire."""
-        return self.wire.state_payload({s: [self.fields(s)] for s in sides}, length)
+        return self.wire.state_payload({s: [self.fields(s)] for s in sides}, length, **self.rest())

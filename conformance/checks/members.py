@@ -1,0 +1,272 @@
+"""The members of a state that clients hardly look at: where filled, they must make sense.
+
+A maker may leave each of them 0. What is there must be what its name says: an uninitialised byte,
+another unit, or a counter in a reserved word is read by somebody some day.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from dexkit.conformance.checks import Check, Context, Outcome, check
+from dexkit.hand import Floats
+
+__all__: list[str] = []
+
+_HG = "HandState_"
+
+
+def _motors(ctx: Context, *names: str) -> list[str]:
+    """Paths of this hand's motors' members."""
+    sequence = "motor_state" if ctx.recording.dialect.state_type.endswith(_HG) else "states"
+    first = ctx.recording.dialect.index[ctx.side]
+    return [f"{sequence}[{first + i}].{n}" for i in range(len(ctx.joints)) for n in names]
+
+
+def _packets(ctx: Context, name: str) -> list[str]:
+    assert ctx.states.columns is not None
+    count = int(ctx.states.columns.count("press_sensor_state").max(initial=0))
+    return [f"press_sensor_state[{i}].{name}" for i in range(count)]
+
+
+def _values(ctx: Context, path: str) -> Floats:
+    """A member in every state that has it, shape (n, length)."""
+    assert ctx.states.columns is not None
+    values = ctx.states.columns[path][ctx.states.columns.ok]
+    return np.asarray(values, dtype=np.float64).reshape(len(values), -1)
+
+
+def _at(ctx: Context, row: int) -> float:
+    assert ctx.states.columns is not None
+    return float(ctx.states.t[ctx.states.columns.ok][row])
+
+
+def _outside(
+    ctx: Context, paths: Iterable[str], low: float, high: float, *, or_zero: bool = False
+) -> Outcome | None:
+    """Failed if a value is not within [low, high]; None if all are."""
+    for path in paths:
+        values = _values(ctx, path)
+        good = (values >= low) & (values <= high)
+        if or_zero:
+            good |= values == 0
+        if not good.all():
+            row, place = (int(i) for i in np.argwhere(~good)[0])
+            name = path if values.shape[1] == 1 else f"{path}[{place}]"
+            value = values[row, place]
+            return ctx.failed(
+                f"{value:g}",
+                f"{name} = {value:g} in {int((~good).any(axis=1).sum())} states",
+                ctx.at(ctx.states.topic, _at(ctx, row)),
+            )
+    return None
+
+
+def _span(ctx: Context, paths: Iterable[str]) -> str:
+    """What the values are, for a verdict that says so."""
+    low, high = np.inf, -np.inf
+    for path in paths:
+        values = _values(ctx, path)
+        low, high = min(low, float(values.min())), max(high, float(values.max()))
+    return f"{low:g}" if low == high else f"{low:g} .. {high:g}"
+
+
+def _within(*names: str, or_zero: bool = False, whole_message: bool = False) -> Check:
+    """A check that members are between the tolerances ``low`` and ``high``."""
+
+    def judge(ctx: Context) -> Outcome:
+        paths = list(names) if whole_message else _motors(ctx, *names)
+        low, high = ctx.tolerance("low"), ctx.tolerance("high")
+        wrong = _outside(ctx, paths, low, high, or_zero=or_zero)
+        figure = _span(ctx, paths)
+        return wrong or ctx.passed(figure, f"{', '.join(names)}: {figure}")
+
+    return judge
+
+
+_MAX = float(np.finfo(np.float32).max)
+
+
+def _finite(ctx: Context, paths: list[str]) -> Outcome:
+    wrong = _outside(ctx, paths, -_MAX, _MAX)
+    return wrong or ctx.passed("all finite", f"{len(paths)} members")
+
+
+@check("DEX1-FIELD-05")
+def mode(ctx: Context) -> Outcome:
+    """A gripper's mode: 0, or 1 while it is driven."""
+    found = np.unique(ctx.states.mode[np.isfinite(ctx.states.mode)])
+    seen = " and ".join(f"{m:g}" for m in found)
+    if set(found) <= {0.0, ctx.tolerance("driven")}:
+        return ctx.passed(seen, f"mode {seen}")
+    wrong = next(m for m in found if m not in (0.0, ctx.tolerance("driven")))
+    row = int(np.argmax(ctx.states.mode[:, 0] == wrong))
+    return ctx.failed(
+        f"{wrong:g}", f"mode {seen}", ctx.at(ctx.states.topic, float(ctx.states.t[row]))
+    )
+
+
+@check("DEX1-FIELD-06", "DEX3-FIELD-05")
+def acceleration(ctx: Context) -> Outcome:
+    """Integral of ddq over a window against the change of dq over it."""
+    states = ctx.states
+    if not np.nan_to_num(states.ddq).any():
+        return ctx.absent("ddq is not filled (0 throughout)")
+    if not np.nan_to_num(states.dq).any():
+        return ctx.skipped("dq is not filled, so that nothing tells what ddq should be")
+    worst = (1.0, 0)
+    for joint in range(len(ctx.joints)):
+        t, dq, ddq = states.clock, states.dq[:, joint], states.ddq[:, joint]
+        ends = np.searchsorted(t, t + ctx.tolerance("window_s"))
+        starts = np.flatnonzero(ends < len(t))
+        ends = ends[starts]
+        span = t[ends] - t[starts]
+        total = np.concatenate(([0.0], np.cumsum((ddq[1:] + ddq[:-1]) / 2 * np.diff(t))))
+        gained, told = dq[ends] - dq[starts], total[ends] - total[starts]
+        busy = (np.abs(gained) > ctx.tolerance("min_change_rad_s")) & (
+            span < 2 * ctx.tolerance("window_s")
+        )
+        if busy.sum() >= 20:
+            ratio = float(np.sum(told[busy] * gained[busy]) / np.sum(gained[busy] ** 2))
+            worst = max(worst, (ratio, joint), key=lambda w: abs(w[0] - 1.0))
+    ratio, joint = worst
+    text = ctx.named(f"ddq is {ratio:.2f} times the change of dq in a second", joint)
+    if ctx.tolerance("min_ratio") <= ratio <= ctx.tolerance("max_ratio"):
+        return ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
+    outcome = ctx.failed(f"x {ratio:.2f}", text, ratio=ratio)
+    return outcome.because("its sign is turned") if ratio < 0 else outcome
+
+
+@check("DEX1-FIELD-07")
+def raw(ctx: Context) -> Outcome:
+    """Raw values are numbers."""
+    return _finite(ctx, _motors(ctx, "q_raw", "dq_raw", "ddq_raw"))
+
+
+@check("DEX1-FIELD-08", "DEX3-FIELD-06")
+def temperature(ctx: Context) -> Outcome:
+    """Motor temperatures in degrees Celsius."""
+    outcome = _within("temperature")(ctx)
+    if outcome.met and outcome.figure == "0":
+        return ctx.absent("temperature is not filled (0 throughout)")
+    return outcome
+
+
+@check("DEX1-FIELD-09")
+def lost(ctx: Context) -> Outcome:
+    """A count of what was lost, no larger than what there was to lose."""
+    path = _motors(ctx, "lost")
+    figure = _span(ctx, path)
+    return _outside(ctx, path, 0.0, ctx.tolerance("max_lost")) or ctx.passed(
+        figure, f"lost {figure}"
+    )
+
+
+@check("DEX1-FIELD-10", "DEX3-FIELD-09")
+def reserved(ctx: Context) -> Outcome:
+    """How many values each reserved word takes."""
+    paths = _motors(ctx, "reserve")
+    if ctx.recording.dialect.state_type.endswith(_HG):
+        paths += _motors(ctx, "sensor")
+        paths += [*_packets(ctx, "reserve"), "reserve"]
+    most = (0, "")
+    for path in paths:
+        values = _values(ctx, path)
+        for place in range(values.shape[1]):
+            most = max(most, (len(np.unique(values[:, place])), f"{path}[{place}]"))
+    count, path = most
+    text = f"{path} takes {count} different value(s)"
+    if count <= ctx.tolerance("max_values"):
+        return ctx.passed(f"{count}", text)
+    return ctx.failed(f"{count} values", text)
+
+
+@check("DEX1-FIELD-11", "DEX3-FIELD-07")
+def voltages(ctx: Context) -> Outcome:
+    """The supply, in volts and amperes."""
+    volts = [*_motors(ctx, "vol"), "power_v", "system_v", "device_v"]
+    wrong = _outside(ctx, volts, ctx.tolerance("min_v"), ctx.tolerance("max_v"), or_zero=True)
+    wrong = wrong or _outside(ctx, ["power_a"], -ctx.tolerance("max_a"), ctx.tolerance("max_a"))
+    figure = _span(ctx, volts)
+    if not wrong and figure == "0":
+        return ctx.absent("no voltage is filled (0 throughout)")
+    return wrong or ctx.passed(f"{figure} V", f"voltages {figure} V")
+
+
+@check("DEX1-FIELD-12", "DEX3-FIELD-08")
+def no_fault(ctx: Context) -> Outcome:
+    """Fault words while a hand moves freely, as it is told."""
+    spans = [ctx.span(p) for p in ctx.phases()]
+    paths = [*_motors(ctx, "motorstate"), "error"]
+    assert ctx.states.columns is not None
+    t = ctx.states.t[ctx.states.columns.ok]
+    free = np.zeros(len(t), dtype=np.bool_)
+    for begin, end in spans:
+        free |= (t >= begin) & (t <= end)
+    # the second word of error is a vendor's own
+    for path in paths:
+        values = _values(ctx, path)[free][:, :1]
+        if values.any():
+            row = int(np.argmax(values.any(axis=1)))
+            return ctx.failed(
+                f"{int(values[row, 0]):#x}",
+                f"{path} = {int(values[row, 0]):#x} in {int(values.any(axis=1).sum())} states of "
+                "a hand that moves as it is told",
+                ctx.at(ctx.states.topic, float(t[free][row])),
+            )
+    return ctx.passed("0", f"no fault in {int(free.sum())} states")
+
+
+@check("DEX1-FIELD-13", "DEX3-IMU-02")
+def attitude_numbers(ctx: Context) -> Outcome:
+    """The rest of the attitude, and of the sensors."""
+    paths = [f"imu_state.{n}" for n in ("quaternion", "gyroscope", "accelerometer", "rpy")]
+    paths += [*_packets(ctx, "pressure"), *_packets(ctx, "temperature")]
+    return _finite(ctx, paths)
+
+
+@check("DEX3-SENS-05")
+def sensor_temperature(ctx: Context) -> Outcome:
+    """Sensor temperatures in degrees Celsius."""
+    paths = _packets(ctx, "temperature")
+    if not paths:
+        return ctx.absent("the states hold no sensor packets")
+    low, high = ctx.tolerance("low"), ctx.tolerance("high")
+    # a slot without an element holds the code for that in its temperature, too
+    wrong = None
+    for path in paths:
+        values = _values(ctx, path)
+        good = ((values >= low) & (values <= high)) | (values == ctx.tolerance("no_value"))
+        if not good.all():
+            wrong = wrong or _outside(ctx, [path], low, high)
+    figure = _span(ctx, paths)
+    if not wrong and figure == "0":
+        return ctx.absent("sensor temperatures are not filled (0 throughout)")
+    return wrong or ctx.passed(f"{figure} C", f"sensor temperatures {figure}")
+
+
+@check("DEX3-SENS-06")
+def sensor_lost(ctx: Context) -> Outcome:
+    """Sensor packets' counts of what was lost."""
+    paths = _packets(ctx, "lost")
+    if not paths:
+        return ctx.absent("the states hold no sensor packets")
+    figure = _span(ctx, paths)
+    return _outside(ctx, paths, 0.0, ctx.tolerance("max_lost")) or ctx.passed(
+        figure, f"lost {figure}"
+    )
+
+
+@check("DEX1-START-02")
+def legacy_ready(ctx: Context) -> Outcome:
+    """Whether any q is not 0 before the first command, on the legacy topic."""
+    first = float(ctx.commands.t[0]) if len(ctx.commands) else np.inf
+    before = [v.states.q[v.states.t < first] for v in ctx.recording.sides.values()]
+    if not any(len(q) for q in before):
+        return ctx.skipped("no state before the first command")
+    most = max((float(np.nanmax(np.abs(q))) for q in before if len(q)), default=0.0)
+    if most > 0:
+        return ctx.passed(f"{most:.2f} rad", f"up to {most:.3f} rad before the first command")
+    return ctx.failed("all zero", "every q is exactly 0 before the first command")
