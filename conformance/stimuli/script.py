@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from dexkit.conformance.phases import Phase
+from dexkit.conformance.stimuli.operator import OPERATOR, operate
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import joints_of
 from dexkit.conformance.wire import Motor, Motors, Wire
@@ -189,6 +190,9 @@ class Script(ABC):
             self._say("no state on any topic: nothing more can be asked of this hand")
             return
         yield from self._provoke()
+        if OPERATOR in self.plan.phases:
+            yield from operate(self)
+            yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
         if "two-writers" in self.plan.phases:
             yield from self._two_writers()
         if "restart" in self.plan.phases:

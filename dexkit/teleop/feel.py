@@ -1,7 +1,7 @@
 """What an operator would feel: figures from where a hand was and where it was wanted.
 
-- *stroke*: seconds from 5 to 95 % of the whole stroke, from steps over at least half of it; where
-  a step goes less far, what it would take at the same mean speed.
+- *stroke*: seconds from 5 to 95 % of the whole stroke, from steps over two fifths of it or more;
+  of a step that goes less far, what the whole would take at the same mean speed.
 - *reaction*: seconds from a step until the hand has moved by 2 % of the stroke.
 - *overshoot*: how far it goes past the end of a step, rad.
 - *stuck*: how far from the wanted place it rests, rad. Xr_teleoperate's filter alone leaves some
@@ -27,7 +27,7 @@ FROM, TO = 0.05, 0.95
 GRID = 0.002
 """Seconds between the points at which hand and operator are compared."""
 _JUMP = 0.15  # of the stroke, from one point to the next: a step
-_LONG = 0.5  # of the stroke: a step long enough to time
+_LONG = 0.4  # of the stroke: a step long enough to time
 _MOVED = 0.02  # of the stroke
 _REST = 0.1  # seconds at the end of a step in which a hand at rest is looked at
 _SETTLE = 0.6  # seconds that a step must be held before it is looked at

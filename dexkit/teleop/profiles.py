@@ -170,6 +170,11 @@ def _fingers(closing: Closing, *, thumb: float, middle: float, index: float) -> 
     return all_joints
 
 
+def _clear(closing: Closing) -> Closing:
+    """A Dex3-1's fingers, and the thumb less far, clear of them."""
+    return _fingers(closing, thumb=0.4, middle=1.0, index=1.0)
+
+
 _STEPS = _course((0.0, 0.2), (1.2, 0.4), (2.4, 0.6), (3.6, 0.8), (4.8, 0.5), move=0.0)
 _GRASP = _course((0.0, 0.1), (0.8, 0.75), (2.8, 0.1), (3.6, 0.95), (5.2, 0.1), move=0.5)
 _QUICK = _course(
@@ -221,7 +226,7 @@ PROFILES: tuple[Profile, ...] = (
         "closed and open at once, two seconds each: how long a stroke takes",
         0.5,
         8.0,
-        _STROKES,
+        _clear(_STROKES),
     ),
     Profile(
         "pinch",
@@ -231,24 +236,35 @@ PROFILES: tuple[Profile, ...] = (
         6.5,
         _fingers(_GRASP, thumb=0.6, middle=0.1, index=0.6),
     ),
-    Profile("fist", DEX3_1.name, "the whole hand closes and opens, twice", 1.0, 6.5, _GRASP),
-    Profile("steps", DEX3_1.name, "all joints, a fifth of the stroke at a time", 0.5, 6.0, _STEPS),
-    Profile("sine", DEX3_1.name, "all joints to and fro, 4 s", 0.5, 8.0, _sine(0.1, 0.9, 4.0)),
+    Profile(
+        "fist", DEX3_1.name, "the whole hand closes and opens, twice", 1.0, 6.5, _clear(_GRASP)
+    ),
+    Profile(
+        "steps",
+        DEX3_1.name,
+        "all joints, a fifth of the stroke at a time",
+        0.5,
+        6.0,
+        _clear(_STEPS),
+    ),
+    Profile(
+        "sine", DEX3_1.name, "all joints to and fro, 4 s", 0.5, 8.0, _clear(_sine(0.1, 0.9, 4.0))
+    ),
     Profile(
         "startle",
         DEX3_1.name,
         "nothing for 3 s, then quick full strokes down to 0.25 s",
         3.0,
         4.0,
-        _QUICK,
+        _clear(_QUICK),
     ),
     Profile(
         "feel",
         DEX3_1.name,
-        "what the conformance suite does: strokes, steps, sine",
+        "what the conformance suite does: all joints half closed, steps, sine",
         0.6,
         10.2,
-        _FEEL,
+        _fingers(_FEEL, thumb=0.5, middle=0.5, index=0.5),
     ),
 )
 """The profiles that ship, by model."""

@@ -1,0 +1,89 @@
+"""An operator at the hand, through the model of Unitree's teleoperation client: a closed loop.
+
+Everything else in the script is commanded whatever the hand answers. Here what is commanded
+depends on the states, as with the genuine client: a hand that says late where it is is commanded
+slowly. What is done is the profile ``feel`` of :mod:`dexkit.teleop.profiles`, kept clear of an
+object; the phase's parameters are enough to know where the operator wanted the hand at any time
+(:func:`operator_of`).
+
+The client learns the newest state each time its receiving thread would have read one; that a
+silent side stops the other's states, too, is not part of this phase.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from dexkit.conformance.phases import Phase
+from dexkit.conformance.wire import Motor
+from dexkit.hand import Side
+from dexkit.models import Dialect
+from dexkit.teleop import Operator, client_for, profile
+
+if TYPE_CHECKING:
+    from dexkit.conformance.stimuli.script import Plan, Script, Steps
+
+__all__ = ["OPERATOR", "operate", "operator_of"]
+
+OPERATOR = "operator"
+"""Name of the phase."""
+PROFILE = "feel"
+_CLEAR = 0.1  # of the stroke: room left to the object
+_DEX3_DEEPEST = 0.5  # how far the profile closes a Dex3-1
+_POLL = 0.001  # seconds between two looks for a state that is waited for
+
+
+def _most(plan: Plan, side: Side) -> float:
+    """How far a side may close, as :class:`~dexkit.teleop.Operator` takes it."""
+    touch = plan.objects.get(side)
+    if touch is None:
+        return 1.0
+    if math.isnan(plan.dialect.q_open):  # percent of closing
+        return min(1.0, max(0.0, (touch / 100 - _CLEAR) / _DEX3_DEEPEST))
+    return min(1.0, max(0.0, 1.0 - touch / plan.dialect.q_open - _CLEAR))
+
+
+def operator_of(phase: Phase, dialect: Dialect) -> Operator:
+    """The operator of a phase, from what is in the recording."""
+    most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in phase.sides}
+    return Operator(profile(phase.params["profile"], dialect.model), dialect, most=most)
+
+
+def operate(script: Script) -> Steps:
+    """The phase."""
+    from dexkit.conformance.stimuli.script import Send  # which loads this module when it is used
+
+    plan = script.plan
+    script._say("an operator at Unitree's client: full strokes, steps, slow motion")
+    phase = script._begin(OPERATOR, plan.sides, profile=PROFILE)
+    phase.params.update({f"most_{s}": f"{_most(plan, s):.6g}" for s in plan.sides})
+    operator = operator_of(phase, plan.dialect)
+    client = client_for(plan.dialect, plan.sides)
+    period = round(1e9 * client.period)
+    tick = begin = script._obs.now_ns
+
+    def receive() -> float:
+        now = (script._obs.now_ns - begin) / 1e9
+        client.receive(now, {s: q for s, q in script._obs.q.items() if s in plan.sides})
+        return now
+
+    while script._elapsed(phase) < operator.profile.duration:
+        now = receive()
+        commands = client.step(now, {}, operator.inputs(now, plan.sides))
+        payloads = script._wire.encode(
+            {s: [Motor(**m._asdict()) for m in motors] for s, motors in commands.items()}
+        )
+        # the next turn, without making up for turns that were missed
+        tick = max(tick + period, script._obs.now_ns)
+        while True:
+            wakes = max(client.receiver.wakes_at, now + _POLL)
+            wake = tick if math.isinf(wakes) else min(tick, begin + round(wakes * 1e9))
+            script._obs = yield Send(payloads, wake)
+            payloads = []
+            if script._obs.now_ns >= tick:
+                break
+            now = receive()
+    script._end(phase)
+    script._next_ns = script._obs.now_ns
+    script._goal.update({s: q for s, q in script._obs.q.items() if s in plan.sides})
