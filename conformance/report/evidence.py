@@ -351,7 +351,7 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
         return ""
     return chart(
         f"{scene.hand.side} hand: time from each state to the next",
-        [Line("each state", "state", t, steps, "stems")],
+        [Line("each state", "state", t, steps, "stems" if span else "dots")],
         y_unit="ms",
         span=span or (0.0, max(scene.view.duration, 0.1)),
         bands=scene.alarms,

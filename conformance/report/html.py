@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from datetime import datetime, timezone
+from datetime import datetime
 from html import escape
 from pathlib import Path
 from urllib.parse import quote
@@ -22,6 +22,7 @@ from dexkit.conformance.report.wording import (
     causes,
     hand_name,
     model_title,
+    moment,
     nature,
     quantity,
 )
@@ -114,7 +115,8 @@ def _verdict(result: RunResult) -> str:
         else "Nothing could be tested, so nothing can be said of the hand: this is not a pass.",
     }[result.overall]
     if result.overall is Overall.PASS and counts[Verdict.WARN]:
-        sentence += f" {counts[Verdict.WARN]} recommendation(s) are not met."
+        n = counts[Verdict.WARN]
+        sentence += f" {n} recommendation{'s are' if n > 1 else ' is'} not met."
     real = nature(result)
     badge = f' <span class="chip real">{real}</span>' if real else ""
     chips = "".join(
@@ -305,11 +307,11 @@ def _card(need: Requirement, group: list[Result], plots: _Plots, link: str) -> s
 def _place(place: Evidence, link: str) -> str:
     """Where in the recording, in a form that can be copied."""
     until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
-    moment = datetime.fromtimestamp(place.log_time_ns / 1e9, tz=timezone.utc)
+    when = moment(place.log_time_ns).isoformat(timespec="milliseconds")
     file = f' in <a href="{escape(quote(link))}">{escape(Path(link).name)}</a>' if link else ""
     return (
         f'<div class="place"><code>{escape(place.topic)}</code> at {place.time_s:.3f} s{until}'
-        f'{file}, log time <code class="copy" title="{moment.isoformat(timespec="milliseconds")}">'
+        f'{file}, log time <code class="copy" title="{when}">'
         f"{place.log_time_ns}</code></div>"
     )
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+from dexkit.conformance.report.wording import hand_name
 from dexkit.conformance.results import RunResult, Verdict
 
 __all__ = ["write_junit"]
+
+_FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML 1.0 has no way to write (section 2.2)."""
+_SKIPPED = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
 
 
 def write_junit(result: RunResult, path: Path) -> None:
@@ -15,7 +21,7 @@ def write_junit(result: RunResult, path: Path) -> None:
     verdicts = [r.verdict for r in result.results]
     suite = ElementTree.Element(
         "testsuite",
-        name=f"dexkit conformance: {result.subject.get('backend') or result.subject['model']}",
+        name=f"dexkit conformance: {hand_name(result)}",
         tests=str(len(verdicts)),
         failures=str(verdicts.count(Verdict.FAIL)),
         errors=str(verdicts.count(Verdict.ERROR) + verdicts.count(Verdict.BLOCKED)),
@@ -27,6 +33,8 @@ def write_junit(result: RunResult, path: Path) -> None:
     for name, value in {
         **result.subject,
         **result.environment,
+        **{f"stage.{side}": str(stage) for side, stage in result.stage.items()},
+        **{f"harness.{name}": f"{value:g}" for name, value in result.harness.items()},
         "overall": str(result.overall),
     }.items():
         ElementTree.SubElement(properties, "property", name=name, value=value)
@@ -49,6 +57,13 @@ def write_junit(result: RunResult, path: Path) -> None:
         else:
             out = ElementTree.SubElement(case, "system-out")
             out.text = entry.explain()
+    for element in suite.iter():
+        element.attrib = {name: _clean(value) for name, value in element.attrib.items()}
+        element.text = _clean(element.text or "") or None
     tree = ElementTree.ElementTree(suite)
     ElementTree.indent(tree)
     tree.write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _clean(text: str) -> str:
+    return _FORBIDDEN.sub("\ufffd", text)

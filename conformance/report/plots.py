@@ -331,7 +331,7 @@ def histogram(
             up = max(math.log10(int(count)), 0.04)
             gap = 0.1 * (b - a)
             text = f"{count} of {a:.2g} to {b:.2g} {unit}"
-            svg.append(axes.rect("bar", float(a + gap), float(b - gap), 0.0, up, text))
+            svg.append(axes.rect("count", float(a + gap), float(b - gap), 0.0, up, text))
     for v in levels:
         svg.append(f'<path class="limit" d="M{axes.x(v.value)},0v{GRID[1]}"/>')
     labels = [

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from dexkit.conformance.report.wording import about_harness
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 
 __all__ = ["MARKS", "print_result"]
@@ -19,6 +20,7 @@ MARKS = {
     Verdict.BLOCKED: ("blocked", "magenta"),
     Verdict.ERROR: ("ERROR", "bold magenta"),
 }
+_UNJUDGED = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
 _STYLE = {Overall.PASS: "green", Overall.FAIL: "red", Overall.INCONCLUSIVE: "magenta"}
 
 
@@ -41,7 +43,7 @@ def print_result(
     hidden = 0
     for requirement, group in result.by_requirement():
         verdict = worst(r.verdict for r in group)
-        if verdict is Verdict.NOT_APPLICABLE and not verbose:
+        if verdict in _UNJUDGED and not verbose:
             hidden += 1
             continue
         mark, style = MARKS[verdict]
@@ -56,7 +58,8 @@ def print_result(
     console.print(table)
     if hidden:
         console.print(
-            f"[dim]{hidden} requirement(s) could not be judged here and are not shown"
+            f"[dim]{hidden} requirement(s) could not be judged here, or are not claimed, and are "
+            "not shown"
             f"{f' ({more})' if more else ''}.[/dim]"
         )
     troubles = [r for r in result.results if r.verdict in (Verdict.FAIL, Verdict.ERROR)]
@@ -64,8 +67,9 @@ def print_result(
     for entry in troubles + warned:
         console.print()
         console.print(escape(entry.explain()), highlight=False)
+    _print_blocked(result, console)
     if verbose:
-        reasons = [r for r in result.results if r.verdict is Verdict.NOT_APPLICABLE]
+        reasons = [r for r in result.results if r.verdict in _UNJUDGED]
         if reasons:
             console.print("\n[dim]not judged:[/dim]")
         for entry in reasons:
@@ -73,16 +77,27 @@ def print_result(
                 f"[dim]  {entry.requirement.id} {entry.side}: {escape(entry.reason)}[/dim]",
                 highlight=False,
             )
-    if result.starved > 0.05:
-        console.print(
-            f"[dim]note: the machine was short of processor time for {result.starved:.0%} of the "
-            "run.[/dim]",
-            highlight=False,
-        )
+    stages = ", ".join(f"{side} {stage}" for side, stage in result.stage.items())
+    if stages:
+        console.print(f"[dim]stage reached: {escape(stages)}[/dim]", highlight=False)
+    if harness := about_harness(result):
+        console.print(f"[dim]test machine: {escape(harness)}[/dim]", highlight=False)
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
     console.print(f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]", highlight=False)
+
+
+def _print_blocked(result: RunResult, console: Console) -> None:
+    """What was not judged because something else failed first, by what that was."""
+    groups: dict[str, dict[str, None]] = {}
+    for entry in result.results:
+        if entry.verdict is Verdict.BLOCKED:
+            groups.setdefault(entry.reason, {})[entry.requirement.id] = None
+    if groups:
+        console.print()
+    for reason, names in groups.items():
+        console.print(f"[magenta]{escape(reason)}[/]: {', '.join(names)}", highlight=False)
 
 
 def _cell(result: Result) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime, timezone
 
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.models import MODELS
@@ -16,6 +17,7 @@ __all__ = [
     "causes",
     "hand_name",
     "model_title",
+    "moment",
     "nature",
     "quantity",
     "tally",
@@ -138,6 +140,11 @@ def about_harness(result: RunResult) -> str:
     if "starved" in figures:
         told.append(f"short of processor time for {figures['starved']:.1%} of the run")
     return "; ".join(told)
+
+
+def moment(time_ns: int) -> datetime:
+    """A log time as a date."""
+    return datetime.fromtimestamp(time_ns / 1e9, tz=timezone.utc)
 
 
 def quantity(name: str, value: float) -> tuple[str, str]:

@@ -20,14 +20,17 @@ __all__ = ["cli", "main"]
 # name -> (module, one-line help); the help is here so that `dexkit --help` imports nothing
 _COMMANDS: dict[str, tuple[str, str]] = {
     "backends": ("dexkit.cli.backends", "List the hands that can be served."),
+    "badge": ("dexkit.cli.badge", "Draw a badge of a result."),
     "calibrate": ("dexkit.cli.calibrate", "Find a gripper's zero and speed and store them."),
     "check": ("dexkit.cli.check", "Judge a recording against the requirements."),
+    "compare": ("dexkit.cli.compare", "Put several results side by side."),
     "demo": ("dexkit.cli.demo", "The whole story on emulators, in under a minute."),
     "doctor": ("dexkit.cli.doctor", "Say why a client and a hand do not meet."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, on a pseudo-terminal or USB/IP."),
     "info": ("dexkit.cli.info", "Say what is in a recording."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),
+    "report": ("dexkit.cli.report", "Write the reports of a result again."),
     "serve": ("dexkit.cli.serve", "Put a hand on Unitree's topics."),
     "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
 }

@@ -1,0 +1,296 @@
+"""Several results side by side: hands, or firmware versions of one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+
+from dexkit.conformance.report.html import document
+from dexkit.conformance.report.markdown import plain, table
+from dexkit.conformance.report.wording import (
+    ANSWERS,
+    VERDICTS,
+    hand_name,
+    model_title,
+    nature,
+    tally,
+)
+from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.results import Result, RunResult, Verdict, worst
+from dexkit.errors import UsageError
+
+__all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
+
+_BADNESS = {Verdict.PASS: 0, Verdict.WARN: 1, Verdict.FAIL: 2}
+"""How bad a verdict is. One that says nothing of the hand is neither better nor worse; what a
+requirement is blocked by is named itself."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A requirement whose verdict differs between two runs of the same hand.
+
+    :param before: index of the earlier run, ``after`` of the later one.
+    """
+
+    requirement: Requirement
+    before: int
+    after: int
+    was: Verdict
+    now: Verdict
+
+    @property
+    def worse(self) -> bool:
+        """Whether it is a regression."""
+        return _BADNESS[self.now] > _BADNESS[self.was]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A requirement, and what each run found for it (nothing where it was not asked)."""
+
+    requirement: Requirement
+    found: tuple[tuple[Result, ...], ...]
+
+    @property
+    def verdicts(self) -> tuple[Verdict | None, ...]:
+        """The verdict of each run, sides together."""
+        return tuple(worst(r.verdict for r in group) if group else None for group in self.found)
+
+    @property
+    def differs(self) -> bool:
+        """Whether the runs do not agree."""
+        return len(set(self.verdicts)) > 1
+
+
+class Comparison:
+    """Runs of one model.
+
+    :param names: what to call each run; the hand's name, made unique, where it is None.
+    :raises UsageError: fewer than two, or of different models.
+    """
+
+    def __init__(self, runs: Sequence[RunResult], names: Sequence[str] | None = None) -> None:
+        if len(runs) < 2:
+            raise UsageError("a comparison needs two results or more")
+        models = list(dict.fromkeys(run.subject.get("model", "?") for run in runs))
+        if len(models) > 1:
+            raise UsageError(
+                f"results of different models: {', '.join(models)}",
+                hint="requirements differ from model to model; compare runs of one",
+            )
+        self.runs = tuple(runs)
+        self.names = tuple(_unique([hand_name(run) for run in runs], names))
+        needs: dict[str, Requirement] = {}
+        found: dict[str, list[tuple[Result, ...]]] = {}
+        for index, run in enumerate(runs):
+            for need, group in run.by_requirement():
+                needs.setdefault(need.id, need)
+                found.setdefault(need.id, [()] * len(runs))[index] = tuple(group)
+        self.rows = tuple(Row(needs[name], tuple(groups)) for name, groups in found.items())
+
+    @property
+    def differing(self) -> list[Row]:
+        """Requirements on which the runs do not agree."""
+        return [row for row in self.rows if row.differs]
+
+    @property
+    def agreeing(self) -> list[Row]:
+        """The others."""
+        return [row for row in self.rows if not row.differs]
+
+    @property
+    def changes(self) -> list[Change]:
+        """What changed from each run to the next one of the same hand, by time."""
+        found: list[Change] = []
+        for before, after in self._successors():
+            for row in self.rows:
+                was, now = row.verdicts[before], row.verdicts[after]
+                if was in _BADNESS and now in _BADNESS and _BADNESS[was] != _BADNESS[now]:
+                    found.append(Change(row.requirement, before, after, was, now))
+        return found
+
+    @property
+    def regressions(self) -> list[Change]:
+        """What became worse."""
+        return [change for change in self.changes if change.worse]
+
+    def _successors(self) -> list[tuple[int, int]]:
+        hands: dict[str, list[int]] = {}
+        for index, run in enumerate(self.runs):
+            # without a name or a backend nobody knows whether it is the same hand
+            who = run.subject.get("name") or run.subject.get("backend")
+            if who:
+                hands.setdefault(who, []).append(index)
+        pairs = []
+        for indices in hands.values():
+            ordered = sorted(indices, key=lambda i: self.runs[i].recorded_at)
+            pairs += list(pairwise(ordered))
+        return pairs
+
+
+def _unique(own: Sequence[str], names: Sequence[str] | None) -> list[str]:
+    """The hands' names; where two are the same, with the result's name behind."""
+    return [
+        name if own.count(name) == 1 else f"{name} ({names[i] if names else i + 1})"
+        for i, name in enumerate(own)
+    ]
+
+
+def _figure(group: Sequence[Result]) -> str:
+    """The figures of a run for one requirement; once where the sides agree."""
+    told = {r.side: r.figure for r in group if r.figure}
+    if len(set(told.values())) == 1:
+        return next(iter(told.values()))
+    return ", ".join(f"{side} {figure}" for side, figure in told.items())
+
+
+def _change_text(comparison: Comparison, change: Change) -> str:
+    return (
+        f"{change.requirement.title}: {VERDICTS[change.was].text} in "
+        f"{comparison.names[change.before]}, {VERDICTS[change.now].text} in "
+        f"{comparison.names[change.after]}"
+    )
+
+
+# ----------------------------------------------------------------------------------- HTML
+
+
+def render_comparison(comparison: Comparison) -> str:
+    """The page as text."""
+    runs, names = comparison.runs, comparison.names
+    title = f"{len(runs)} runs as {model_title(runs[0])}"
+    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
+    regressions = comparison.regressions
+    better = [c for c in comparison.changes if not c.worse]
+    differing, agreeing = comparison.differing, comparison.agreeing
+    body = [
+        f"<h1>Comparison: {escape(title)}</h1>",
+        _about(comparison),
+        _changes(comparison, regressions, "Regressions", "bad"),
+        _changes(comparison, better, "Became better", "ok"),
+        f"<h2>Where they differ ({len(differing)})</h2>",
+        _matrix(differing, names, heads) if differing else "<p>Nowhere: all verdicts agree.</p>",
+        f"<h2>Where they agree ({len(agreeing)})</h2>",
+        _matrix(agreeing, names, heads) if agreeing else "<p>Nowhere.</p>",
+    ]
+    return document(f"Comparison: {title}", "".join(body))
+
+
+def _about(comparison: Comparison) -> str:
+    rows = []
+    for run, name in zip(comparison.runs, comparison.names, strict=True):
+        answer, found, real = ANSWERS[run.overall], tally(run), nature(run)
+        stages = ", ".join(f"{side} {stage}" for side, stage in run.stage.items())
+        badge = f' <span class="chip real">{real}</span>' if real else ""
+        rows.append(
+            f'<tr><th scope="row">{escape(name)}{badge}</th>'
+            f'<td data-run="verdict"><b class="{answer.css}">{answer.text}</b></td>'
+            f'<td data-run="passed">{found.passed} of {found.applicable}</td>'
+            f'<td data-run="reached">{escape(stages)}</td>'
+            f'<td data-run="recorded">{escape(run.recorded_at)}</td>'
+            f'<td data-run="dexkit">{escape(run.environment.get("dexkit", "?"))}</td></tr>'
+        )
+    return (
+        '<div class="wrap"><table class="matrix"><thead><tr><th scope="col">run</th>'
+        '<th scope="col">verdict</th><th scope="col">passed</th><th scope="col">reached</th>'
+        '<th scope="col">recorded</th><th scope="col">dexkit</th></tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _changes(comparison: Comparison, changes: Sequence[Change], title: str, css: str) -> str:
+    if not changes:
+        return ""
+    rows = "".join(
+        f"<li><code>{escape(c.requirement.id)}</code> {escape(_change_text(comparison, c))}</li>"
+        for c in changes
+    )
+    return f'<section class="card {css}"><h2>{title} ({len(changes)})</h2><ul>{rows}</ul></section>'
+
+
+def _matrix(rows: Sequence[Row], names: Sequence[str], heads: str) -> str:
+    lines = []
+    area = ""
+    for row in rows:
+        need = row.requirement
+        if need.area != area:
+            area = need.area
+            lines.append(
+                f'<tr class="area-row"><th scope="colgroup" colspan="{len(names) + 1}">'
+                f"{escape(area)}</th></tr>"
+            )
+        cells = "".join(_cell(name, group) for name, group in zip(names, row.found, strict=True))
+        lines.append(
+            f'<tr><th scope="row"><code>{escape(need.id)}</code> {escape(need.title)} '
+            f'<span class="dim">{need.level}</span></th>{cells}</tr>'
+        )
+    return (
+        f'<div class="wrap"><table class="matrix"><thead><tr><th scope="col">requirement</th>'
+        f"{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+    )
+
+
+def _cell(name: str, group: Sequence[Result]) -> str:
+    if not group:
+        return f'<td data-run="{escape(name)}" class="na">not asked</td>'
+    word = VERDICTS[worst(r.verdict for r in group)]
+    figure = _figure(group)
+    return (
+        f'<td data-run="{escape(name)}"><b class="{word.css}">{word.text}</b>'
+        + (f"<span>{escape(figure)}</span>" if figure else "")
+        + "</td>"
+    )
+
+
+# ------------------------------------------------------------------------------- Markdown
+
+
+def render_comparison_markdown(comparison: Comparison) -> str:
+    """The comparison as Markdown: regressions, differences, the rest folded away."""
+    runs, names = comparison.runs, comparison.names
+    lines = [f"## Comparison: {len(runs)} runs as {model_title(runs[0])}", ""]
+    rows = []
+    for run, name in zip(runs, names, strict=True):
+        answer, found = ANSWERS[run.overall], tally(run)
+        real = nature(run)
+        rows.append(
+            [
+                plain(name) + (f" ({real})" if real else ""),
+                f"{answer.mark} {answer.text}",
+                f"{found.passed} of {found.applicable}",
+                plain(run.recorded_at),
+            ]
+        )
+    lines += [*table(["run", "verdict", "passed", "recorded"], rows), ""]
+    for title, changes in (
+        ("Regressions", comparison.regressions),
+        ("Became better", [c for c in comparison.changes if not c.worse]),
+    ):
+        if changes:
+            lines += [f"### {title}", ""]
+            lines += [
+                f"- `{c.requirement.id}` {plain(_change_text(comparison, c))}" for c in changes
+            ]
+            lines.append("")
+    lines += [f"### Where they differ ({len(comparison.differing)})", ""]
+    lines += _markdown_matrix(comparison.differing, names) or ["Nowhere: all verdicts agree."]
+    lines += ["", "<details>", f"<summary>Where they agree ({len(comparison.agreeing)})</summary>"]
+    lines += ["", *_markdown_matrix(comparison.agreeing, names), "", "</details>"]
+    return "\n".join(lines) + "\n"
+
+
+def _markdown_matrix(rows: Sequence[Row], names: Sequence[str]) -> list[str]:
+    def cell(group: Sequence[Result]) -> str:
+        if not group:
+            return "not asked"
+        word = VERDICTS[worst(r.verdict for r in group)]
+        return f"{word.mark} {plain(_figure(group) or word.text)}"
+
+    lines = [
+        [f"`{row.requirement.id}`", plain(row.requirement.title), *(cell(g) for g in row.found)]
+        for row in rows
+    ]
+    return table(["requirement", "what", *(plain(n) for n in names)], lines) if rows else []

@@ -1,0 +1,35 @@
+"""``dexkit badge``: the verdict of a result as a picture for a README."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from dexkit.cli.report import write_text
+
+
+@click.command("badge")
+@click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default="badge.svg",
+    show_default=True,
+    metavar="FILE.svg",
+    help="Where to write it; - prints it.",
+)
+def command(result: Path, output: Path) -> None:
+    """Draw a badge of a result: what it is a drop-in for, and how much of that was proved.
+
+    It says so when the hand was emulated, simulated or only recorded, and how many requirements
+    could not be judged.
+    """
+    from dexkit.conformance.report.badge import badge_text, render_badge
+    from dexkit.conformance.results import read_json
+
+    found = read_json(result)
+    write_text(output, render_badge(found))
+    if str(output) != "-":
+        click.echo(f"{output}: {' | '.join(badge_text(found))}")

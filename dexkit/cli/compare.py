@@ -1,0 +1,59 @@
+"""``dexkit compare``: several results side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from dexkit.cli.report import write_text
+
+
+@click.command("compare")
+@click.argument(
+    "results",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, path_type=Path),
+    metavar="A.json B.json ...",
+)
+@click.option(
+    "--html",
+    "html_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the comparison as a page.",
+)
+@click.option(
+    "--markdown",
+    "markdown_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write it as Markdown; - prints it. Default: print it.",
+)
+def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Path | None) -> None:
+    """Put results of several hands, or of several versions of one, side by side.
+
+    Runs of the same hand (its name in capabilities.toml, else the backend) are taken in the order
+    of their time; what became worse from one to the next is named as a regression.
+
+    Exit code: 0 no regression, 1 there is one, 2 the results cannot be compared.
+    """
+    from dexkit.conformance.report.compare import (
+        Comparison,
+        render_comparison,
+        render_comparison_markdown,
+    )
+    from dexkit.conformance.results import read_json
+
+    comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
+    if html_path:
+        html_path.write_text(render_comparison(comparison), encoding="utf-8")
+        click.echo(f"report: {html_path}", err=True)
+    if markdown_path or not html_path:
+        write_text(markdown_path or Path("-"), render_comparison_markdown(comparison))
+    regressions = comparison.regressions
+    if regressions:
+        names = ", ".join(dict.fromkeys(c.requirement.id for c in regressions))
+        click.echo(f"{len(regressions)} regression(s): {names}", err=True)
+        raise click.exceptions.Exit(1)

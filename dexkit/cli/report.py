@@ -1,0 +1,112 @@
+"""``dexkit report``: write the reports of a result file again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+from dexkit.errors import UsageError
+
+if TYPE_CHECKING:
+    from dexkit.conformance.results import RunResult
+    from dexkit.conformance.view import Recording
+
+_SIDES = ("left", "right")
+_FILE = click.Path(path_type=Path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a report; ``-`` is standard output."""
+    if str(path) == "-":
+        click.echo(text, nl=False)
+    else:
+        path.write_text(text, encoding="utf-8")
+
+
+@click.command("report")
+@click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
+@click.option(
+    "--recording",
+    type=click.Path(exists=True, path_type=Path),
+    metavar="RUN.mcap",
+    help="The recording that was judged: the page then shows plots. Default: the one that the "
+    "result names, if it lies beside it.",
+)
+@click.option("--html", "html_path", type=_FILE, metavar="FILE", help="Write the report page.")
+@click.option(
+    "--markdown", "markdown_path", type=_FILE, metavar="FILE", help="Write a summary; - prints it."
+)
+@click.option("--junit", "junit_path", type=_FILE, metavar="FILE", help="Write JUnit XML.")
+@click.option("-v", "--verbose", is_flag=True, help="Also say what could not be judged, and why.")
+def command(
+    result: Path,
+    recording: Path | None,
+    html_path: Path | None,
+    markdown_path: Path | None,
+    junit_path: Path | None,
+    verbose: bool,
+) -> None:
+    """Write the reports of a result file again.
+
+    A result file comes from 'dexkit check --json FILE' or from the conformance suite with
+    '--json FILE'. Without an option the result is printed as a table.
+
+    Exit code: 0 the reports are written, whatever the verdict; 2 the result, or the recording,
+    cannot be used.
+    """
+    from dexkit.conformance.report.html import write_html
+    from dexkit.conformance.report.junit import write_junit
+    from dexkit.conformance.report.markdown import render_markdown
+    from dexkit.conformance.report.terminal import print_result
+    from dexkit.conformance.results import read_json
+
+    found = read_json(result)
+    if html_path:
+        file = recording or _beside(result, found.subject.get("recording", ""))
+        view = None
+        if file is not None:
+            view = _view(file, found, given=recording is not None)
+        write_html(found, view, html_path, recording=file if view is not None else None)
+    if markdown_path:
+        write_text(markdown_path, render_markdown(found))
+    if junit_path:
+        write_junit(found, junit_path)
+    if not (html_path or markdown_path or junit_path):
+        print_result(found, Console(), verbose=verbose, more="-v says why")
+    for path in (html_path, junit_path, markdown_path):
+        if path and str(path) != "-":
+            click.echo(f"report: {path}", err=True)
+
+
+def _beside(result: Path, name: str) -> Path | None:
+    """The recording that the result names, where it lies in the same folder."""
+    if not name or Path(name).name != name:
+        return None
+    path = result.parent / name
+    return path if path.is_file() else None
+
+
+def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
+    """The recording as the result saw it; None if one that nobody named is another.
+
+    :raises UsageError: the one that was named is not the one that was judged.
+    """
+    from dexkit.conformance.report.wording import moment
+    from dexkit.conformance.view import Recording
+    from dexkit.hand import Side
+    from dexkit.traces import open_trace
+
+    about = result.subject
+    sides = [Side(name) for name in about.get("sides", "").split(", ") if name in _SIDES]
+    view = Recording.of(open_trace(path), dialect_name=about.get("dialect"), sides=sides)
+    when = moment(view.origin_ns).isoformat(timespec="seconds")
+    if not result.recorded_at or when == result.recorded_at:
+        return view
+    text = f"{path} begins at {when}, the run of this result at {result.recorded_at}"
+    if given:
+        raise UsageError(text, hint="give the recording that was judged, or none")
+    click.echo(f"no plots: {text}", err=True)
+    return None
