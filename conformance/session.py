@@ -121,7 +121,8 @@ class SuiteOptions:
             raise UsageError(
                 "one --device for two hands", hint="--device left=PATH --device right=PATH"
             )
-        chosen = _dialect(backend, dialect_name, has_device=bool(devices))
+        named = _by_side(devices, sides, str, "--device")
+        chosen = _dialect(backend, dialect_name, sides[0], named, settings)
         touch = [o for o in objects if o != "none"]
         by_side = _by_side(touch, sides, float, "--object")
         low, high, of_what = (5, 60, "opening") if chosen.q_open > 0 else (55, 75, "closing")
@@ -158,7 +159,7 @@ class SuiteOptions:
             dialect=chosen,
             domain=domain,
             interface=interface,
-            devices=_by_side(devices, sides, str, "--device"),
+            devices=named,
             objects=by_side,
             settings=tuple(settings),
             trace=trace,
@@ -217,23 +218,34 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
     return quick_ones(found) if config.getoption("dexkit_quick") else found
 
 
-def _dialect(name: str, wanted: str | None, *, has_device: bool) -> Dialect:
+def _dialect(
+    name: str,
+    wanted: str | None,
+    side: Side,
+    devices: Mapping[Side, str],
+    settings: Sequence[str],
+) -> Dialect:
     """The dialect to judge in: the one that is wanted, or the first of the backend's model.
 
+    A hand class says its model only once there is a hand of it: one is made, and not opened.
+
     :raises UsageError: the backend needs a device, or its hand does not speak that dialect.
+    :raises BackendError: it makes no hand.
     """
     if name == EXTERNAL:
         return dialect(wanted) if wanted else DEX1_1.dialects[0]
-    from dexkit.backends import backend
+    from dexkit.backends import BackendOptions, backend
 
     found = backend(name)
-    if found.needs_device and not has_device and name not in EMULATED:
-        raise UsageError(f"the backend {name} needs a device", hint=f"--device: {found.needs}")
-    spoken = model(found.model).dialects
+    if found.needs_device and not devices and name not in EMULATED:
+        raise UsageError(f"the backend {name} needs a device", hint=f"give {found.needs}")
+    values = dict(s.partition("=")[::2] for s in settings)
+    its_model = model(found.model_of(BackendOptions(side, devices.get(side), values)))
+    spoken = its_model.dialects
     chosen = dialect(wanted) if wanted else spoken[0]
     if chosen not in spoken:
         raise UsageError(
-            f"{name} is a {model(found.model).title}, which does not speak {chosen.name}",
+            f"{name} is a {its_model.title}, which does not speak {chosen.name}",
             hint=f"--dialect {' or '.join(d.name for d in spoken)}",
         )
     return chosen

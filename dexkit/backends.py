@@ -21,6 +21,7 @@ import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib import metadata
+from typing import Any
 
 from dexkit.errors import (
     BackendBroken,
@@ -29,7 +30,7 @@ from dexkit.errors import (
     UnknownBackend,
     UsageError,
 )
-from dexkit.hand import Hand, Side
+from dexkit.hand import Hand, HandSpec, Side
 
 __all__ = ["GROUP", "Backend", "BackendInfo", "BackendOptions", "backend", "list_backends"]
 
@@ -70,7 +71,7 @@ class Backend:
     """A way to be a hand.
 
     :param summary: one line for ``dexkit backends``.
-    :param model: hand model that it implements.
+    :param model: hand model that it implements; empty where only a hand of it can tell.
     :param needs: what must be there: ``"--device PATH or serial number"``, or empty.
     :param make: makes the hand, without opening it.
     :param needs_device: refuse to start without a device.
@@ -88,13 +89,15 @@ class Backend:
         """Make the hand; nothing is opened yet.
 
         :raises UsageError: a device is needed and missing, or a setting is unknown.
-        :raises BackendBroken: the backend's own code failed.
+        :raises BackendBroken: the backend's own code failed, or did not make the hand asked for.
         """
         if self.needs_device and not options.device:
             raise UsageError("this backend needs a device", hint=f"give {self.needs}")
         options.refuse_unknown(self.settings)
         try:
-            return self.make(options)
+            hand = self.make(options)
+            _check(hand, options.side, self.model)
+            return hand
         except DexkitError:
             raise
         except Exception as error:  # a plug-in may raise anything
@@ -102,6 +105,13 @@ class Backend:
                 f"the backend failed to make its hand: {type(error).__name__}: {error}",
                 hint=_where(error),
             ) from error
+
+    def model_of(self, options: BackendOptions) -> str:
+        """The model of the hand that :meth:`create` makes.
+
+        :raises DexkitError: it has to be asked, and as :meth:`create`.
+        """
+        return self.model or self.create(options).spec.model
 
 
 @dataclass(frozen=True)
@@ -154,13 +164,12 @@ def _select(name: str) -> metadata.EntryPoint | None:
 def _coerce(target: str, value: object) -> Backend:
     if isinstance(value, Backend):
         return value
-    if inspect.isclass(value) and all(
-        hasattr(value, name) for name in ("open", "close", "exchange")
-    ):
-        factory: Callable[[Side], object] = value
+    if inspect.isclass(value):
+        factory: Callable[[Side], Any] = value
 
         def make_from_class(options: BackendOptions) -> Hand:
-            return _checked(target, factory(options.side))
+            hand: Hand = factory(options.side)  # create() looks whether it is one
+            return hand
 
         return Backend(
             summary=(value.__doc__ or target).strip().splitlines()[0],
@@ -168,13 +177,8 @@ def _coerce(target: str, value: object) -> Backend:
             make=make_from_class,
         )
     if callable(value):
-        function = value
-
-        def make(options: BackendOptions) -> Hand:
-            return _checked(target, function(options))
-
         return Backend(
-            summary=(value.__doc__ or target).strip().splitlines()[0], model="", make=make
+            summary=(value.__doc__ or target).strip().splitlines()[0], model="", make=value
         )
     raise BackendBroken(
         f"{target} is a {type(value).__name__}, not a backend",
@@ -182,17 +186,49 @@ def _coerce(target: str, value: object) -> Backend:
     )
 
 
-def _checked(target: str, hand: object) -> Hand:
-    if not isinstance(hand, Hand):
+_PARTS = ("spec", "open", "close", "exchange")
+
+
+def _check(hand: object, side: Side, model: str) -> None:
+    """Refuse what a backend that is still being written makes instead of the hand.
+
+    :raises BackendBroken: naming what is missing or wrong.
+    """
+    name = type(hand).__name__
+    # a property that raises AttributeError is there, and its own error says more
+    absent = object()
+    missing = [
+        part
+        for part in _PARTS
+        if inspect.getattr_static(hand, part, absent) is absent and not hasattr(hand, part)
+    ]
+    if missing:
         raise BackendBroken(
-            f"{target} returned {type(hand).__name__}, not a Hand",
-            hint="a Hand has spec, open, close and exchange (dexkit/hand.py)",
+            f"the backend made a {name}, which is not a Hand: it has no {' and no '.join(missing)}",
+            hint=f"a Hand has {', '.join(_PARTS)} (docs/backends.md)",
         )
-    return hand
+    spec: object = hand.spec  # type: ignore[attr-defined]
+    if not isinstance(spec, HandSpec):
+        raise BackendBroken(
+            f"{name}.spec is a {type(spec).__name__}, not a HandSpec",
+            hint="spec is a property, not a method; DEX1_1.spec(side, io_rate=...) makes one",
+        )
+    if spec.side is not side:
+        raise BackendBroken(
+            f"{name} was asked for the {side} hand, and its spec says {spec.side}",
+            hint="hand the side that is given on to the spec",
+        )
+    if model and spec.model != model:
+        raise BackendBroken(f"the backend says that it is a {model}, and {name} is a {spec.model}")
 
 
 def _where(error: BaseException) -> str:
     frame = traceback.extract_tb(error.__traceback__)[-1]
+    if frame.filename == __file__:  # its own code was not even reached
+        return (
+            "a Hand class is called with the side alone, a function with BackendOptions "
+            "(docs/backends.md)"
+        )
     return f"at {frame.filename}:{frame.lineno}"
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from click.testing import CliRunner
 from dexkit.backends import Backend, BackendOptions, backend, list_backends
 from dexkit.cli import cli
 from dexkit.errors import BackendBroken, BackendConflict, UnknownBackend, UsageError
-from dexkit.hand import Hand, Side
+from dexkit.hand import Hand, HandSpec, Side
 from dexkit.models import MODELS
 from tests.service_helpers import ScriptedHand
 
@@ -158,6 +159,27 @@ def make_nothing(options: BackendOptions) -> object:
     return None
 
 
+class SpecMethod(ScriptedHand):
+    def spec(self) -> HandSpec:  # type: ignore[override]
+        return self._spec
+
+
+class SpecBroken(ScriptedHand):
+    @property
+    def spec(self) -> HandSpec:
+        return self._speck  # type: ignore[attr-defined, no-any-return]
+
+
+class AlwaysLeft(ScriptedHand):
+    def __init__(self, side: Side) -> None:
+        super().__init__()
+
+
+class WithPort(ScriptedHand):
+    def __init__(self, side: Side, port: str) -> None:
+        super().__init__(side)
+
+
 class TestByPath:
     def test_a_hand_class(self) -> None:
         kind = backend("tests.service_helpers:ScriptedHand")
@@ -173,6 +195,31 @@ class TestByPath:
     def test_what_makes_no_hand(self, name: str) -> None:
         with pytest.raises(BackendBroken, match="not a Hand"):
             backend(f"{__name__}:{name}").create(LEFT)
+
+    @pytest.mark.parametrize(
+        ("name", "says", "hint"),
+        [
+            ("WithoutSpec", "has no spec", "spec, open, close, exchange"),
+            ("WithoutClose", "no spec and no open and no close and no exchange", "a Hand has"),
+            ("SpecMethod", "spec is a method, not a HandSpec", "a property"),
+            ("SpecBroken", "no attribute '_speck'", f"at {__file__}"),
+            ("AlwaysLeft", "asked for the right hand, and its spec says left", "hand the side"),
+            ("WithPort", "missing 1 required positional argument: 'port'", "with the side alone"),
+        ],
+    )
+    def test_a_half_written_hand_is_told_what_is_wrong(
+        self, name: str, says: str, hint: str
+    ) -> None:
+        with pytest.raises(BackendBroken, match=says) as raised:
+            backend(f"{__name__}:{name}").create(BackendOptions(Side.RIGHT))
+        assert hint in raised.value.hint
+
+    def test_the_model_is_the_hands(self) -> None:
+        kind = backend("tests.service_helpers:ScriptedHand")
+        assert kind.model_of(LEFT) == "dex1-1"
+        wrong = replace(kind, model="dex3-1")
+        with pytest.raises(BackendBroken, match="says that it is a dex3-1"):
+            wrong.create(LEFT)
 
     @pytest.mark.parametrize(
         "path", ["no_such_package:x", "tests.service_helpers:nope", "tests.service_helpers:", ":x"]
