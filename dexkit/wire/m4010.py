@@ -1,0 +1,538 @@
+"""The M4010's serial frames, sans-IO: the motor of the Dex1-1 (facts/unitree-dex G, measured from
+the vendor's library).
+
+A command is 20 bytes, the data that answer it 26: the structures of the Dex3-1's motors (seed 002)
+with other units. Several motors on a line are told apart by the id in the mode byte; id 15
+addresses all of them, and none answers.
+
+:class:`MotorCmd`, :class:`MotorData` and :class:`Calibration` are frames as raw integers with ways
+from and to SI units at the *joint*; :class:`FrameParser` finds frames in a stream.
+
+What the vendor's library does differently, and why it is not copied: it sends every negative
+feed-forward torque as 0, lets velocities and gains beyond the wire's range wrap round (they
+saturate here), and checks neither head nor id of an answer.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import NamedTuple, TypeAlias
+
+from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
+from dexkit.models import DEX1_1
+from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.dex3_usb.layout import BROADCAST_ID, Field, Structure, ris_mode
+from dexkit.wire.dex3_usb.units import (
+    MOTOR_VOLTAGE,
+    POSITION,
+    TEMPERATURE,
+    WINDING_TEMPERATURE,
+    Scale,
+)
+
+__all__ = [
+    "BAUD_RATE",
+    "BROADCAST_ID",
+    "COMMAND",
+    "DAMPING",
+    "DATA",
+    "GEAR_RATIO",
+    "OPENING_BAUD_RATE",
+    "POSITION",
+    "REPLY_TIMEOUT",
+    "SIDES",
+    "STIFFNESS",
+    "STROKE",
+    "TORQUE",
+    "USER_ID",
+    "VELOCITY",
+    "Calibration",
+    "CalibrationProblem",
+    "Feedback",
+    "Frame",
+    "FrameParser",
+    "MotorCmd",
+    "MotorData",
+    "Setpoint",
+    "Status",
+    "calibration_outcome",
+]
+
+GEAR_RATIO = 25.0
+"""Turns of the rotor for one of the gripper's joint (facts G "Constants")."""
+BAUD_RATE = 6_000_000
+OPENING_BAUD_RATE = 4_000_000
+"""The vendor's library opens the port at this rate; its first exchange with an M4010 switches to
+:data:`BAUD_RATE` (facts G "Serial")."""
+REPLY_TIMEOUT = 0.02
+"""Seconds that the vendor's library waits for an answer (facts G "Serial")."""
+STROKE = math.radians(322.0)
+"""Range that the vendor's service writes into the motor, rad at the joint (facts B.2)."""
+USER_ID = 0x776C
+"""User id of the vendor's calibration frame (facts G "Calibration")."""
+SIDES = {number: side for side, number in DEX1_1.vendor_ids.items()}
+"""Which hand the motor with an id is: 0 right, 1 left (facts B.2)."""
+
+VELOCITY = Scale(
+    "velocity", ("spd_des", "speed"), "rad/s", 256 / (2 * math.pi), -0x8000, 0x7FFF, power=1
+)
+TORQUE = Scale("torque", ("tor_des", "torque"), "N·m", 2560.0, -0x8000, 0x7FFF, power=-1)
+STIFFNESS = Scale("stiffness", ("k_pos",), "N·m/rad", 12800.0, 0, 0xFFFF, power=-2)
+DAMPING = Scale("damping", ("k_spd",), "N·m·s/rad", 12800.0, 0, 0xFFFF, power=-2)
+_CALIBRATION_ANGLE = Scale("angle", ("position", "range"), "rad", POSITION.counts, 0, 0xFFFF)
+
+COMMAND = Structure(
+    "MotorCmd",
+    "Command to a motor",
+    b"\xfe\xee",
+    (
+        Field("head", "u8", 2, "FE EE"),
+        Field("mode", "u8", 1, "id, status, time-out bit"),
+        Field("res", "u8", 1, "reserved; passed through"),
+        Field("tor_des", "i16", 1, "torque to add, of the rotor", "1/2560 N·m"),
+        Field("spd_des", "i16", 1, "velocity wanted, of the rotor", "2π/256 rad/s"),
+        Field("pos_des", "i32", 1, "position wanted, of the rotor", "2π/32768 rad"),
+        Field("k_pos", "u16", 1, "stiffness, of the rotor", "1/12800 N·m/rad"),
+        Field("k_spd", "u16", 1, "damping, of the rotor", "1/12800 N·m·s/rad"),
+        Field("CRC32", "u32", 1, "checksum"),
+    ),
+    (0, 16),
+)
+DATA = Structure(
+    "MotorData",
+    "State of a motor",
+    b"\xfc\xee",
+    (
+        Field("head", "u8", 2, "FC EE"),
+        Field("mode", "u8", 1, "id, status, time-out bit: the protection has tripped"),
+        Field("temp", "i8", 1, "temperature of the case", "1 °C"),
+        Field("winding", "u8", 1, "temperature of the winding", "1 °C"),
+        Field("vol", "u8", 1, "voltage at the terminals", "0.5 V"),
+        Field("torque", "i16", 1, "torque, of the rotor", "1/2560 N·m"),
+        Field("speed", "i16", 1, "velocity, of the rotor", "2π/256 rad/s"),
+        Field("pos", "i32", 1, "position, of the rotor", "2π/32768 rad"),
+        Field("MError", "u32", 1, "error bits"),
+        Field("ExSensor1", "u16", 1, "extended sensor data"),
+        Field("ExSensor2", "u16", 1, "extended sensor data"),
+        Field("CRC32", "u32", 1, "checksum"),
+    ),
+    (2, 22),
+)
+
+Bytes: TypeAlias = bytes | bytearray | memoryview
+_U32 = struct.Struct("<I")
+_CALIBRATION = struct.Struct("<2sBBhHHHI")
+_CALIBRATION_TORQUE = -0x400  # 0xFC00, in command and answer
+_CALIBRATED = 2  # speed field of the answer
+
+
+class Status(IntEnum):
+    """What a motor is told to do; bits 4 to 6 of the mode byte (facts G, D 28)."""
+
+    BRAKE = 0
+    FOC = 1
+    CALIBRATE = 6
+
+
+class CalibrationProblem(IntFlag):
+    """MError bits of the answer to a calibration (facts G "Calibration"); the lowest wins."""
+
+    NONE = 0
+    ALREADY_CALIBRATED = 0x01  # since power-up
+    OUTPUT_ENCODER = 0x02
+    ANGLE_OUT_OF_RANGE = 0x04
+    RANGE_INVALID = 0x08
+    USER_ID_ZERO = 0x10
+    TIME_ZERO = 0x20
+    FLASH_WRITE = 0x40
+
+
+class Setpoint(NamedTuple):
+    """What a command asks of the joint: rad, rad/s, N·m, N·m/rad, N·m·s/rad."""
+
+    q: float
+    dq: float
+    tau: float
+    kp: float
+    kd: float
+
+
+class Feedback(NamedTuple):
+    """What a motor measures, at the joint: rad, rad/s, N·m."""
+
+    q: float
+    dq: float
+    tau: float
+
+
+def _sealed(structure: Structure, *values: int | bytes) -> bytes:
+    start, end = structure.covered
+    packet = structure.pack(structure.head, *values, 0)
+    return packet[:end] + _U32.pack(crc32_words(packet[start:end]))
+
+
+def _opened(structure: Structure, data: Bytes) -> tuple[int, ...]:
+    """Fields between head and CRC."""
+    if len(data) < structure.size:
+        raise TruncatedError(f"{structure.name} is {structure.size} bytes, got {len(data)}")
+    if len(data) > structure.size:
+        raise OversizeError(f"{structure.name} is {structure.size} bytes, got {len(data)}")
+    if data[:2] != structure.head:
+        raise WireError(
+            f"{structure.name} starts with {structure.head.hex(' ')}, "
+            f"these bytes with {bytes(data[:2]).hex(' ')}"
+        )
+    start, end = structure.covered
+    stored, computed = _U32.unpack_from(data, end)[0], crc32_words(data[start:end])
+    if stored != computed:
+        raise ChecksumError(
+            f"{structure.name}: CRC is 0x{stored:08X}, the data make it 0x{computed:08X}"
+        )
+    return structure.struct.unpack(data)[1:-1]
+
+
+@dataclass(slots=True)
+class MotorCmd:
+    """A command: raw integers, rotor side.
+
+    :param timeout: asks for the motor's protection, which stops it when commands stop.
+    """
+
+    id: int
+    status: int = Status.BRAKE
+    timeout: bool = False
+    tor_des: int = 0
+    spd_des: int = 0
+    pos_des: int = 0
+    k_pos: int = 0
+    k_spd: int = 0
+    res: int = 0
+
+    @classmethod
+    def setpoint(
+        cls,
+        number: int,
+        *,
+        q: float = 0.0,
+        dq: float = 0.0,
+        tau: float = 0.0,
+        kp: float = 0.0,
+        kd: float = 0.0,
+        timeout: bool = False,
+        ratio: float = GEAR_RATIO,
+    ) -> MotorCmd:
+        """Drive the joint: ``tau_motor = kp (q - q_now) + kd (dq - dq_now) + tau``.
+
+        SI units at the joint; toward zero (as the vendor's library), saturated.
+
+        :param number: id of the motor.
+        :raises EncodeError: NaN or infinity.
+        """
+        return cls(
+            number,
+            Status.FOC,
+            timeout,
+            TORQUE.encode(tau, ratio),
+            VELOCITY.encode(dq, ratio),
+            POSITION.encode(q, ratio),
+            STIFFNESS.encode(kp, ratio),
+            DAMPING.encode(kd, ratio),
+        )
+
+    def joint(self, ratio: float = GEAR_RATIO) -> Setpoint:
+        """What it asks of the joint, SI units."""
+        return Setpoint(
+            POSITION.decode(self.pos_des, ratio),
+            VELOCITY.decode(self.spd_des, ratio),
+            TORQUE.decode(self.tor_des, ratio),
+            STIFFNESS.decode(self.k_pos, ratio),
+            DAMPING.decode(self.k_spd, ratio),
+        )
+
+    def pack(self) -> bytes:
+        """Its 20 bytes.
+
+        :raises EncodeError: a value does not fit.
+        """
+        mode = ris_mode(self.id, self.status, self.timeout)
+        values = (self.tor_des, self.spd_des, self.pos_des, self.k_pos, self.k_spd)
+        return _sealed(COMMAND, mode, self.res, *values)
+
+    @classmethod
+    def parse(cls, data: Bytes) -> MotorCmd:
+        """One frame.
+
+        :raises WireError: wrong length, head or CRC.
+        """
+        mode, res, tor, spd, pos, k_pos, k_spd = _opened(COMMAND, data)
+        return cls(mode & 15, mode >> 4 & 7, mode > 127, tor, spd, pos, k_pos, k_spd, res)
+
+
+@dataclass(slots=True)
+class MotorData:
+    """The state that answers a command: raw integers, rotor side.
+
+    :param timeout: the motor's protection has tripped; cleared by a command without the bit.
+    :param temp: of the case, °C.
+    :param winding: °C.
+    :param vol: counts of 0.5 V.
+    :param merror: :class:`dexkit.hand.MotorError` bits; in the answer to a calibration
+        :class:`CalibrationProblem`.
+    """
+
+    id: int
+    status: int = Status.BRAKE
+    timeout: bool = False
+    temp: int = 0
+    winding: int = 0
+    vol: int = 0
+    torque: int = 0
+    speed: int = 0
+    pos: int = 0
+    merror: int = 0
+    ex_sensor1: int = 0
+    ex_sensor2: int = 0
+
+    @classmethod
+    def measured(
+        cls,
+        number: int,
+        status: int,
+        *,
+        q: float,
+        dq: float = 0.0,
+        tau: float = 0.0,
+        temperature: float = 0.0,
+        winding: float = 0.0,
+        voltage: float = 0.0,
+        error: int = 0,
+        timeout: bool = False,
+        ratio: float = GEAR_RATIO,
+    ) -> MotorData:
+        """From SI units at the joint.
+
+        :param number: id of the motor.
+        :raises EncodeError: NaN or infinity.
+        """
+        return cls(
+            number,
+            status,
+            timeout,
+            TEMPERATURE.encode(temperature),
+            WINDING_TEMPERATURE.encode(winding),
+            MOTOR_VOLTAGE.encode(voltage),
+            TORQUE.encode(tau, ratio),
+            VELOCITY.encode(dq, ratio),
+            POSITION.encode(q, ratio),
+            error,
+        )
+
+    def joint(self, ratio: float = GEAR_RATIO) -> Feedback:
+        """What it measured, at the joint, SI units."""
+        return Feedback(
+            POSITION.decode(self.pos, ratio),
+            VELOCITY.decode(self.speed, ratio),
+            TORQUE.decode(self.torque, ratio),
+        )
+
+    @property
+    def voltage(self) -> float:
+        """V."""
+        return MOTOR_VOLTAGE.decode(self.vol)
+
+    def pack(self) -> bytes:
+        """Its 26 bytes.
+
+        :raises EncodeError: a value does not fit.
+        """
+        mode = ris_mode(self.id, self.status, self.timeout)
+        heat = (self.temp, self.winding, self.vol)
+        motion = (self.torque, self.speed, self.pos)
+        rest = (self.merror, self.ex_sensor1, self.ex_sensor2)
+        return _sealed(DATA, mode, *heat, *motion, *rest)
+
+    @classmethod
+    def parse(cls, data: Bytes) -> MotorData:
+        """One frame.
+
+        :raises WireError: wrong length, head or CRC.
+        """
+        mode, *values = _opened(DATA, data)
+        return cls(mode & 15, mode >> 4 & 7, mode > 127, *values)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The command frame that makes a motor take its present place for a position.
+
+    :param position: what the joint is at now, rad, 0 to 4 pi. The vendor's library also takes
+        negative ones, and then spoils the user id.
+    :param range: stroke of the joint, rad, likewise; unlike all else not of the rotor.
+    :param time: Unix time, seconds.
+    """
+
+    id: int
+    position: float = 0.0
+    range: float = STROKE
+    time: int = 0
+    user_id: int = USER_ID
+
+    def pack(self) -> bytes:
+        """Its 20 bytes.
+
+        :raises EncodeError: a value does not fit.
+        """
+        for name in ("position", "range"):
+            if not 0.0 <= getattr(self, name) <= _CALIBRATION_ANGLE.limits()[1]:
+                raise EncodeError(f"{name} = {getattr(self, name)} rad is not 0 to 4 pi")
+        if not 0 <= self.time <= 0xFFFFFFFF or not 0 <= self.user_id <= 0xFFFF:
+            raise EncodeError(f"time {self.time} or user id {self.user_id} does not fit")
+        packet = _CALIBRATION.pack(
+            COMMAND.head,
+            ris_mode(self.id, Status.CALIBRATE, False),
+            0,
+            _CALIBRATION_TORQUE,
+            _CALIBRATION_ANGLE.encode(self.range),
+            _CALIBRATION_ANGLE.encode(self.position),
+            self.user_id,
+            self.time,
+        )
+        return packet + _U32.pack(crc32_words(packet))
+
+    @classmethod
+    def of(cls, command: MotorCmd) -> Calibration | None:
+        """The calibration that a command with status 6 is, or None."""
+        if command.status != Status.CALIBRATE or command.tor_des != _CALIBRATION_TORQUE:
+            return None
+        position = command.pos_des & 0xFFFF
+        return cls(
+            command.id,
+            _CALIBRATION_ANGLE.decode(position),
+            _CALIBRATION_ANGLE.decode(command.spd_des & 0xFFFF),
+            command.k_pos | command.k_spd << 16,
+            command.pos_des >> 16 & 0xFFFF,
+        )
+
+    def answer(self, problem: int = CalibrationProblem.NONE, *, done: bool = True) -> MotorData:
+        """The frame that a motor answers it with.
+
+        :param problem: error bits.
+        :param done: False where calibrating is not enabled.
+        """
+        return MotorData(
+            self.id,
+            Status.CALIBRATE,
+            torque=_CALIBRATION_TORQUE,
+            speed=_CALIBRATED if done else 0,
+            merror=problem,
+        )
+
+
+def calibration_outcome(data: MotorData) -> str:
+    """What an answer to a calibration says: empty when it succeeded, else why it did not.
+
+    The vendor's library takes everything that is not the answer to a calibration, silence
+    included, for success (facts G).
+    """
+    if data.status != Status.CALIBRATE or data.torque != _CALIBRATION_TORQUE:
+        return "the motor does not know the command (firmware without calibration?)"
+    if data.speed != _CALIBRATED:
+        return "the motor's calibration mode is not enabled"
+    for problem in CalibrationProblem:
+        if problem and data.merror & problem:
+            return _PROBLEMS[problem]
+    return f"error bits 0x{data.merror:X}" if data.merror else ""
+
+
+_PROBLEMS = {
+    CalibrationProblem.ALREADY_CALIBRATED: (
+        "it was calibrated before since power-up: switch its supply off and on first"
+    ),
+    CalibrationProblem.OUTPUT_ENCODER: "the encoder on the output reports an error",
+    CalibrationProblem.ANGLE_OUT_OF_RANGE: "the position is out of range",
+    CalibrationProblem.RANGE_INVALID: "the range is not one that the motor takes",
+    CalibrationProblem.USER_ID_ZERO: "the user id is 0",
+    CalibrationProblem.TIME_ZERO: "the time is 0",
+    CalibrationProblem.FLASH_WRITE: "the motor could not write its flash memory",
+}
+
+Frame: TypeAlias = MotorCmd | MotorData
+_KINDS: dict[str, type[MotorCmd] | type[MotorData]] = {
+    COMMAND.name: MotorCmd,
+    DATA.name: MotorData,
+}
+
+
+class FrameParser:
+    """Finds frames in a stream of bytes that may come in any pieces, garbage between them.
+
+    :param kinds: of frames that may come: :data:`COMMAND` at the motor's end, :data:`DATA` at the
+        host's, both for a listener.
+
+    A frame with a wrong CRC costs one byte: the search goes on right behind, so a frame that it
+    seemed to swallow is found. Less than one frame is held.
+
+    :ivar frames: found so far.
+    :ivar skipped: bytes that belonged to no frame.
+    :ivar crc_errors: heads whose frame had a wrong CRC.
+    """
+
+    def __init__(self, kinds: Iterable[Structure] = (DATA,)) -> None:
+        self.kinds = tuple(kinds)
+        self.frames = 0
+        self.skipped = 0
+        self.crc_errors = 0
+        self._buffer = bytearray()
+        self._firsts = bytes(kind.head[0] for kind in self.kinds)
+
+    @property
+    def pending(self) -> int:
+        """Bytes held that may be the beginning of a frame."""
+        return len(self._buffer)
+
+    def reset(self) -> None:
+        """Forget a frame begun."""
+        self.skipped += len(self._buffer)
+        self._buffer.clear()
+
+    def feed(self, data: Bytes) -> list[Frame]:
+        """Take ``data`` and return the frames that are now complete."""
+        buffer = self._buffer
+        buffer += data
+        frames: list[Frame] = []
+        start = 0  # of what is not yet consumed
+        while len(buffer) - start >= 2:
+            places = [
+                (at, kind) for kind in self.kinds if (at := buffer.find(kind.head, start)) >= 0
+            ]
+            if not places:
+                keep = 1 if buffer[-1] in self._firsts else 0
+                self.skipped += len(buffer) - keep - start
+                start = len(buffer) - keep
+                break
+            at, kind = min(places, key=_place)
+            self.skipped += at - start
+            start = at
+            if len(buffer) - start < kind.size:
+                break
+            try:
+                frames.append(_KINDS[kind.name].parse(bytes(buffer[start : start + kind.size])))
+                start += kind.size
+            except ChecksumError:
+                self.crc_errors += 1
+                self.skipped += 1
+                start += 1
+        if len(buffer) - start == 1 and buffer[start] not in self._firsts:
+            self.skipped += 1
+            start += 1
+        del buffer[:start]
+        self.frames += len(frames)
+        return frames
+
+
+def _place(found: tuple[int, Structure]) -> int:
+    return found[0]
