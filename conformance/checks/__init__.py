@@ -32,6 +32,7 @@ _MODULES = (
     "safety",
     "lifecycle",
     "tracking",
+    "operator",
     "dex3",
 )
 
