@@ -27,6 +27,13 @@ REPORTED_KEY: pytest.StashKey[list[Result]] = pytest.StashKey()
 
 _MARK = "conformance"
 _TRACE = "--dexkit-trace"
+_FILES = {
+    "json": "result",
+    "report": "report",
+    "markdown": "summary",
+    "recording": "recording",
+}
+"""Options that name a file to write, and what it is."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -107,6 +114,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add("level", choices=["must", "should", "info"], help="only requirements at least this binding")
     add("json", metavar="FILE", help="write the result file")
     add("report", metavar="FILE.html", help="write the report page")
+    add("markdown", metavar="FILE.md", help="write a summary in Markdown, for a comment or a wiki")
     add("recording", metavar="FILE.mcap", help="keep the recording")
 
 
@@ -124,7 +132,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", f"{_MARK}: a requirement of the conformance suite")
     config.stash[OPTIONS_KEY] = None
     config.stash[REPORTED_KEY] = []
-    names = ("device", "side", "object", "set", "domain", "trace", "json", "report", "recording")
+    names = ("device", "side", "object", "set", "domain", "trace", *_FILES)
     if not config.getoption("dexkit_backend"):
         given = [f"--{name}" for name in names if config.getoption(f"dexkit_{name}")]
         if given:
@@ -221,7 +229,7 @@ def pytest_terminal_summary(
         force_terminal=terminalreporter._tw.hasmarkup,
     )
     print_result(result, console)
-    for option, name in (("json", "result"), ("report", "report"), ("recording", "recording")):
+    for option, name in _FILES.items():
         path = config.getoption(f"dexkit_{option}")
         if path:
             terminalreporter.write_line(f"{name}: {path}")

@@ -53,6 +53,7 @@ class SuiteOptions:
     claims: Claims = field(default_factory=Claims)
     json: Path | None = None
     report: Path | None = None
+    markdown: Path | None = None
     recording: Path | None = None
 
     @classmethod
@@ -86,6 +87,7 @@ class SuiteOptions:
             capabilities=path("capabilities"),
             json=path("json"),
             report=path("report"),
+            markdown=path("markdown"),
             recording=path("recording"),
         )
 
@@ -108,6 +110,7 @@ class SuiteOptions:
         capabilities: Path | None = None,
         json: Path | None = None,
         report: Path | None = None,
+        markdown: Path | None = None,
         recording: Path | None = None,
     ) -> SuiteOptions:
         """Check and complete what a user gave.
@@ -141,7 +144,7 @@ class SuiteOptions:
             raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
         if trace is not None and not trace.exists():
             raise UsageError(f"no such file: {trace}")
-        for file in (json, report, recording):
+        for file in (json, report, markdown, recording):
             if file is not None and not file.absolute().parent.is_dir():
                 raise UsageError(f"cannot write {file}: there is no such directory")
         every = catalogue(chosen.model)
@@ -167,6 +170,7 @@ class SuiteOptions:
             claims=claims,
             json=json,
             report=report,
+            markdown=markdown,
             recording=recording,
         )
         options.rig(0).check()
@@ -332,5 +336,9 @@ def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
     if options.report:
         from dexkit.conformance.report.html import write_html
 
-        write_html(result, view, options.report)
+        write_html(result, view, options.report, recording=options.recording)
+    if options.markdown:
+        from dexkit.conformance.report.markdown import render_markdown
+
+        options.markdown.write_text(render_markdown(result), encoding="utf-8")
     return result
