@@ -4,7 +4,8 @@ A check is a function of a :class:`Context` that returns an :class:`Outcome`. It
 missing evidence, and takes every figure from its requirement's tolerances, so that several hand
 models share it. Modules, by what they look at: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.motion`, :mod:`~.force`,
-:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.dex3` for what only that hand has.
+:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.dex3` for what only that hand
+has.
 """
 
 from __future__ import annotations

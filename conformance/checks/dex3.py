@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +135,7 @@ def touch(ctx: Context) -> Outcome:
     begin, end = ctx.span(phase)
     count = int(_packets(ctx).max(initial=0))
     if not count:
-        return ctx.skipped("the states hold no sensor packets")
+        return ctx.absent("the states hold no sensor packets")
     before, during = ctx.states.between(begin - 0.2, begin), ctx.states.between(end - 0.3, end)
     rises = []
     for packet in range(count):
@@ -165,7 +166,7 @@ def attitude(ctx: Context) -> Outcome:
             ctx.at(ctx.states.topic, float(ctx.states.t[columns.ok][i])),
         )
     if not norm.any():
-        return ctx.passed("not filled", "the quaternion is 0: no IMU")
+        return replace(ctx.passed("not filled", "the quaternion is 0: no IMU"), absent=True)
     return ctx.passed("norm 1", f"a norm of {norm.min():.3f} to {norm.max():.3f}")
 
 

@@ -101,7 +101,7 @@ def _velocity(ctx: Context, joint: int) -> Outcome:
     if len(t) < 10 or float(t[-1] - t[0]) <= 0:
         return ctx.skipped("too few states")
     if not dq.any():
-        return ctx.skipped("dq is not filled (0 throughout)")
+        return ctx.absent("dq is not filled (0 throughout)")
     window = ctx.tolerance("window_s")
     ends = np.searchsorted(t, t + window)
     starts = np.flatnonzero(ends < len(t))

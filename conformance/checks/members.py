@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from dexkit.conformance.checks import Check, Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.hand import Floats
 
 __all__: list[str] = []
@@ -71,19 +71,6 @@ def _span(ctx: Context, paths: Iterable[str]) -> str:
         values = _values(ctx, path)
         low, high = min(low, float(values.min())), max(high, float(values.max()))
     return f"{low:g}" if low == high else f"{low:g} .. {high:g}"
-
-
-def _within(*names: str, or_zero: bool = False, whole_message: bool = False) -> Check:
-    """A check that members are between the tolerances ``low`` and ``high``."""
-
-    def judge(ctx: Context) -> Outcome:
-        paths = list(names) if whole_message else _motors(ctx, *names)
-        low, high = ctx.tolerance("low"), ctx.tolerance("high")
-        wrong = _outside(ctx, paths, low, high, or_zero=or_zero)
-        figure = _span(ctx, paths)
-        return wrong or ctx.passed(figure, f"{', '.join(names)}: {figure}")
-
-    return judge
 
 
 _MAX = float(np.finfo(np.float32).max)
@@ -148,10 +135,12 @@ def raw(ctx: Context) -> Outcome:
 @check("DEX1-FIELD-08", "DEX3-FIELD-06")
 def temperature(ctx: Context) -> Outcome:
     """Motor temperatures in degrees Celsius."""
-    outcome = _within("temperature")(ctx)
-    if outcome.met and outcome.figure == "0":
+    paths = _motors(ctx, "temperature")
+    wrong = _outside(ctx, paths, ctx.tolerance("low"), ctx.tolerance("high"))
+    figure = _span(ctx, paths)
+    if not wrong and figure == "0":
         return ctx.absent("temperature is not filled (0 throughout)")
-    return outcome
+    return wrong or ctx.passed(f"{figure} C", f"temperature {figure} C")
 
 
 @check("DEX1-FIELD-09")
@@ -219,12 +208,19 @@ def no_fault(ctx: Context) -> Outcome:
     return ctx.passed("0", f"no fault in {int(free.sum())} states")
 
 
-@check("DEX1-FIELD-13", "DEX3-IMU-02")
+_IMU = [f"imu_state.{name}" for name in ("quaternion", "gyroscope", "accelerometer", "rpy")]
+
+
+@check("DEX1-FIELD-13")
+def rest_of_the_hand(ctx: Context) -> Outcome:
+    """What a gripper does not have."""
+    return _finite(ctx, [*_IMU, *_packets(ctx, "pressure"), *_packets(ctx, "temperature")])
+
+
+@check("DEX3-IMU-02")
 def attitude_numbers(ctx: Context) -> Outcome:
-    """The rest of the attitude, and of the sensors."""
-    paths = [f"imu_state.{n}" for n in ("quaternion", "gyroscope", "accelerometer", "rpy")]
-    paths += [*_packets(ctx, "pressure"), *_packets(ctx, "temperature")]
-    return _finite(ctx, paths)
+    """The rest of the attitude; the sensors have requirements of their own."""
+    return _finite(ctx, _IMU)
 
 
 @check("DEX3-SENS-05")

@@ -454,7 +454,7 @@ class Script(ABC):
         self._age_s = 3600.0
         yield from self._everyone("old-stamps", self._other_place(), most=1.5)
         self._age_s = 0.0
-        yield from self._hold(0.1)
+        yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides}, most=1.5)
 
     def _load(self) -> Steps:
         """Many commands, and a reliable subscriber that hardly ever reads."""

@@ -27,9 +27,9 @@ _PRESSED_BY = {"thumb": (2, 1), "middle": (4, 3), "index": (6, 5)}
 # one motor and one sensor packet of a HandState_ on the wire (facts/unitree-dex A.2, A.4)
 _MOTOR = np.dtype(
     {
-        "names": ["mode", "q", "dq", "tau_est"],
-        "formats": ["u1", "<f4", "<f4", "<f4"],
-        "offsets": [0, 4, 8, 16],
+        "names": ["mode", "q", "dq", "ddq", "tau_est"],
+        "formats": ["u1", "<f4", "<f4", "<f4", "<f4"],
+        "offsets": [0, 4, 8, 12, 16],
         "itemsize": 56,
     }
 )
@@ -78,6 +78,8 @@ class Dex3Hand:
         self.status: Ints = np.zeros(n, dtype=np.intp)
         self.guarded: Flags = np.zeros(n, dtype=np.bool_)
         self.tripped: Flags = np.zeros(n, dtype=np.bool_)
+        self.gained: tuple[list[float], float] = (self.dq, 1.0)
+        """Velocities before the last step, and how long that was."""
         self.now = 0.0
         self.heard = math.inf
         self.newest: tuple[Motor, ...] = ()
@@ -141,6 +143,7 @@ class Dex3Hand:
             return  # nothing has changed since a step that changed nothing
         self.version += 1
         before = self.dq
+        self.gained = before, dt
         pull = [
             kp * (goal - q) + tau
             for kp, goal, q, tau in zip(self.law_kp, self.law_q, self.q, self.law_tau, strict=True)
@@ -284,6 +287,8 @@ class Dex3Service(Service):
         motors["mode"] = hand.mode[:n]
         motors["q"] = hand.q[:n]
         motors["dq"] = hand.dq[:n]
+        before, dt = hand.gained
+        motors["ddq"] = [(a - b) / dt for a, b in zip(hand.dq[:n], before, strict=False)]
         motors["tau_est"] = hand.tau[:n]
 
     def pressures(self, hand: Dex3Hand) -> Floats:
@@ -294,16 +299,22 @@ class Dex3Service(Service):
         """The hand's attitude: upright."""
         return [1.0, 0.0, 0.0, 0.0]
 
+    def message(self, count: int) -> Any:
+        """What does not change: so many motors, sensor packets, attitude, supply."""
+        motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
+        packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
+        message = self.wire.state.cls()
+        message.motor_state = [motor(temperature=(30, 40), vol=24.0) for _ in range(count)]
+        message.press_sensor_state = [packet(temperature=(25.0,) * 12) for _ in range(self.sensors)]
+        message.imu_state.quaternion = self.quaternion()
+        message.power_v, message.power_a = 24.0, 0.3
+        message.system_v, message.device_v = 12.0, 12.0
+        return message
+
     def _message(self, count: int) -> tuple[bytearray, Any, Any]:
         """A message of so many motors, and views of the motors and packets in it; made once."""
         if count not in self._blank:
-            motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
-            packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
-            message = self.wire.state.cls()
-            message.motor_state = [motor() for _ in range(count)]
-            message.press_sensor_state = [packet() for _ in range(self.sensors)]
-            message.imu_state.quaternion = self.quaternion()
-            data = bytearray(self.wire.state.encode(message))
+            data = bytearray(self.wire.state.encode(self.message(count)))
             at = 8  # header and length
             motors = np.frombuffer(data, _MOTOR, count, at)
             at += count * _MOTOR.itemsize + 4

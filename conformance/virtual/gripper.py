@@ -38,6 +38,7 @@ class ReferenceHand:
         self.touch = touch
         self.q = 0.3 * stroke if touch is None else touch + 0.15 * stroke
         self.dq = 0.0
+        self.ddq = 0.0
         self.tau = 0.0
         self.now = 0.0
         self.goal: Motor | None = None
@@ -77,7 +78,8 @@ class ReferenceHand:
         # implicit in the damping, so that a stiff brake is stable at this step
         dq = (self.dq + dt * force / self.inertia) / (1.0 + dt * damping / self.inertia)
         slip = dt * self.coulomb / self.inertia
-        self.dq = 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
+        was, self.dq = self.dq, 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
+        self.ddq = (self.dq - was) / dt
         self.q += dt * self.dq
 
     def release(self) -> None:
@@ -95,7 +97,13 @@ class ReferenceHand:
 
     def fields(self) -> dict[str, float]:
         """The state's fields."""
-        return {"mode": int(not self.braking), "q": self.q, "dq": self.dq, "tau_est": self.tau}
+        return {
+            "mode": int(not self.braking),
+            "q": self.q,
+            "dq": self.dq,
+            "ddq": self.ddq,
+            "tau_est": self.tau,
+        }
 
 
 class ReferenceService(Service):
@@ -140,7 +148,7 @@ class ReferenceService(Service):
 
     def fields(self, side: Side) -> dict[str, Any]:
         """What a side's motor says of itself."""
-        found: dict[str, Any] = self.hands[side].fields()
+        found: dict[str, Any] = {**self.hands[side].fields(), "temperature": 35}
         if self.dialect.name == "unitree_hg":  # seed 000: mode 0, 25 degrees, 12 V, no sign
             grip = abs(found["tau_est"])
             found |= {"mode": 0, "tau_est": grip, "temperature": (25, 25), "vol": 12.0}
