@@ -140,13 +140,14 @@ class Judgement:
         except Exception as error:  # a check that breaks must not look like a hand that does
             text = f"the check itself failed: {type(error).__name__}: {error}"
             return self.result(Verdict.ERROR, Outcome(None, reason=text))
+        if outcome.absent and self._claimed:
+            unit = self.requirement.capability
+            claim = f"{outcome.reason or outcome.observed}, but the unit '{unit}' is claimed"
+            outcome = replace(outcome, met=False, figure="absent", observed=claim, reason="")
+        if outcome.met is None:
+            return self.result(Verdict.NOT_APPLICABLE, outcome)
         if outcome.met:
             return self.result(Verdict.PASS, outcome)
-        if outcome.met is None and not (outcome.absent and self._claimed):
-            return self.result(Verdict.NOT_APPLICABLE, outcome)
-        if outcome.met is None:
-            claim = f"{outcome.reason}, but the unit '{self.requirement.capability}' is claimed"
-            outcome = replace(outcome, figure="absent", observed=claim, reason="")
         busy = excuse(outcome)
         if busy:
             return self.result(Verdict.BLOCKED, replace(outcome, reason=busy))

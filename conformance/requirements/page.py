@@ -4,11 +4,12 @@ in docs/conformance.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from dexkit.conformance.requirements import Requirement, catalogue
 
-__all__ = ["BEGIN", "END", "catalogue_page"]
+__all__ = ["BEGIN", "END", "catalogue_page", "entry"]
 
 BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
 END = "<!-- end of catalogue -->"
@@ -24,15 +25,34 @@ def catalogue_page() -> str:
         if requirement.area != area:
             area = requirement.area
             lines += ["", f"### {area}", ""]
-        killers = [f"`{m.name}`" for m in MUTANTS if m.kills == requirement.id]
-        lines += [
-            f"**{requirement.id}** ({requirement.level}) {requirement.sentence}  ",
-            f"{requirement.rationale}  ",
-            f"*Source:* {requirement.source} ({requirement.confidence}). "
-            f"*Judged from:* {_needs(requirement)}. *Proven by:* {', '.join(killers)}.",
-            "",
-        ]
+        killers = [m.name for m in MUTANTS if m.kills == requirement.id]
+        lines += entry(requirement, _needs(requirement), killers)
     return "\n".join(lines)
+
+
+def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[str]:
+    """Lines about one requirement.
+
+    :param where: what it is judged from.
+    :param killers: the wrong hands that it catches.
+    """
+    unit = f", if `{requirement.capability}` is claimed" if requirement.capability else ""
+    proof = ", ".join(f"`{name}`" for name in killers)
+    lines = [
+        f"**{requirement.id}** ({requirement.level}{unit}) {requirement.sentence}  ",
+        f"{requirement.rationale}  ",
+    ]
+    if requirement.expected != requirement.sentence:
+        lines.append(f"*Expected:* {requirement.expected}.  ")
+    if requirement.cause:
+        lines.append(
+            f"*Likely cause of a failure:* {requirement.cause} *Try:* {requirement.advice}  "
+        )
+    lines.append(
+        f"*Source:* {requirement.source} ({requirement.confidence}). *Judged from:* {where}. "
+        f"*Proven by:* {proof}."
+    )
+    return [*lines, ""]
 
 
 def _needs(requirement: Requirement) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.requirements.page import BEGIN, END
+from dexkit.conformance.requirements.page import BEGIN, END, entry
 from dexkit.conformance.usb.mutants import MUTANTS
 
 __all__ = ["catalogue_page"]
@@ -21,15 +21,9 @@ def catalogue_page() -> str:
         if requirement.area != area:
             area = requirement.area
             lines += ["", f"### {area.removeprefix('USB: ').capitalize()}", ""]
-        killers = ", ".join(f"`{m.name}`" for m in MUTANTS if m.kills == requirement.id)
+        killers = [m.name for m in MUTANTS if m.kills == requirement.id]
         where = f"phase `{requirement.phase}`" if requirement.phase else "the descriptors"
-        lines += [
-            f"**{requirement.id}** ({requirement.level}) {requirement.sentence}  ",
-            f"{requirement.rationale}  ",
-            f"*Source:* {requirement.source} ({requirement.confidence}). "
-            f"*Judged from:* {where}. *Proven by:* {killers}.",
-            "",
-        ]
+        lines += entry(requirement, where, killers)
     return "\n".join(lines)
 
 
