@@ -32,7 +32,7 @@ from dexkit.emulators.mx64 import (
     Servo,
     emulated_ezgripper,
 )
-from dexkit.emulators.mx64.port import client_baudrate
+from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet

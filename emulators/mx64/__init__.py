@@ -2,15 +2,15 @@
 
 From the inside out: :mod:`settings` (uncertain points and body), :mod:`drive` (controllers and
 physics), :mod:`servo` (control table and instructions), :mod:`bus` (several servos, line time,
-faults) are sans-IO; :mod:`port` puts a bus on a pseudo-terminal; :mod:`gripper` has the helper
-:func:`emulated_ezgripper` for tests.
+faults) are sans-IO; :mod:`dexkit.emulators.serial_port` puts a bus on a pseudo-terminal;
+:mod:`gripper` has the helper :func:`emulated_ezgripper` for tests.
 """
 
 from dexkit.emulators.mx64.bus import Bus
 from dexkit.emulators.mx64.gripper import EmulatedProcess, EmulatedThread, emulated_ezgripper
-from dexkit.emulators.mx64.port import Port
 from dexkit.emulators.mx64.servo import Servo
 from dexkit.emulators.mx64.settings import Firmware, GripperBody, Physics
+from dexkit.emulators.serial_port import Port
 
 __all__ = [
     "Bus",

@@ -1,25 +1,19 @@
 """Several servos on one half-duplex line behind a USB-serial adapter, sans-IO.
 
 ``receive`` takes the bytes that the host sent and when; ``due`` gives the bytes that have
-reached the host by a time. In between lie the line (10 bits a byte at the baud rate, both ways),
-each servo's return delay and the adapter's latency timer.
-
-The adapter is modelled as the FTDI chip of the manual's U2D2 (facts/mx64 C2): what has arrived
-is handed to the host at the ticks of a free-running timer, or as soon as 62 bytes are there.
-Not modelled: USB scheduling beyond that, collisions of a host that talks while a servo answers.
+reached the host by a time. In between lie the line and the adapter
+(:mod:`dexkit.emulators.serial_line`) and each servo's return delay.
 """
 
 from __future__ import annotations
 
-import heapq
-import math
-import random
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dexkit.emulators.faults import Fault, FaultSchedule
+from dexkit.emulators.faults import Fault
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 from dexkit.emulators.mx64.servo import Servo
+from dexkit.emulators.serial_line import BITS_PER_BYTE, LineCounters, SerialLine
 from dexkit.errors import UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import ErrorNumber, Instruction, Packet, PacketParser
@@ -27,7 +21,6 @@ from dexkit.wire.mx64 import HardwareError
 
 __all__ = ["Bus", "Counters"]
 
-_USB_PACKET = 62  # data bytes of a full-speed FTDI packet
 _GROUP_READS = (
     Instruction.SYNC_READ,
     Instruction.BULK_READ,
@@ -38,26 +31,16 @@ _FAST = (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
 
 
 @dataclass
-class Counters:
+class Counters(LineCounters):
     """What the bus has seen and done."""
 
-    bytes_in: int = 0
-    bytes_out: int = 0
     instructions: int = 0
     statuses: int = 0
     crc_errors: int = 0
     skipped: int = 0
-    garbled: int = 0  # bytes that came at a baud rate no servo has
-    dropped: int = 0
-    corrupted: int = 0
-    delayed: int = 0
-
-    def summary(self) -> str:
-        """One line for the end of a run: what is not zero."""
-        return ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in vars(self).items() if v)
 
 
-class Bus:
+class Bus(SerialLine):
     """The line, its servos and its faults.
 
     :param servos: on the line; ids must differ.
@@ -69,10 +52,6 @@ class Bus:
     :param seed: of the faults' chance.
     :param protocol_1: servos whose firmware speaks Protocol 1.0 only.
     :raises UsageError: two servos have one id, or none is there.
-
-    :ivar host_baudrate: bits a second that the host has set, or None if that is not known;
-        servos at another rate hear nothing.
-    :ivar unplugged: the adapter is away.
     """
 
     def __init__(
@@ -91,25 +70,20 @@ class Bus:
         ids = [servo.id for servo in servos] + [servo.id for servo in protocol_1]
         if len(set(ids)) != len(ids):
             raise UsageError(f"servos on one bus need different ids, not {ids}")
-        if latency_timer < 0:
-            raise UsageError("a latency timer cannot be negative")
+        super().__init__(
+            line_time=line_time,
+            latency_timer=latency_timer,
+            faults=faults,
+            start=start,
+            seed=seed,
+        )
         self.servos = list(servos)
         self.protocol_1 = list(protocol_1)
-        self.line_time = line_time
-        self.latency_timer = latency_timer
-        self.host_baudrate: int | None = None
-        self.unplugged = False
-        self.counters = Counters()
-        self.schedule = FaultSchedule(faults, start=start)
-        self._random = random.Random(seed)
+        self.counters: Counters = Counters()
         self._parser = PacketParser(keep_bad=True)
-        self._start = start
-        self._line_free = start
         self._last_byte = start
         self._parser_rate: int | None = None
         self._byte_gap = min((s.firmware.byte_gap for s in servos), default=1.5e-3)
-        self._out: list[tuple[float, int, bytes]] = []
-        self._sequence = 0
         for servo in self.servos:
             servo.advance_to(start)
 
@@ -127,19 +101,9 @@ class Bus:
         """Whether a servo moves or holds, so that time should be let pass often."""
         return any(not servo.drive.resting for servo in self.servos)
 
-    @property
-    def next_time(self) -> float | None:
-        """When ``due`` or a fault has something next, or None."""
-        times = [self._out[0][0]] if self._out else []
-        fault = self.schedule.next_time
-        if fault is not None:
-            times.append(fault)
-        return min(times, default=None)
-
     def _strike(self, fault: Fault, begins: bool) -> None:
         if fault.kind == "unplug":
-            self.unplugged = bool(self.schedule.of("unplug"))
-            self._out.clear()
+            self._plug()
             self._parser.reset()
             return
         for servo in self.servos:
@@ -175,7 +139,7 @@ class Bus:
             return
         begin = max(now, self._line_free) if self.line_time else now
         line_rate = rate or (hearing[0].baudrate if hearing else 1_000_000)
-        byte_time = 10.0 / line_rate if self.line_time else 0.0
+        byte_time = BITS_PER_BYTE / line_rate if self.line_time else 0.0
         if self._parser.pending and (
             begin - self._last_byte > self._byte_gap or self._parser_rate != rate
         ):
@@ -351,51 +315,4 @@ class Bus:
     def _answer(self, begin: float, data: bytes, rate: int) -> None:
         """Send ``data`` from a servo, its first bit at ``begin``."""
         self.counters.statuses += 1
-        chance = self._random.random
-        end = begin + len(data) * 10.0 / rate if self.line_time else begin
-        self._line_free = max(self._line_free, end)
-        if any(chance() < fault["p"] for fault in self.schedule.of("drop")):
-            self.counters.dropped += 1
-            return
-        if any(chance() < fault["p"] for fault in self.schedule.of("corrupt")):
-            self.counters.corrupted += 1
-            bit = self._random.randrange(8 * len(data))
-            spoilt = bytearray(data)
-            spoilt[bit // 8] ^= 1 << bit % 8
-            data = bytes(spoilt)
-        late = sum(f["ms"] * 1e-3 for f in self.schedule.of("delay") if chance() < f["p"])
-        if late:
-            self.counters.delayed += 1
-        if not self.line_time:
-            self._deliver(begin + late, data)
-            return
-        self._through_adapter(begin + late, data, 10.0 / rate)
-
-    def _through_adapter(self, begin: float, data: bytes, byte_time: float) -> None:
-        timer = self.latency_timer
-        if timer <= 0:
-            self._deliver(begin + len(data) * byte_time, data)
-            return
-        done = 0
-        while done < len(data):
-            first = begin + (done + 1) * byte_time
-            tick = self._start + math.ceil((first - self._start) / timer) * timer
-            there = min(len(data), int((tick - begin) / byte_time + 1e-9)) - done
-            if there >= _USB_PACKET:
-                there = _USB_PACKET
-                tick = begin + (done + there) * byte_time
-            there = max(1, there)
-            self._deliver(tick, data[done : done + there])
-            done += there
-
-    def _deliver(self, at: float, data: bytes) -> None:
-        self._sequence += 1
-        heapq.heappush(self._out, (at, self._sequence, data))
-
-    def due(self, now: float) -> bytes:
-        """The bytes that have reached the host by ``now``."""
-        out = b""
-        while self._out and self._out[0][0] <= now:
-            out += heapq.heappop(self._out)[2]
-        self.counters.bytes_out += len(out)
-        return out
+        self._send(begin, data, rate)

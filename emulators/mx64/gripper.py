@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from dexkit.clock import RealClock
 from dexkit.emulators.faults import MX64_FAULTS, parse_fault
 from dexkit.emulators.mx64.bus import Bus
-from dexkit.emulators.mx64.port import Port
 from dexkit.emulators.mx64.servo import Servo
 from dexkit.emulators.mx64.settings import Firmware, Physics
 from dexkit.emulators.process import EmulatorProcess
+from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
 
 __all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
@@ -24,9 +24,12 @@ class EmulatedThread:
     """A gripper in a thread of this process, whose servos can be looked into.
 
     Reading ``servos`` while a client talks to them is a snapshot of a moving thing.
+
+    :ivar bus: the line.
     """
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self, bus: Bus, port: Port) -> None:
+        self.bus = bus
         self.port = port
         port.start()
 
@@ -36,19 +39,14 @@ class EmulatedThread:
         return self.port.path
 
     @property
-    def bus(self) -> Bus:
-        """The line."""
-        return self.port.bus
-
-    @property
     def servos(self) -> list[Servo]:
         """The servos on it."""
-        return self.port.bus.servos
+        return self.bus.servos
 
     @property
     def servo(self) -> Servo:
         """The only or first servo."""
-        return self.port.bus.servos[0]
+        return self.bus.servos[0]
 
     def inject(self, spec: str) -> None:
         """Have a fault now (or at its ``@TIME`` from now)."""
@@ -170,7 +168,7 @@ def emulated_ezgripper(
             start=now,
             seed=seed,
         )
-        gripper = EmulatedThread(Port(bus, link, check_baudrate=check_baudrate))
+        gripper = EmulatedThread(bus, Port(bus, link, check_baudrate=check_baudrate))
     try:
         yield gripper
     finally:

@@ -1,4 +1,4 @@
-"""The bus on a pseudo-terminal: the thin, impure end of the emulator.
+"""A serial line on a pseudo-terminal: the thin, impure end of an emulator.
 
 A symbolic link names the terminal, because ``/dev/pts`` numbers change. The link is replaced
 atomically, never over anything but a dangling link, and removed at the end. While unplugged,
@@ -21,7 +21,7 @@ from pathlib import Path
 
 from dexkit.clock import Clock, RealClock
 from dexkit.emulators.faults import Fault
-from dexkit.emulators.mx64.bus import Bus
+from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
 
 __all__ = ["Port", "client_baudrate"]
@@ -47,12 +47,12 @@ def client_baudrate(fd: int) -> int | None:
 
 
 class Port:
-    """Runs a bus on a pseudo-terminal.
+    """Runs a line on a pseudo-terminal.
 
-    :param bus: with its servos.
+    :param line: with its devices.
     :param link: where to put the symbolic link; None for a name in a temporary directory.
-    :param clock: the bus' clock.
-    :param check_baudrate: a client at another baud rate than a servo's is not understood.
+    :param clock: the line's clock.
+    :param check_baudrate: a client at another baud rate than a device's is not understood.
     :raises EmulatorError: ``link`` is something else than a dangling symbolic link, or its
         directory is missing or not writable, or there are no pseudo-terminals.
 
@@ -64,20 +64,20 @@ class Port:
 
     def __init__(
         self,
-        bus: Bus,
+        line: SerialLine,
         link: str | os.PathLike[str] | None = None,
         *,
         clock: Clock | None = None,
         check_baudrate: bool = True,
     ) -> None:
-        self.bus = bus
+        self.line = line
         self.overruns = 0
         self.error: BaseException | None = None
         self._clock: Clock = clock or RealClock()
         self._check_baudrate = check_baudrate
         self._directory: str | None = None
         if link is None:
-            self._directory = tempfile.mkdtemp(prefix="dexkit-mx64-")
+            self._directory = tempfile.mkdtemp(prefix="dexkit-tty-")
             self.path = os.path.join(self._directory, "tty")
         else:
             self.path = os.path.abspath(os.fspath(link))
@@ -152,7 +152,7 @@ class Port:
 
     def start(self) -> None:
         """Serve in a background thread."""
-        self._thread = threading.Thread(target=self._guarded, name="dexkit-mx64", daemon=True)
+        self._thread = threading.Thread(target=self._guarded, name="dexkit-tty", daemon=True)
         self._thread.start()
 
     def _guarded(self) -> None:
@@ -177,28 +177,28 @@ class Port:
 
     def run(self) -> None:
         """Serve until :meth:`stop`."""
-        bus = self.bus
+        line = self.line
         clock = self._clock
         while not self._stopping:
             now = clock.now()
             with self._lock:
                 injected, self._injected = self._injected, []
             for fault in injected:
-                bus.schedule.add(fault, now)
-            bus.advance_to(now)
-            if bus.unplugged != (self._master < 0):
-                if bus.unplugged:
+                line.schedule.add(fault, now)
+            line.advance_to(now)
+            if line.unplugged != (self._master < 0):
+                if line.unplugged:
                     self._unplug()
                 else:
                     self._plug()
-            out = bus.due(now)
+            out = line.due(now)
             if out:
                 self._write(out)
-            self._wait(bus.next_time)
+            self._wait(line.next_time)
 
     def _wait(self, next_time: float | None) -> None:
         """Sleep until something is to be done, and take what the client sent."""
-        deadline = self._clock.now() + (_BUSY_TICK if self.bus.busy else _IDLE_TICK)
+        deadline = self._clock.now() + (_BUSY_TICK if self.line.busy else _IDLE_TICK)
         sharp = next_time is not None and next_time < deadline
         if sharp and next_time is not None:
             deadline = next_time
@@ -230,10 +230,10 @@ class Port:
             raise
         now = self._clock.now()
         if self._check_baudrate:
-            self.bus.host_baudrate = client_baudrate(self._master)
-        self.bus.advance_to(now)
-        if not self.bus.unplugged:
-            self.bus.receive(data, now)
+            self.line.host_baudrate = client_baudrate(self._master)
+        self.line.advance_to(now)
+        if not self.line.unplugged:
+            self.line.receive(data, now)
 
     def _write(self, data: bytes) -> None:
         if self._master < 0:

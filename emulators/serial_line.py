@@ -1,0 +1,168 @@
+"""What lies between the devices on a serial line and the host's program, sans-IO.
+
+A byte takes its ten bits at the baud rate, both ways, and what the devices send goes through a
+USB-serial adapter, which is modelled as an FTDI chip (facts/mx64 C2): bytes are handed to the host
+at the ticks of a free-running timer, or as soon as 62 of them are there. On the way an answer may
+meet a fault.
+
+Not modelled: USB scheduling beyond that, collisions of a host that talks while a device answers.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import random
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from dexkit.emulators.faults import Fault, FaultSchedule
+from dexkit.errors import UsageError
+
+__all__ = ["BITS_PER_BYTE", "LineCounters", "SerialLine"]
+
+BITS_PER_BYTE = 10.0
+"""8N1: start bit, eight data bits, stop bit."""
+_USB_PACKET = 62  # data bytes of a full-speed FTDI packet
+
+
+@dataclass
+class LineCounters:
+    """What the line has seen and done."""
+
+    bytes_in: int = 0
+    bytes_out: int = 0
+    garbled: int = 0  # bytes that came at a baud rate no device has
+    dropped: int = 0
+    corrupted: int = 0
+    delayed: int = 0
+
+    def summary(self) -> str:
+        """One line for the end of a run: what is not zero."""
+        return ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in vars(self).items() if v)
+
+
+class SerialLine(ABC):
+    """Time, faults and the way to the host; whoever derives from it adds the devices.
+
+    :param line_time: bytes and latency take their time; otherwise everything is there at once.
+    :param latency_timer: seconds; 0 for an adapter without one.
+    :param faults: to come, times counted from ``start``.
+    :param start: time on the caller's clock.
+    :param seed: of the faults' chance.
+    :raises UsageError: the latency timer is negative.
+
+    :ivar host_baudrate: bits a second that the host has set, or None if that is not known;
+        devices at another rate hear nothing.
+    :ivar unplugged: the adapter is away.
+    """
+
+    counters: LineCounters
+
+    def __init__(
+        self,
+        *,
+        line_time: bool,
+        latency_timer: float,
+        faults: Sequence[Fault],
+        start: float,
+        seed: int,
+    ) -> None:
+        if latency_timer < 0:
+            raise UsageError("a latency timer cannot be negative")
+        self.line_time = line_time
+        self.latency_timer = latency_timer
+        self.host_baudrate: int | None = None
+        self.unplugged = False
+        self.schedule = FaultSchedule(faults, start=start)
+        self._random = random.Random(seed)
+        self._start = start
+        self._line_free = start
+        self._out: list[tuple[float, int, bytes]] = []
+        self._sequence = 0
+
+    # --- the devices
+
+    @abstractmethod
+    def advance_to(self, now: float) -> None:
+        """Let faults strike and devices live up to ``now``."""
+
+    @property
+    @abstractmethod
+    def busy(self) -> bool:
+        """Whether a device moves or holds, so that time should be let pass often."""
+
+    @abstractmethod
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes that the host's adapter began to send at ``now``.
+
+        Call it in order of time, after :meth:`advance_to` of the same ``now``.
+        """
+
+    # --- to the host
+
+    @property
+    def next_time(self) -> float | None:
+        """When ``due`` or a fault has something next, or None."""
+        times = [self._out[0][0]] if self._out else []
+        fault = self.schedule.next_time
+        if fault is not None:
+            times.append(fault)
+        return min(times, default=None)
+
+    def due(self, now: float) -> bytes:
+        """The bytes that have reached the host by ``now``."""
+        out = b""
+        while self._out and self._out[0][0] <= now:
+            out += heapq.heappop(self._out)[2]
+        self.counters.bytes_out += len(out)
+        return out
+
+    def _plug(self) -> None:
+        """Take note of an ``unplug`` that began or ended; what was on its way is lost."""
+        self.unplugged = bool(self.schedule.of("unplug"))
+        self._out.clear()
+
+    def _send(self, begin: float, data: bytes, rate: int) -> None:
+        """Send ``data`` from a device, its first bit at ``begin``; a fault may strike it."""
+        chance = self._random.random
+        end = begin + len(data) * BITS_PER_BYTE / rate if self.line_time else begin
+        self._line_free = max(self._line_free, end)
+        if any(chance() < fault["p"] for fault in self.schedule.of("drop")):
+            self.counters.dropped += 1
+            return
+        if any(chance() < fault["p"] for fault in self.schedule.of("corrupt")):
+            self.counters.corrupted += 1
+            bit = self._random.randrange(8 * len(data))
+            spoilt = bytearray(data)
+            spoilt[bit // 8] ^= 1 << bit % 8
+            data = bytes(spoilt)
+        late = sum(f["ms"] * 1e-3 for f in self.schedule.of("delay") if chance() < f["p"])
+        if late:
+            self.counters.delayed += 1
+        if not self.line_time:
+            self._deliver(begin + late, data)
+            return
+        self._through_adapter(begin + late, data, BITS_PER_BYTE / rate)
+
+    def _through_adapter(self, begin: float, data: bytes, byte_time: float) -> None:
+        timer = self.latency_timer
+        if timer <= 0:
+            self._deliver(begin + len(data) * byte_time, data)
+            return
+        done = 0
+        while done < len(data):
+            first = begin + (done + 1) * byte_time
+            tick = self._start + math.ceil((first - self._start) / timer) * timer
+            there = min(len(data), int((tick - begin) / byte_time + 1e-9)) - done
+            if there >= _USB_PACKET:
+                there = _USB_PACKET
+                tick = begin + (done + there) * byte_time
+            there = max(1, there)
+            self._deliver(tick, data[done : done + there])
+            done += there
+
+    def _deliver(self, at: float, data: bytes) -> None:
+        self._sequence += 1
+        heapq.heappush(self._out, (at, self._sequence, data))
