@@ -1,0 +1,338 @@
+"""The GitHub Action and the container file, as far as they can be run without either.
+
+The shell scripts of action.yml are run as a runner would: bash with its flags, the steps' ``env``
+with the inputs put in, GITHUB_OUTPUT and GITHUB_STEP_SUMMARY as files. What is not run: the
+actions of others that it uses (setup-python, upload-artifact), and a real build of the container.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from tests import test_package as package
+from tests.dds_helpers import free_domain
+
+ROOT = Path(__file__).parent.parent
+ACME = ROOT / "examples" / "acme-gripper"
+ACTION: dict[str, Any] = YAML(typ="safe").load(ROOT / "action.yml")
+STEPS: list[dict[str, Any]] = ACTION["runs"]["steps"]
+
+
+@dataclass
+class Runner:
+    """As much of GitHub's runner as a composite action's shell steps see."""
+
+    home: Path
+    path: str
+
+    @property
+    def workspace(self) -> Path:
+        return self.home / "workspace"
+
+    def __call__(self, name: str, **inputs: str) -> subprocess.CompletedProcess[str]:
+        """Run the step of that name."""
+        step = next(s for s in STEPS if s["name"] == name)
+        assert step["shell"] == "bash"
+        self.workspace.mkdir(exist_ok=True)
+        script = self.home / "step.sh"
+        script.write_text(step["run"])
+        env = {k: v for k, v in os.environ.items() if k not in {"VIRTUAL_ENV", "PYTHONPATH"}}
+        env |= {k: fill_in(v, inputs) for k, v in step.get("env", {}).items()}
+        env |= {
+            "PATH": self.path,
+            "GITHUB_ACTION_PATH": str(ROOT),
+            "GITHUB_WORKSPACE": str(self.workspace),
+            "GITHUB_OUTPUT": str(self.home / "output"),
+            "GITHUB_STEP_SUMMARY": str(self.home / "summary.md"),
+        }
+        return subprocess.run(
+            ["bash", "--noprofile", "--norc", "-eo", "pipefail", script],
+            cwd=self.workspace,
+            env=env,
+            capture_output=True,
+            text=True,
+            timeout=240,
+        )
+
+    @property
+    def outputs(self) -> dict[str, str]:
+        lines = (self.home / "output").read_text().splitlines()
+        return dict(line.split("=", 1) for line in lines)
+
+    @property
+    def summary(self) -> str:
+        return (self.home / "summary.md").read_text()
+
+
+def fill_in(value: str, inputs: dict[str, str]) -> str:
+    def of_input(match: re.Match[str]) -> str:
+        name = match[1].replace("-", "_")
+        return inputs[name] if name in inputs else str(ACTION["inputs"][match[1]]["default"])
+
+    filled = re.sub(r"\$\{\{ inputs\.([a-z-]+) \}\}", of_input, value)
+    assert "${{" not in filled
+    return filled
+
+
+def command(path: Path, text: str) -> None:
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+# ---------------------------------------------------------------------- what it is made of
+
+
+def test_it_is_a_composite_action_as_the_metadata_syntax_has_it() -> None:
+    assert set(ACTION) == {"name", "description", "branding", "inputs", "outputs", "runs"}
+    assert ACTION["runs"]["using"] == "composite"
+    assert set(ACTION["branding"]) == {"icon", "color"}
+    for name, about in ACTION["inputs"].items():
+        assert re.fullmatch(r"[a-z][a-z-]*", name)
+        assert about["description"]
+        # required inputs have no default, all others one that is a text
+        assert about.get("required", False) != isinstance(about.get("default"), str), name
+    ids = {step.get("id") for step in STEPS}
+    for about in ACTION["outputs"].values():
+        step, output = re.fullmatch(
+            r"\$\{\{ steps\.(\w+)\.outputs\.([a-z-]+) \}\}", about["value"]
+        ).groups()  # type: ignore[union-attr]
+        assert step in ids
+        assert f"{output}=" in next(s["run"] for s in STEPS if s.get("id") == step)
+    for step in STEPS:
+        allowed = {"name", "id", "if"} | (
+            {"shell", "env", "run"} if "run" in step else {"uses", "with"}
+        )
+        assert set(step) <= allowed
+        assert ("run" in step) != ("uses" in step)
+
+
+def test_inputs_reach_the_shell_as_variables_only() -> None:
+    for step in STEPS:
+        assert "${{" not in step.get("run", "")  # would be pasted into the script
+    used = re.findall(r"inputs\.([a-z-]+)", (ROOT / "action.yml").read_text())
+    assert set(used) == set(ACTION["inputs"])
+
+
+def test_every_input_is_in_the_document() -> None:
+    document = (ROOT / "docs" / "ci.md").read_text()
+    for name in (*ACTION["inputs"], *ACTION["outputs"]):
+        assert f"`{name}`" in document
+
+
+# -------------------------------------------------- its arguments and exit codes, on stand-ins
+
+
+@pytest.fixture
+def pretended(tmp_path: Path) -> Runner:
+    """A python that notes its arguments and exits as the file ``status`` says."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    note = f"""#!/bin/bash
+printf '%s\\n' "$@" > {tmp_path}/arguments
+[[ ! -f {tmp_path}/result ]] || cp {tmp_path}/result dexkit-report/result.json
+exit $(cat {tmp_path}/status)
+"""
+    command(programs / "python", note)
+    command(programs / "dexkit", '#!/bin/bash\necho "table of $2"\n')
+    (tmp_path / "status").write_text("0")
+    return Runner(tmp_path, f"{programs}:{os.environ['PATH']}")
+
+
+def test_every_input_becomes_an_option(pretended: Runner) -> None:
+    ran = pretended(
+        "Judge the hand",
+        backend="external",
+        device="left=/dev/a b\nright=/dev/c\n",
+        side="both",
+        dialect="unitree_hg",
+        domain="3",
+        object="right=37",
+        capabilities="my capabilities.toml",
+        level="must",
+        requirements="DEX1-RATE\nDEX1-MOVE-02",
+        arguments="--quick --set 'force=12 N'",
+    )
+    assert ran.returncode == 0, ran.stderr
+    arguments = (pretended.home / "arguments").read_text().splitlines()
+    assert arguments[:3] == ["-m", "pytest", "--pyargs"]
+    given = " ".join(shlex.quote(a) for a in arguments)
+    for part in (
+        "--backend external --device 'left=/dev/a b' --device right=/dev/c --side both",
+        "--dialect unitree_hg --domain 3 --object right=37 --capabilities 'my capabilities.toml'",
+        "--level must --require DEX1-RATE --require DEX1-MOVE-02",
+        "--json dexkit-report/result.json --report dexkit-report/report.html",
+        "--junitxml dexkit-report/junit.xml --quick --set 'force=12 N'",
+    ):
+        assert part in given
+
+
+def test_inputs_that_are_left_out_become_none(pretended: Runner) -> None:
+    assert pretended("Judge the hand", backend="acme").returncode == 0
+    arguments = (pretended.home / "arguments").read_text().splitlines()
+    assert "" not in arguments
+    assert arguments[-1] == "dexkit-report/junit.xml"
+
+
+@pytest.mark.parametrize("status", [0, 1, 2, 4, 5])
+def test_the_exit_code_of_the_suite_is_the_steps(pretended: Runner, status: int) -> None:
+    (pretended.home / "status").write_text(str(status))
+    if status < 2:
+        (pretended.home / "result").write_text("{}")
+    assert pretended("Judge the hand", backend="acme").returncode == status
+    assert pretended.outputs["exit-code"] == str(status)
+    said = "nothing was judged" if status >= 2 else "table of dexkit-report/result.json"
+    assert said in pretended.summary
+
+
+def test_the_result_of_a_run_before_is_not_taken_for_this_one(pretended: Runner) -> None:
+    folder = pretended.home / "workspace" / "dexkit-report"
+    folder.mkdir(parents=True)
+    (folder / "result.json").write_text("{}")
+    (pretended.home / "status").write_text("2")
+    assert pretended("Judge the hand", backend="acme").returncode == 2
+    assert "nothing was judged" in pretended.summary
+
+
+def test_an_installation_that_fails_ends_it(pretended: Runner) -> None:
+    (pretended.home / "status").write_text("1")
+    assert pretended("Install dexkit and the backend", install="nothing-of-this-name") != 0
+    arguments = (pretended.home / "arguments").read_text().splitlines()
+    assert arguments[-2:] == [f"{ROOT}[conformance]", "nothing-of-this-name"]
+
+
+HALF = """
+class Half:
+    '''Forgot to say what it is.'''
+    def __init__(self, side): pass
+    def open(self): pass
+    def close(self): pass
+    def exchange(self, command): raise ZeroDivisionError("half a hand")
+"""
+
+
+def test_a_half_written_hand_is_told_what_is_missing(tmp_path: Path) -> None:
+    runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    runner.workspace.mkdir()
+    (runner.workspace / "mine.py").write_text(HALF)
+    ran = runner("Judge the hand", backend="mine:Half", output="half")
+    assert ran.returncode == 4, ran.stdout + ran.stderr
+    assert "not a Hand: it has no spec" in ran.stderr
+    assert "nothing was judged" in runner.summary
+
+
+# --------------------------------------------------------------------------- the whole of it
+
+
+@contextmanager
+def emulator(runner: Runner, *arguments: str) -> Iterator[str]:
+    """An emulated Acme gripper, as an earlier step of a workflow starts it; its address."""
+    program = Path(runner.path.partition(":")[0]) / "acme-emulator"
+    with subprocess.Popen(
+        [program, "--port", "0", *arguments], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().removeprefix("ready: ").strip()
+        process.terminate()
+
+
+@pytest.fixture(scope="module")
+def vendor(tmp_path_factory: pytest.TempPathFactory) -> Runner:
+    """A fresh environment, with dexkit and the Acme package put in by the action's own step.
+
+    uv does what pip would: the same, faster.
+    """
+    home = tmp_path_factory.mktemp("vendor")
+    package.run(package.UV, "venv", "--quiet", "--python", sys.executable, "env", cwd=home)
+    shims = home / "shims"
+    shims.mkdir()
+    env, uv = home / "env", f"{package.UV} pip install --refresh-package dexkit --quiet"
+    command(
+        shims / "python",
+        f"""#!/bin/bash
+case "$*" in
+    "-m pip install --disable-pip-version-check --quiet "*)
+        exec {uv} --python {env} "${{@:6}}" ;;
+    *)  exec {env}/bin/python "$@" ;;
+esac
+""",
+    )
+    runner = Runner(home, f"{home}/env/bin:{os.environ['PATH']}")
+    installer = Runner(home, f"{shims}:{runner.path}")
+    ran = installer("Install dexkit and the backend", install=f"'{ACME}'")
+    assert ran.returncode == 0, ran.stderr
+    assert "acme (acme-gripper 0.1.0, dex1-1)" in ran.stdout
+    return runner
+
+
+def test_a_plug_in_is_judged_through_its_entry_point_outside_the_checkout(vendor: Runner) -> None:
+    """Default options of a vendor's workflow, but for the requirements: it is one live run."""
+    # a repository's own settings of pytest are not the suite's
+    vendor.workspace.mkdir(exist_ok=True)
+    (vendor.workspace / "pytest.ini").write_text("[pytest]\naddopts = --no-such-option\n")
+    with emulator(vendor) as address:
+        ran = vendor(
+            "Judge the hand",
+            backend="acme",
+            device=address,
+            domain=str(free_domain()),
+            capabilities=str(ACME / "capabilities.toml"),
+            # none that a busy machine leaves open
+            requirements="DEX1-TOPIC\nDEX1-FIELD-02\nDEX1-MOVE-02\n",
+        )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    out = vendor.workspace / "dexkit-report"
+    result = json.loads((out / "result.json").read_text())
+    assert result["subject"]["backend"] == "acme"
+    verdicts = {r["id"]: r["verdict"] for r in result["results"]}
+    asked = ("DEX1-TOPIC-01", "DEX1-TOPIC-02", "DEX1-FIELD-02", "DEX1-MOVE-02")
+    assert verdicts == dict.fromkeys(asked, "pass")
+    assert result["subject"]["hand"] == "Acme G2"  # of the capabilities
+    assert "DEX1-MOVE-02" in (out / "junit.xml").read_text()
+    assert "DEX1-MOVE-02" in (out / "report.html").read_text()
+    assert (out / "recording.mcap").stat().st_size > 10_000
+    assert "dex1" in vendor.summary.lower()
+    assert vendor.outputs == {
+        "exit-code": "0",
+        "result": "dexkit-report/result.json",
+        "report": "dexkit-report/report.html",
+    }
+
+
+# ------------------------------------------------------------------------------ the container
+
+
+def instructions() -> list[tuple[str, str]]:
+    text = (ROOT / "Containerfile").read_text().replace("\\\n", "")
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in lines)]
+
+
+def test_the_container_runs_dexkit_on_the_right_python_and_not_as_root() -> None:
+    steps = instructions()
+    words = [word for word, _ in steps]
+    assert set(words) <= {"FROM", "WORKDIR", "COPY", "RUN", "USER", "ENTRYPOINT", "CMD"}
+    assert all(rest.startswith("python:3.10-slim") for word, rest in steps if word == "FROM")
+    assert dict(steps)["USER"] == "1000"
+    assert max(i for i, word in enumerate(words) if word == "RUN") < words.index("USER")
+    assert json.loads(dict(steps)["ENTRYPOINT"]) == ["dexkit"]
+
+
+def test_the_container_is_built_from_all_that_the_wheel_needs() -> None:
+    left_out = (ROOT / ".containerignore").read_text().splitlines()
+    for needed in ("dexkit", "drivers", "emulators", "conformance", "traces", "packaging"):
+        assert needed not in left_out
+    for heavy in (".git", ".venv"):
+        assert heavy in left_out

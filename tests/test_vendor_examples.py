@@ -1,0 +1,195 @@
+"""The examples for vendors: the invented Acme gripper, and a service that knows no dexkit."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from dexkit.backends import BackendOptions
+from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
+from dexkit.hand import Hand, HandCommand, Side
+from tests.dds_helpers import free_domain
+
+if TYPE_CHECKING:
+    import socketserver
+    from types import ModuleType
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+ACME = EXAMPLES / "acme-gripper"
+SERVICE = EXAMPLES / "external-service" / "gripper_service.py"
+
+
+# ------------------------------------------------------------------------- the Acme gripper
+
+
+@pytest.fixture
+def acme(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    monkeypatch.syspath_prepend(str(ACME))
+    import acme_gripper.hand
+
+    yield acme_gripper
+    for name in [n for n in sys.modules if n.partition(".")[0] == "acme_gripper"]:
+        del sys.modules[name]
+
+
+@contextmanager
+def emulated(acme: ModuleType, object_at: float | None = None) -> Iterator[str]:
+    """An emulated gripper; its address."""
+    import acme_gripper.emulator as emulator
+
+    server: socketserver.TCPServer = emulator.serve(object_at=object_at)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    try:
+        yield f"127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def opened(acme: ModuleType, address: str, **settings: str) -> Hand:
+    hand: Hand = acme.hand.backend.create(BackendOptions(Side.LEFT, address, settings))
+    hand.open()
+    return hand
+
+
+def drive(hand: Hand, command: HandCommand, until: float) -> float:
+    """Exchange until q is there or stands still; the last tau_est."""
+    while True:
+        before = hand.exchange(command)
+        for _ in range(20):
+            state = hand.exchange(command)
+        if abs(state.q[0] - until) < 0.02:
+            return float(state.tau_est[0])
+        if state.dq[0] == 0 and state.q[0] == before.q[0] and state.tau_est[0] != 0:
+            return float(state.tau_est[0])
+
+
+def test_it_speaks_the_units_of_a_dex1(acme: ModuleType) -> None:
+    with emulated(acme) as address:
+        hand = opened(acme, address)
+        state = hand.exchange(HandCommand.brake(1))
+        assert state.q == pytest.approx([0.2 * 5.4])
+        assert state.temperature == pytest.approx([31.2])
+        assert np.isnan(state.voltage).all()  # not known, so not told
+        assert drive(hand, HandCommand.position([2.7]), 2.7) == 0.0
+        hand.close()
+        hand.close()
+
+
+def test_it_feels_an_object_with_the_force_that_was_set(acme: ModuleType) -> None:
+    with emulated(acme, object_at=40.0) as address:
+        hand = opened(acme, address, force="12")
+        drive(hand, HandCommand.position([4.0]), 4.0)
+        assert drive(hand, HandCommand.position([0.5]), 0.5) == pytest.approx(-12 * 0.09 / 5.4)
+        limp = HandCommand.position([0.5], kp=0.0, kd=0.0)
+        while hand.exchange(limp).tau_est[0] != 0.0:
+            pass
+        assert hand.exchange(limp).q == pytest.approx([0.4 * 5.4])
+        hand.close()
+
+
+def test_a_gripper_that_goes_is_lost_and_comes_back(acme: ModuleType) -> None:
+    with emulated(acme) as address:
+        hand = opened(acme, address)
+        hand._socket.shutdown(2)  # type: ignore[attr-defined]
+        with pytest.raises(HandLost):
+            hand.exchange(HandCommand.brake(1))
+        hand.close()
+        hand.open()
+        hand.exchange(HandCommand.brake(1))
+        hand.close()
+    with pytest.raises(HandLost, match="not open"):
+        hand.exchange(HandCommand.brake(1))
+    with pytest.raises(HandNotFound) as caught:
+        hand.open()
+    assert "switched on" in caught.value.hint
+
+
+def test_what_it_refuses(acme: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    import acme_gripper.emulator as emulator
+
+    with pytest.raises(UsageError, match="needs a device"):
+        acme.hand.backend.create(BackendOptions(Side.LEFT))
+    with pytest.raises(UsageError, match="5 to 40 N"):
+        acme.hand.backend.create(BackendOptions(Side.LEFT, "x:1", {"force": "400"}))
+    monkeypatch.setattr(emulator.Gripper, "answer", lambda self, line: "TOASTER")
+    with emulated(acme) as address, pytest.raises(HandRefused, match="TOASTER"):
+        opened(acme, address)
+
+
+def test_the_document_shows_the_hand_as_it_is() -> None:
+    document = (EXAMPLES.parent / "docs" / "certify-your-gripper.md").read_text()
+    source = (ACME / "acme_gripper" / "hand.py").read_text()
+    for begin in ("STROKE = ", "def make"):
+        shown = document[document.index(begin) :]
+        assert shown[: shown.index("```")].strip() in source
+    claims = (ACME / "capabilities.toml").read_text()
+    shown = document[document.index("[hand]") :]
+    assert shown[: shown.index("```")].strip() in claims
+
+
+# ------------------------------------------------------------- a service without dexkit
+
+
+@contextmanager
+def service(domain: int) -> Iterator[subprocess.Popen[str]]:
+    """The left gripper, once it serves."""
+    command = [sys.executable, str(SERVICE), "left", "--domain", str(domain)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        yield process
+        process.terminate()
+
+
+def judged(domain: int, folder: Path, *arguments: str) -> dict[str, str]:
+    """Verdict by requirement, of the suite's result file."""
+    result = folder / "result.json"
+    run = subprocess.run(
+        [
+            *(sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q"),
+            *("--pyargs", "dexkit.conformance", "--backend", "external", "--side", "left"),
+            *("--domain", str(domain), "--json", str(result), *arguments),
+        ],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    document = json.loads(result.read_text())
+    return {row["id"]: row["verdict"] for row in document["results"]}
+
+
+def test_the_service_shares_nothing_with_dexkit() -> None:
+    assert "dexkit" not in SERVICE.read_text().partition('"""\n')[2].replace("dexkit:", "", 1)
+
+
+def test_a_service_without_dexkit_is_judged(tmp_path: Path) -> None:
+    domain = free_domain()
+    with service(domain) as process:
+        verdicts = judged(domain, tmp_path, "--require", "DEX1-TOPIC", "--require", "DEX1-MOVE-02")
+        assert process.poll() is None
+    assert verdicts == dict.fromkeys(("DEX1-TOPIC-01", "DEX1-TOPIC-02", "DEX1-MOVE-02"), "pass")
+
+
+@pytest.mark.soak
+def test_a_service_without_dexkit_meets_every_must(tmp_path: Path) -> None:
+    domain = free_domain()
+    with service(domain):
+        verdicts = judged(domain, tmp_path)
+    assert set(verdicts.values()) <= {"pass", "not applicable"}
+    assert list(verdicts.values()).count("pass") > 30
