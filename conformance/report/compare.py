@@ -228,7 +228,7 @@ def _matrix(rows: Sequence[Row], names: Sequence[str], heads: str) -> str:
             f'<span class="dim">{need.level}</span></th>{cells}</tr>'
         )
     return (
-        f'<div class="wrap"><table class="matrix"><thead><tr><th scope="col">requirement</th>'
+        f'<div class="wrap"><table class="matrix fixed"><thead><tr><th scope="col">requirement</th>'
         f"{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
     )
 

@@ -18,12 +18,13 @@ from dexkit.conformance.phases import Phase
 from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, histogram
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence, Result
+from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Floats, JointSpec, Side
 
-__all__ = ["PHASES", "command_and_state", "evidence", "phase_bands"]
+__all__ = ["PHASES", "command_and_state", "evidence", "operated", "phase_bands"]
 
 PHASES = {
     "listen": "listen",
@@ -154,6 +155,8 @@ def _by_kind(scene: _Scene) -> list[str]:
         return [_intervals(scene, None)]
     if need.needs == "session":
         return _session(scene)
+    if need.phase == OPERATOR:
+        return [_operated(scene)]
     if any("tau" in name for name in (*limits, *values)):
         return [_follow(scene), _torque(scene), _torque_by_position(scene)]
     if any(p.targets.get(scene.hand.side) for p in scene.phases):
@@ -174,13 +177,57 @@ def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band
     for phase in view.stimulus.phases:
         if side not in phase.sides:
             continue
-        name = PHASES.get(phase.name, phase.name)
+        name = PHASES.get(phase.name, phase.name.replace("-", " "))
         a, b = view.seconds(phase.begin_ns), view.seconds(phase.end_ns)
         if merged and merged[-1].label == name and a - merged[-1].end < 0.05:
             merged[-1] = Band(name, merged[-1].begin, b)
         else:
             merged.append(Band(name, a, b))
     return merged if label else [Band("", b.begin, b.end) for b in merged]
+
+
+def _busy(view: Recording) -> list[Band]:
+    """When the kit's own machine was short of processor time: what is late then proves little."""
+    merged: list[Band] = []
+    for stall in view.stimulus.stalls if view.stimulus else ():
+        a, b = view.seconds(stall.begin_ns), view.seconds(stall.end_ns)
+        if merged and a - merged[-1].end < 0.02:
+            merged[-1] = Band("", merged[-1].begin, max(b, merged[-1].end), "busy")
+        else:
+            merged.append(Band("", a, b, "busy"))
+    return merged
+
+
+def wish(view: Recording, hand: SideView, joint: int) -> Line | None:
+    """Where the modelled operator wanted a joint, or None without such a phase."""
+    phases = view.phases(OPERATOR, hand.side)
+    if not phases:
+        return None
+    begin, end = view.seconds(phases[0].begin_ns), view.seconds(phases[0].end_ns)
+    operator = operator_of(phases[0], view.dialect)
+    t = np.asarray(np.arange(begin, end, 0.01), dtype=np.float64)
+    poses = [operator.intent(float(x) - begin, hand.side) for x in t]
+    q = np.array([np.nan if pose is None else pose[joint] for pose in poses])
+    return Line("where the operator wants it", "other", t, q)
+
+
+def operated(view: Recording, hand: SideView, joint: int, span: tuple[float, float]) -> str:
+    """What the operator wants, what the client commands of it, and what the hand does."""
+    wanted = wish(view, hand, joint)
+    return chart(
+        f"{hand.side} hand, {_called(hand, joint)}: driven by Unitree's teleoperation client",
+        [*([wanted] if wanted else []), *command_and_state(hand, joint)],
+        y_unit="rad",
+        span=span,
+        bands=_busy(view),
+        height=190,
+        include=_room(hand, joint, span),
+    )
+
+
+def _operated(scene: _Scene) -> str:
+    span = scene.window(pad=0.3)
+    return "".join(operated(scene.view, scene.hand, joint, span) for joint in scene.joints(span))
 
 
 def _clipped(values: Floats, joint: JointSpec) -> Floats:
@@ -207,7 +254,8 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
     if span is None:
         span = scene.window()
     hand = scene.hand
-    bands = phase_bands(scene.view, hand.side) + scene.alarms
+    bands = _busy(scene.view) + phase_bands(scene.view, hand.side)
+    bands += [b for b in scene.alarms if b.end - b.begin < 0.85 * (span[1] - span[0])]
     return "".join(
         chart(
             f"{hand.side} hand, {_called(hand, joint)}: command and state, "
@@ -354,7 +402,7 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
         [Line("each state", "state", t, steps, "stems" if span else "dots")],
         y_unit="ms",
         span=span or (0.0, max(scene.view.duration, 0.1)),
-        bands=scene.alarms,
+        bands=_busy(scene.view) + scene.alarms,
         levels=_interval_levels(scene.need),
         include=(0.0,),
         height=150,
@@ -429,7 +477,7 @@ def _fastest(hand: SideView) -> float:
 def _torque(scene: _Scene) -> str:
     hand, span = scene.hand, scene.window()
     levels = [
-        Level(sign * value, f"{name.removeprefix('min_').removeprefix('max_')} {value:g}")
+        Level(sign * value, f"at {'least' if name[:3] == 'min' else 'most'} {value:g} N m in size")
         for name, value in scene.need.tolerances.items()
         if name in ("min_tau_nm", "max_tau_nm")
         for sign in (1, -1)
@@ -450,19 +498,24 @@ def _torque(scene: _Scene) -> str:
 
 
 def _torque_by_position(scene: _Scene) -> str:
-    hand, span = scene.hand, scene.window()
-    rows = hand.states.between(*span)
+    hand, span = scene.hand, scene.window(pad=0.0)
     joint = scene.joints(span, 1)[0]
-    q, tau = hand.states.q[rows, joint], hand.states.tau[rows, joint]
+    q, tau = hand.states.q[:, joint], hand.states.tau[:, joint]
     good = np.isfinite(q) & np.isfinite(tau)
     if good.sum() < 5:
         return ""
+    here = good.copy()
+    here[: hand.states.between(*span).start] = False
+    here[hand.states.between(*span).stop :] = False
     spec = hand.joints[joint]
     touch = scene.view.stimulus.objects.get(hand.side) if scene.view.stimulus else None
     held = touch is not None and len(hand.joints) == 1
     return chart(
         f"{hand.side} hand, {_called(hand, joint)}: torque over position",
-        [Line("each state", "force", q[good], tau[good], "dots")],
+        [
+            Line("each state of the run", "force", q[good], tau[good], "dots"),
+            Line("here", "bad", q[here], tau[here], "dots"),
+        ],
         y_unit="N m",
         x_unit="rad",
         span=(spec.q_min - 0.05 * spec.stroke, spec.q_max + 0.05 * spec.stroke),
@@ -508,9 +561,12 @@ def _endpoints(scene: _Scene) -> str:
         f"<td><code>{escape(name)}</code></td><td></td></tr>"
         for topic, name, kind in wanted
     ]
+    other = {t for s in Side if s is not side for t in dialect.topics(s)}
+    other -= set(dialect.topics(side))  # of both, where a dialect has one for both
     seen = dict.fromkeys(
         (e.kind, e.topic, e.type_name, f"{e.reliability} {e.durability}".strip())
         for e in scene.view.endpoints
+        if e.topic not in other
     )
     rows += [
         f"<tr><td>seen</td><td>{escape(kind)}</td><td><code>{escape(topic)}</code></td>"

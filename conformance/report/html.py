@@ -36,6 +36,7 @@ from dexkit.conformance.results import (
     Verdict,
     worst,
 )
+from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording
 
 __all__ = ["document", "render", "write_html"]
@@ -43,6 +44,8 @@ __all__ = ["document", "render", "write_html"]
 _STYLE = Path(__file__).with_name("report.css")
 _PLOT_BUDGET = 1_000_000
 """Bytes of plots on a page; beyond, failures are told in words only."""
+_BUSY = 0.2
+"""Part of a run without processor time from which on the page warns of itself."""
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
 _REALITY = {
     "emulated": "No real hand was involved: the device was an emulator at the far end of a wire. "
@@ -91,6 +94,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _facts(result),
         _areas(result),
         _troubles(result, view, link),
+        _operator(result),
         overview(result, view) if view is not None else "",
         _requirements(result, link),
         _what(result),
@@ -124,12 +128,18 @@ def _verdict(result: RunResult) -> str:
         for v, n in counts.items()
         if n
     )
+    caution = ""
+    if result.starved > _BUSY:
+        caution = (
+            f"<p><b>The testing machine was short of processor time for {result.starved:.0%} of "
+            "the run.</b> Run it again on one that is not busy before you rely on this.</p>"
+        )
     stages = "".join(_stage(side, stage) for side, stage in result.stage.items())
     return (
         f'<header class="verdict {answer.css}">'
         f"<p class='question'>Is this a drop-in for Unitree's {escape(model_title(result))}?</p>"
         f"<h1>{answer.text}<small>{escape(hand_name(result))}{badge}</small></h1>"
-        f"<p>{escape(sentence)}</p></header>"
+        f"<p>{escape(sentence)}</p>{caution}</header>"
         f'<div class="chips">{chips}</div><div class="stages">{stages}</div>'
     )
 
@@ -338,6 +348,22 @@ def _blocked(blocked: list[Result]) -> str:
             f"<ul>{rows}</ul></article>"
         )
     return "".join(parts)
+
+
+def _operator(result: RunResult) -> str:
+    """What an operator would feel, where one was modelled."""
+    rows = [
+        (need.title, " · ".join(f"{r.side} {r.figure or VERDICTS[r.verdict].text}" for r in group))
+        for need, group in result.by_requirement()
+        if need.phase == OPERATOR and any(r.verdict.judged for r in group)
+    ]
+    if not rows:
+        return ""
+    return (
+        "<h2>What an operator would feel</h2><p>A model of Unitree's teleoperation client drove "
+        "the hand: it sends no command further than 0.18 rad from the last state, so that a hand "
+        f"which reports late is slow.</p>{_definitions(rows)}"
+    )
 
 
 # ------------------------------------------------------------------------ every requirement

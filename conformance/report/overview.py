@@ -6,9 +6,10 @@ from html import escape
 
 import numpy as np
 
-from dexkit.conformance.report.evidence import command_and_state, phase_bands
+from dexkit.conformance.report.evidence import command_and_state, operated, phase_bands
 from dexkit.conformance.report.plots import Band, Level, Line, chart, histogram
 from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import JointSpec
 
@@ -39,6 +40,7 @@ def _hand(result: RunResult, view: Recording, hand: SideView) -> str:
             f"<h3>{name}{opening}</h3>",
             *(_joint(result, view, hand, index) for index in range(len(hand.joints))),
             _session(view, hand) if gripper else "",
+            _operator(view, hand),
             _force(view, hand),
             _timing(view, hand),
         ]
@@ -98,6 +100,19 @@ def _session(view: Recording, hand: SideView) -> str:
         legend=False,
         titled=False,
     )
+
+
+def _operator(view: Recording, hand: SideView) -> str:
+    """The first joint that the modelled operator moves."""
+    phases = view.phases(OPERATOR, hand.side)
+    if not phases:
+        return ""
+    span = view.seconds(phases[0].begin_ns), view.seconds(phases[0].end_ns)
+    sent = hand.commands.q[(hand.commands.t >= span[0]) & (hand.commands.t <= span[1])]
+    if len(sent) < 2:
+        return ""
+    moved = np.ptp(np.where(np.isfinite(sent), sent, 0.0), axis=0)
+    return operated(view, hand, int(np.argmax(moved)), span)
 
 
 def _force(view: Recording, hand: SideView) -> str:

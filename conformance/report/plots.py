@@ -306,6 +306,8 @@ def chart(
         *_x_ticks(axes, nice_ticks(*span, 8), x_unit),
     ]
     keys = [(line.label, line.css) for line in lines] if legend else []
+    if any(b.css == "busy" for b in shown):
+        keys.append(("the testing machine is short of processor time", "busy"))
     keys += [(r.label, "range") for r in ranges] + [(v.label, "limit") for v in levels]
     return _figure(title, height, "".join(svg), labels, _legend(keys), titled=titled)
 
