@@ -179,6 +179,7 @@ class TestSettings:
             (None, {"motors": "0.15,0.1,0.2,1.0,1.1,2.0,2.1"}),
             (None, {"motors": "0/1"}),
             (None, {"sensors": "9.0"}),
+            (None, {"sensors": "0.0"}),
             (None, {"in_endpoint": "0x181"}),
             (None, {"usb": "tcp://h"}),
             ("usbip://h", {"usb": "usbip://other"}),
@@ -189,6 +190,19 @@ class TestSettings:
     def test_nonsense_is_refused(self, device: str | None, settings: dict[str, str]) -> None:
         with pytest.raises(UsageError):
             backend.create(self.options(device, **settings))
+
+    @pytest.mark.parametrize(
+        ("name", "text", "says"),
+        [
+            ("motors", "0.0", "motors: the hand has 7, here are 1"),
+            ("sensors", "0.0,0.1", "sensors: the hand has 9, here are 2"),
+            ("head", "fe", "head is two bytes"),
+        ],
+    )
+    def test_what_is_refused_is_named_with_a_hint(self, name: str, text: str, says: str) -> None:
+        with pytest.raises(UsageError, match=says) as caught:
+            backend.create(self.options(**{name: text}))
+        assert caught.value.hint
 
     def test_an_unknown_setting_is_refused(self) -> None:
         with pytest.raises(UsageError, match="no setting 'baud'"):
@@ -421,6 +435,16 @@ class TestOpening:
             r'^SUB.*idVendor}=="(\w+)".*idProduct}=="(\w+)"', path.read_text(), re.M
         )
         assert active == [(f"{VENDOR_ID:04x}", f"{PRODUCT_ID[side]:04x}") for side in Side]
+
+    def test_one_that_does_not_open_is_not_said_to_be_closed(
+        self, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level(logging.INFO)
+        with serving(RawDevice(lambda data: [])) as server:
+            for _ in range(2):
+                with pytest.raises(HandTimeout):
+                    hand_on(server).open()
+        assert "closed" not in caplog.text
 
     def test_a_device_that_says_nothing(self) -> None:
         device = RawDevice(lambda data: [])

@@ -126,18 +126,22 @@ class TestFaults:
     def test_the_hand_gets_there_all_the_same(self, fault: str) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject(fault)
+            statistics = hand.statistics
+
+            def struck() -> bool:  # on a busy machine a motion is but a few exchanges
+                if fault.startswith("drop"):
+                    return statistics.link.timeouts > 0
+                if fault.startswith("corrupt"):
+                    return statistics.damaged_frames + statistics.damaged_packets > 0
+                return True
+
             state = drive(
                 hand,
                 go(GOAL[Side.LEFT]),
-                lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02,
+                lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02 and struck(),
                 timeout=10.0,
             )
             assert not (state.fault & ~np.uint32(LOST | TRIPPED)).any()
-            statistics = hand.statistics
-            if fault.startswith("drop"):
-                assert statistics.link.timeouts > 0
-            if fault.startswith("corrupt"):
-                assert statistics.damaged_frames + statistics.damaged_packets > 0
 
     @pytest.mark.parametrize("fault", ["stall", "stall-out"])
     def test_a_stall_is_cleared(self, fault: str) -> None:

@@ -207,7 +207,9 @@ class Dex3Usb:
             log.warning("could not brake: %s; %s", error, rest)
         finally:
             link.close()
-            log.info("%s closed: %s", link.name, self.statistics)
+            # one that did not open is reported by open(), every time that it is tried
+            level = logging.DEBUG if self._last is None else logging.INFO
+            log.log(level, "%s closed: %s", link.name, self.statistics)
 
     def _let_go(self, link: UsbLink) -> None:
         # bit 7 = 0: a brake needs no protection, and trips would only be left behind

@@ -77,7 +77,8 @@ def hand_error(error: Exception, what: str) -> HandError:
         return HandRefused(
             f"{what}: another program holds its USB interface",
             hint="another dexkit, the vendor's hand service, or a virtual machine that took the "
-            "device over? See: sudo lsof /dev/bus/usb/*/*",
+            "device over? See: sudo lsof /dev/bus/usb/*/*; over USB/IP: another client of its "
+            "server",
         )
     if number in _LATE or isinstance(error, TimeoutError):
         return HandTimeout(text)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from dexkit.backends import BackendOptions
 from dexkit.drivers.dex3_usb.discovery import Server, parse_server
 from dexkit.errors import UsageError, WireError
+from dexkit.hand import Side
+from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import (
     COMMAND_1234,
     COMMAND_HEAD,
@@ -54,7 +56,19 @@ class Dex3Settings:
             if not 1e-3 <= getattr(self, name) <= 5:
                 raise UsageError(f"{name} must be 0.001 to 5 s, not {getattr(self, name):g}")
         if len(self.head) != 2:
-            raise UsageError(f"head is two bytes, not {self.head.hex() or 'none'}")
+            raise UsageError(
+                f"head is two bytes, not {self.head.hex() or 'none'}",
+                hint=f"in hex; the default is {COMMAND_HEAD.hex()}",
+            )
+        for name, places, wanted in (
+            ("motors", self.bus_map.motors, len(DEX3_1.joints[Side.LEFT])),
+            ("sensors", self.bus_map.sensors, len(DEX3_1.sensors)),
+        ):
+            if len(places) != wanted:
+                raise UsageError(
+                    f"{name}: the hand has {wanted}, here are {len(places)} place(s)",
+                    hint=f"{name} is {_PARSERS[name][1]}",
+                )
 
 
 def parse_places(text: str) -> tuple[tuple[int, int], ...]:
