@@ -76,6 +76,11 @@ class Context:
         return self.hand.side
 
     @property
+    def other(self) -> Side:
+        """The other one."""
+        return Side.RIGHT if self.side is Side.LEFT else Side.LEFT
+
+    @property
     def states(self) -> States:
         """Its states."""
         return self.hand.states

@@ -37,7 +37,9 @@ def low_rate_topic(ctx: Context) -> Outcome:
     text = f"{found[0].message_count} samples on {topic}, {rate:.1f} Hz"
     if rate <= ctx.tolerance("max_rate_hz"):
         return ctx.passed(f"{rate:.0f} Hz", text, rate_hz=rate)
-    return ctx.failed(f"{rate:.0f} Hz", text, rate_hz=rate)
+    return ctx.failed(f"{rate:.0f} Hz", text, rate_hz=rate).because(
+        "Every state is copied to the slow topic, too."
+    )
 
 
 @check("DEX3-START-02")
@@ -50,12 +52,18 @@ def rest_pose(ctx: Context) -> Outcome:
         return ctx.skipped("no state before the first command")
     zero = ~q.any(axis=1)
     if zero.any():
+        later = ctx.states.q[np.isfinite(ctx.states.q).all(axis=1)]
+        cause = (
+            "State starts with zeros, before the first measurement."
+            if later.any() and not zero.all()
+            else "Positions are never read from the device, or the hand rests with all joints at 0."
+        )
         return ctx.failed(
             "all zero",
             f"q is exactly 0 in every joint in {int(zero.sum())} of {len(q)} states before the "
             "first command",
             ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(zero))])),
-        )
+        ).because(cause)
     most = float(np.abs(q).max(axis=1).min())
     return ctx.passed("not zero", f"at least one joint is {most:.3f} rad or more from 0")
 
@@ -83,7 +91,10 @@ def packets(ctx: Context) -> Outcome:
     seen = " or ".join(str(n) for n in found)
     if len(found) == 1 and found[0] <= most:
         return ctx.passed(seen, f"{seen} sensor packets in each state")
-    return ctx.failed(seen, f"{seen} sensor packets, from state to state")
+    outcome = ctx.failed(seen, f"{seen} sensor packets, from state to state")
+    if len(found) == 1:
+        return outcome.because("Each sensor element is published as a packet of its own.")
+    return outcome.because("A packet is published only when its sensor has news.")
 
 
 @check("DEX3-SENS-02")
@@ -123,7 +134,10 @@ def no_value(ctx: Context) -> Outcome:
     text = f"{elements} of {count * _SLOTS} slots hold a value, the others {code:g}"
     if elements == ctx.tolerance("elements"):
         return ctx.passed(f"{elements} elements", text)
-    return ctx.failed(f"{elements} elements", text)
+    outcome = ctx.failed(f"{elements} elements", text)
+    if elements == count * _SLOTS:
+        return outcome.because("No slot is marked: those without a sensor hold a number, too.")
+    return outcome
 
 
 @check("DEX3-SENS-04")
@@ -189,11 +203,18 @@ def ids(ctx: Context) -> Outcome:
         return ctx.passed("0 .. 6", f"{len(mode)} states")
     row = found[int(np.argmax(wrong))]
     joint = int(np.argmax(row != np.arange(len(ctx.joints))))
+    cause = ""
+    if not mode.any():
+        cause = "mode is left 0."
+    elif not found.any():
+        cause = "mode holds the status without the id."
+    elif sorted(row) == list(range(len(ctx.joints))):
+        cause = "The motors are in another order than the message has."
     return ctx.failed(
         f"id {row[joint]}",
         ctx.named(f"motor {joint} says id {row[joint]}, in {int(wrong.sum())} states", joint),
         ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(wrong))])),
-    )
+    ).because(cause)
 
 
 @check("DEX3-MODE-02")
@@ -262,11 +283,26 @@ def order(ctx: Context) -> Outcome:
                     f"{name} was told to go {abs(step.size):.2f} rad and moved {own:.2f} rad; "
                     + (seen or "no joint moved"),
                     ctx.at(ctx.states.topic, begin, end),
-                )
+                ).because(_order_cause(ctx, step.joint, wrong, own < 0.1 * abs(step.size)))
             found += 1
     if not found:
         return ctx.failed("no step", "there is no state while the joints were moved")
     return ctx.passed(f"{found} of {found}", f"{found} steps, each of the joint that was told")
+
+
+def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) -> str:
+    """Why another joint moved than the one that was told, where it shows."""
+    name = ctx.joints[joint].name
+    if still and not wrong:
+        return f"{name} is not driven: its commands are lost, it is locked, or it has no power."
+    if still and len(wrong) == 1:
+        other = ctx.joints[wrong[0]].name
+        if {name.partition("_")[0], other.partition("_")[0]} == {"middle", "index"}:
+            return f"{name} and {other} are swapped, as xr_teleoperate's enum has the right hand."
+        return f"{name} and {other} are swapped."
+    if wrong and not still:
+        return "The joints are coupled, or a command for one is applied to others as well."
+    return ""
 
 
 @check("DEX3-GAIN-02")
@@ -318,9 +354,14 @@ def contact(ctx: Context) -> Outcome:
     text = f"tau_est towards closing from {weakest:.2f} to {strongest:.2f} N m while squeezing"
     if strongest >= ctx.tolerance("min_tau_nm") and weakest > -ctx.tolerance("min_tau_nm"):
         return ctx.passed(f"{strongest:.2f} N m", text, tau_nm=strongest)
-    return ctx.failed(
+    outcome = ctx.failed(
         f"{strongest:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=strongest
     )
+    if not ctx.states.tau.any():
+        return outcome.because("tau_est is not filled (0 throughout).")
+    if weakest <= -ctx.tolerance("min_tau_nm"):
+        return outcome.because("tau_est has the wrong sign, in some joints or on this side.")
+    return outcome
 
 
 # ---------------------------------------------------------------------------- when commands end

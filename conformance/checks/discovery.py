@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.models import DIALECTS
 from dexkit.traces import TraceEndpoint
 
 
@@ -25,14 +26,37 @@ def state_topic(ctx: Context) -> Outcome:
     types |= {e.type_name for e in _endpoints(ctx, topic, "writer") if e.type_name}
     others = types - {wanted}
     if others:
-        return ctx.failed("wrong type", f"{topic} has type {', '.join(sorted(others))}")
+        return ctx.failed("wrong type", f"{topic} has type {', '.join(sorted(others))}").because(
+            causes.of_type(others, wanted, dialect)
+        )
     if types or _endpoints(ctx, topic, "writer"):
-        return ctx.failed("no sample", f"a publisher of {topic} was seen, but no sample came")
+        return ctx.failed(
+            "no sample", f"a publisher of {topic} was seen, but no sample came"
+        ).because(
+            "Its writer is there and writes nothing: it waits for a command, for the device, or "
+            "for a reader. If it does write, its QoS or its interface keeps samples away."
+        )
     similar = sorted(
         {c.topic for c in ctx.recording.channels if c.topic.endswith("state")} - {topic}
     )
     seen = f"; other state topics: {', '.join(similar)}" if similar else ""
-    return ctx.failed("no topic", f"nobody publishes {topic}{seen}")
+    return ctx.failed("no topic", f"nobody publishes {topic}{seen}").because(_absent(ctx))
+
+
+def _absent(ctx: Context) -> str:
+    """Why nobody publishes the state topic, as far as the others tell."""
+    recording, topic = ctx.recording, ctx.states.topic
+    seen = {c.topic for c in recording.channels}
+    seen |= {e.topic for e in recording.endpoints if e.kind == "writer"}
+    if topic.removeprefix("rt/") in seen:
+        return f"It is published as {topic.removeprefix('rt/')}, without ROS 2's prefix rt/."
+    for dialect in DIALECTS.values():
+        if dialect is not recording.dialect and dialect.topics(ctx.side)[1] in seen - {topic}:
+            name = dialect.topics(ctx.side)[1]
+            return f"{name} is there, the topic of another generation (--dialect {dialect.name})."
+    if recording.dialect.topics(ctx.other)[1] in seen:
+        return f"Only the {ctx.other} hand is served."
+    return ""
 
 
 @check("DEX1-TOPIC-02", "DEX3-TOPIC-02")
@@ -47,7 +71,9 @@ def command_topic(ctx: Context) -> Outcome:
         return ctx.passed(wanted.rpartition("::")[2], f"a reader of {wanted}")
     if "" in types:
         return ctx.skipped(f"{topic} has a reader, but the recording does not say of which type")
-    return ctx.failed("wrong type", f"{topic} is read as {', '.join(sorted(types))}")
+    return ctx.failed("wrong type", f"{topic} is read as {', '.join(sorted(types))}").because(
+        causes.of_type(types, wanted, ctx.recording.dialect)
+    )
 
 
 @check("DEX1-QOS-01", "DEX3-QOS-01")

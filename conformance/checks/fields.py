@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.view import joints_of
 
 
 @check("DEX1-FIELD-01", "DEX3-FIELD-01")
@@ -78,6 +79,12 @@ def in_stroke(ctx: Context) -> Outcome:
                 ctx.at(states.topic, float(states.t[i])),
                 q_min=low,
                 q_max=high,
+            ).because(
+                causes.of_positions(
+                    states.q[~excused],
+                    ctx.joints,
+                    joints_of(ctx.recording.dialect, ctx.other),
+                )
             )
         beyond = max(spec.q_min - low, high - spec.q_max)
         if widest is None or beyond > widest[0]:

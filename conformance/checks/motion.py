@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.phases import Phase
 from dexkit.hand import Floats
 
@@ -114,7 +115,7 @@ def direction(ctx: Context) -> Outcome:
         f"{step}: {verdict}",
         ctx.at(ctx.states.topic, step.begin, step.end),
         progress=progress[worst],
-    )
+    ).because(_cause(found))
 
 
 @check("DEX1-MOVE-02", "DEX3-MOVE-02")
@@ -135,7 +136,17 @@ def arrives(ctx: Context) -> Outcome:
         f"{worst}",
         ctx.at(ctx.states.topic, worst.begin, worst.end),
         error_rad=worst.error,
-    )
+    ).because(_cause(found))
+
+
+def _cause(found: Sequence[Step]) -> str:
+    """Why steps end elsewhere, where they show it."""
+    if all(float(np.ptp(s.q)) < 0.02 * s.stroke for s in found):
+        return "Nothing moves at all: commands do not reach the motors, or these are not driven."
+    if len({s.joint for s in found}) > 1:
+        return ""
+    ends = np.array([(s.target, s.final) for s in found])
+    return causes.of_scale(ends[:, 0], ends[:, 1], found[0].stroke)
 
 
 @check("DEX1-MOVE-03", "DEX3-MOVE-03")

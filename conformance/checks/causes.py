@@ -1,0 +1,87 @@
+"""Likely causes that can be told from the figures: wrong units, wrong sides, wrong types."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dexkit.hand import Floats, JointSpec
+from dexkit.models import DIALECTS, Dialect
+
+__all__ = ["of_positions", "of_scale", "of_type"]
+
+
+def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec]) -> str:
+    """Why positions leave their range, or nothing.
+
+    :param q: rad, shape (n, n_joints).
+    :param other: the joints of the hand's other side.
+    """
+    q = q[np.isfinite(q).all(axis=1)]
+    if not len(q):
+        return ""
+    low, high = q.min(axis=0), q.max(axis=0)
+
+    def within(limits: Sequence[JointSpec], scale: float = 1.0, margin: float = 0.1) -> bool:
+        return all(
+            scale * (j.q_min - margin * j.stroke) <= a
+            and b <= scale * (j.q_max + margin * j.stroke)
+            for a, b, j in zip(low, high, limits, strict=True)
+        )
+
+    if len(joints) > 1 and within(other):
+        return (
+            "These are the other side's positions: its signs are used here, or sides are swapped."
+        )
+    if within([_mirrored(j) for j in joints]):
+        return "The sign of q is turned."
+    if low.min() >= -1.0 and 20.0 < high.max() <= 101.0:
+        return "q looks like percent, not radians."
+    widest = max(max(-j.q_min, j.q_max) for j in joints)
+    if np.abs(q).max() > 3 * widest and within(joints, 180 / np.pi):
+        return "q looks like degrees, not radians."
+    if np.abs(q).max() > 100.0:
+        return "q looks like the device's own counts, or the rotor's angle before the gear."
+    return ""
+
+
+def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
+    """Why steps of one joint end elsewhere, or nothing.
+
+    :param targets: q that was commanded, rad; ``reached``: where each step ended.
+    :param stroke: of a joint whose q counts from 0.
+    """
+    if len(targets) < 2 or np.ptp(targets) < 0.2 * stroke:
+        return ""
+    if np.allclose(reached, stroke - targets, atol=0.06 * stroke):
+        return "Travel is mirrored: what should open closes."
+    for scale, what in ((1 / stroke, "0 to 1"), (100 / stroke, "0 to 100 (percent)")):
+        if np.allclose(reached, scale * targets, atol=0.06 * scale * stroke):
+            return f"q is published as {what} instead of radians."
+    return ""
+
+
+def of_type(found: Iterable[str], wanted: str, dialect: Dialect) -> str:
+    """Why a topic has these types and not the wanted one, or nothing."""
+    for name in sorted(found):
+        if name in (dialect.cmd_type, dialect.state_type) and name != wanted:
+            return "The types of state and command are swapped."
+        speak = [d.name for d in DIALECTS.values() if name in (d.cmd_type, d.state_type)]
+        if speak:
+            return (
+                f"{_short(name)} is the type of another hand or generation "
+                f"(--dialect {' or '.join(speak)}); here it has to be {_short(wanted)}."
+            )
+        if _short(name) == _short(wanted):
+            return f"The type has the right name in another package: {name}."
+    return ""
+
+
+def _short(type_name: str) -> str:
+    return type_name.rpartition("::")[2]
+
+
+def _mirrored(joint: JointSpec) -> JointSpec:
+    return replace(joint, q_min=-joint.q_max, q_max=-joint.q_min)

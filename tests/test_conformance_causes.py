@@ -1,0 +1,94 @@
+"""A failure says why: from what the check saw, where that tells more than the rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dexkit.conformance.checks.causes import of_positions, of_scale, of_type
+from dexkit.conformance.mutants import MUTANTS, run_mutant
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.view import joints_of
+from dexkit.hand import Side
+from dexkit.models import dialect
+from tests.conformance_helpers import of
+
+GRIPPER = joints_of(dialect("unitree_go"), Side.LEFT)
+LEFT, RIGHT = (joints_of(dialect("dex3"), side) for side in Side)
+
+
+@pytest.mark.parametrize(
+    ("q", "says"),
+    [
+        ([0.0, 98.0], "percent"),
+        ([0.0, 309.0], "degrees"),
+        ([-5.4, 0.0], "sign of q is turned"),
+        ([0.0, 65535.0], "counts"),
+        ([0.0, 7.0], ""),
+        ([np.nan], ""),
+    ],
+)
+def test_units_are_told_from_the_positions_of_a_gripper(q: list[float], says: str) -> None:
+    found = of_positions(np.array(q)[:, None], GRIPPER, GRIPPER)
+    assert (says in found) if says else not found
+
+
+def test_the_other_sides_signs_are_told() -> None:
+    ends = np.array([[j.q_min for j in RIGHT], [j.q_max for j in RIGHT]])
+    assert "other side's positions" in of_positions(ends, LEFT, RIGHT)
+    assert of_positions(np.full((3, 7), 2.9), LEFT, RIGHT) == ""
+
+
+@pytest.mark.parametrize(
+    ("reached", "says"),
+    [
+        ([4.86, 0.54, 2.7], "mirrored"),
+        ([0.1, 0.9, 0.5], "0 to 1"),
+        ([10.0, 90.0, 50.0], "percent"),
+        ([0.54, 4.86, 2.7], ""),
+        ([0.54, 3.0, 2.7], ""),
+    ],
+)
+def test_a_scale_is_told_from_steps(reached: list[float], says: str) -> None:
+    targets = np.array([0.54, 4.86, 2.7])
+    found = of_scale(targets, np.array(reached), 5.4)
+    assert (says in found) if says else not found
+
+
+def test_one_step_tells_no_scale() -> None:
+    assert of_scale(np.array([2.7]), np.array([2.7]), 5.4) == ""
+
+
+def test_types_of_another_hand_are_told() -> None:
+    go, dex3 = dialect("unitree_go"), dialect("dex3")
+    assert "swapped" in of_type({go.cmd_type}, go.state_type, go)
+    assert "--dialect unitree_hg or dex3" in of_type({dex3.state_type}, go.state_type, go)
+    assert "another package" in of_type({"my::MotorStates_"}, go.state_type, go)
+    assert of_type({"std_msgs::String_"}, go.state_type, go) == ""
+
+
+@pytest.mark.parametrize(
+    ("mutant", "requirement", "says"),
+    [
+        ("OtherStateType", "DEX1-TOPIC-01", "is the type of another hand"),
+        ("Percent", "DEX1-FIELD-03", "percent"),
+        ("Inverted", "DEX1-MOVE-01", "mirrored"),
+        ("Frozen", "DEX1-MOVE-01", "Nothing moves at all"),
+    ],
+)
+def test_a_wrong_hand_is_told_its_own_mistake(mutant: str, requirement: str, says: str) -> None:
+    wrong = next(m for m in MUTANTS if m.name == mutant and m.kills == requirement)
+    result = run_mutant(wrong.service, wrong.plan)
+    found = next(
+        r for r in result.results if (r.requirement.id, r.verdict) == (requirement, Verdict.FAIL)
+    )
+    assert says in found.cause
+    assert f"cause:    {found.cause}" in found.explain()
+
+
+def test_what_passes_has_no_cause() -> None:
+    from dexkit.conformance.judge import judge
+    from dexkit.conformance.view import Recording
+    from tests.conformance_helpers import short_run
+
+    assert of(judge(Recording.of(short_run())), "DEX1-RATE-01").cause == ""
