@@ -233,6 +233,10 @@ class TestArguments:
             (["sim-dex1", "--side", "left", "--set", "colour=red"], "no setting 'colour'"),
             (["sim-dex1", "--side", "left", "--set", "colour"], "not KEY=VALUE"),
             (["sim-dex1", "--side", "left", "--set", "right.start=1"], "only the left"),
+            (
+                ["dex3-usb", "--side", "left", "--usb", "usbip://h", "--set", "left.usb=system"],
+                "two places",
+            ),
             (["sim-dex1", "--side", "left", "--dialect", "dex3"], "does not speak dex3"),
             (["sim-dex3", "--side", "left", "--dialect", "unitree_go"], "it speaks dex3"),
             (["sim-dex1", "--side", "left", "--usb", "usbip://x:1"], "no setting 'usb'"),

@@ -131,6 +131,12 @@ def command(
     domain 1 (that of xr_teleoperate's simulation mode).
     """
     if usb is not None:
+        for text in settings:
+            if text.partition("=")[0].rpartition(".")[2] == "usb":
+                raise UsageError(
+                    f"--usb {usb} and --set {text} are two places",
+                    hint="--usb is short for --set usb=URL, for all hands",
+                )
         settings = (*settings, f"usb={usb}")
     status = sys.stderr.isatty() and not quiet
     _log_to_stderr(logging.WARNING if quiet else logging.INFO, status)
