@@ -9,8 +9,16 @@ import time
 
 import pytest
 
-from dexkit.errors import DdsError, HandLost, HandTimeout, TopicConflict, UsageError
-from dexkit.hand import HandState, MotorError, Side
+from dexkit.errors import (
+    BackendBroken,
+    DdsError,
+    HandError,
+    HandLost,
+    HandTimeout,
+    TopicConflict,
+    UsageError,
+)
+from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go, unitree_hg
 from dexkit.models import dialect
 from dexkit.service import Backoff, HandService, diagnose
@@ -206,6 +214,24 @@ class TestLink:
         with pytest.raises(HandLost):
             serve(hand, node).start()
         assert node.open_entities == 0
+
+    def test_a_bug_at_the_start_is_named_with_its_place(self) -> None:
+        class Unfinished(ScriptedHand):
+            def open(self) -> None:
+                raise OSError("no such port")
+
+        with pytest.raises(BackendBroken, match="left hand: OSError: no such port") as raised:
+            serve(Unfinished(), FakeNode(), wait_for_device=True).start()
+        assert f"at {__file__}:" in raised.value.hint
+
+    def test_what_is_no_state_is_named(self) -> None:
+        class Bare(ScriptedHand):
+            def exchange(self, command: HandCommand) -> HandState:
+                return 2.7  # type: ignore[return-value]
+
+        with pytest.raises(HandError, match="returned a float, not a HandState") as raised:
+            serve(Bare(), FakeNode()).start()
+        assert "HandState.of" in raised.value.hint
 
     def test_missing_at_the_start_can_be_waited_for(self) -> None:
         hand, node = ScriptedHand(q=0.5), FakeNode()

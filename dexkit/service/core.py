@@ -176,10 +176,16 @@ class HandCore:
     def measured(self, state: HandState) -> None:
         """An exchange returned ``state``.
 
-        :raises HandError: the state has the wrong shape or a q that is not finite; count it as
-            a failed exchange.
+        :raises HandError: it is no state, has the wrong shape or a q that is not finite; count it
+            as a failed exchange.
         """
         n = self.spec.n_joints
+        given: object = state  # a backend is other people's code
+        if not isinstance(given, HandState):
+            raise HandError(
+                f"the backend returned a {type(given).__name__}, not a HandState",
+                hint="exchange ends with: return HandState.of(q, stamp=time.monotonic())",
+            )
         if state.q.shape != (n,) or not all(map(math.isfinite, state.q.tolist())):
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")
         now = self._clock.now()

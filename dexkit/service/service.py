@@ -17,12 +17,21 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from dexkit.clock import Clock, Rate, RealClock
-from dexkit.errors import DexkitError, HandError, TopicConflict, UsageError, WireError
+from dexkit.errors import (
+    BackendBroken,
+    DexkitError,
+    HandError,
+    TopicConflict,
+    UsageError,
+    WireError,
+)
 from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model
@@ -360,6 +369,13 @@ class HandService:
                 raise
             log.warning("%s: %s; waiting for it", unit.side, error)
             unit.problem = str(error)
+        except DexkitError:
+            raise
+        except Exception as error:  # a backend is other people's code
+            raise BackendBroken(
+                f"the backend failed to open the {unit.side} hand: {type(error).__name__}: {error}",
+                hint=_in_backend(error),
+            ) from error
 
     def _open(self, unit: _Unit) -> None:
         """Open the hand and do one exchange, so that there is a state from the first sample on."""
@@ -550,3 +566,11 @@ def _one_model(hands: Sequence[Hand]) -> HandModel:
     if len(names) != 1:
         raise UsageError(f"a service needs hands of one model, got {sorted(names)}")
     return model(names.pop())
+
+
+def _in_backend(error: BaseException) -> str:
+    """Where the code that is not dexkit's began to fail."""
+    package = os.path.dirname(os.path.dirname(__file__)) + os.sep
+    frames = traceback.extract_tb(error.__traceback__)
+    frame = next((f for f in frames if not f.filename.startswith(package)), frames[-1])
+    return f"at {frame.filename}:{frame.lineno}, in {frame.name}"
