@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -166,6 +168,158 @@ def test_a_damaged_packet_harms_nothing(
         data[at % len(data)] = value
     observer.receive(bytes(data[:length]), 0.1)
     observer.tick(1.0)
+
+
+class Grammar:
+    """What RTPS 8.3.7 and 9.4 demand of the packets of one participant; read on its own.
+
+    CycloneDDS 0.10 calls a packet that breaks one of these rules malformed, and drops it.
+    """
+
+    def __init__(self) -> None:
+        self.kinds: set[int] = set()
+        self._counts: dict[tuple[int, bytes, bytes], int] = {}
+
+    def check(self, packet: bytes) -> None:
+        assert packet[:8] == b"RTPS\2\1\0\0"
+        assert packet[8:20] == ME
+        at, destination = 20, bytes(12)
+        assert len(packet) > at
+        while at < len(packet):
+            kind, flags, length = (
+                packet[at],
+                packet[at + 1],
+                struct.unpack_from("<H", packet, at + 2)[0],
+            )
+            body = packet[at + 4 : at + 4 + length]
+            assert at % 4 == 0
+            assert len(body) == length > 0
+            assert length % 4 == 0
+            at += 4 + length
+            self.kinds.add(kind)
+            if kind == 0x0E:
+                assert length == 12
+                assert flags == 1
+                destination = body
+                continue
+            rule = {0x15: self._data, 0x07: self._heartbeat, 0x06: self._acknack}[kind]
+            rule(flags, body, destination)
+
+    def _increases(self, kind: int, body: bytes, destination: bytes, count: int) -> None:
+        key = (kind, body[:8], destination)
+        assert self._counts.get(key, 0) < count < 1 << 31
+        self._counts[key] = count
+
+    def _data(self, flags: int, body: bytes, destination: bytes) -> None:
+        extra, to_qos, _, writer, high, low = struct.unpack_from("<HH4s4siI", body)
+        assert (extra, to_qos) == (0, 16)
+        assert high << 32 | low >= 1
+        at = 20
+        if flags == 0x0B:  # disposed and unregistered, the key alone
+            assert writer == rtps.SPDP_WRITER
+            assert body[at : at + 12] == bytes.fromhex("710004000000000301000000")
+            at += 12
+        else:
+            assert flags == 0x05
+        assert body[at : at + 4] == b"\0\3\0\0"  # a parameter list, little-endian
+        at += 4
+        while True:
+            pid, length = struct.unpack_from("<HH", body, at)
+            at += 4 + length
+            assert length % 4 == 0
+            if pid == 1:
+                assert length == 0
+                break
+        assert at == len(body)
+
+    def _heartbeat(self, flags: int, body: bytes, destination: bytes) -> None:
+        assert len(body) == 28
+        assert flags in (0x01, 0x03)
+        high, low, last_high, last_low, count = struct.unpack("<8xiIiII", body)
+        first, last = high << 32 | low, last_high << 32 | last_low
+        assert first >= 1
+        assert last >= first - 1
+        self._increases(0x07, body, destination, count)
+
+    def _acknack(self, flags: int, body: bytes, destination: bytes) -> None:
+        assert flags in (0x01, 0x03)
+        high, low, bits = struct.unpack_from("<8xiII", body)
+        assert high << 32 | low >= 1
+        assert bits <= 256
+        words = (bits + 31) // 32
+        assert len(body) == 24 + 4 * words
+        bitmap = struct.unpack_from(f"<{words}I", body, 20)
+        if bits % 32:
+            assert not bitmap[-1] & ((1 << 32 - bits % 32) - 1)
+        self._increases(0x06, body, destination, struct.unpack_from("<I", body, 20 + 4 * words)[0])
+
+
+_WRITERS = st.sampled_from([rtps.SEDP_PUBLICATIONS, rtps.SEDP_SUBSCRIPTIONS])
+_NUMBERS = st.one_of(
+    st.integers(-2, 6), st.sampled_from([257, 4096, 2**31, 2**32, 2**63 - 2, 2**63 - 1, -(2**63)])
+)
+
+
+def _gap(writer: bytes, start: int, base: int) -> bytes:
+    body = rtps.detector_of(writer) + writer
+    body += struct.pack("<iIiII", start >> 32, start & 0xFFFFFFFF, base >> 32, base & 0xFFFFFFFF, 0)
+    return struct.pack("<BBH", 0x08, 1, len(body)) + body
+
+
+_SUBMESSAGES = st.one_of(
+    st.builds(rtps.build_heartbeat, _WRITERS, _NUMBERS, _NUMBERS, st.just(1)),
+    st.builds(_gap, _WRITERS, _NUMBERS, _NUMBERS),
+    st.builds(
+        lambda base, offsets: rtps.build_acknack(
+            rtps.SEDP_SUBSCRIPTIONS,
+            base,
+            [base + o for o in offsets],
+            1,
+            destination=ME,
+            final=False,
+        ),
+        _NUMBERS.filter(lambda n: n < 2**62),
+        st.lists(st.integers(0, 255), max_size=3),
+    ),
+)
+
+
+@given(st.lists(st.one_of(_SUBMESSAGES, st.floats(0.0, 0.5), st.sampled_from(_REAL)), max_size=12))
+@settings(max_examples=100)
+def test_it_sends_nothing_malformed_whatever_it_is_told(
+    events: list[bytes | float],
+) -> None:
+    """It is run beside robots: no reply to any peer, right or wrong, may break the protocol."""
+    grammar, now = Grammar(), 0.0
+    observer = Observer(
+        ME, PLACE, properties={"__ProcessName": "x"}, wanted=lambda topic, type_name: True
+    )
+    source = packets.CYCLONE_0_10_PARTICIPANT[8:20]
+    grammar.check(observer.announcement())
+    sent = observer.receive(_addressed(packets.CYCLONE_0_10_PARTICIPANT), now)
+    for event in events:
+        if isinstance(event, float):
+            now += event
+            sent += observer.tick(now)
+        elif event[:4] == b"RTPS":
+            sent += observer.receive(_addressed(event), now)
+        else:
+            sent += observer.receive(rtps.message(source, event), now)
+    for packet, _ in sent:
+        grammar.check(packet)
+    grammar.check(observer.farewell())
+    assert grammar.kinds >= {0x15, 0x0E, 0x06}
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 0), (5, 3), (5, -9), (-1, -1), (1, 2**63 - 1)])
+def test_a_wrong_heartbeat_is_counted_and_not_answered(first: int, last: int) -> None:
+    observer = Observer(ME, PLACE)
+    observer.receive(_addressed(packets.CYCLONE_0_10_PARTICIPANT), 0.0)
+    prefix = packets.CYCLONE_0_10_PARTICIPANT[8:20]
+    beat = rtps.message(prefix, rtps.build_heartbeat(rtps.SEDP_PUBLICATIONS, first, last, 1))
+    assert observer.receive(beat, 0.1) == []
+    assert observer.damaged == 1
+    assert not observer.settled
 
 
 @given(st.binary(max_size=80))

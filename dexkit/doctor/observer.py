@@ -27,6 +27,8 @@ _SEDP = {rtps.SEDP_PUBLICATIONS: True, rtps.SEDP_SUBSCRIPTIONS: False}
 _REPEAT = 0.2  # seconds between tries to be told, or to tell, the rest
 _TRIES = 15
 _LEASE = 20  # seconds; a look is shorter, and ends with a farewell
+_MOST = 4096  # announcements of one writer
+_LAST = (1 << 63) - 1  # the largest sequence number
 _MAX_SAMPLE = 1 << 20
 _PARTIAL = 4  # incomplete samples kept of a writer
 
@@ -225,18 +227,19 @@ class Observer:
         if isinstance(item, AckNack):
             if item.writer == rtps.SEDP_SUBSCRIPTIONS:
                 peer.acked = max(peer.acked, min(item.base - 1, len(self._readers)))
-                if any(n <= len(self._readers) for n in item.missing):
+                if any(1 <= n <= len(self._readers) for n in item.missing):
                     self._tell(peer, out)
             return
         history = peer.histories.get(item.writer)
         if history is None:
             return
         if isinstance(item, Gap):
-            if item.before - item.start <= 4096:
+            if item.before - item.start <= _MOST:
                 history.seen.update(range(item.start, item.before))
             history.seen.update(item.numbers)
             return
-        if item.last - item.first > 4096 or item.first < 1:
+        # RTPS 8.3.7.5.3; what is answered to a wrong one would itself be wrong
+        if not 1 <= item.first <= item.last + 1 <= min(item.first + _MOST, _LAST):
             raise WireError(f"a heartbeat of {item.first} to {item.last}")
         history.first, history.last = item.first, item.last
         history.told = True
