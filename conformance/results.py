@@ -16,6 +16,7 @@ error          the kit's own fault
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -310,7 +311,7 @@ def _result_dict(result: Result) -> dict[str, Any]:
         "cause": result.cause,
         "blocked_by": result.blocked_by,
         "evidence": [asdict(e) for e in result.evidence],
-        "values": dict(result.values),
+        "values": {name: v for name, v in result.values.items() if math.isfinite(v)},
         "requirement": requirement,
     }
 

@@ -1,0 +1,116 @@
+"""What a vendor claims, and what becomes of it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import dexkit.conformance
+from dexkit.conformance.checks import Outcome
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
+from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.view import Recording
+from dexkit.errors import UsageError
+from dexkit.hand import Side
+from tests.conformance_helpers import of, short_run
+
+DOCS = Path(__file__).parent.parent / "docs" / "capabilities.md"
+VELOCITY = next(r for r in catalogue("dex1-1") if r.id == "DEX1-FIELD-04")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[claims]\nforse = true", "no unit 'forse'"),
+        ("[claims]\nforce = 1", "force is true or false"),
+        ("[claim]\nforce = true", "claim is not understood"),
+        ("claims = true", "hand or claims is not understood"),
+        ("[hand]\ncolour = 'red'", "colour is not understood"),
+        ("[hand]\nname = 1", "name is not understood"),
+        ("[hand]\nmodel = 'dex9'", "no hand model 'dex9'"),
+        ("[claims", "capabilities.toml: "),
+    ],
+)
+def test_a_file_that_is_not_understood_is_an_error(text: str, says: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(says)):
+        Claims.parse(text)
+
+
+def test_a_file_about_another_model_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "capabilities.toml"
+    path.write_text("[hand]\nmodel = 'dex3-1'\n")
+    assert Claims.load(path, "dex3-1").hand["model"] == "dex3-1"
+    with pytest.raises(UsageError, match="about a dex3-1, and a dex1-1 is to be judged"):
+        Claims.load(path, "dex1-1")
+    with pytest.raises(UsageError, match="cannot read"):
+        Claims.load(tmp_path / "missing.toml", "dex1-1")
+
+
+def test_the_shipped_example_and_the_documentation_have_every_unit() -> None:
+    assert dexkit.conformance.__file__ is not None
+    example = Path(dexkit.conformance.__file__).parent / "capabilities.example.toml"
+    claims = Claims.load(example, "dex1-1")
+    assert claims.units is not None
+    text, documented = example.read_text(), DOCS.read_text()
+    for unit, meaning in CAPABILITIES.items():
+        assert re.search(rf"^{unit} = ", text, re.M)
+        assert f"| `{unit}` | {meaning}" in documented
+
+
+def test_every_unit_has_a_requirement() -> None:
+    assert {r.capability for r in catalogue(None, None)} == {"", *CAPABILITIES}
+
+
+def test_without_a_file_nothing_changes() -> None:
+    claims = Claims()
+    assert claims.apply(catalogue()) == catalogue()
+    assert claims.claimed(VELOCITY) is None
+
+
+def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
+    recording = Recording.of(short_run())
+    silent = judge(recording)
+    assert of(silent, VELOCITY.id).requirement.level is Level.SHOULD
+    assert silent.claims is None
+    claimed = judge(recording, claims=Claims.parse("[claims]\nvelocity = true"))
+    assert of(claimed, VELOCITY.id).requirement.level is Level.MUST
+    assert of(claimed, VELOCITY.id).verdict is Verdict.PASS
+    assert claimed.claims is not None
+    assert claimed.claims["velocity"]
+    assert not claimed.claims["force"]
+    nothing = judge(recording, claims=Claims.parse('[hand]\nname = "X"\nfirmware = "1"'))
+    assert of(nothing, VELOCITY.id).verdict is Verdict.NOT_CLAIMED
+    assert (nothing.subject["hand"], nothing.subject["firmware"]) == ("X", "1")
+
+
+def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
+    claims = Claims.parse(text) if text else Claims()
+    (applied,) = claims.apply([requirement])
+    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: "")
+
+
+@pytest.mark.parametrize("met", [None, True])
+def test_a_claimed_unit_of_which_nothing_is_seen_fails(met: bool | None) -> None:
+    absent = Outcome(met, observed="all 0", reason="" if met else "dq is 0", absent=True)
+    usual = Verdict.PASS if met else Verdict.NOT_APPLICABLE
+    assert concluded(VELOCITY, "", absent).verdict is usual
+    found = concluded(VELOCITY, "[claims]\nvelocity = true", absent)
+    assert found.verdict is Verdict.FAIL
+    assert "but the unit 'velocity' is claimed" in found.observed
+
+
+def test_a_claimed_should_fails_where_it_would_warn() -> None:
+    bad = Outcome(False, "200 %", "dq is off")
+    assert concluded(VELOCITY, "", bad).verdict is Verdict.WARN
+    assert concluded(VELOCITY, "[claims]\nvelocity = true", bad).verdict is Verdict.FAIL
+
+
+def test_an_info_stays_an_info() -> None:
+    info = replace(VELOCITY, level=Level.INFO)
+    assert concluded(info, "[claims]\nvelocity = true", Outcome(False)).verdict is Verdict.WARN

@@ -1,0 +1,68 @@
+"""Result files are what their published schema says."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
+from dexkit.conformance.results import VERSION, Overall, Stage, Verdict
+from dexkit.conformance.view import Recording
+from dexkit.hand import Side
+from dexkit.traces import open_trace, sample_path
+from tests.conformance_helpers import short_run
+
+jsonschema = pytest.importorskip("jsonschema")
+
+
+def schema() -> dict[str, Any]:
+    text = files("dexkit.conformance.report").joinpath("result.schema.json").read_text("utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+def validate(data: object) -> None:
+    jsonschema.Draft202012Validator(schema()).validate(data)
+
+
+def test_the_schema_is_one() -> None:
+    jsonschema.Draft202012Validator.check_schema(schema())
+
+
+@pytest.mark.parametrize("name", ["dex1_hand_dropout", "dex3_pinch"])
+def test_results_of_genuine_recordings_validate(name: str, tmp_path: Path) -> None:
+    result = judge(Recording.of(open_trace(sample_path(name))), subject={"recording": name})
+    result.write_json(tmp_path / "r.json")
+    validate(json.loads((tmp_path / "r.json").read_text()))
+
+
+def test_a_result_with_claims_and_stimulus_validates() -> None:
+    recording = Recording.of(short_run(), sides=tuple(Side))
+    claims = Claims.parse('[hand]\nname = "x"\n[claims]\nvelocity = true')
+    data = json.loads(json.dumps(judge(recording, claims=claims).as_dict()))
+    validate(data)
+    assert data["harness"] == {"starved": 0.0}
+    assert {r["verdict"] for r in data["results"]} >= {"pass", "fail", "blocked", "not claimed"}
+    with pytest.raises(jsonschema.ValidationError):
+        validate({**data, "version": 1})
+    with pytest.raises(jsonschema.ValidationError):
+        validate({**data, "surprise": 1})
+
+
+def test_the_schema_knows_every_value() -> None:
+    known = schema()
+    properties, defs = known["properties"], known["$defs"]
+    assert properties["version"]["const"] == VERSION
+    assert set(properties["overall"]["enum"]) == {str(o) for o in Overall}
+    assert set(properties["counts"]["properties"]) == {str(v) for v in Verdict}
+    assert set(defs["result"]["properties"]["verdict"]["enum"]) == {str(v) for v in Verdict}
+    assert properties["stage"]["additionalProperties"]["enum"] == [str(s) for s in Stage]
+    assert defs["level"]["enum"] == [str(level) for level in Level]
+    assert defs["requirement"]["properties"]["confidence"]["enum"] == list(CONFIDENCE)
+    assert defs["requirement"]["properties"]["layer"]["enum"] == list(LAYERS)
