@@ -261,8 +261,9 @@ class TestDiscovery:
     def test_what_there_is_instead_is_named(self) -> None:
         right = RawDevice(FakeHand(Side.RIGHT), side=Side.RIGHT, serial="R7")
         with serving(right) as server:
-            with pytest.raises(HandNotFound, match=r"34b7:1010.*there is the right.*R7"):
+            with pytest.raises(HandNotFound, match=r"34b7:1010.*there is the right"):
                 hand_on(server).open()
+            assert not right.attachments  # somebody may be about to take it
             with pytest.raises(HandNotFound, match=r"X9.*there is the right hand R7"):
                 hand_on(server, serial="X9").open()
 
@@ -300,6 +301,37 @@ class TestDiscovery:
             )
             with pytest.raises(HandNotFound):
                 Dex3Usb(Side.LEFT, Dex3Settings(local=False)).open()
+
+    @pytest.mark.parametrize("first", ["usb", "server"])
+    def test_a_lost_hand_is_looked_for_where_it_was(
+        self, first: str, no_usb: None, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        real = FakeBackend(FakeHand())
+        there: list[str] = ["device"] if first == "usb" else []
+        monkeypatch.setattr(real, "enumerate_devices", lambda: there)
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: real)
+        emulated = RawDevice(FakeHand())
+        emulated.plugged = first == "server"
+        with serving(emulated) as server:
+            monkeypatch.setattr(discovery, "LOCAL_SERVER", at(server))
+            hand = Dex3Usb(Side.LEFT, QUICK)
+            hand.open()
+            hand.close()
+            there[:] = ["device"] if first == "server" else []
+            emulated.plugged = first == "usb"
+            with pytest.raises(HandNotFound):
+                hand.open()
+            there[:] = ["device"]
+            emulated.plugged = True
+            with hand:
+                assert hand.exchange(GO).measured
+            assert (emulated.attachments > 0) == (first == "server")
+
+    def test_two_of_a_side_one_taken(self) -> None:
+        hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2")]
+        with serving(*hands) as server, hand_on(server, serial="A1"):
+            with pytest.raises(HandNotFound, match=r"another program has it.*\(A2\)"):
+                hand_on(server).open()
 
     def test_this_machines_usb_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with serving(RawDevice(FakeHand())) as server:

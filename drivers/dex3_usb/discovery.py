@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,12 +72,14 @@ class Candidate:
     :param device: one of the backend's devices.
     :param side: by its product id.
     :param where: for messages.
+    :param server: that exports it; None for this machine's USB.
     """
 
     backend: Backend
     device: Any
     side: Side
     where: str
+    server: Server | None = None
 
     def __str__(self) -> str:
         return f"the {self.side} Dex3-1 on {self.where}"
@@ -162,24 +165,25 @@ def _on_system(seen: list[str], hints: list[str]) -> list[Candidate]:
         seen.append(_NO_LIBUSB)
         hints.append(_INSTALL_LIBUSB)
         return []
-    return _candidates(backend, "USB")
+    return _candidates(backend)
 
 
 def _on_server(server: Server) -> list[Candidate]:
     # here, not above: it loads the mDNS code that comes with the package
     from dexkit.drivers.dex3_usb.usbip import UsbIpBackend
 
-    return _candidates(UsbIpBackend(server.host, server.port), str(server))
+    return _candidates(UsbIpBackend(server.host, server.port), server)
 
 
-def _candidates(backend: Backend, where: str) -> list[Candidate]:
+def _candidates(backend: Backend, server: Server | None = None) -> list[Candidate]:
+    where = "USB" if server is None else str(server)
     found = []
     for device in backend.enumerate_devices():
         descriptor = backend.get_device_descriptor(device)
         side = _SIDES.get(descriptor.idProduct)
         if descriptor.idVendor == VENDOR_ID and side is not None:
             place = f"{where}, bus {descriptor.bus} device {descriptor.address}"
-            found.append(Candidate(backend, device, side, place))
+            found.append(Candidate(backend, device, side, place, server))
     return found
 
 
@@ -197,7 +201,8 @@ def _choose(
             )
         if mine:
             return mine[0]
-        seen += [f"there is {_name(c)}" for c in candidates]
+        # not asked for their numbers: that would take them from whoever is about to have them
+        seen += [f"there is {c}" for c in candidates]
         return None
     denied: OSError | None = None
     for candidate in candidates:
@@ -225,7 +230,8 @@ def _name(candidate: Candidate) -> str:
     try:
         number = candidate.serial() or "no serial number"
     except OSError as error:
-        number = f"serial number unknown: {error.strerror or error}"
+        busy = error.errno == errno.EBUSY
+        number = "another program has it" if busy else f"no serial number: {error}"
     return f"{candidate} ({number})"
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
-from dexkit.drivers.dex3_usb.discovery import find_hand
+from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
 from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, WireError
@@ -55,7 +55,8 @@ class Dex3Usb:
     :param side: which hand.
     :param configuration: how to reach it and how to talk to it.
 
-    ``open`` finds the hand and brakes it. The motors obey for a second at most without the next
+    ``open`` finds the hand and brakes it; a hand that was lost is looked for where it was found
+    the first time. The motors obey for a second at most without the next
     command (unless ``protect`` is off), so a process that dies leaves none of them driven;
     those that stopped by themselves are braked and take the command after that one.
     """
@@ -75,6 +76,8 @@ class Dex3Usb:
         self.statistics = Dex3Statistics()
         self._clock: Clock = clock if clock is not None else RealClock()
         self._link: UsbLink | None = None
+        self._found = False
+        self._server: Server | None = None  # where it was found
         self._spec = DEX3_1.spec(
             side,
             io_rate=_IO_RATE,
@@ -125,8 +128,8 @@ class Dex3Usb:
         candidate = find_hand(
             self._spec.side,
             serial=configuration.serial,
-            server=configuration.server,
-            local=configuration.local,
+            server=self._server if self._found else configuration.server,
+            local=configuration.local and not self._found,
         )
         self._reset()
         self._link = UsbLink(
@@ -142,6 +145,8 @@ class Dex3Usb:
         except BaseException:
             self.close()
             raise
+        # whoever drives an emulated hand must not find a real one in its place, nor the reverse
+        self._found, self._server = True, candidate.server
         log.info(
             "%s: serial number %s, endpoints %#04x and %#04x, supply %.1f V",
             self._link.name,
