@@ -418,6 +418,14 @@ class TestDiagnose:
         assert "rt/dex3/left/state, the state of a dex3-1" in text
         served = FakeEndpoint("rt/dex3/left/state", self.HG.state_type, "writer")
         assert diagnose([waiting, served], self.GO, [Side.LEFT]) == []
+        example = FakeEndpoint("rt/lf/dex3/left/state", self.HG.state_type, "reader")
+        (text,) = diagnose([example], self.GO, [Side.LEFT])
+        assert "the state of a dex3-1" in text
+
+    def test_a_client_of_the_other_side_is_not_our_business(self) -> None:
+        other = self.GO.topics(Side.RIGHT)[1]
+        peers = [FakeEndpoint(other, self.GO.state_type, "reader")]
+        assert diagnose(peers, self.GO, [Side.LEFT]) == []
 
     def test_the_low_rate_topic(self) -> None:
         topic = "rt/lf/dex3/left/state"

@@ -13,7 +13,8 @@ from rich.table import Table
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
 from dexkit.doctor.rules import Readiness, Verdict
-from dexkit.doctor.topics import roles, short
+from dexkit.doctor.topics import short
+from dexkit.topics import roles
 
 __all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
 

@@ -19,9 +19,10 @@ from dexkit.doctor.observations import (
     Stream,
     UsbDevice,
 )
-from dexkit.doctor.topics import Role, nearly, roles, short
+from dexkit.doctor.topics import nearly, short
 from dexkit.hand import Side
 from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.topics import Role, roles
 from dexkit.wire import dex3_usb, mx64
 
 __all__ = ["Readiness", "Verdict", "Wish", "diagnose", "readiness", "verdict"]

@@ -1,60 +1,20 @@
-"""Which topic is whose: the hand topics of all dialects, and names that are nearly one."""
+"""Hand topics as people write them: names that are nearly one, and types in short."""
 
 from __future__ import annotations
 
 import difflib
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 
-from dexkit.hand import Side
 from dexkit.messages import message_types
-from dexkit.models import DIALECTS, Dialect
+from dexkit.topics import HAND_TOPICS, roles
 
-__all__ = ["Role", "is_hand_topic", "nearly", "roles", "short"]
+__all__ = ["is_hand_topic", "nearly", "short"]
 
 _KNOWN_TYPES = frozenset(kind.name for kind in message_types())
 _ALIKE = 0.86  # ratio of difflib above which a name is a slip of the pen
 # other hands of the vendor's stack; not slips of the pen
 _OTHERS = re.compile(r"(rt)?/?(lf/)?(dex\d+|inspire\w*|brainco\w*)/")
-
-
-@dataclass(frozen=True)
-class Role:
-    """What a topic is in a dialect.
-
-    :param kind: ``"cmd"``, ``"state"`` or ``"low"`` (the low-rate copy of the state).
-    :param sides: whose; both where they share it.
-    """
-
-    dialect: Dialect
-    kind: str
-    sides: tuple[Side, ...]
-    type_name: str
-
-
-def _table() -> dict[str, list[Role]]:
-    table: dict[str, list[Role]] = {}
-    for dialect in DIALECTS.values():
-        by_topic: dict[tuple[str, str, str], list[Side]] = {}
-        for side in Side:
-            cmd, state = dialect.topics(side)
-            by_topic.setdefault((cmd, "cmd", dialect.cmd_type), []).append(side)
-            by_topic.setdefault((state, "state", dialect.state_type), []).append(side)
-            if dialect.low_rate_topic:
-                low = dialect.low_rate_topic.format(side=side)
-                by_topic.setdefault((low, "low", dialect.state_type), []).append(side)
-        for (topic, kind, type_name), sides in by_topic.items():
-            table.setdefault(topic, []).append(Role(dialect, kind, tuple(sides), type_name))
-    return table
-
-
-_TABLE = _table()
-
-
-def roles(topic: str, type_name: str | None = None) -> list[Role]:
-    """What a topic is, in each dialect that has it, of one type or any."""
-    return [r for r in _TABLE.get(topic, []) if type_name in (None, r.type_name)]
 
 
 def is_hand_topic(topic: str, type_name: str) -> bool:
@@ -73,15 +33,15 @@ def nearly(topic: str, among: Iterable[str] = ()) -> tuple[str, str] | None:
 
     :param among: names to choose from; default all hand topics.
     """
-    if topic in _TABLE:
+    if topic in HAND_TOPICS:
         return None
-    names = sorted(among or _TABLE)
+    names = sorted(among or HAND_TOPICS)
     plain = _plain(topic)
     for name in names:
         if _plain(name) == plain:
             return name, _slip(topic)
     known = _OTHERS.match(topic.lower())
-    if known and not any(f"/{known[3]}/" in name for name in _TABLE):
+    if known and not any(f"/{known[3]}/" in name for name in HAND_TOPICS):
         return None
     best = difflib.get_close_matches(plain, [_plain(name) for name in names], 1, _ALIKE)
     for name in names:
