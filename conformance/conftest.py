@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 
 import pytest
 
@@ -26,5 +27,8 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
     except DexkitError as error:
         hint = f"\n{error.hint}" if error.hint else ""
         pytest.exit(f"the kit cannot judge: {error.message}{hint}", returncode=2)
+    except Exception:  # once, instead of once for each requirement
+        text = "the kit itself has failed, which says nothing about the hand"
+        pytest.exit(f"{text}; please report this:\n{traceback.format_exc()}", returncode=2)
     request.config.stash[RESULT_KEY] = result
     return result

@@ -27,12 +27,12 @@ class Heartbeat:
     kernel without it) only the former is known.
 
     :ivar stalls: when the machine lacked processor time.
-    :ivar beats: by how much this thread was woken late, all along: the jitter of the kit itself.
     """
 
     def __init__(self) -> None:
         self.stalls: list[Stall] = []
-        self.beats = Beats(time.time_ns())
+        self._begin_ns = time.time_ns()
+        self._beats: list[tuple[int, int]] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
@@ -44,15 +44,22 @@ class Heartbeat:
             clock.sleep_until(due)
             late = clock.now() - due
             end = time.time_ns()
-            self.beats.t_us.append((end - self.beats.begin_ns) // 1000)
-            self.beats.late_us.append(round(late * 1e6))
+            # one append, so that whoever looks meanwhile never sees half a beat
+            self._beats.append(((end - self._begin_ns) // 1000, round(late * 1e6)))
             before, waited = waited, _waited()
             short = (waited - before) * 1e9 > _PRESSURE * (end - begin)
             if late <= _LATE and not short:
                 continue
             if self.stalls and begin - self.stalls[-1].end_ns < _BEAT * 1e9:
-                begin = self.stalls.pop().begin_ns
-            self.stalls.append(Stall(begin, end))
+                self.stalls[-1] = Stall(self.stalls[-1].begin_ns, end)
+            else:
+                self.stalls.append(Stall(begin, end))
+
+    @property
+    def beats(self) -> Beats:
+        """By how much this thread was woken late, up to now: the jitter of the kit itself."""
+        beats = self._beats.copy()
+        return Beats(self._begin_ns, [t for t, _ in beats], [late for _, late in beats])
 
     def __enter__(self) -> Heartbeat:
         self._thread.start()
