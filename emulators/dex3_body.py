@@ -116,7 +116,7 @@ _FORCE_MIN, _FORCE_MAX = 0.010 * _GRAVITY, 2.5 * _GRAVITY  # seed 002 "Range of 
 # the code for "no value" on the wire (30000 counts of 8 Pa).
 _ELEMENT_AREA = 1.05e-4
 
-# per finger, in the order of the packets tip, pad: (joint that presses it, lever arm)
+# per place of a finger: (joint that presses it, lever arm, share of each element)
 _INDEX = {spec.name: i for i, spec in enumerate(DEX3_1.joints[Side.LEFT])}
 _PRESSES = {
     "thumb tip": ("thumb_2", _TIP_LEVER, _TIP_SHARE),

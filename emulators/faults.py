@@ -13,7 +13,8 @@ Times count from the moment the emulator is ready. ``for`` limits a fault that c
 itself; ``id`` picks one servo of several, or one motor of a hand, and ``side`` one hand of two.
 Chance is seeded, so a run can be repeated.
 
-Each family of devices has its kinds: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`.
+Each family of devices has its kinds: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`,
+:data:`M4010_FAULTS`.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from dexkit.hand import Side
 __all__ = [
     "DEX3_FAULTS",
     "FAULT_KINDS",
+    "M4010_FAULTS",
     "MX64_FAULTS",
     "Fault",
     "FaultFamily",
@@ -118,6 +120,40 @@ DEX3_FAULTS = FaultFamily(
     sided=True,
 )
 """Faults of an emulated Dex3-1; ``id`` is a motor's index in the IDL, 0 thumb_0 to 6 index_1."""
+
+M4010_FAULTS = FaultFamily(
+    "m4010",
+    (
+        _DROP,
+        _CORRUPT,
+        _DELAY,
+        FaultKind("short", "answers end after some bytes", {"bytes": 20.0, "p": 1.0}, lasting=True),
+        FaultKind(
+            "pause",
+            "answers pause for ms after some bytes",
+            {"ms": 30.0, "bytes": 13.0, "p": 1.0},
+            lasting=True,
+        ),
+        FaultKind(
+            "stray",
+            "bytes that are nobody's come before and after answers",
+            {"before": 1.0, "after": 0.0, "p": 1.0},
+            lasting=True,
+        ),
+        _UNPLUG,
+        FaultKind("silent", "a motor is off the line: no data, no commands", {}, True, True),
+        FaultKind(
+            "overheat", "a motor's winding is at c degrees Celsius", {"c": 140.0}, True, True
+        ),
+        FaultKind("overcurrent", "a motor reports overcurrent", {}, True, True),
+        FaultKind("encoder", "a motor reports an error of its output encoder", {}, True, True),
+        _STUCK,
+        FaultKind("brown-out", "a motor's supply falls to volts", {"volts": 10.0}, True, True),
+    ),
+    max_id=1,
+)
+"""Faults of the Dex1-1's motor; ``id`` is its own, 0 right, 1 left. ``short``, ``pause`` and
+``stray`` are those that put the vendor's library out of step (facts/unitree-dex G)."""
 
 FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kinds}
 """The kinds of the MX-64 by name."""

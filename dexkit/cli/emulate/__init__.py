@@ -10,6 +10,11 @@ __all__ = ["command"]
 
 # name -> (module, attribute, one-line help); the help is here so that a listing imports nothing
 _DEVICES = {
+    "dex1-motor": (
+        "dexkit.cli.emulate.dex1_motor",
+        "emulate_dex1_motor",
+        "Emulate the serial motor of a Dex1-1 on a pseudo-terminal.",
+    ),
     "dex3-usb": (
         "dexkit.cli.emulate.dex3_usb",
         "emulate_dex3_usb",

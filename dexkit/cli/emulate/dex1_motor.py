@@ -1,0 +1,150 @@
+"""``dexkit emulate dex1-motor``: the Dex1-1's serial motor on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from dexkit.cli.common import stop_on_signals
+from dexkit.cli.emulate.stdin import read_faults
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.hand import Side
+from dexkit.wire import m4010
+
+__all__ = ["emulate_dex1_motor"]
+
+
+@click.command("dex1-motor", context_settings={"show_default": True})
+@click.option(
+    "--side",
+    type=click.Choice(["left", "right", "both"]),
+    default="left",
+    help="Whose motor: id 0 is the right one, 1 the left one.",
+)
+@click.option(
+    "--link",
+    "links",
+    multiple=True,
+    required=True,
+    metavar="PATH",
+    help="Link that clients open. With --side both, one for a line with both motors, or "
+    "left=PATH and right=PATH for a line each.",
+)
+@click.option(
+    "--object",
+    "object_pct",
+    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    metavar="PCT",
+    help="Percent of opening at which the jaws touch an object.  [default: no object]",
+)
+@click.option(
+    "--start", type=click.FloatRange(0, 100), default=20.0, metavar="PCT", help="Opening at first."
+)
+@click.option(
+    "--zero-error",
+    type=click.FloatRange(-6, 6),
+    default=0.0,
+    metavar="RAD",
+    help="Report the position too large by this, until it is calibrated.",
+)
+@click.option(
+    "--baudrate",
+    type=click.IntRange(9600, 12_000_000),
+    default=m4010.BAUD_RATE,
+    metavar="B",
+    help="Bits a second that the motor understands.",
+)
+@click.option("--line-time/--no-line-time", default=True, help="Bytes take their time.")
+@click.option(
+    "--answer-time",
+    type=click.FloatRange(0, 1000),
+    default=0.0,
+    metavar="MS",
+    help="From a command to its answer; what the real motor needs is not known.",
+)
+@click.option(
+    "--latency-timer",
+    type=click.FloatRange(0, 255),
+    default=0.0,
+    metavar="MS",
+    help="Of the USB-serial adapter, where it has one.",
+)
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="SPEC",
+    help="Have a fault, e.g. unplug@5s:for=2s, stray:before=1, silent:id=1; may be repeated.",
+)
+@click.option(
+    "--faults-from-stdin",
+    is_flag=True,
+    help="Also take faults as lines of input, and stop at its end.",
+)
+@click.option("--seed", type=int, default=0, help="Of the faults' chance.")
+@click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
+def emulate_dex1_motor(
+    side: str,
+    links: tuple[str, ...],
+    object_pct: float | None,
+    start: float,
+    zero_error: float,
+    baudrate: int,
+    line_time: bool,
+    answer_time: float,
+    latency_timer: float,
+    faults: tuple[str, ...],
+    faults_from_stdin: bool,
+    seed: int,
+    any_baudrate: bool,
+) -> None:
+    """Emulate the motor of a Dex1-1 (Unitree M4010) with the gripper on its shaft.
+
+    Prints "ready: PATH SIDE ..." for each line when it answers there. Ctrl-C or SIGTERM ends it
+    and removes the link.
+    """
+    from dexkit.emulators.m4010 import Dex1Motors, Firmware
+
+    sides = tuple(Side) if side == "both" else (Side(side),)
+    with (
+        stop_on_signals() as request,
+        Dex1Motors(
+            sides,
+            links=_places(links, sides),
+            object_pct=object_pct,
+            start_pct=start,
+            zero_error=zero_error,
+            firmware=Firmware(baudrate=baudrate, answer_time=answer_time * 1e-3),
+            line_time=line_time,
+            latency_timer=latency_timer * 1e-3,
+            faults=faults,
+            seed=seed,
+            check_baudrate=not any_baudrate,
+        ) as motors,
+    ):
+        if faults_from_stdin:
+            read_faults(motors.inject, request)
+        click.echo("\n".join(motors.ready_lines))
+        sys.stdout.flush()
+        while not request.wait(0.2):
+            if motors.error is not None:
+                raise EmulatorError(f"the emulator stopped: {motors.error}") from motors.error
+    for line in motors.summaries():
+        click.echo(f"stopped: {line}")
+
+
+def _places(links: tuple[str, ...], sides: tuple[Side, ...]) -> dict[Side, str]:
+    if len(links) == 1 and not links[0].startswith(tuple(f"{side}=" for side in Side)):
+        return dict.fromkeys(sides, links[0])
+    places: dict[Side, str] = {}
+    for text in links:
+        name, _, path = text.partition("=")
+        if name not in [str(side) for side in sides] or Side(name) in places or not path:
+            raise UsageError(
+                f"--link {text}: which line is it?", hint="--link left=PATH --link right=PATH"
+            )
+        places[Side(name)] = path
+    if set(places) != set(sides):
+        raise UsageError("a link is needed for each side", hint="or one --link PATH for both")
+    return places

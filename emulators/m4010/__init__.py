@@ -1,0 +1,14 @@
+"""An emulated M4010, the motor of the Dex1-1, with the gripper on its shaft.
+
+From the inside out: :mod:`settings` (uncertain points, heat), :mod:`motor` (commands, protection,
+calibration) and :mod:`bus` (motors on a line, faults) are sans-IO;
+:mod:`dexkit.emulators.serial_port` puts a bus on a pseudo-terminal; :mod:`gripper` has
+:class:`Dex1Motors` for the command line and the helper :func:`emulated_dex1` for tests.
+"""
+
+from dexkit.emulators.m4010.bus import Bus
+from dexkit.emulators.m4010.gripper import Dex1Motors, Dex1Process, emulated_dex1
+from dexkit.emulators.m4010.motor import Motor
+from dexkit.emulators.m4010.settings import Firmware, Heat
+
+__all__ = ["Bus", "Dex1Motors", "Dex1Process", "Firmware", "Heat", "Motor", "emulated_dex1"]

@@ -1,0 +1,245 @@
+"""Emulated Dex1-1 motors, ready to be opened: in threads or in a process of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+
+from dexkit.clock import RealClock
+from dexkit.emulators.dex1_body import Dex1Body
+from dexkit.emulators.faults import M4010_FAULTS, parse_fault
+from dexkit.emulators.m4010.bus import Bus
+from dexkit.emulators.m4010.motor import LOCKING, Motor
+from dexkit.emulators.m4010.settings import Firmware
+from dexkit.emulators.process import EmulatorProcess
+from dexkit.emulators.serial_port import Port
+from dexkit.errors import UsageError
+from dexkit.hand import Side
+from dexkit.models import DEX1_1
+
+__all__ = ["Dex1Motors", "Dex1Process", "emulated_dex1"]
+
+
+class Dex1Motors:
+    """The motors of one gripper or of both, on one line or on two, served in threads.
+
+    :param sides: whose motors.
+    :param links: where each side's line is put; one path for both sides makes one line. None for
+        a name in a temporary directory, and one line.
+    :param object_pct: opening at which an object is touched, percent; None for none.
+    :param start_pct: opening at first, percent.
+    :param zero_error: rad by which the position is reported too large, until calibrated.
+    :param faults: specifications, see :mod:`dexkit.emulators.faults`. Those of the line strike
+        every line.
+    :param check_baudrate: a client at another baud rate is not understood.
+    :raises EmulatorError: a link cannot be made.
+    :raises UsageError: a fault or a figure that cannot be.
+
+    Reading ``motors`` while a client talks to them is a snapshot of a moving thing.
+    """
+
+    def __init__(
+        self,
+        sides: Sequence[Side] = (Side.LEFT,),
+        *,
+        links: Mapping[Side, str | os.PathLike[str]] | None = None,
+        object_pct: float | None = None,
+        start_pct: float = 20.0,
+        zero_error: float = 0.0,
+        firmware: Firmware | None = None,
+        line_time: bool = True,
+        latency_timer: float = 0.0,
+        faults: Sequence[str] = (),
+        seed: int = 0,
+        check_baudrate: bool = True,
+    ) -> None:
+        plan = [parse_fault(spec, M4010_FAULTS) for spec in faults]
+        now = RealClock().now()
+        self.motors: dict[Side, Motor] = {}
+        for side in sides:
+            body = Dex1Body(object_pct=object_pct, start_pct=start_pct, locking=LOCKING)
+            self.motors[side] = Motor(
+                DEX1_1.vendor_ids[side],
+                body=body,
+                firmware=firmware,
+                zero_error=zero_error,
+                now=now,
+            )
+        lines: dict[str | None, list[Side]] = {}
+        for side in sides:
+            link = None if links is None else os.path.abspath(os.fspath(links[side]))
+            lines.setdefault(link, []).append(side)
+        self.ports: dict[Side, Port] = {}
+        try:
+            for link, together in lines.items():
+                bus = Bus(
+                    [self.motors[side] for side in together],
+                    line_time=line_time,
+                    latency_timer=latency_timer,
+                    faults=plan,
+                    start=now,
+                    seed=seed,
+                )
+                port = Port(bus, link, check_baudrate=check_baudrate)
+                self.ports |= dict.fromkeys(together, port)
+        except BaseException:
+            self.close()
+            raise
+        for port in self._lines:
+            port.start()
+
+    @property
+    def _lines(self) -> list[Port]:
+        return list({id(port): port for port in self.ports.values()}.values())
+
+    @property
+    def path(self) -> str:
+        """What a client opens, of the first line."""
+        return self._lines[0].path
+
+    @property
+    def motor(self) -> Motor:
+        """The only or first motor."""
+        return next(iter(self.motors.values()))
+
+    @property
+    def error(self) -> BaseException | None:
+        """What ended the service of a line, if anything."""
+        return next((port.error for port in self._lines if port.error is not None), None)
+
+    @property
+    def ready_lines(self) -> list[str]:
+        """One a line: where it is and who answers there."""
+        lines = []
+        for port in self._lines:
+            here = [side for side in self.ports if self.ports[side] is port]
+            ids = ",".join(str(self.motors[side].number) for side in here)
+            names = ",".join(str(side) for side in here)
+            rate = self.motors[here[0]].firmware.baudrate
+            lines.append(f"ready: {port.path} {names} id={ids} baudrate={rate} pty={port.terminal}")
+        return lines
+
+    def bus(self, side: Side) -> Bus:
+        """The line of a side."""
+        line = self.ports[side].line
+        assert isinstance(line, Bus)
+        return line
+
+    def inject(self, spec: str) -> None:
+        """Have a fault now (or at its ``@TIME`` from now), on every line."""
+        fault = parse_fault(spec, M4010_FAULTS)
+        for port in self._lines:
+            port.inject(fault)
+
+    def summaries(self) -> list[str]:
+        """One a line: what passed on it."""
+        found = []
+        for port in self._lines:
+            bus = port.line
+            assert isinstance(bus, Bus)
+            text = bus.counters.summary() or "nothing was sent"
+            trips = sum(motor.trips for motor in bus.motors)
+            if trips:
+                text += f", {trips} trips"
+            if port.overruns:
+                text += f", {port.overruns} bytes not read by the client"
+            found.append(f"{port.path}: {text}")
+        return found
+
+    def close(self) -> None:
+        """Stop, and remove the paths. May be called twice."""
+        for port in self._lines:
+            port.close()
+
+    def __enter__(self) -> Dex1Motors:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class Dex1Process(EmulatorProcess):
+    """Motors in a process of their own: ``dexkit emulate dex1-motor``.
+
+    :param arguments: of that command, without ``--link``.
+    :param link: where to put the link; None for a name in a temporary directory.
+    :raises EmulatorError: it did not become ready.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str] = (),
+        link: str | os.PathLike[str] | None = None,
+        *,
+        timeout: float = 20.0,
+    ) -> None:
+        self._directory: tempfile.TemporaryDirectory[str] | None = None
+        if link is None:
+            self._directory = tempfile.TemporaryDirectory(prefix="dexkit-dex1-")
+            link = os.path.join(self._directory.name, "tty")
+        self.path = os.path.abspath(os.fspath(link))
+        try:
+            super().__init__(
+                "dex1-motor", ["--link", self.path, *arguments], M4010_FAULTS, timeout=timeout
+            )
+        except BaseException:
+            self._cleanup()
+            raise
+
+    def close(self) -> None:
+        """Stop it; ``output`` and ``errors`` then hold what it printed behind the ready line."""
+        super().close()
+        self._cleanup()
+
+    def _cleanup(self) -> None:
+        if self._directory is not None:
+            self._directory.cleanup()
+            self._directory = None
+
+
+@contextlib.contextmanager
+def emulated_dex1(
+    side: Side | str = Side.LEFT,
+    *,
+    process: bool = False,
+    object_pct: float | None = None,
+    start_pct: float = 20.0,
+    faults: Sequence[str] = (),
+    firmware: Firmware | None = None,
+) -> Iterator[Dex1Motors | Dex1Process]:
+    """A motor that answers at ``.path``, or both on one line, and takes faults by ``.inject``.
+
+    :param side: ``left``, ``right`` or ``both``.
+    :param process: run it as ``dexkit emulate dex1-motor`` in a process of its own. A client in
+        the same process competes with the thread for the interpreter, so rates are measured
+        against a process; a thread's motors can be looked into (``.motor``).
+    :param firmware: only in a thread.
+    :raises EmulatorError: it did not become ready.
+    :raises UsageError: an option that cannot be.
+    """
+    found: Dex1Motors | Dex1Process
+    if process:
+        if firmware is not None:
+            raise UsageError("firmware can be given to a thread only")
+        found = Dex1Process(
+            [
+                f"--side={side}",
+                f"--start={start_pct:g}",
+                *(f"--fault={spec}" for spec in faults),
+                *([] if object_pct is None else [f"--object={object_pct:g}"]),
+            ]
+        )
+    else:
+        found = Dex1Motors(
+            tuple(Side) if side == "both" else (Side(side),),
+            object_pct=object_pct,
+            start_pct=start_pct,
+            faults=faults,
+            firmware=firmware,
+        )
+    try:
+        yield found
+    finally:
+        found.close()

@@ -1,0 +1,249 @@
+"""One M4010 with the gripper on its shaft, sans-IO: a command in, its data out.
+
+It keeps its last command until the next one, and watches over its own time-out protection: a cable
+that is pulled does not stop it, the protection does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from dexkit.emulators.dex1_body import STEP, Dex1Body
+from dexkit.emulators.faults import Fault
+from dexkit.emulators.m4010.settings import Firmware, Heat
+from dexkit.emulators.mechanics import FixedSteps
+from dexkit.errors import UsageError
+from dexkit.hand import JointMode, MotorError
+from dexkit.wire.m4010 import (
+    BROADCAST_ID,
+    Calibration,
+    CalibrationProblem,
+    MotorCmd,
+    MotorData,
+    Status,
+)
+
+__all__ = ["LOCKING", "Motor"]
+
+LOCKING = 1.0
+"""Self-locking: jaws that hold something go on holding it without the motor."""
+_MOST_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
+_HEAT_STEPS = 20  # heat is stepped once in so many steps
+_OVERHEATED = MotorError.WINDING_OVERTEMPERATURE | MotorError.CASE_TEMPERATURE
+
+
+class Motor:
+    """The motor of one gripper.
+
+    :param number: its id, 0 to 14.
+    :param body: the gripper; a new one by default.
+    :param zero_error: rad by which the position that it reports is too large, until it is
+        calibrated.
+    :param now: time on the caller's clock.
+    :raises UsageError: there is no such id.
+
+    :ivar tripped: the time-out protection has stopped it.
+    :ivar silent: it is off the line.
+    :ivar trips: times that the protection stopped it; ``ignored``: commands not obeyed.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        *,
+        body: Dex1Body | None = None,
+        firmware: Firmware | None = None,
+        heat: Heat | None = None,
+        zero_error: float = 0.0,
+        now: float = 0.0,
+    ) -> None:
+        if not 0 <= number < BROADCAST_ID:
+            raise UsageError(f"an id is 0 to {BROADCAST_ID - 1}, not {number}")
+        self.number = number
+        self.body = body or Dex1Body(locking=LOCKING)
+        self.firmware = firmware or Firmware()
+        self.heat = heat or Heat()
+        self.zero_error = zero_error
+        self.tripped = False
+        self.silent = False
+        self.trips = self.ignored = 0
+        self.calibrated = False  # since power-up
+        self.case = self.winding = self.heat.ambient
+        self.supply = self.heat.supply
+        self._held_hot: float | None = None
+        self._own_errors = MotorError.NONE
+        self._faults = MotorError.NONE
+        self._deadline = math.inf  # when the protection trips
+        self._steps = FixedSteps(STEP, most=_MOST_CATCH_UP)
+        self._steps.restart(now)
+        self._to_heat = _HEAT_STEPS
+        self._now = now
+
+    @property
+    def error(self) -> MotorError:
+        """What it reports, the trip of its protection included."""
+        tripped = MotorError.MOTOR_SAW_HOST_TIMEOUT if self.tripped else MotorError.NONE
+        return self._own_errors | self._faults | tripped
+
+    @property
+    def resting(self) -> bool:
+        """Whether nothing changes for now."""
+        return self.body.mode is JointMode.BRAKE and self.body.joint.dq == 0.0
+
+    @property
+    def q(self) -> float:
+        """Position that it reports, rad at the joint."""
+        return self.body.joint.q + self.zero_error
+
+    # --- time and faults
+
+    def advance_to(self, now: float) -> None:
+        """Live up to ``now``."""
+        if self._deadline <= now:
+            self._live(max(self._deadline, self._now))
+            self._deadline = math.inf
+            self.tripped = True
+            self.trips += 1
+            if self.firmware.tripped_brakes:
+                self.body.brake()
+            else:
+                self.body.drive(0.0, 0.0, 0.0, 0.0, 0.0)
+        self._live(now)
+
+    def _live(self, now: float) -> None:
+        self._now = max(self._now, now)
+        left = self._steps.due(now)
+        while left:
+            part = min(left, self._to_heat)
+            self.body.step(part)
+            left -= part
+            self._to_heat -= part
+            if not self._to_heat:
+                self._to_heat = _HEAT_STEPS
+                self._warm(_HEAT_STEPS * STEP)
+
+    def _warm(self, dt: float) -> None:
+        heat = self.heat
+        to_case = (self.winding - self.case) / heat.winding_to_case
+        to_air = (self.case - heat.ambient) / heat.case_to_air
+        loss = heat.copper_loss * self.body.torque**2
+        self.winding += dt * (loss - to_case) / heat.winding_capacity
+        self.case += dt * (to_case - to_air) / heat.case_capacity
+        if self._held_hot is not None:
+            self.winding = self._held_hot
+        self._examine()
+
+    def _examine(self) -> None:
+        """Errors that the motor finds by itself; it brakes on any."""
+        heat = self.heat
+        errors = self._own_errors & ~_OVERHEATED & ~MotorError.UNDERVOLTAGE
+        for bit, value, limit in (
+            (MotorError.WINDING_OVERTEMPERATURE, self.winding, heat.winding_limit),
+            (MotorError.CASE_TEMPERATURE, self.case, heat.case_limit),
+        ):
+            still = self._own_errors & bit and value > limit - heat.hysteresis
+            if value > limit or still:
+                errors |= bit
+        if self.supply < heat.voltage_min:
+            errors |= MotorError.UNDERVOLTAGE
+        self._own_errors = errors
+        self._stop_on_error()
+
+    def _stop_on_error(self) -> None:
+        if (self._own_errors | self._faults) and self.body.mode is not JointMode.BRAKE:
+            self.body.brake()
+
+    def suffer(self, faults: Iterable[Fault]) -> None:
+        """The faults that are on now, for this motor or for all."""
+        mine = [fault for fault in faults if fault.device in (None, self.number)]
+        kinds = {fault.kind: fault for fault in mine}
+        self.silent = "silent" in kinds
+        self.body.joint.locked = "stuck" in kinds
+        hot = kinds.get("overheat")
+        self._held_hot = None if hot is None else hot["c"]
+        if self._held_hot is not None:
+            self.winding = self._held_hot
+        dip = kinds.get("brown-out")
+        self.supply = self.heat.supply if dip is None else dip["volts"]
+        self._faults = MotorError.NONE
+        if "overcurrent" in kinds:
+            self._faults |= MotorError.OVERCURRENT
+        if "encoder" in kinds:
+            self._faults |= MotorError.OUTPUT_ENCODER
+        self._examine()
+
+    # --- the line
+
+    def handle(self, command: MotorCmd) -> MotorData | None:
+        """Obey a command; the answer, or None when it is silent or not meant.
+
+        Call it after :meth:`advance_to`.
+        """
+        if self.silent or command.id not in (self.number, BROADCAST_ID):
+            return None
+        calibration = Calibration.of(command)
+        if calibration is not None:
+            answer = self._calibrate(calibration)
+        else:
+            self._obey(command)
+            answer = self.data()
+        return None if command.id == BROADCAST_ID else answer
+
+    def _obey(self, command: MotorCmd) -> None:
+        known = command.status in (Status.BRAKE, Status.FOC)
+        if not known and not self.firmware.other_status_brakes:
+            self.ignored += 1
+            return
+        if not command.timeout:
+            self.tripped = False
+            self._deadline = math.inf
+        elif self.tripped:
+            # stays stopped until the host has taken note, which it says with the bit at 0
+            self.ignored += 1
+            return
+        else:
+            self._deadline = self._now + self.firmware.command_timeout
+        if command.status != Status.FOC or self._own_errors | self._faults:
+            self.body.brake()
+            return
+        q, dq, tau, kp, kd = command.joint()
+        self.body.drive(q - self.zero_error, dq, tau, kp, kd)
+
+    def _calibrate(self, calibration: Calibration) -> MotorData:
+        self.body.brake()
+        if not self.firmware.calibration_enabled:
+            return calibration.answer(done=False)
+        problem = CalibrationProblem.NONE
+        for bit, wrong in (
+            (CalibrationProblem.ALREADY_CALIBRATED, self.calibrated),
+            (CalibrationProblem.OUTPUT_ENCODER, self._faults & MotorError.OUTPUT_ENCODER),
+            (CalibrationProblem.ANGLE_OUT_OF_RANGE, calibration.position > calibration.range),
+            (CalibrationProblem.RANGE_INVALID, calibration.range == 0.0),
+            (CalibrationProblem.USER_ID_ZERO, calibration.user_id == 0),
+            (CalibrationProblem.TIME_ZERO, calibration.time == 0),
+            (CalibrationProblem.FLASH_WRITE, not self.firmware.flash_works),
+        ):
+            if wrong:
+                problem |= bit
+        if not problem:
+            self.zero_error = calibration.position - self.body.joint.q
+            self.calibrated = True
+        return calibration.answer(problem)
+
+    def data(self) -> MotorData:
+        """What it measures now."""
+        status = Status.FOC if self.body.mode is JointMode.FOC else Status.BRAKE
+        return MotorData.measured(
+            self.number,
+            status,
+            q=self.q,
+            dq=self.body.joint.dq,
+            # braking, its windings are shorted: no current is controlled, none reported
+            tau=self.body.torque if status is Status.FOC else 0.0,
+            temperature=self.case,
+            winding=self.winding,
+            voltage=self.supply,
+            error=int(self.error),
+            timeout=self.tripped,
+        )
