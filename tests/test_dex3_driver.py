@@ -329,9 +329,12 @@ class TestDiscovery:
 
     def test_two_of_a_side_one_taken(self) -> None:
         hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2")]
-        with serving(*hands) as server, hand_on(server, serial="A1"):
-            with pytest.raises(HandNotFound, match=r"another program has it.*\(A2\)"):
-                hand_on(server).open()
+        with (
+            serving(*hands) as server,
+            hand_on(server, serial="A1"),
+            pytest.raises(HandNotFound, match=r"another program has it.*\(A2\)"),
+        ):
+            hand_on(server).open()
 
     def test_this_machines_usb_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with serving(RawDevice(FakeHand())) as server:

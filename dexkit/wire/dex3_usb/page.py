@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from dexkit.hand import MotorError
 from dexkit.models import DEX3_1
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import units
@@ -97,6 +98,15 @@ def _commands() -> str:
 
 def _type(name: str, count: int) -> str:
     return name if count == 1 else f"{name}[{count}]"
+
+
+def _errors() -> str:
+    rows: list[list[object]] = [
+        [f"`{int(bit):08X}`", str(bit.name).lower().replace("_", " ").replace("mos ", "MOS ")]
+        for bit in MotorError
+        if bit
+    ]
+    return _table(["bit", "meaning"], rows)
 
 
 def _mode() -> str:
@@ -263,6 +273,7 @@ def _packets() -> str:
 BLOCKS: dict[str, Callable[[], str]] = {
     "identity": _identity,
     "ris-mode": _mode,
+    "errors": _errors,
     "motor-cmd": lambda: _structure(MOTOR_CMD),
     "motor-state": lambda: _structure(MOTOR_STATE),
     "sensor-state": lambda: _structure(SENSOR_STATE),
