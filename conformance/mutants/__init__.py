@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import dex3, gripper, shared
+from dexkit.conformance.mutants import dex3, gripper, operator, shared
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli import SCRIPTS, Plan, Session, phases_for
+from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import Service, run_virtual
@@ -54,6 +55,9 @@ class Mutant:
     def plan(self) -> Plan:
         """The stimulus that shows it: all of it, or what its requirement needs."""
         full = plan_for(model(self.model).dialects[0].name, sides=self.sides)
+        if "-OPER-" not in self.kills:
+            # eleven seconds that show an operator what the other phases show already
+            full = replace(full, phases=full.phases - {OPERATOR})
         if not self.brief:
             return full
         wanted = select(catalogue(self.model), prefixes=[self.kills])
@@ -76,7 +80,7 @@ MUTANTS: tuple[Mutant, ...] = tuple(
         brief=model_name == DEX3_1.name and hasattr(shared, service.__name__),
     )
     for model_name, zoo in ((DEX1_1.name, gripper.ZOO), (DEX3_1.name, dex3.ZOO))
-    for service, kills, also in zoo
+    for service, kills, also in (*zoo, *operator.ZOO[model_name])
 )
 REFERENCES: dict[str, type[Service]] = {
     DEX1_1.name: ReferenceService,

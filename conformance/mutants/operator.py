@@ -1,0 +1,179 @@
+"""Wrong hands that only an operator notices: with Unitree's client in the loop.
+
+Each keeps every MUST; what is wrong shows where commands depend on states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from dexkit.conformance.mutants import shared
+from dexkit.conformance.virtual import Service
+from dexkit.conformance.virtual.dex3 import Dex3Service
+from dexkit.conformance.virtual.gripper import ReferenceService
+from dexkit.conformance.wire import Motor
+from dexkit.hand import Side
+from dexkit.models import DEX1_1, DEX3_1
+
+__all__ = ["ZOO"]
+
+
+class _PerJoint(Service):
+    """Changes what each joint is told, where it is something finite."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.told: dict[tuple[Side, int], tuple[float, float]] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if all(math.isfinite(m.q) for m in motors):
+            here = self.positions(side)
+            motors = tuple(
+                replace(m, q=self.change((side, i), m.q, here[i])) for i, m in enumerate(motors)
+            )
+        super().motors(side, motors)
+
+    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+        """The target that is obeyed in place of ``q``."""
+        raise AssertionError  # overridden
+
+    def stroke(self, joint: tuple[Side, int]) -> float:
+        """The joint's range, rad."""
+        side, index = joint
+        if self.dialect.model == DEX1_1.name:
+            return self.dialect.q_open
+        return DEX3_1.joints[side][index].stroke
+
+
+class _DeadBand(_PerJoint):
+    band = 0.0
+    """Of the stroke."""
+
+    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+        if abs(q - here) >= self.band * self.stroke(joint):
+            self.told[joint] = (q, self.now)
+        return self.told.setdefault(joint, (here, self.now))[0]
+
+
+class DeadBand(_DeadBand, ReferenceService):
+    """Ignores a target nearer than 0.14 rad: where the client sticks there, it never goes on."""
+
+    band = 0.14 / 5.4
+
+
+class FingerDeadBand(_DeadBand, Dex3Service):
+    """Ignores a target nearer than a fifteenth of a joint's range."""
+
+    band = 1 / 15
+
+
+class _Coarse(_PerJoint):
+    grid = 0.0
+    """Of the stroke."""
+
+    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+        grid = self.grid * self.stroke(joint)
+        return round(q / grid) * grid
+
+
+class CoarseTargets(_Coarse, ReferenceService):
+    """Goes to the nearest of nineteen places."""
+
+    grid = 1 / 18
+
+
+class CoarseFingers(_Coarse, Dex3Service):
+    """Goes to the nearest of twenty-one places."""
+
+    grid = 1 / 20
+
+
+class LateState(ReferenceService):
+    """Says where it was 60 ms ago, in ever fresh messages."""
+
+    late = 0.06
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.past: dict[Side, list[tuple[float, dict[str, float]]]] = {}
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        found = super().fields(side)
+        past = self.past.setdefault(side, [])
+        past.append((self.now, {name: found[name] for name in ("q", "dq", "ddq")}))
+        while len(past) > 1 and past[1][0] <= self.now - self.late:
+            del past[0]
+        return {**found, **past[0][1]}
+
+
+class RunsAhead(_PerJoint, ReferenceService):
+    """Goes where moving targets will soon be, and so too far when they stop."""
+
+    lead, memory = 0.07, 0.1
+    """Seconds ahead, and over which the targets' speed is smoothed."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
+        self.speed: dict[tuple[Side, int], float] = {}
+
+    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+        before, since = self.told.get(joint, (q, self.now))
+        step, seconds = q - before, self.now - since
+        if abs(step) > 0.04 * self.stroke(joint):  # a jump is no speed
+            self.speed[joint] = 0.0
+        elif seconds > 0.0:
+            speed = self.speed.get(joint, 0.0)
+            part = min(1.0, seconds / self.memory)
+            self.speed[joint] = speed + part * (step / seconds - speed)
+        self.told[joint] = (q, self.now)
+        return q + self.lead * self.speed.get(joint, 0.0)
+
+
+class _SlowToWake(_PerJoint):
+    sleeps_after, wakes_in = 0.3, 0.2
+    """Seconds without a new target until it sleeps, and until it is awake again."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
+        self.awake: dict[tuple[Side, int], float] = {}
+
+    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+        before, since = self.told.get(joint, (q, self.now))
+        if abs(q - before) > 1e-4 * self.stroke(joint):
+            if self.now - since > self.sleeps_after:
+                self.awake[joint] = self.now + self.wakes_in
+            if self.now >= self.awake.get(joint, 0.0):
+                self.told[joint] = (q, self.now)
+                return q
+            self.told[joint] = (before, self.now)
+        elif joint not in self.told:
+            self.told[joint] = (q, self.now)
+        return before
+
+
+class SlowToWake(_SlowToWake, ReferenceService):
+    """Sleeps when its target rests, and needs 0.2 s to wake."""
+
+
+class LateFingers(shared.Delayed, Dex3Service):
+    """Carries out each command 0.15 s late."""
+
+
+ZOO: dict[str, tuple[tuple[type[Service], str, tuple[str, ...]], ...]] = {
+    DEX1_1.name: (
+        # where the client's filter sticks within the dead band, nothing moves any more
+        (DeadBand, "DEX1-OPER-01", ("DEX1-OPER-04",)),
+        (LateState, "DEX1-OPER-02", ("DEX1-OPER-01", "DEX1-OPER-05")),
+        (RunsAhead, "DEX1-OPER-03", ()),
+        (CoarseTargets, "DEX1-OPER-04", ()),
+        (SlowToWake, "DEX1-OPER-05", ()),
+    ),
+    DEX3_1.name: (
+        (FingerDeadBand, "DEX3-OPER-02", ()),
+        (CoarseFingers, "DEX3-OPER-04", ("DEX3-MOVE-04",)),
+        (LateFingers, "DEX3-OPER-05", ("DEX3-TRACK-02",)),
+    ),
+}
+"""By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
