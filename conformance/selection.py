@@ -26,22 +26,22 @@ def length(model_name: str, phases: frozenset[str]) -> float:
 def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
     """The MUSTs that need no long observation.
 
-    Those with the shortest stimulus first, as long as all their stimuli together take no more
-    than :data:`QUICK` seconds. Those that need a recorded session are too long.
+    Those stimuli that serve the most MUSTs for their length, as long as all together take no more
+    than :data:`QUICK` seconds. What needs a recorded session takes too long.
     """
     chosen: set[str] = set()
     for name in dict.fromkeys(r.model for r in requirements):
-        musts = [
-            (r.id, phases_for([r]))
-            for r in requirements
-            if (r.model, r.layer, r.level) == (name, "dds", Level.MUST)
-        ]
-        short = [(length(name, own), id_, own) for id_, own in musts if "replay" not in own]
+        needs: dict[frozenset[str], list[str]] = {}
+        for r in requirements:
+            own = phases_for([r])
+            if (r.model, r.layer, r.level) == (name, "dds", Level.MUST) and "replay" not in own:
+                needs.setdefault(own, []).append(r.id)
+        least = length(name, frozenset()) - 0.1  # s; what needs no stimulus comes first
         phases: frozenset[str] = frozenset()
-        for _, id_, own in sorted(short, key=lambda candidate: candidate[0]):
+        for own in sorted(needs, key=lambda o: (length(name, o) - least) / len(needs[o])):
             if length(name, phases | own) <= QUICK[name]:
                 phases |= own
-                chosen.add(id_)
+        chosen |= {id_ for own, ids in needs.items() if own <= phases for id_ in ids}
     return tuple(r for r in requirements if r.id in chosen)
 
 

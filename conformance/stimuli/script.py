@@ -48,6 +48,8 @@ FLOOD = 500
 """Commands of a burst."""
 LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
 """Commands a second under load, twice and more what official clients send, and for how long."""
+_SERVICE_START_NS = 3_000_000_000
+"""About what it takes to start a service: measured on two cores with emulated devices."""
 Payloads = list[tuple[str, bytes]]
 Pose = tuple[float, ...]
 """q of every joint of a hand, rad."""
@@ -206,15 +208,21 @@ class Script(ABC):
     def length(self) -> float:
         """Seconds that :meth:`run` takes with hands that are where they should at once."""
         now = 0
+        stopped: dict[str, float | None] = {}
         steps = self.run()
         action = next(steps)
         still = {s: (0.0,) * len(self._joints[s]) for s in self.plan.sides}
         while True:
             if isinstance(action, Send):
                 now = max(now, action.until_ns)
+            elif isinstance(action, StopService):
+                stopped = {"exit_s": 0.0, "gone_s": 0.0}
+            elif isinstance(action, StartService):
+                now += _SERVICE_START_NS
             joined = dict.fromkeys(self.plan.sides, 0.0)
+            q = {**still, **self._goal}
             try:
-                action = steps.send(Observation(now, {**still, **self._goal}, still, joined))
+                action = steps.send(Observation(now, q, still, joined, stopped))
             except StopIteration:
                 return now / 1e9
 
