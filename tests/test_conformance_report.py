@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 
 import numpy as np
@@ -12,15 +13,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import gripper
+from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
+from dexkit.conformance.report.evidence import evidence
 from dexkit.conformance.report.html import render
-from dexkit.conformance.report.plots import nice_ticks, pieces, thin
+from dexkit.conformance.report.plots import Line, chart, nice_ticks, pieces, thin
+from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.usb import mutants as usb_mutants
+from dexkit.conformance.usb.judge import judge_usb
+from dexkit.conformance.usb.virtual import run_virtual as run_usb
 from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
-from tests.conformance_helpers import copy_of, short_run
+from tests.conformance_helpers import copy_of, of, short_run
+from tests.report_helpers import HOSTILE, result_of_every_kind
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
@@ -104,17 +112,149 @@ def test_a_hand_that_was_never_heard_has_a_page_too() -> None:
 
 
 def test_nan_in_states_does_not_reach_the_drawing() -> None:
-    from dexkit.conformance.mutants import plan_for
-
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"}))
     view = Recording.of(run_virtual(plan, gripper.NanVelocity))
     assert "nan" not in "".join(re.findall(r' d="[^"]*"', render(judge(view), view)))
 
 
-def test_names_from_outside_are_escaped() -> None:
+def test_every_verdict_is_rendered_from_the_result_alone() -> None:
+    result = result_of_every_kind()
+    page = render(result)
+    structure = parsed(page)
+    assert "svg" not in structure.counts
+    for verdict in Verdict:
+        word = VERDICTS[verdict]
+        assert f"<b>{word.text}</b>" in page  # in a row
+    failed = next(r for r in result.results if r.verdict is Verdict.FAIL)
+    need = failed.requirement
+    card = page[page.index(f'id="card-{need.id}"') :].partition("</article>")[0]
+    for text in (need.sentence, failed.observed, need.advice, need.source, need.confidence):
+        assert escape(text) in card
+    assert "1.250 s to 1.500 s" in card
+    assert ">1700000001250000000<" in card
+    assert "likely cause, left" in card
+    assert "cause plain words right" in card
+    assert f"by <a href='#{result.results[2].requirement.id}'>" in page  # what blocked it
+    assert "reached: <b>topic seen</b> (2 of 5)" in page
+    assert "max gap <b>0.25 s</b>" in page
+    assert "rate <b>199.5 Hz</b>" in page
+    assert "<dt>claimed units</dt><dd>force</dd>" in page
+    for link in structure.links:
+        assert not link.startswith("#") or f'id="{link[1:]}"' in page
+
+
+def test_text_from_outside_is_escaped() -> None:
+    page = render(result_of_every_kind(HOSTILE), link="../a b/<script>.mcap")
+    structure = parsed(page)
+    assert "script" not in structure.counts
+    assert {link for link in structure.links if link[0] != "#"} == {"../a%20b/%3Cscript%3E.mcap"}
+    assert not re.search(r"https?://", re.sub(r"\(http://evil.example\)", "", page))
+
+
+def test_a_busy_testing_machine_is_not_passed_over() -> None:
+    result = result_of_every_kind()
+    assert "short of processor time for 1" not in render(result).partition("</header>")[0]
+    result.harness["starved"] = 0.5
+    assert "short of processor time for 50%" in render(result).partition("</header>")[0]
+
+
+def test_a_page_does_not_grow_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
+    result = judge(view)
+    monkeypatch.setattr("dexkit.conformance.report.html._PLOT_BUDGET", 1)
+    page = render(result, view)
+    assert page.count("<svg") == 8 + 2  # the first one fits
+    bad = [r for r in result.results if r.verdict is Verdict.FAIL]
+    result.results += [replace(r, requirement=replace(r.requirement, id="DEX1-X-99")) for r in bad]
+    assert "as many as it can hold" in render(result, view)
+    x = np.linspace(0, 100, 100_000)
+    noise = np.random.default_rng(0).normal(size=len(x))
+    assert len(chart("t", [Line("a", "state", x, noise)], y_unit="", span=(0, 100))) < 15_000
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance (WCAG 2.1)."""
+    digits = colour.lstrip("#")
+    digits = digits if len(digits) == 6 else "".join(2 * c for c in digits)
+    parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_text_has_contrast(failing: str, theme: str) -> None:
+    blocks = re.findall(r":root\{([^}]*)\}", failing)
+    colours: dict[str, str] = {}
+    for block in blocks[: 1 if theme == "light" else 2]:
+        colours |= dict(re.findall(r"--(\w+):(#[0-9a-f]+)", block))
+    grounds = {"bg", "card"}
+    pairs = [(name, ground) for name in ("ink", "dim", "link") for ground in grounds]
+    pairs += [(name, ground) for name in ("ok", "bad", "warn", "open") for ground in grounds]
+    pairs += [(name, f"{name}bg") for name in ("ok", "bad", "open")]
+    pairs += [
+        (name, f"{verdict}bg") for name in ("ink", "dim") for verdict in ("ok", "bad", "open")
+    ]
+    for text, ground in pairs:
+        a, b = sorted((luminance(colours[text]), luminance(colours[ground])))
+        assert (b + 0.05) / (a + 0.05) >= 4.5, (theme, text, ground)
+
+
+PLAN = plan_for(sides=(Side.LEFT,))
+WRONG = {m.name: m.service for m in MUTANTS if m.model == "dex1-1"}
+
+
+@pytest.mark.parametrize(
+    ("name", "phases", "need", "titles"),
+    [
+        ("Hiccup", {"step"}, "RATE-03", ["time from each state", "command and state"]),
+        (
+            "HalfRate",
+            {"step"},
+            "RATE-02",
+            ["rate of the state", "how often", "time from each"],
+        ),
+        ("StaleState", {"step"}, "FRESH-01", ["each sample of the state"]),
+        ("Overshoots", {"step"}, "MOVE-05", ["steps laid over", "command and state"]),
+        ("NanVelocity", {"step"}, "FIELD-02", ["left hand: dq", "command and state"]),
+        ("OldTopic", {"step"}, "TOPIC-01", ["On the network"]),
+    ],
+)
+def test_evidence_suits_what_is_required(
+    name: str, phases: set[str], need: str, titles: list[str]
+) -> None:
+    view = Recording.of(
+        run_virtual(replace(PLAN, phases=frozenset(phases)), WRONG[name]),
+        dialect_name="unitree_go",
+        sides=(Side.LEFT,),
+    )
+    found = of(judge(view), f"DEX1-{need}")
+    assert found.verdict in (Verdict.FAIL, Verdict.WARN)
+    figures = evidence(found, view)
+    assert len(figures) == len(titles)
+    for figure, title in zip(figures, titles, strict=True):
+        parsed(figure)
+        assert title in figure
+    if "steps laid over" in titles[0]:
+        assert 'class="bad line"' in figures[0]
+        assert 'class="faint line"' in figures[0]
+
+
+def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
+    kinds = {
+        usb_mutants.StaleCrc: "transfer from the hand",
+        usb_mutants.Backwards: "joint positions in the answers",
+        usb_mutants.OtherRelease: "<td>2.00</td>",
+        usb_mutants.Slow: "from command to answer",
+    }
     view = Recording.of(short_run())
-    page = render(judge(view, subject={"backend": "<script>alert(1)</script>"}), view)
-    assert "script" not in parsed(page).counts
+    every = catalogue("dex3-1", "usb")
+    for device, title in kinds.items():
+        kills = next(m.kills for m in usb_mutants.MUTANTS if m.device is device)
+        usb = run_usb(device(Side.LEFT))
+        found = next(r for r in judge_usb(usb, every) if r.requirement.id == kills)
+        (figure,) = evidence(found, replace(view, usb=usb))
+        parsed(figure)
+        assert title in figure
 
 
 floats = st.floats(-1e6, 1e6)

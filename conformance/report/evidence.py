@@ -22,6 +22,7 @@ from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.view import Recording, SideView
+from dexkit.errors import UsageError
 from dexkit.hand import Floats, JointSpec, Side
 
 __all__ = ["PHASES", "command_and_state", "evidence", "operated", "phase_bands"]
@@ -57,7 +58,9 @@ PHASES = {
 _LONGEST = 8.0
 """Seconds of a plot about a place in the recording."""
 _MOST_ROWS = 24
-_FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m", "mode": "", "q": "rad"}
+_FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m"}
+_PATH = re.compile(r"[A-Za-z_]\w*(?:\[\d+\])?(?:\.\w+(?:\[\d+\])?)+|\w+_[av]\b")
+"""The path of a message's member in a sentence, as checks write it."""
 
 
 def evidence(result: Result, view: Recording) -> list[str]:
@@ -69,7 +72,8 @@ def evidence(result: Result, view: Recording) -> list[str]:
     if side is None:
         return []
     scene = _Scene(result, view, view.sides[side])
-    if need.needs in ("nothing", "endpoints") or not len(scene.hand.states):
+    bare = need.needs in ("nothing", "endpoints") or need.area == "Discovery"
+    if bare or not len(scene.hand.states):
         return [_endpoints(scene)]
     return [figure for figure in _by_kind(scene) if figure]
 
@@ -149,7 +153,7 @@ def _by_kind(scene: _Scene) -> list[str]:
         return [_intervals(scene, scene.window(pad=1.0)), _follow(scene)]
     if {"min_rate_hz", "max_rate_hz", "max_p99_s"} & set(limits):
         return [_rates(scene), _interval_histogram(scene), _intervals(scene, None)]
-    if "hold_s" in values:
+    if {"max_hold_s", "max_frozen_s"} & set(limits):
         return _samples(scene)
     if need.area == "Rate":
         return [_intervals(scene, None)]
@@ -526,24 +530,56 @@ def _torque_by_position(scene: _Scene) -> str:
 
 
 def _field(scene: _Scene) -> str:
-    """The member that the requirement speaks of, about the place."""
-    hand, need = scene.hand, scene.need
-    text = f"{scene.result.observed} {need.title} {need.sentence}"
-    name = next((f for f in _FIELDS if re.search(rf"\b{f}\b", text)), None)
-    if name in (None, "q"):
+    """The member that the finding is about, about the place."""
+    hand, span = scene.hand, scene.window(pad=0.3)
+    found = _member(scene)
+    if found is None:
         return ""
-    states, span = hand.states, scene.window(pad=0.3)
-    column = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}[name]
-    joints = scene.joints(span, 1)
+    name, column = found
     return chart(
         f"{hand.side} hand: {name}",
-        [Line(name, "force", states.t, column[:, j]) for j in joints],
-        y_unit=_FIELDS[name],
+        [Line(name, "force", hand.states.t, column)],
+        y_unit=_FIELDS.get(name, ""),
         span=span,
-        bands=scene.alarms,
+        bands=_busy(scene.view) + scene.alarms,
         include=(0.0,),
         height=150,
     )
+
+
+def _member(scene: _Scene) -> tuple[str, Floats] | None:
+    """(name, a value for each state): the member that the finding names, or its requirement."""
+    states, need, told = scene.hand.states, scene.need, scene.result.observed
+    for path in _PATH.findall(told) if states.columns is not None else ():
+        if (column := _column(scene, path)) is not None:
+            return path, column
+    text = f"{told} {need.title} {need.sentence}"
+    if re.search(r"\b(decodes?|length|packets)\b", text) and need.area == "Fields":
+        return "motors in the sequence", np.asarray(states.length, dtype=np.float64)
+    columns = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
+    # what it speaks of first is what it is about
+    named = re.search(rf"\b({'|'.join(columns)})\b", told) or re.search(
+        rf"\b({'|'.join(columns)})\b", text
+    )
+    if named is None:
+        return None
+    return named[1], columns[named[1]][:, scene.joints(scene.window(), 1)[0]]
+
+
+def _column(scene: _Scene, path: str) -> Floats | None:
+    """A member by its path, whose last index may be a place in an array; None if none is."""
+    columns = scene.hand.states.columns
+    assert columns is not None
+    head, _, index = path.rpartition("[")
+    for name, place in ((path, 0), (head, int(index[:-1]) if index[:-1].isdigit() else 0)):
+        try:
+            values = columns[name] if name else None
+        except UsageError:
+            continue
+        if values is not None:
+            table = values.reshape(len(values), -1)
+            return table[:, place] if place < table.shape[1] else None
+    return None
 
 
 # -------------------------------------------------------------------------------- network
@@ -604,8 +640,8 @@ def _usb(result: Result, usb: UsbRecording) -> list[str]:
     span = (max(0.0, place.time_s - 0.3), (place.end_s or place.time_s) + 0.3)
     figures = [_bytes_at(hand, place)]
     if {"min_rate_hz", "max_s"} & set(result.requirement.tolerances):
-        return [_latency(result, hand)]
-    if place.end_s is not None:
+        figures = [_latency(result, hand) or figures[0]]
+    elif place.end_s is not None:
         figures = [_joints(result, hand, span)]
     return [figure for figure in figures if figure]
 
@@ -641,17 +677,22 @@ def _bytes_at(hand: UsbSide, place: Evidence) -> str:
     if not there:
         return ""
     transfer = min(there, key=distance)
-    rows = [
-        f"{i:04x}  {transfer.data[i : i + 8].hex(' ')}"
-        for i in range(0, min(len(transfer.data), 96), 8)
-    ]
-    more = f"\n... {len(transfer.data)} bytes in all" if len(transfer.data) > 96 else ""
+    data, head = transfer.data, 96
+    whole = len(data) <= head + 16
+    rows = [_hex(data, at) for at in range(0, len(data) if whole else head, 8)]
+    if not whole:
+        last = (len(data) - 9) // 8 * 8  # the CRC of a frame is at its end
+        rows += [f"... {len(data)} bytes in all", *(_hex(data, a) for a in (last, last + 8))]
     way = "from the hand" if inward else "to the hand"
     return (
-        f'<figure class="plot"><pre class="bytes">{chr(10).join(rows) or "no bytes"}{more}</pre>'
+        f'<figure class="plot"><pre class="bytes">{chr(10).join(rows) or "no bytes"}</pre>'
         f"<figcaption>transfer {way} at {hand.seconds(transfer.done_ns):.4f} s"
         f"</figcaption></figure>"
     )
+
+
+def _hex(data: bytes, at: int) -> str:
+    return f"{at:04x}  {data[at : at + 8].hex(' ')}"
 
 
 def _joints(result: Result, hand: UsbSide, span: tuple[float, float]) -> str:

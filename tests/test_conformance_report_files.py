@@ -1,0 +1,308 @@
+"""Markdown, badge, JUnit, comparison, and the commands that write them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from click.testing import CliRunner, Result
+
+from dexkit.cli import cli
+from dexkit.conformance.judge import judge
+from dexkit.conformance.report.badge import badge_text, render_badge
+from dexkit.conformance.report.compare import (
+    Comparison,
+    render_comparison,
+    render_comparison_markdown,
+)
+from dexkit.conformance.report.junit import write_junit
+from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
+from dexkit.conformance.report.wording import VERDICTS
+from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.view import Recording
+from dexkit.errors import UsageError
+from dexkit.traces import open_trace, sample_path
+from tests.report_helpers import HOSTILE, result_of_every_kind, run_named
+
+# ------------------------------------------------------------------------------- Markdown
+
+
+def test_markdown_tells_every_verdict_and_each_failure_wholly() -> None:
+    result = result_of_every_kind()
+    text = render_markdown(result)
+    assert text.startswith("## ❌ Fail: plain words as Dex1-1")
+    for verdict in Verdict:
+        assert VERDICTS[verdict].mark in text
+    failed = next(r for r in result.results if r.verdict is Verdict.FAIL)
+    need = failed.requirement
+    for part in (need.sentence, failed.observed, failed.cause, need.advice, need.source):
+        assert plain(part) in text
+    assert "rt/plain words` at 1.250 s to 1.500 s, log time `1700000001250000000`" in text
+    assert "left hand reached: **moving**" in text
+    assert "itself late by 0.10 ms (median), 1.50 ms" in text
+
+
+def test_text_from_outside_stays_text() -> None:
+    text = render_markdown(result_of_every_kind(HOSTILE))
+    text = re.sub(r"`[^`\n]*`", "", text.replace("\\`", ""))  # code shows what it holds
+    assert "<script" not in text
+    assert "http://evil" not in text
+    assert not re.search(r"@\w", text)
+    table = [line for line in text.splitlines() if line.startswith("|")]
+    for line in table:
+        assert len(re.findall(r"(?<!\\)\|", line)) in (len(Verdict) + 2, 6), line
+
+
+def test_a_comment_does_not_grow_without_end() -> None:
+    result = result_of_every_kind()
+    bad = next(r for r in result.results if r.verdict is Verdict.FAIL)
+    many = [
+        replace(bad, requirement=replace(bad.requirement, id=f"DEX1-MANY-{i:02}"))
+        for i in range(MOST_CARDS + 7)
+    ]
+    text = render_markdown(replace(result, results=many))
+    assert text.count("\n### ") == MOST_CARDS
+    assert "... and 7 more." in text
+    assert len(text) < 65536
+
+
+def test_a_run_without_results_says_so() -> None:
+    text = render_markdown(replace(result_of_every_kind(), results=[]))
+    assert "Inconclusive" in text
+    assert "nothing was judged" in text
+
+
+# ---------------------------------------------------------------------------------- badge
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "subject", "text"),
+    [
+        ((Verdict.PASS, Verdict.PASS), {}, "2/2 pass"),
+        ((Verdict.PASS, Verdict.PASS), {"device": "emulated"}, "2/2 pass (emulated)"),
+        ((Verdict.PASS, Verdict.PASS), {"backend": "sim-dex1"}, "2/2 pass (simulated)"),
+        ((Verdict.PASS, Verdict.PASS), {"backend": ""}, "2/2 pass (recorded)"),
+        ((Verdict.PASS, Verdict.WARN), {}, "1/2 pass, 1 warn"),
+        ((Verdict.PASS, Verdict.NOT_APPLICABLE), {}, "1/2 pass, 1 not judged"),
+        ((Verdict.PASS, Verdict.NOT_CLAIMED), {}, "1/1 pass"),
+        ((Verdict.PASS, Verdict.FAIL), {}, "fail, 1 of 2 not met"),
+        ((Verdict.PASS, Verdict.ERROR), {}, "inconclusive, 1 of 2 pass"),
+        ((), {}, "inconclusive, 0 of 0 pass"),
+    ],
+)
+def test_a_badge_claims_no_more_than_was_shown(
+    verdicts: tuple[Verdict, ...], subject: dict[str, str], text: str
+) -> None:
+    run = run_named("h", "", **dict(zip(("TOPIC_01", "TOPIC_02"), verdicts, strict=False)))
+    run.subject.pop("name")
+    run.subject.update(subject)
+    assert badge_text(run) == ("Dex1-1 drop-in", text)
+
+
+def test_requirements_of_other_dialects_are_not_counted() -> None:
+    run = run_named("h", "", TOPIC_01=Verdict.PASS, TOPIC_02=Verdict.NOT_APPLICABLE)
+    other = replace(run.results[1].requirement, dialects=("unitree_hg",))
+    run.results[1] = replace(run.results[1], requirement=other)
+    assert badge_text(run)[1] == "1/1 pass"
+
+
+def test_the_badge_is_an_image_with_its_text() -> None:
+    svg = render_badge(result_of_every_kind())
+    root = ElementTree.fromstring(svg)
+    assert root.attrib["role"] == "img"
+    title = root.find("{http://www.w3.org/2000/svg}title")
+    assert title is not None
+    assert title.text == "Dex1-1 drop-in: fail, 1 of 6 not met"
+    assert "http" not in svg.replace("http://www.w3.org/2000/svg", "")
+    width = float(root.attrib["width"])
+    ends = [
+        float(t.attrib["x"]) + float(t.attrib["textLength"])
+        for t in root.iter("{http://www.w3.org/2000/svg}text")
+    ]
+    assert max(ends) < width
+
+
+# ---------------------------------------------------------------------------------- JUnit
+
+
+def test_junit_counts_every_verdict_and_stays_xml(tmp_path: Path) -> None:
+    write_junit(result_of_every_kind(HOSTILE), tmp_path / "r.xml")
+    suite = ElementTree.parse(tmp_path / "r.xml").getroot()
+    counts = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
+    assert counts == {"tests": 14, "failures": 2, "errors": 4, "skipped": 4}
+    assert len(suite.findall("testcase/skipped")) == 4
+    assert "cause:    cause <script>" in "".join(suite.itertext())
+
+
+# ----------------------------------------------------------------------------- comparison
+
+
+def three_runs() -> list[RunResult]:
+    ok, bad, warn = Verdict.PASS, Verdict.FAIL, Verdict.WARN
+    return [
+        run_named("Grip", "2026-01-02", TOPIC_01=ok, RATE_01=bad, RATE_02=ok, MOVE_01=ok),
+        run_named("Grip", "2026-01-01", TOPIC_01=ok, RATE_01=ok, RATE_02=warn, MOVE_01=bad),
+        run_named("Hand", "2026-01-03", TOPIC_01=ok, RATE_01=bad, MOVE_01=Verdict.BLOCKED),
+    ]
+
+
+def test_regressions_are_named_between_runs_of_one_hand_by_their_time() -> None:
+    found = Comparison(three_runs(), ["new", "old", "other"])
+    assert [(c.requirement.id, c.before, c.after) for c in found.regressions] == [
+        ("DEX1-RATE-01", 1, 0)
+    ]
+    better = {c.requirement.id for c in found.changes if not c.worse}
+    assert better == {"DEX1-RATE-02", "DEX1-MOVE-01"}
+
+
+def test_what_says_nothing_of_the_hand_is_no_regression() -> None:
+    runs = [
+        run_named("Grip", "1", TOPIC_01=Verdict.PASS),
+        run_named("Grip", "2", TOPIC_01=Verdict.BLOCKED),
+        run_named("Grip", "3", TOPIC_01=Verdict.NOT_APPLICABLE),
+    ]
+    assert Comparison(runs).changes == []
+
+
+def test_recordings_of_nobody_knows_what_are_not_the_same_hand() -> None:
+    runs = [
+        run_named("a", "1", TOPIC_01=Verdict.PASS),
+        run_named("a", "2", TOPIC_01=Verdict.FAIL),
+    ]
+    for run in runs:
+        run.subject = {"model": "dex1-1", "recording": "run.mcap"}
+    assert Comparison(runs).regressions == []
+
+
+def test_the_comparison_shows_differences_first() -> None:
+    page = render_comparison(Comparison(three_runs(), ["new", "old", "other"]))
+    differ, agree = page.index("Where they differ (3)"), page.index("Where they agree (1)")
+    regress = page.index("Regressions (1)")
+    assert regress < differ < agree
+    assert differ < page.index("<code>DEX1-MOVE-01</code>", differ) < agree
+    assert page.index("<code>DEX1-TOPIC-01</code>") > agree
+    assert "Grip (new)" in page
+    assert "Grip (old)" in page
+    assert ">Hand</th>" in page
+    assert 'class="na">not asked' in page
+    text = render_comparison_markdown(Comparison(three_runs(), ["new", "old", "other"]))
+    assert text.index("### Regressions") < text.index("### Where they differ (3)")
+    assert "fail in Grip (new)" in text
+
+
+def test_hostile_names_stay_text_in_a_comparison() -> None:
+    runs = [result_of_every_kind(HOSTILE), result_of_every_kind("b")]
+    assert "<script" not in render_comparison(Comparison(runs))
+    assert "<script" not in render_comparison_markdown(Comparison(runs))
+
+
+def test_models_are_not_mixed() -> None:
+    other = replace(run_named("a", "1"), subject={"model": "dex3-1"})
+    with pytest.raises(UsageError, match=r"different models: dex1-1, dex3-1"):
+        Comparison([run_named("a", "1"), other])
+    with pytest.raises(UsageError, match="two results or more"):
+        Comparison([run_named("a", "1")])
+
+
+# ----------------------------------------------------------------------------- commands
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(cli, [str(a) for a in args])
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result beside its recording."""
+    folder = tmp_path_factory.mktemp("judged")
+    source = sample_path("dex1_hand_dropout")
+    (folder / "run.mcap").write_bytes(source.read_bytes())
+    view = Recording.of(open_trace(folder / "run.mcap"))
+    judge(view, subject={"recording": "run.mcap"}).write_json(folder / "result.json")
+    return folder
+
+
+def test_reports_are_written_again_from_the_file(judged: Path, tmp_path: Path) -> None:
+    done = run(
+        "report",
+        judged / "result.json",
+        "--html",
+        tmp_path / "r.html",
+        "--markdown",
+        tmp_path / "r.md",
+        "--junit",
+        tmp_path / "r.xml",
+    )
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "r.html").read_text()
+    assert "<svg" in page  # the recording lies beside the result
+    links = set(re.findall(r'href="([^#"][^"]*)"', page))
+    assert len(links) == 1
+    link = links.pop()
+    assert not link.startswith("/")
+    assert (tmp_path / link).resolve() == (judged / "run.mcap").resolve()
+    assert "No gap in the state" in (tmp_path / "r.md").read_text()
+    assert ElementTree.parse(tmp_path / "r.xml").getroot().tag == "testsuite"
+
+
+def test_without_a_recording_the_page_has_words_only(judged: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "result.json"
+    alone.write_bytes((judged / "result.json").read_bytes())
+    assert run("report", alone, "--html", tmp_path / "r.html").exit_code == 0
+    page = (tmp_path / "r.html").read_text()
+    assert "<svg" not in page
+    assert "Plots of the evidence need the recording" in page
+    assert "gap(s); the first from 9.49" in page
+
+
+def test_another_recording_is_refused(judged: Path, tmp_path: Path) -> None:
+    other = sample_path("dex1_pick_place")
+    page = tmp_path / "r.html"
+    done = run("report", judged / "result.json", "--recording", other, "--html", page)
+    assert isinstance(done.exception, UsageError)
+    assert "begins at" in done.exception.message
+    assert not page.exists()
+    (tmp_path / "run.mcap").write_bytes(other.read_bytes())
+    (tmp_path / "result.json").write_bytes((judged / "result.json").read_bytes())
+    done = run("report", tmp_path / "result.json", "--html", page)
+    assert done.exit_code == 0
+    assert "no plots: " in done.output
+    assert "<svg" not in page.read_text()
+
+
+def test_the_table_and_the_summary_go_to_the_terminal(judged: Path) -> None:
+    table = run("report", judged / "result.json")
+    assert "DEX1-RATE-03" in table.output
+    assert "FAIL: a MUST is not met" in table.output
+    assert "stage reached: left" in table.output
+    assert run("report", judged / "result.json", "--markdown", "-").output.startswith("## ❌ Fail")
+
+
+def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) -> None:
+    done = run("badge", judged / "result.json", "-o", tmp_path / "b.svg")
+    assert done.exit_code == 0
+    assert "Dex1-1 drop-in | fail, " in done.output
+    assert "(recorded)" in done.output
+    assert (tmp_path / "b.svg").read_text().startswith("<svg")
+    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    run_named("G", "2026-01-01", TOPIC_01=Verdict.PASS).write_json(a)
+    run_named("G", "2026-01-02", TOPIC_01=Verdict.FAIL).write_json(b)
+    done = run("compare", a, b, "--html", tmp_path / "c.html")
+    assert done.exit_code == 1
+    assert "1 regression(s): DEX1-TOPIC-01" in done.output
+    assert "Regressions (1)" in (tmp_path / "c.html").read_text()
+    same = run("compare", a, a)
+    assert same.exit_code == 0
+    assert "Nowhere: all verdicts agree" in same.output
+
+
+def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("{}")
+    for args in (["report"], ["badge"], ["compare", tmp_path / "x.json"]):
+        done = run(*args, tmp_path / "x.json")
+        assert isinstance(done.exception, UsageError), args
+    assert run("report", tmp_path / "missing.json").exit_code == 2
+    assert run("compare").exit_code == 2
