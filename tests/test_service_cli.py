@@ -16,6 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
+from dexkit.cli.common import stop_on_signals
 from dexkit.dds import DdsNode, Qos
 from dexkit.emulators.mx64 import emulated_ezgripper
 from dexkit.hand import MotorError, Side
@@ -85,7 +86,7 @@ def counters(line: str) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int) -> None:
     def there() -> bool:
         return any(not e.own and e.topic.startswith("rt/dex1/") for e in dds_node.endpoints())
@@ -105,6 +106,17 @@ def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int)
     assert "Traceback" not in err
     last = counters(next(line for line in err.splitlines() if "counters" in line))
     assert last["published"]
+
+
+def test_under_nohup_a_hangup_is_nothing() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_on_signals() as request:
+            signal.raise_signal(signal.SIGHUP)
+            assert not request
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_sigusr1_logs_the_counters(dds_domain: int) -> None:

@@ -40,7 +40,11 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Turn SIGINT and SIGTERM into a :class:`StopRequest`; a second SIGINT interrupts at once."""
+    """Turn SIGINT, SIGTERM and SIGHUP into a :class:`StopRequest`.
+
+    A second SIGINT interrupts at once. SIGHUP, which comes when the terminal or its ssh connection
+    goes, is left alone where it is ignored (``nohup``).
+    """
     request = StopRequest()
 
     def handle(signum: int, frame: FrameType | None) -> None:
@@ -49,7 +53,10 @@ def stop_on_signals() -> Iterator[StopRequest]:
         request.signum = request.signum or signum
         request.event.set()
 
-    previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
+    ending = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        ending.append(signal.SIGHUP)
+    previous = {s: signal.signal(s, handle) for s in ending}
     try:
         yield request
     finally:
