@@ -16,7 +16,6 @@ What is different from the plain SDK, and why (facts/mx64 A3, C3):
 
 from __future__ import annotations
 
-import errno
 import os
 import select
 import termios
@@ -35,9 +34,9 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
+from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import (
     HandLost,
-    HandNotFound,
     HandRefused,
     HandTimeout,
     UsageError,
@@ -90,23 +89,6 @@ class ServoError(HandRefused):
     def __init__(self, message: str, number: int, *, hint: str = "") -> None:
         super().__init__(message, hint=hint)
         self.number = number
-
-
-@contextmanager
-def _port_errors(path: str) -> Iterator[None]:
-    """One exception for the many faces of an unplugged adapter."""
-    try:
-        yield
-    except (serial.SerialException, termios.error) as error:
-        raise HandLost(
-            f"the port {path} has gone away: {error}", hint="check the cable and the power"
-        ) from error
-    except OSError as error:
-        if isinstance(error, HandLost | HandTimeout):
-            raise
-        raise HandLost(
-            f"the port {path} has gone away: {error}", hint="check the cable and the power"
-        ) from error
 
 
 class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
@@ -253,30 +235,6 @@ def _set_length(packet: list[int], length: int) -> None:
     packet[6] = length >> 8
 
 
-def _open_failed(path: str, error: Exception) -> Exception:
-    number = getattr(error, "errno", None)
-    if number == errno.ENOENT:
-        return HandNotFound(
-            f"there is no device {path}",
-            hint="is it plugged in? 'python -m serial.tools.list_ports -v' lists the adapters",
-        )
-    if number in (errno.EACCES, errno.EPERM):
-        return HandNotFound(
-            f"no permission to open {path}",
-            hint="add yourself to the group of the device: sudo usermod -a -G dialout $USER, "
-            "then log in again",
-        )
-    if number in (errno.EBUSY, errno.EWOULDBLOCK) or "exclusively lock" in str(error):
-        return HandRefused(
-            f"another program is using {path}",
-            hint="stop it first (lsof or fuser on the device names it); a servo has one master",
-        )
-    # pyserial wraps a failing tcgetattr without its number
-    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in str(error):
-        return HandNotFound(f"{path} is not a serial port: {error}")
-    return HandLost(f"cannot open {path}: {error}", hint="check the cable and the power")
-
-
 class ServoBus:
     """Transactions with servos on one line.
 
@@ -325,7 +283,7 @@ class ServoBus:
             known = self._port.setBaudRate(baudrate)
         except (serial.SerialException, OSError, termios.error, ValueError) as error:
             self.close()
-            raise _open_failed(self.path, error) from error
+            raise open_failed(self.path, error) from error
         if not known:
             raise UsageError(
                 f"baud rate {baudrate} is not supported by dynamixel-sdk",
@@ -336,7 +294,7 @@ class ServoBus:
     def _line(self) -> Iterator[None]:
         """A transaction; whatever cuts it short (Ctrl-C, too), the next one can be made."""
         try:
-            with _port_errors(self.path):
+            with port_errors(self.path):
                 yield
         except BaseException:
             self._port.abandon()
@@ -347,7 +305,7 @@ class ServoBus:
 
         :raises HandLost: the port has gone away.
         """
-        with _port_errors(self.path):
+        with port_errors(self.path):
             self._port.ser.flush()
         time.sleep(_BUFFERED)
 
