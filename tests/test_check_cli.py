@@ -85,6 +85,36 @@ def test_selection(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-QOS-02", "--level", "must") == 2
 
 
+def test_the_selection_is_listed_without_a_recording(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check("--list", "--require", "DEX3-SENS") == 0
+    rows = [r for r in capsys.readouterr().out.splitlines() if r.startswith("DEX3-SENS")]
+    assert len(rows) >= 4
+    assert any("phase:squeeze" in r and r.endswith("pressure") for r in rows)
+    assert check(sample_path("dex3_pinch"), "--list") == 0
+    assert "DEX1" not in capsys.readouterr().out
+    assert check() == 2
+    assert "which recording is to be judged" in capsys.readouterr().err
+
+
+def test_claims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    claims, out = tmp_path / "capabilities.toml", tmp_path / "r.json"
+    claims.write_text('[hand]\nname = "X"\n[claims]\nvelocity = true\n')
+    junit = tmp_path / "r.xml"
+    sample = sample_path("dex1_pick_place")
+    assert check(sample, "--capabilities", claims, "--json", out, "--junit", junit) == 0
+    data = json.loads(out.read_text())
+    verdicts = {r["id"]: r["verdict"] for r in data["results"]}
+    levels = {r["id"]: r["requirement"]["level"] for r in data["results"]}
+    assert (verdicts["DEX1-FIELD-04"], levels["DEX1-FIELD-04"]) == ("pass", "MUST")
+    assert verdicts["DEX1-FORCE-03"] == "not claimed"
+    assert data["claims"]["force"] is False
+    suite = ElementTree.parse(junit).getroot()
+    assert "is not claimed" in ElementTree.tostring(suite, "unicode")
+    claims.write_text('[hand]\nmodel = "dex3-1"\n')
+    assert check(sample, "--capabilities", claims) == 2
+    assert "about a dex3-1" in capsys.readouterr().err
+
+
 def test_verbose_says_what_was_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path("dex1_pick_place"), "-v") == 0
     out = capsys.readouterr().out

@@ -8,10 +8,13 @@ import pytest
 
 from dexkit.conformance.checks import all_checks
 from dexkit.conformance.mutants import MUTANTS
-from dexkit.conformance.requirements import Level, catalogue, parse, select
+from dexkit.conformance.requirements import Level, catalogue, models, parse, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
-from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimuli.script import default_objects
 from dexkit.errors import UsageError
+from dexkit.hand import Side
+from dexkit.models import model
 
 DOCS = Path(__file__).parent.parent / "docs" / "conformance.md"
 
@@ -50,11 +53,26 @@ def test_tolerances_come_from_the_model_and_fill_the_sentence() -> None:
         ('"model:command_timeout"', '"1 s"', "a tolerance is a number"),
         ('needs = "state"', 'needs = "state"\nafter = ["DEX1-Y-01"]', "does not come before"),
         ('needs = "state"', 'needs = "state"\ndialects = ["latin"]', "no dialect"),
+        ('needs = "state"', 'needs = "state"\ncapability = "song"', "capability is one of"),
+        ('needs = "state"', 'needs = "state"\nrepeat = 0', "repeat is a number from 1 on"),
+        ('model = "dex1-1"', 'model = "dex1-1"\nretired = ["DEX1-X-01"]', "never used again"),
+        ('model = "dex1-1"', 'model = "dex1-1"\nretried = []', "unknown keys ['retried']"),
     ],
 )
 def test_what_is_wrong_in_a_requirement_is_said(old: str, new: str, says: str) -> None:
     with pytest.raises(UsageError, match=says.replace("[", r"\[").replace("]", r"\]")):
         parse(GOOD.replace(old, new))
+
+
+def test_what_is_expected_is_the_sentence_unless_it_is_said_shorter() -> None:
+    (requirement,) = parse(GOOD)
+    assert requirement.expected == requirement.sentence
+    (short,) = parse(GOOD + 'expected = "{limit:g} s"\ncause = "c"\nrepeat = 3\n')
+    assert (short.expected, short.cause, short.repeat) == ("1 s", "c", 3)
+
+
+def test_every_must_and_should_has_a_likely_cause() -> None:
+    assert [r.id for r in catalogue(None, None) if r.level is not Level.INFO and not r.cause] == []
 
 
 def test_an_id_occurs_once() -> None:
@@ -71,14 +89,14 @@ def test_every_requirement_has_a_hand_that_breaks_it() -> None:
     assert {m.kills for m in MUTANTS} == {r.id for r in catalogue()}
 
 
-def test_every_stimulus_that_is_needed_exists() -> None:
-    known = {
-        *("step", "nan", "out-of-range", "empty", "limp", "replay", "late-joiner"),
-        *("squeeze", "silence", "resume", "restart"),
-    }
-    assert phases_for(catalogue("dex1-1")) == known
-    own = {p for r in catalogue("dex3-1") if (p := r.phase)}
-    assert own <= phases_for(catalogue("dex3-1"))
+@pytest.mark.parametrize("name", models())
+def test_every_stimulus_that_is_needed_exists(name: str) -> None:
+    needed = phases_for(catalogue(name))
+    dialect = model(name).dialects[0]
+    plan = Plan(dialect, tuple(Side), default_objects(dialect, tuple(Side)), phases=needed)
+    script = SCRIPTS[name](plan)
+    script.length()
+    assert needed - {p.name for p in script.phases} == {"replay"}  # there is no session here
 
 
 def test_dependencies_bring_their_stimuli() -> None:

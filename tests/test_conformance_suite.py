@@ -7,22 +7,25 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, record_run
-from dexkit.conformance.mutants import shared
+from dexkit.conformance.mutants import plan_for, shared
 from dexkit.conformance.mutants.live import LiveMutant
 from dexkit.conformance.mutants.shared import of
 from dexkit.conformance.processes import EXTERNAL, RigOptions
+from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements
-from dexkit.conformance.requirements import select
 from dexkit.conformance.results import RunResult
+from dexkit.conformance.selection import QUICK, length, quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.view import Recording
+from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
@@ -76,6 +79,76 @@ def test_requirements_are_the_test_ids() -> None:
     )  # fmt: skip
     ids = [line.partition("::")[2] for line in run.stdout.splitlines() if "::" in line]
     assert ids == [f"test_requirement[DEX1-RATE-0{i}-left]" for i in range(1, 5)]
+
+
+def test_a_selection_that_leaves_nothing_is_no_success() -> None:
+    run = suite("conformance/", "--backend", "sim-dex1", "-k", "nothing-is-called-so")
+    assert run.returncode == 2, run.stdout
+    assert "Nothing was judged, which is not a pass" in run.stdout
+
+
+def test_a_hand_that_cannot_be_reached_is_no_success() -> None:
+    run = suite(
+        "conformance/", "--backend", "external", "--domain", str(free_domain()), "--quick",
+        "--side", "left",
+    )  # fmt: skip
+    assert run.returncode == 2, run.stdout
+    assert "nobody publishes rt/dex1/left/state" in run.stdout
+    assert "passed" not in run.stdout
+
+
+def test_one_hand_is_judged_by_one_run() -> None:
+    run = suite("conformance/", "--backend", "sim-dex1", "-n", "2")
+    assert run.returncode == 4
+    assert "does not work with pytest-xdist's -n" in run.stderr
+
+
+def listed(*arguments: object) -> list[list[str]]:
+    run = suite("conformance/", "--list", *arguments)
+    assert run.returncode == 0, run.stdout + run.stderr
+    rows = [line for line in run.stdout.splitlines() if line.startswith("DEX")]
+    assert run.stdout.splitlines()[-1] == f"{len(rows)} requirements"
+    return [line.split("  ") for line in rows]
+
+
+def test_the_selection_is_listed_without_a_hand(tmp_path: Path) -> None:
+    claims = tmp_path / "capabilities.toml"
+    claims.write_text("[claims]\nvelocity = true\n")
+    rows = listed("--require", "DEX1-FIELD", "--capabilities", claims)
+    expected = [r for r in requirements() if r.id.startswith("DEX1-FIELD")]
+    assert [row[0] for row in rows] == [r.id for r in expected]
+    by_id = {row[0]: " ".join(filter(None, row)).split() for row in rows}
+    assert by_id["DEX1-FIELD-04"][1] == "MUST"
+    assert by_id["DEX1-FIELD-04"][-1] == "velocity"
+    for r in expected:
+        assert r.confidence in " ".join(by_id[r.id])
+        assert r.needs in by_id[r.id]
+    claims.write_text("[claims]\nspeed = true\n")
+    run = suite("conformance/", "--list", "--capabilities", claims)
+    assert run.returncode == 4
+    assert "no unit 'speed'" in run.stderr
+
+
+@pytest.mark.parametrize("name", ["dex1-1", "dex3-1"])
+def test_what_is_quick_is_derived_from_the_stimuli(name: str) -> None:
+    every = requirements(name)
+    chosen = quick(every)
+    phases = phases_for(chosen)
+    assert {r.level for r in chosen} == {Level.MUST}
+    assert length(name, phases) <= QUICK[name]
+    assert "replay" not in phases
+    # it is about motion, and nothing that comes without a further stimulus is left out
+    assert any(r.area == "Motion" for r in chosen)
+    musts = [r for r in every if r.level is Level.MUST]
+    assert {r.id for r in musts if phases_for([r]) <= phases} == {r.id for r in chosen}
+    # half an hour of steps would not be quick
+    assert quick([r for r in every if r.level is not Level.MUST]) == ()
+
+
+def test_the_length_of_a_stimulus_is_that_of_a_run() -> None:
+    plan = replace(plan_for(), phases=frozenset({"step", "nan", "squeeze"}), session=None)
+    recording = Recording.of(run_virtual(plan, ReferenceService))
+    assert length("dex1-1", plan.phases) == pytest.approx(recording.duration, rel=0.3)
 
 
 def test_defaults() -> None:
