@@ -1,0 +1,207 @@
+"""A serial line with motors on it: one command out, one data frame back.
+
+The two motors of a robot may share a line, and one process may serve both: its hands then share
+one :class:`MotorLine`, which :func:`acquire` gives out, and take turns on it.
+
+Unlike the vendor's library (facts/unitree-dex G "Receive behaviour") it looks for frames by head
+and CRC, checks the id, forgets what was left over before each command, and waits for an answer that
+is late before it sends the next command: a stray byte or a late answer costs one exchange at most.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import termios
+import threading
+import time
+from dataclasses import dataclass
+
+import serial
+
+from dexkit.drivers.serial_port import open_failed, port_errors
+from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
+from dexkit.wire.m4010 import DATA, FrameParser, MotorData
+
+__all__ = ["LATE", "LineStatistics", "MotorLine", "acquire", "is_shared"]
+
+log = logging.getLogger(__name__)
+
+LATE = 0.01
+"""Seconds that a late answer is waited for, before the next command is sent."""
+_CHUNK = 4096
+
+
+@dataclass
+class LineStatistics:
+    """What happened on the line since it was opened, for all its motors.
+
+    :ivar exchanges: commands that were answered.
+    :ivar timeouts: commands that were not.
+    :ivar damaged: frames with a wrong CRC.
+    :ivar stray: bytes that belonged to no frame, or came when none was due.
+    :ivar foreign: frames of a motor that was not asked.
+    """
+
+    exchanges: int = 0
+    timeouts: int = 0
+    damaged: int = 0
+    stray: int = 0
+    foreign: int = 0
+
+
+class MotorLine:
+    """An open port; :func:`acquire` makes it.
+
+    :param path: of the port.
+    :param baudrate: bits a second.
+    :raises HandNotFound: no such port, no permission, or no serial port.
+    :raises HandRefused: another program has it, or it does not do the baud rate.
+    :raises HandLost: it cannot be opened for another reason.
+    """
+
+    def __init__(self, path: str, baudrate: int) -> None:
+        self.path = path
+        self.baudrate = baudrate
+        self.statistics = LineStatistics()
+        self.users = 0
+        self._lock = threading.Lock()
+        self._parser = FrameParser((DATA,))
+        self._owed = False
+        try:
+            self._port: serial.Serial | None = serial.Serial(
+                path, baudrate, timeout=0, exclusive=True
+            )
+        except ValueError as error:  # of a rate that its driver does not know
+            raise HandRefused(
+                f"{path} does not do {baudrate} baud: {error}",
+                hint="the motor needs a USB adapter for 6000000 baud, such as a CH343",
+            ) from error
+        except (serial.SerialException, OSError, termios.error) as error:
+            raise open_failed(path, error) from error
+
+    @property
+    def broken(self) -> bool:
+        """Whether it must be opened again."""
+        return self._port is None
+
+    def exchange(self, command: bytes, number: int, timeout: float) -> MotorData:
+        """Send a command, return the data of that motor.
+
+        :param command: a frame that motor ``number`` answers.
+        :param timeout: seconds until the answer.
+        :raises HandTimeout: no intact answer of that motor.
+        :raises HandLost: the port has gone away.
+        """
+        with self._lock:
+            port = self._port
+            if port is None:
+                raise HandLost(f"the port {self.path} has gone away")
+            try:
+                with port_errors(self.path):
+                    return self._exchange(port.fileno(), command, number, timeout)
+            except HandTimeout:
+                raise
+            except HandError:
+                self._break()
+                raise
+            except BaseException:  # Ctrl-C, perhaps between the command and its answer
+                self._owed = True
+                raise
+
+    def _exchange(self, fd: int, command: bytes, number: int, timeout: float) -> MotorData:
+        statistics, parser = self.statistics, self._parser
+        if self._owed:
+            self._owed = False
+            select.select([fd], [], [], LATE)
+        while data := self._read(fd):
+            statistics.stray += len(data)
+        parser.reset()
+        if os.write(fd, command) != len(command):
+            raise HandLost(f"the port {self.path} takes no more bytes")
+        deadline = time.monotonic() + timeout
+        skipped, errors = parser.skipped, parser.crc_errors
+        try:
+            while (left := deadline - time.monotonic()) > 0:
+                if not select.select([fd], [], [], left)[0]:
+                    break
+                data = self._read(fd)
+                if not data:
+                    raise HandLost(f"the port {self.path} reports data but has none")
+                for frame in parser.feed(data):
+                    assert isinstance(frame, MotorData)
+                    if frame.id == number:
+                        statistics.exchanges += 1
+                        return frame
+                    statistics.foreign += 1
+        finally:
+            statistics.stray += parser.skipped - skipped
+            statistics.damaged += parser.crc_errors - errors
+        statistics.timeouts += 1
+        self._owed = True
+        raise HandTimeout(
+            f"motor {number} on {self.path} does not answer",
+            hint="check its supply, the cable and the id",
+        )
+
+    @staticmethod
+    def _read(fd: int) -> bytes:
+        try:
+            return os.read(fd, _CHUNK)
+        except BlockingIOError:
+            return b""
+
+    def _break(self) -> None:
+        """Close the port; whoever shares it finds out at its next exchange."""
+        port, self._port = self._port, None
+        if port is not None:
+            try:
+                port.close()
+            except (OSError, termios.error) as error:  # a device that is gone
+                log.debug("closing %s: %s", self.path, error)
+
+    def release(self) -> None:
+        """Give it back; the last one closes it."""
+        with _lines_lock:
+            self.users -= 1
+            if self.users > 0:
+                return
+            if _lines.get(_key(self.path)) is self:
+                del _lines[_key(self.path)]
+        with self._lock:
+            self._break()
+
+
+_lines: dict[str, MotorLine] = {}
+_lines_lock = threading.Lock()
+
+
+def _key(path: str) -> str:
+    return os.path.realpath(path)
+
+
+def acquire(path: str, baudrate: int) -> MotorLine:
+    """The line at ``path``, shared with whoever of this process has it already.
+
+    Raises as :class:`MotorLine`.
+
+    :raises HandRefused: it is open at another baud rate.
+    """
+    with _lines_lock:
+        line = _lines.get(_key(path))
+        if line is None or line.broken:
+            line = _lines[_key(path)] = MotorLine(path, baudrate)
+        elif line.baudrate != baudrate:
+            raise HandRefused(
+                f"{path} is open at {line.baudrate} baud already",
+                hint=f"both motors on a line need one baud rate, not {baudrate} as well",
+            )
+        line.users += 1
+        return line
+
+
+def is_shared(line: MotorLine) -> bool:
+    """Whether more than one hand has it."""
+    with _lines_lock:
+        return line.users > 1

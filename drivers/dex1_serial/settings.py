@@ -1,0 +1,86 @@
+"""How to reach a motor and how to talk to it; ``--set`` on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dexkit.backends import BackendOptions
+from dexkit.errors import UsageError
+from dexkit.wire import m4010
+
+__all__ = ["PORTS", "SETTINGS", "Dex1Settings", "from_options"]
+
+PORTS = ("/dev/ttyUSB*", "/dev/ttyCH343USB*")
+"""Where the vendor's service looks for motors (facts/unitree-dex B.2)."""
+
+
+@dataclass(frozen=True)
+class Dex1Settings:
+    """How to reach a motor and how to talk to it.
+
+    :param device: path of the serial port or USB serial number of its adapter; None to look for
+        the motor on every port of ``ports``.
+    :param ports: glob patterns.
+    :param id: of the motor; None for that of the side.
+    :param baudrate: bits a second.
+    :param protect: have the motor stop by itself after a second without a command.
+    :param timeout: seconds to wait for an answer.
+    """
+
+    device: str | None = None
+    ports: tuple[str, ...] = PORTS
+    id: int | None = None
+    baudrate: int = m4010.BAUD_RATE
+    protect: bool = True
+    timeout: float = m4010.REPLY_TIMEOUT
+
+    def __post_init__(self) -> None:
+        if not 1e-3 <= self.timeout <= 1:
+            raise UsageError(f"timeout must be 0.001 to 1 s, not {self.timeout:g}")
+        if self.id is not None and not 0 <= self.id < m4010.BROADCAST_ID:
+            raise UsageError(f"id must be 0 to {m4010.BROADCAST_ID - 1}, not {self.id}")
+        if not 9600 <= self.baudrate <= 12_000_000:
+            raise UsageError(f"baudrate must be 9600 to 12000000, not {self.baudrate}")
+        if not self.ports or not all(self.ports):
+            raise UsageError("ports must name at least one place to look")
+
+
+def _switch(text: str) -> bool:
+    if text not in ("on", "off"):
+        raise ValueError("on or off")
+    return text == "on"
+
+
+def _patterns(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
+
+
+_PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
+    "ports": (
+        _patterns,
+        f"where to look without --device, patterns with commas (default {','.join(PORTS)})",
+    ),
+    "id": (int, "of the motor (default 0 for the right hand, 1 for the left)"),
+    "baudrate": (int, f"bits a second (default {m4010.BAUD_RATE})"),
+    "protect": (_switch, "on: the motor stops after 1 s without a command; off (default on)"),
+    "timeout": (float, f"seconds to wait for an answer (default {m4010.REPLY_TIMEOUT:g})"),
+}
+
+SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.items()}
+"""Name and help of each setting."""
+
+
+def from_options(options: BackendOptions) -> Dex1Settings:
+    """The settings that a user's options make.
+
+    :raises UsageError: one of them makes no sense.
+    """
+    values: dict[str, object] = {}
+    for name, text in options.settings.items():
+        parse, meaning = _PARSERS[name]
+        try:
+            values[name] = parse(text)
+        except ValueError as error:
+            raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
+    return Dex1Settings(device=options.device, **values)  # type: ignore[arg-type]
