@@ -361,6 +361,14 @@ class HandService:
 
     # -- exchange ---------------------------------------------------------------------------
 
+    @property
+    def _ending(self) -> bool:
+        """Whether the hands are to be braked and released: it stops, or a thread of it has died.
+
+        Nobody would hear of a hand that is driven on without its commands or its states.
+        """
+        return self._stop.is_set()
+
     def _open_first(self, unit: _Unit) -> None:
         try:
             self._open(unit)
@@ -397,12 +405,12 @@ class HandService:
         longest = getattr(unit.hand, "reconnect_interval", None)
         backoff = Backoff() if longest is None else Backoff(maximum=longest)
         try:
-            while not self._stop.is_set():
+            while not self._ending:
                 if not core.connected and not self._reconnect(unit, backoff):
                     continue
                 align(self._clock, core.spec.io_rate, self._phase)
                 rate = Rate(core.spec.io_rate, self._clock)
-                while core.connected and not self._stop.is_set():
+                while core.connected and not self._ending:
                     rate.wait()
                     if self._exchange(unit):
                         backoff.reset()
@@ -557,7 +565,7 @@ def _beyond(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:
             if not low <= value <= high:
                 yield (
                     f"{spec.side} {joint.name} {name}",
-                    f"{name} of {joint.name} = {value:.6g} {unit} is outside {low:g} .. {high:g}",
+                    f"{name} of {joint.name} = {value:.7g} {unit} is outside {low:g} .. {high:g}",
                 )
 
 

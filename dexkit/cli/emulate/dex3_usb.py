@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 
 import click
 
@@ -73,6 +74,11 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     help="Also take faults as lines of input, and stop at its end.",
 )
 @click.option("--seed", type=int, default=0, help="Of the faults' chance.")
+@click.option(
+    "--real-time",
+    is_flag=True,
+    help="Run before ordinary processes, as 'dexkit serve' does, where the system permits it.",
+)
 def emulate_dex3_usb(
     side: str,
     serials: tuple[str, ...],
@@ -85,15 +91,19 @@ def emulate_dex3_usb(
     faults: tuple[str, ...],
     faults_from_stdin: bool,
     seed: int,
+    real_time: bool,
 ) -> None:
     """Emulate a Dex3-1 hand on USB, served by USB/IP.
 
     Prints "ready: URL SIDE ..." for each hand when it can be attached. Ctrl-C or SIGTERM ends it.
     """
     from dexkit.emulators.dex3_mcu import Dex3Hands
+    from dexkit.service.realtime import real_time as real_time_priority
 
     sides = tuple(Side) if side == "both" else (Side(side),)
     with (
+        # before its thread is started, which inherits it
+        real_time_priority() if real_time else nullcontext(True) as granted,
         stop_on_signals() as request,
         Dex3Hands(
             sides,
@@ -108,6 +118,8 @@ def emulate_dex3_usb(
             seed=seed,
         ) as hands,
     ):
+        if not granted:
+            click.echo("no real-time priority: this user has no rtprio limit", err=True)
         if faults_from_stdin:
             read_faults(hands.inject, request)
         click.echo("\n".join([*hands.ready_lines, *_how_to(hands.url, host, hands.busids)]))
