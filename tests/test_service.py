@@ -244,6 +244,29 @@ class TestLink:
             assert newest(node).q == 0.5
 
 
+@pytest.mark.parametrize("thread", ["receive", "publish"])
+def test_a_thread_that_dies_leaves_no_hand_driven(
+    thread: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    with serve(hand, node) as service:
+        core = service.cores[Side.LEFT]
+        node.deliver(CMD, cmd(2.0))
+        wait_until(lambda: core.driving)
+
+        def fail(*arguments: object, **options: object) -> None:
+            raise RuntimeError("a bug")
+
+        monkeypatch.setattr(service, "_receive" if thread == "receive" else "_publish", fail)
+        node.deliver(CMD, cmd(1.0))
+        wait_until(lambda: not hand.is_open)
+        assert hand.last is not None
+        assert hand.last.is_brake
+        assert isinstance(service.failure, RuntimeError)
+        monkeypatch.undo()
+    assert node.open_entities == 0
+
+
 class TestStop:
     def test_it_brakes_says_so_and_leaves(self) -> None:
         hand, node = ScriptedHand(), FakeNode()

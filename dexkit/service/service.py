@@ -367,7 +367,7 @@ class HandService:
 
         Nobody would hear of a hand that is driven on without its commands or its states.
         """
-        return self._stop.is_set()
+        return self._stop.is_set() or self.failure is not None
 
     def _open_first(self, unit: _Unit) -> None:
         try:
