@@ -6,6 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
+from dexkit.hand import JointMode
 from dexkit.models import DEX3_1
 
 
@@ -110,7 +111,7 @@ def last_word(ctx: Context) -> Outcome:
     modes = modes[np.isfinite(modes).all(axis=1)].astype(np.intp)
     if ctx.recording.model.name == DEX3_1.name:
         modes = modes >> 4 & 7
-    if len(modes) < 2 or not (modes[0] > 0).all():
+    if len(modes) < 2 or not (modes[0] == JointMode.FOC).all():
         return ctx.absent("the mode of this hand does not tell whether it is driven")
     if not modes[-1].any():
         return ctx.passed("brakes", "its last state says that it is not driven any more")

@@ -39,8 +39,10 @@ class Mutant:
     :param kills: the requirement that must catch it.
     :param also: requirements that fail or warn with it.
     :param sides: the hands that are needed to see it.
-    :param brief: only the phases that its requirement needs are gone through: it is a wrong hand
-        of any model, and another model's has gone through all of them.
+    :param brief: only the phases that its requirement needs are gone through: it does everything
+        right and only tells of it wrongly, or it is a wrong hand of any model, and another
+        model's has gone through all of them.
+    :param dialect: where it is wrong in one dialect only; empty for the model's first.
     """
 
     name: str
@@ -50,11 +52,12 @@ class Mutant:
     also: tuple[str, ...] = ()
     sides: tuple[Side, ...] = tuple(Side)
     brief: bool = False
+    dialect: str = ""
 
     @property
     def plan(self) -> Plan:
         """The stimulus that shows it: all of it, or what its requirement needs."""
-        full = plan_for(model(self.model).dialects[0].name, sides=self.sides)
+        full = plan_for(self.dialect or model(self.model).dialects[0].name, sides=self.sides)
         if "-OPER-" not in self.kills:
             # eleven seconds that show an operator what the other phases show already
             full = replace(full, phases=full.phases - {OPERATOR})
@@ -69,18 +72,23 @@ class Mutant:
         return (self.service.__doc__ or "").strip().splitlines()[0]
 
 
-MUTANTS: tuple[Mutant, ...] = tuple(
-    Mutant(
-        service.__name__,
-        model_name,
-        service,
-        kills,
-        also,
-        LEFT if model_name == DEX3_1.name and service.__name__ not in dex3.BOTH else tuple(Side),
-        brief=model_name == DEX3_1.name and hasattr(shared, service.__name__),
-    )
-    for model_name, zoo in ((DEX1_1.name, gripper.ZOO), (DEX3_1.name, dex3.ZOO))
-    for service, kills, also in (*zoo, *operator.ZOO[model_name])
+def _dex1(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
+    name = service.__name__
+    sides = LEFT if name in gripper.ALONE else tuple(Side)
+    spoken = gripper.DIALECTS.get(name, "")
+    return Mutant(name, DEX1_1.name, service, kills, also, sides, dialect=spoken)
+
+
+def _dex3(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
+    name = service.__name__
+    sides = tuple(Side) if name in dex3.BOTH else LEFT
+    brief = hasattr(shared, name) or name in dex3.TOLD
+    return Mutant(name, DEX3_1.name, service, kills, also, sides, brief)
+
+
+MUTANTS: tuple[Mutant, ...] = (
+    *(_dex1(*entry) for entry in (*gripper.ZOO, *operator.ZOO[DEX1_1.name])),
+    *(_dex3(*entry) for entry in (*dex3.ZOO, *operator.ZOO[DEX3_1.name])),
 )
 REFERENCES: dict[str, type[Service]] = {
     DEX1_1.name: ReferenceService,

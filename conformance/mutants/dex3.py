@@ -86,6 +86,80 @@ class TurnedVelocity(Dex3Service):
         motors["dq"] = -motors["dq"]
 
 
+class TurnedAcceleration(Dex3Service):
+    """Publishes ddq with the wrong sign."""
+
+    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+        super().fill(motors, hand)
+        motors["ddq"] = -motors["ddq"]
+
+
+class _Filled(Dex3Service):
+    """Motors that say something else of themselves, or a hand that does."""
+
+    motor: tuple[str, Any] | None = None
+    whole: tuple[str, Any] | None = None
+    packet: tuple[str, Any] | None = None
+
+    def message(self, count: int) -> Any:
+        message = super().message(count)
+        for change, parts in (
+            (self.motor, message.motor_state),
+            (self.packet, message.press_sensor_state),
+            (self.whole, [message]),
+        ):
+            for part in parts if change else []:
+                setattr(part, *change)
+        return message
+
+
+class Kelvin(_Filled):
+    """Publishes its motors' temperatures in kelvins."""
+
+    motor = ("temperature", (303, 313))
+
+
+class RawSupply(_Filled):
+    """Publishes the converter's count as the supply voltage."""
+
+    whole = ("power_v", 22696.0)
+
+
+class FaultForAStatus(_Filled):
+    """Publishes a status of its own as the hand's faults."""
+
+    whole = ("error", (7, 0))
+
+
+class CountsInReserve(Dex3Service):
+    """Counts its states in a reserved word of the first motor."""
+
+    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+        super().fill(motors, hand)
+        motors["reserve"][0] = hand.version
+
+
+class HotSensors(_Filled):
+    """Publishes the sensors' temperatures in hundredths of a degree."""
+
+    packet = ("temperature", (2500.0,) * 12)
+
+
+class UnsetLost(_Filled):
+    """Publishes memory that was never set as the sensors' count of lost packets."""
+
+    packet = ("lost", 0xCCCCCCCC)
+
+
+class NanGyroscope(Dex3Service):
+    """Publishes NaN for an angular velocity that it does not know."""
+
+    def message(self, count: int) -> Any:
+        message = super().message(count)
+        message.imu_state.gyroscope = [math.nan] * 3
+        return message
+
+
 class IdsFromOne(Dex3Service):
     """Counts its motors from 1."""
 
@@ -248,6 +322,33 @@ class Coupled(Dex3Service):
         super().motors(side, motors)
 
 
+class _Creeps(Dex3Hand):
+    since = 0.0
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        if not np.array_equal(rows[0], self.goal):
+            self.since = self.now
+        super().take(rows, mode)
+
+    def move(self, dt: float, pull: list[float]) -> None:
+        if self.now - self.since > 0.2 and self.law_on[6] and self.law_kp[6] > 1.0:
+            left = self.law_q[6] - self.q[6]
+            if 0.02 < abs(left) < 0.14:
+                wanted = math.copysign(0.045, left)
+                pull[6] = self.law_kd[6] * wanted + math.copysign(self.coulomb, left)
+        super().move(dt, pull)
+
+    def step(self, dt: float) -> None:
+        self.rests = False
+        super().step(dt)
+
+
+class Creeps(Dex3Service):
+    """Creeps the last part of the way with one finger."""
+
+    hand = _Creeps
+
+
 class _IgnoresZeroGains(Dex3Hand):
     def take(self, rows: Floats, mode: Ints) -> None:
         own = rows.copy()
@@ -320,7 +421,27 @@ class TurnedForce(Dex3Service):
         motors["tau_est"] = -motors["tau_est"]
 
 
+class MilliNewtonMetres(Dex3Service):
+    """Publishes tau_est in mN m."""
+
+    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= 1e3
+
+
 # ------------------------------------------------------------------------------------ safety
+
+
+class _NegativeGains(Dex3Hand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        self.kp, self.kd = rows[3].copy(), rows[4].copy()
+
+
+class NegativeGains(Dex3Service):
+    """Takes negative gains as they come."""
+
+    hand = _NegativeGains
 
 
 class _NanPerJoint(Dex3Hand):
@@ -367,17 +488,6 @@ class FillsUpWithZeros(Dex3Service):
                 given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence]
                 missing = range(len(given), self.wire.joints)
                 self.motors(side, (*given, *(Motor(mode=mode_byte(i)) for i in missing)))
-
-
-class TakesTheLastSeven(Dex3Service):
-    """Takes the last seven motors of an over-long command."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        message = self.wire.command.decode(payload)
-        if len(message.motor_cmd) > self.wire.joints:
-            message.motor_cmd = message.motor_cmd[-self.wire.joints :]
-            payload = self.wire.command.encode(message)
-        super().receive(topic, payload, client)
 
 
 class _KeepsSpeed(Dex3Hand):
@@ -524,9 +634,20 @@ _SHARED = {
     "JOINT-01": (shared.Frozen,),
     "SAFE-01": (shared.NanIsZero,),
     "SAFE-03": (shared.EmptyIsZero, shared.DiesOfEmpty),
+    "SAFE-05": (shared.TakesTheLast,),
+    "SAFE-07": (shared.TakesAnyType, shared.DiesOfAnyType),
+    "SAFE-08": (shared.QueuesCommands, shared.StopsInABurst),
+    "SAFE-09": (shared.GivesUpOnTwo, shared.StaysWithTheNewest),
+    "ORDER-02": (shared.DropsOldStamps,),
+    "LOAD-01": (shared.StuttersUnderLoad, shared.WaitsForItsReaders),
+    "FRESH-02": (shared.FreezesOnce,),
+    "MOVE-06": (shared.KicksBack,),
     "WDOG-02": (shared.QuietInSilence,),
     "LIFE-01": (shared.ServesOnlyTheFirst,),
     "LIFE-02": (shared.BoundToOneClient,),
+    "LIFE-03": (shared.DeafAfterRestart, shared.SilentAfterRestart),
+    "LIFE-04": (shared.HangsAtTheEnd, shared.LeavesItsName),
+    "LIFE-05": (shared.LeavesItDriven,),
     "TRACK-01": (shared.WaitsForRest,),
     "TRACK-02": (shared.Delayed,),
 }
@@ -538,6 +659,17 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (NanVelocity, "FIELD-02", ()),
     (Unmirrored, "FIELD-03", ()),
     (TurnedVelocity, "FIELD-04", ()),
+    (TurnedAcceleration, "FIELD-05", ()),
+    (Kelvin, "FIELD-06", ()),
+    (RawSupply, "FIELD-07", ()),
+    (FaultForAStatus, "FIELD-08", ()),
+    (CountsInReserve, "FIELD-09", ()),
+    (HotSensors, "SENS-05", ()),
+    (UnsetLost, "SENS-06", ()),
+    (NanGyroscope, "IMU-02", ()),
+    (MilliNewtonMetres, "FORCE-02", ()),
+    (Creeps, "MOVE-07", ()),
+    (NegativeGains, "SAFE-06", ()),
     (IndexFirst, "JOINT-01", ()),
     (CoupledFinger, "JOINT-01", ()),
     (OneJointBackwards, "MOVE-01", ()),
@@ -564,7 +696,6 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (RejectsOnlyTheBadJoint, "SAFE-01", ()),
     (NoLimits, "SAFE-02", ()),
     (FillsUpWithZeros, "SAFE-04", ()),
-    (TakesTheLastSeven, "SAFE-05", ()),
     (KeepsDriving, "WDOG-01", ()),
     (StuckAfterSilence, "WDOG-03", ()),
     (LetsGo, "HOLD-01", ()),
@@ -592,3 +723,9 @@ BOTH = (
 )
 """What is wrong of the right hand, of both together, or in touch; the others show it in the left
 hand alone, in half the time."""
+TOLD = (
+    *("NoLowRate", "LowRateIsFull", "OddPackets", "SevenPackets", "NanPressure", "ZeroForNoValue"),
+    *("LongQuaternion", "NanGyroscope", "TurnedAcceleration", "Kelvin", "RawSupply"),
+    *("FaultForAStatus", "CountsInReserve", "HotSensors", "UnsetLost", "MilliNewtonMetres"),
+)
+"""What tells wrongly of a hand that does everything right."""

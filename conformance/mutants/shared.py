@@ -120,6 +120,10 @@ class Bursts(Service):
         self.waiting = []
         return burst
 
+    def end(self) -> list[Sample]:
+        self.together = 1
+        return super().end()
+
 
 class RepeatsOldStates(Service):
     """Sends every hundredth state a second time, after the next one."""
@@ -149,6 +153,23 @@ class StaleState(Service):
         if self.now - at >= 0.2:
             self.measured[sides] = (self.now, super().payload(sides, length))
         return self.measured[sides][1]
+
+
+class FreezesOnce(Service):
+    """Publishes the same values for a third of a second when it first begins to move."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.start: dict[Side, float] = {}
+        self.kept: dict[tuple[Side, ...], tuple[float, bytes]] = {}
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        here = sum(self.positions(s)[-1] for s in sides)
+        start = self.start.setdefault(sides[0], here)
+        if sides not in self.kept and abs(here - start) > 0.02 and not self.restarted:
+            self.kept[sides] = (self.now + 0.3, super().payload(sides, length))
+        until, old = self.kept.get(sides, (0.0, b""))
+        return old if self.now < until else super().payload(sides, length)
 
 
 class Frozen(Service):
@@ -192,6 +213,29 @@ class Swapped(Service):
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
+
+
+class KicksBack(Service):
+    """Goes the wrong way for a moment when its target jumps."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.kicks: dict[Side, tuple[float, tuple[Motor, ...]]] = {}
+        self.told: dict[Side, tuple[Motor, ...]] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        here = self.positions(side)
+        before = self.told.get(side, motors)
+        self.told[side] = motors
+        jumps = [b.q - a.q for a, b in zip(before, motors, strict=True)]
+        if any(0.25 < abs(j) < 6.0 for j in jumps) and all(m.kp > 0 for m in motors):
+            back = tuple(
+                replace(m, q=q - math.copysign(0.35, j) if abs(j) > 0.25 else m.q)
+                for m, q, j in zip(motors, here, jumps, strict=True)
+            )
+            self.kicks[side] = (self.now + 0.06, back)
+        until, back = self.kicks.get(side, (0.0, motors))
+        super().motors(side, back if self.now < until else motors)
 
 
 # ----------------------------------------------------------------------------------- safety
@@ -241,6 +285,144 @@ class DiesOfEmpty(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+class TakesTheLast(Service):
+    """Takes the last motors of an over-long command."""
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        message = self.wire.command.decode(payload)
+        motors = getattr(message, self.wire.command_sequence)
+        if len(motors) > self.dialect.length:
+            setattr(message, self.wire.command_sequence, motors[-self.dialect.length :])
+            payload = self.wire.command.encode(message)
+        super().receive(topic, payload, client)
+
+
+class TakesAnyType(Service):
+    """Decodes whatever is published on its command topic."""
+
+    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
+        message = message_type(type_name).decode(payload)
+        motors = message.motor_cmd if hasattr(message, "motor_cmd") else message.cmds
+        for side in self.sides:
+            if self.wire.command_topics[side] == topic:
+                first = self.dialect.index[side]
+                mine = motors[first : first + self.wire.joints]
+                self.motors(side, tuple(Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in mine))
+
+
+class DiesOfAnyType(Service):
+    """Crashes on a message of another type, and is restarted half a second later."""
+
+    dead_until = 0.0
+
+    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
+        self.dead_until = self.now + 0.4
+
+    def publish(self) -> list[Sample]:
+        return [] if self.now < self.dead_until else super().publish()
+
+
+class QueuesCommands(Service):
+    """Works off every command it was ever sent, two in each cycle."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.queues: dict[Side, list[tuple[Motor, ...]]] = {s: [] for s in self.sides}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.queues[side].append(motors)
+
+    def live(self, dt: float) -> None:
+        for side, queue in self.queues.items():
+            for _ in range(min(len(queue), 2 if dt > 0.0025 else 1)):
+                super().motors(side, queue.pop(0))
+        super().live(dt)
+
+
+class StopsInABurst(Service):
+    """Receives in the publishing thread: each waiting command delays the next state."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.busy_until = 0.0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.busy_until = max(self.busy_until, self.now) + 0.001 / len(self.sides)
+        super().motors(side, motors)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.busy_until > self.now + 0.02 else super().publish()
+
+
+class GivesUpOnTwo(Service):
+    """Ends when a second client commands it, and is restarted half a second later."""
+
+    dead_until = 0.0
+    quarrel = (0, -math.inf)
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        other, at = self.quarrel
+        if client != other and self.now - at < 0.05:
+            self.dead_until = self.now + 0.4
+        self.quarrel = (client, self.now)
+        super().receive(topic, payload, client)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.now < self.dead_until else super().publish()
+
+
+class StaysWithTheNewest(Service):
+    """Keeps to the client that it heard of last, even when that one has gone."""
+
+    master: int | None = None
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.known: set[int] = set()
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if client not in self.known:
+            self.known.add(client)
+            self.master = client
+        if client == self.master:
+            super().receive(topic, payload, client)
+
+
+class DropsOldStamps(Service):
+    """Ignores commands whose source timestamps are more than a second old."""
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if self.now - self.stamp < 1.0:
+            super().receive(topic, payload, client)
+
+
+class StuttersUnderLoad(Service):
+    """Publishes one state in three while commands come faster than every 4 ms."""
+
+    tick = period = 0.0025
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.came: dict[Side, tuple[float, float]] = {s: (-1.0, -1.0) for s in self.sides}
+        self.cycle = 0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.came[side] = (self.came[side][1], self.now)
+        super().motors(side, motors)
+
+    def publish(self) -> list[Sample]:
+        self.cycle += 1
+        busy = any(b - a < 0.004 and self.now - b < 0.01 for a, b in self.came.values())
+        return [] if busy and self.cycle % 3 else super().publish()
+
+
+class WaitsForItsReaders(Service):
+    """Keeps all samples for a slow reliable reader, and blocks when its history is full."""
+
+    def publish(self) -> list[Sample]:
+        return [] if self.loaded and self.now % 0.5 < 0.2 else super().publish()
+
+
 class QuietInSilence(Service):
     """Publishes only while it is commanded."""
 
@@ -273,6 +455,46 @@ class BoundToOneClient(Service):
             self.master = client
         if client == self.master:
             super().receive(topic, payload, client)
+
+
+class DeafAfterRestart(Service):
+    """Finds only the clients that come after it."""
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if not self.restarted:
+            super().receive(topic, payload, client)
+
+
+class SilentAfterRestart(Service):
+    """Waits two seconds for its device when it is started a second time."""
+
+    began = 0.0
+
+    def begin(self, now: float) -> None:
+        super().begin(now)
+        self.began = now
+
+    def publish(self) -> list[Sample]:
+        return [] if self.restarted and self.now - self.began < 2.0 else super().publish()
+
+
+class HangsAtTheEnd(Service):
+    """Does not end when it is asked to."""
+
+    exit_s = None
+
+
+class LeavesItsName(Service):
+    """Ends without a word, so that its publisher is announced for another ten seconds."""
+
+    gone_s = 10.0
+
+
+class LeavesItDriven(Service):
+    """Ends without braking."""
+
+    def brake(self) -> None:
+        pass
 
 
 # --------------------------------------------------------------------------------- tracking

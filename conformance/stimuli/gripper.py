@@ -136,7 +136,7 @@ class GripperScript(Script):
         if free:
             self._goal.update(dict.fromkeys(free, (0.0,)))
             phase = self._begin("ends", free, targets={s: {0: 0.0} for s in free})
-            yield from self._until_settled(phase, free, least=0.6, most=2.0)
+            yield from self._until_settled(phase, free, least=0.6, most=2.8)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _bad(self, name: str) -> Steps:

@@ -438,9 +438,7 @@ class Script(ABC):
         )
         self._obs = yield Join(Role.STRANGER)
         phase = self._begin("foreign", self.plan.sides)
-        while self._elapsed(phase) < 0.5:
-            self._obs = yield Send(far, 0, by=Role.STRANGER)
-            yield from self._command()
+        yield from self._beside(phase, far, Role.STRANGER, 0.5)
         self._end(phase)
         self._obs = yield Leave(Role.STRANGER)
         yield from self._everyone("recover", self._other_place(), most=1.5, after="foreign")
@@ -498,12 +496,20 @@ class Script(ABC):
         targets = {s: dict(enumerate(pose)) for s, pose in there.items()}
         self._obs = yield Join(Role.RIVAL)
         phase = self._begin("two-writers", self.plan.sides, targets=targets)
-        while self._elapsed(phase) < 0.6:
-            self._obs = yield Send(rival, 0, by=Role.RIVAL)
-            yield from self._command()
+        yield from self._beside(phase, rival, Role.RIVAL, 0.6)
         self._end(phase)
         self._obs = yield Leave(Role.RIVAL)
-        yield from self._everyone("recover", there, most=1.5, after="two-writers")
+        yield from self._everyone("recover", dict(self._goal), most=1.5, after="two-writers")
+
+    def _beside(self, phase: Phase, payloads: Payloads, role: Role, seconds: float) -> Steps:
+        """Somebody else sends between the client's commands, at the same rate."""
+        period = self._period_ns
+        self._period_ns = period // 2
+        while self._elapsed(phase) < seconds:
+            yield from self._command()
+            self._next_ns += self._period_ns
+            self._obs = yield Send(payloads, self._next_ns, by=role)
+        self._period_ns = period
 
     def _service_restart(self) -> Steps:
         """End the service and start it again, where the kit can."""

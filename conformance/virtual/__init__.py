@@ -8,7 +8,7 @@ right, and each mutant in :mod:`dexkit.conformance.mutants` changes one thing.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -221,15 +221,40 @@ class MemoryTrace:
         return found
 
 
+class _Poses(Mapping[Side, Pose]):
+    """The newest poses (0) or velocities (1) of all sides, decoded only when they are looked at."""
+
+    def __init__(self, wire: Wire, newest: Mapping[Side, bytes], which: int) -> None:
+        self._wire, self._newest, self._which = wire, newest, which
+        self._read: dict[Side, tuple[Pose, Pose] | None] = {}
+
+    def _state(self, side: Side) -> tuple[Pose, Pose] | None:
+        if side not in self._read:
+            self._read[side] = self._wire.read_state(self._newest[side], side)
+        return self._read[side]
+
+    def __getitem__(self, side: Side) -> Pose:
+        state = self._state(side)
+        if state is None:
+            raise KeyError(side)
+        return state[self._which]
+
+    def __iter__(self) -> Iterator[Side]:
+        return (s for s in self._newest if self._state(s) is not None)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
 def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
     """Go through the plan with a service of that class, and return the recording."""
     service = service_class(plan.dialect, plan.sides, plan.objects)
     trace = MemoryTrace(endpoints=service.endpoints())
     script = script_for(plan)
     wire = Wire(plan.dialect)
-    states = {wire.state_topics[s] for s in plan.sides}
+    topics = {s: wire.state_topics[s] for s in plan.sides}
+    states = set(topics.values())
     newest: dict[str, bytes] = {}
-    seen: dict[Side, tuple[bytes, tuple[Pose, Pose] | None]] = {}
     joined: dict[Side, float] = {}
     joined_at: float | None = None
     stopped: dict[str, float | None] = {}
@@ -256,17 +281,8 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
                         joined.setdefault(side, now - joined_at)
 
     def observe() -> Observation:
-        q: dict[Side, Pose] = {}
-        dq: dict[Side, Pose] = {}
-        for side in plan.sides:
-            payload = newest.get(wire.state_topics[side])
-            if payload is None:
-                continue
-            if seen.get(side, (b"", None))[0] is not payload:
-                seen[side] = (payload, wire.read_state(payload, side))
-            state = seen[side][1]
-            if state is not None:
-                q[side], dq[side] = state
+        given = {s: newest[t] for s, t in topics.items() if t in newest}
+        q, dq = _Poses(wire, given, 0), _Poses(wire, given, 1)
         return Observation(EPOCH_NS + round(now * 1e9), q, dq, dict(joined), dict(stopped))
 
     def send(action: Send) -> None:

@@ -27,9 +27,9 @@ _PRESSED_BY = {"thumb": (2, 1), "middle": (4, 3), "index": (6, 5)}
 # one motor and one sensor packet of a HandState_ on the wire (facts/unitree-dex A.2, A.4)
 _MOTOR = np.dtype(
     {
-        "names": ["mode", "q", "dq", "ddq", "tau_est"],
-        "formats": ["u1", "<f4", "<f4", "<f4", "<f4"],
-        "offsets": [0, 4, 8, 12, 16],
+        "names": ["mode", "q", "dq", "ddq", "tau_est", "reserve", "values"],
+        "formats": ["u1", "<f4", "<f4", "<f4", "<f4", "<u4", ("<f4", 4)],
+        "offsets": [0, 4, 8, 12, 16, 40, 4],  # values are the four floats at once
         "itemsize": 56,
     }
 )
@@ -285,11 +285,9 @@ class Dex3Service(Service):
         """What the motors say of themselves."""
         n = len(motors)
         motors["mode"] = hand.mode[:n]
-        motors["q"] = hand.q[:n]
-        motors["dq"] = hand.dq[:n]
         before, dt = hand.gained
-        motors["ddq"] = [(a - b) / dt for a, b in zip(hand.dq[:n], before, strict=False)]
-        motors["tau_est"] = hand.tau[:n]
+        ddq = [(a - b) / dt for a, b in zip(hand.dq, before, strict=True)]
+        motors["values"] = np.array((hand.q, hand.dq, ddq, hand.tau)).T[:n]
 
     def pressures(self, hand: Dex3Hand) -> Floats:
         """What its sensor packets hold."""
