@@ -334,6 +334,8 @@ def _steps(scene: _Scene) -> str:
             if not abs(target - start) > 0.02 * stroke:
                 continue
             left = 100 * (q - target) * np.sign(target - start) / stroke
+            if "max_ripple_stroke" in limits:  # small beside the way: only its end is shown
+                left = np.where(left < -1500 * limits["max_ripple_stroke"] / 2, np.nan, left)
             pairs.append((guilty and joint == named, Line("", "", t - begin, left)))
     if not pairs:
         return ""

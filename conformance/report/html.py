@@ -244,7 +244,7 @@ def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
     ]
     full = [(n, [r for r in g if not r.blocked_by]) for n, g in groups]
     full = [(need, group) for need, group in full if group]
-    full.sort(key=lambda item: _ORDER.index(worst(r.verdict for r in item[1])))
+    full.sort(key=lambda item: _TROUBLE.index(worst(r.verdict for r in item[1])))
     blocked = [r for _, group in groups for r in group if r.blocked_by]
     if not full and not blocked:
         return ""
@@ -306,6 +306,8 @@ def _card(need: Requirement, group: list[Result], plots: _Plots, link: str) -> s
     rows.append(("source", f"{escape(need.source)} (confidence: {escape(need.confidence)})"))
     facts = "".join(f"<dt>{k}</dt><dd>{v}</dd>" for k, v in rows)
     figures = "".join(plots.of(entry) for entry in group)
+    if figures and all(r.verdict is Verdict.BLOCKED for r in group):
+        figures = f"<details><summary>What was seen</summary>{figures}</details>"
     return (
         f'<article class="card {word.css}" id="card-{escape(need.id)}">'
         f'<h3><b class="{word.css}">{word.text}</b> {escape(need.title)} '

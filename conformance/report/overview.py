@@ -61,7 +61,7 @@ def _joint(result: RunResult, view: Recording, hand: SideView, index: int) -> st
     figure = chart(
         f"{hand.side} hand, {name}: command and state over the whole run",
         command_and_state(hand, index),
-        y_unit="rad" if gripper else f"{joint.name}, rad",
+        y_unit="rad",
         span=_span(view),
         bands=phase_bands(view, hand.side, label=gripper or index == 0) + _alarms(result, hand),
         levels=_felt(view, hand),
