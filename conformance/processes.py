@@ -36,7 +36,7 @@ STOP_TIMEOUT = 5.0
 class Emulation:
     """How to emulate a backend's device: one process a hand.
 
-    :param arguments: of ``dexkit emulate``, without object.
+    :param arguments: of ``dexkit emulate``, without object; ``{side}`` is the hand's.
     :param linked: whether it is reached by a path that it is told (``--link``). Otherwise it says
         where it is, in the first word after ``ready:``, and is told its side.
     :param settings: that the backend needs to go with it.
@@ -49,12 +49,14 @@ class Emulation:
     def command(self, side: Side, path: Path) -> tuple[str, ...]:
         """The arguments for one hand."""
         place = ("--link", str(path)) if self.linked else ("--side", str(side))
-        return ("emulate", *self.arguments, *place)
+        arguments = [argument.format(side=side) for argument in self.arguments]
+        return ("emulate", *arguments, *place)
 
 
 _CLOSED_AT = "1510"  # encoder tick of the emulated zero: told to both, so nothing has to move
 EMULATED: dict[str, Emulation] = {
     "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), True, {"zero": _CLOSED_AT}),
+    "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }
 """Backends whose device the kit can start itself."""
