@@ -8,6 +8,7 @@ import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import termios
@@ -495,3 +496,13 @@ def test_help_lists_the_devices_and_their_options() -> None:
     for option in ("--side", "--serial", "--port", "--host", "--object", "--fault", "--seed"):
         assert option in result.output
     assert CliRunner().invoke(command, ["dex9"]).exit_code == 2
+
+
+def test_a_hand_on_every_address_is_attached_by_the_machines_name() -> None:
+    from dexkit.cli.emulate.dex3_usb import _how_to
+
+    name = socket.gethostname()
+    text = "\n".join(_how_to("usbip://0.0.0.0:3240", "0.0.0.0", ["1-1"]))
+    assert "0.0.0.0" not in text
+    assert f"usbip attach -r {name} -b 1-1" in text
+    assert f"usbip://{name}:3240" in text

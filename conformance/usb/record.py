@@ -22,7 +22,6 @@ __all__ = [
     "RECORD",
     "SCHEMA",
     "SCHEMA_NAME",
-    "STALLED",
     "TIMED_OUT",
     "Descriptors",
     "SideRecord",
@@ -44,7 +43,6 @@ uint32 requested  # bytes offered to the device, or room for bytes from it
 uint8[] data      # bytes that were sent, or that came
 """
 TIMED_OUT = -110
-STALLED = -32
 
 _HEAD = struct.Struct("<4sB3xiII")
 _CDR = b"\0\1\0\0"  # plain CDR, little endian

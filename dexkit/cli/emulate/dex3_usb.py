@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 from contextlib import nullcontext
 
@@ -134,6 +135,9 @@ def emulate_dex3_usb(
 
 def _how_to(url: str, host: str, busids: list[str]) -> list[str]:
     port = url.rsplit(":", 1)[1]
+    if host == "0.0.0.0":  # every address of this machine: clients need one of them
+        host = socket.gethostname()
+        url = f"usbip://{host}:{port}"
     tcp = "" if port == "3240" else f"--tcp-port {port} "
     lines = ["as a USB device of a Linux host (as root): modprobe vhci-hcd"]
     lines += [f"  usbip {tcp}attach -r {host} -b {busid}" for busid in busids]

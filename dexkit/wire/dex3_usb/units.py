@@ -132,8 +132,3 @@ def encode_pressure(pascal: float) -> int:
         return NO_VALUE
     count = PRESSURE.encode(pascal)
     return NO_VALUE + 1 if count == NO_VALUE else count
-
-
-def decode_pressure(count: int) -> float:
-    """Pa, or NaN where there is no sensor element."""
-    return math.nan if count == NO_VALUE else PRESSURE.decode(count)
