@@ -119,8 +119,8 @@ def command(
 
     At the end, on Ctrl-C too, the hands are told to stay where they are.
 
-    Exit codes: 0 done, 1 the hand gave no state or fell silent, 2 wrong usage or nothing that can
-    be driven, 130 interrupted.
+    Exit codes: 0 done, 1 the hand gave no state, fell silent, or is commanded by somebody else,
+    2 wrong usage, 130 interrupted.
     """
     if list_profiles:
         _list()

@@ -1,0 +1,180 @@
+"""``dexkit teleop`` against served hands: starting, waiting, refusing, leaving."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from dexkit.cli import cli
+from dexkit.conformance.view import Recording
+from dexkit.dds import DdsNode
+from dexkit.errors import DexkitError
+from dexkit.hand import Side
+from dexkit.models import DIALECTS
+from dexkit.traces import open_trace
+from tests.dds_helpers import free_domain, take_until
+
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+TELEOP = [sys.executable, "-m", "dexkit", "teleop"]
+
+
+@contextmanager
+def served(backend: str, side: str) -> Iterator[int]:
+    """A domain on which ``dexkit serve`` serves a simulated hand."""
+    domain = free_domain()
+    arguments = [sys.executable, "-m", "dexkit", "serve", backend, "--side", side, "--quiet"]
+    with subprocess.Popen(
+        [*arguments, "--domain", str(domain)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("ready: ")
+            yield domain
+        finally:
+            process.terminate()
+
+
+@pytest.fixture(scope="module")
+def dex1() -> Iterator[int]:
+    with served("sim-dex1", "both") as domain:
+        yield domain
+
+
+@pytest.fixture(scope="module")
+def dex3() -> Iterator[int]:
+    with served("sim-dex3", "both") as domain:
+        yield domain
+
+
+def teleop(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["teleop", *map(str, arguments)])
+
+
+def test_a_stroke_of_both_grippers_is_measured_and_recorded(dex1: int, tmp_path: Path) -> None:
+    path = tmp_path / "stroke.mcap"
+    result = teleop(
+        *("full-stroke", "--domain", dex1, "--duration", 4.0, "--record", path, "--json")
+    )
+    assert result.exit_code == 0, result.output
+    assert "ready: full-stroke on unitree_go" in result.stderr
+    data = json.loads(result.stdout)
+    for side in ("left", "right"):
+        found = data["sides"][side]
+        assert found["client_hz"] < 201  # what it is above 0 depends on the machine
+        assert found["joints"]["gripper"]["stroke_s"] > 0.5  # the lead of 0.18 rad limits it
+    recording = Recording.of(open_trace(path))
+    for side in Side:
+        commands, states = recording.sides[side].commands, recording.sides[side].states
+        assert set(commands.kp[:, 0]) == {5.0}
+        assert set(commands.mode[:, 0]) == {0.0}
+        assert float(np.ptp(states.q[:, 0])) > 4.0
+        # each command is a short lead on a state, but for states that came meanwhile
+        at = np.clip(np.searchsorted(states.t, commands.t) - 1, 0, None)
+        assert np.quantile(np.abs(commands.q[:, 0] - states.q[at, 0]), 0.9) < 0.3
+
+
+def test_a_dex3_makes_a_fist(dex3: int) -> None:
+    result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert any(line.startswith("left: the client ran at") for line in lines)
+    assert any("middle_0: " in line for line in lines)
+
+
+def test_somebody_else_at_the_hand_is_refused_unless_forced(dex1: int) -> None:
+    topic = DIALECTS["unitree_go"].topics(LEFT)[0]
+    with DdsNode(domain=dex1, interface="lo") as other:
+        other.writer(topic, DIALECTS["unitree_go"].cmd_type)
+        script = [*TELEOP, "steps", "--domain", str(dex1)]
+        refused = subprocess.run(script, capture_output=True, text=True, timeout=60)
+        assert refused.returncode == 1
+        assert f"somebody else commands this hand on domain {dex1}: {topic}" in refused.stderr
+        assert "--force" in refused.stderr
+        forced = subprocess.run(
+            [*script, "--force", "--duration", "0.5"], capture_output=True, text=True, timeout=60
+        )
+        assert forced.returncode == 0, forced.stderr
+
+
+def test_with_one_hand_it_waits_and_says_for_whom_and_where_to_look() -> None:
+    with served("sim-dex1", "left") as domain:
+        result = teleop("steps", "--domain", domain, "--wait", 1.0)
+        assert result.exit_code == 1
+        assert "waiting for state of right ..." in result.stderr
+        assert f"dexkit doctor --domain {domain}" in result.stderr
+        assert isinstance(result.exception, DexkitError | SystemExit)
+        alone = teleop("steps", "--domain", domain, "--side", "left", "--duration", 0.5)
+        assert alone.exit_code == 0, alone.output
+
+
+def test_the_hint_comes_after_five_seconds_once(capsys: pytest.CaptureFixture[str]) -> None:
+    from dexkit.cli.teleop import _Waiting
+
+    with DdsNode(domain=free_domain(), interface="lo") as node:
+        waiting = _Waiting(node, None)
+        for seconds in (0.0, 1.0, 4.9):
+            waiting({LEFT: "", RIGHT: "every q is exactly 0"}, seconds)
+        assert capsys.readouterr().err == (
+            "waiting for state of left, right (every q is exactly 0) ...\n"
+        )
+        waiting({LEFT: ""}, 5.0)
+        waiting({LEFT: ""}, 60.0)
+        said = capsys.readouterr().err
+        assert said.count("waiting for state of left ...") == 1
+        assert said.count(f"'dexkit doctor --domain {node.domain}' says what is wrong") == 1
+
+
+def test_when_interrupted_it_locks_a_dex3_where_it_is(dex3: int) -> None:
+    spoken = DIALECTS["dex3"]
+    topic = spoken.topics(LEFT)[0]
+    with DdsNode(domain=dex3, interface="lo") as node:
+        reader = node.reader(topic, spoken.cmd_type)
+        with subprocess.Popen(
+            [*TELEOP, "sine", "--dialect", "dex3", "--domain", str(dex3), "--duration", "60"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
+            driven = take_until(reader, lambda samples: len(samples) > 3, 30)
+            modes = {m.mode for s in driven for m in s.message.motor_cmd}
+            assert modes == set(range(0x10, 0x17))
+            process.send_signal(signal.SIGINT)
+            locked = take_until(
+                reader,
+                lambda samples: any(s.message.motor_cmd[0].mode == 0 for s in samples),
+                10,
+            )
+            assert [m.mode for m in locked[-1].message.motor_cmd] == list(range(7))
+            assert process.wait(15) == 130
+            assert process.stderr is not None
+            assert "Traceback" not in process.stderr.read()
+
+
+def test_the_profiles_are_listed_without_any_hand() -> None:
+    result = teleop("--list")
+    assert result.exit_code == 0
+    for name in ("full-stroke", "pick-place", "startle", "pinch", "fist"):
+        assert f"  {name} " in result.stdout
+    unknown = teleop("juggle")
+    assert unknown.exit_code != 0
+    assert unknown.exception is not None
+
+
+def test_a_recording_is_an_operator(dex1: int) -> None:
+    from dexkit.traces import sample_path
+
+    result = teleop(sample_path("dex1_pick_place"), "--domain", dex1, "--duration", 1.0)
+    assert result.exit_code == 0, result.output
+    assert "ready: dex1_pick_place on unitree_go" in result.stderr
