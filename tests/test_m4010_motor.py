@@ -162,7 +162,7 @@ def test_two_motors_on_a_line_answer_for_themselves() -> None:
     both = MotorCmd(1).pack() + MotorCmd(0).pack()
     answers = host.parser.feed(host.send(both))
     assert [data.id for data in answers] == [1, 0]
-    assert [round(data.joint().q, 2) for data in answers] == [4.32, 0.54]  # type: ignore[union-attr]
+    assert [round(data.joint().q, 2) for data in answers] == [4.32, 0.54]
     assert host.ask(MotorCmd(2)) is None
     assert host.bus.counters.unknown_ids == 1
     with pytest.raises(UsageError, match="different ids"):

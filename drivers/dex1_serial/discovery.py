@@ -91,12 +91,11 @@ def _probe(
 
 def _who_else(line: MotorLine, number: int, timeout: float, sleep: Callable[[float], None]) -> str:
     """What a port without the motor has instead."""
-    garbled = line.statistics.damaged or line.statistics.stray
     if not is_shared(line):  # nobody else's motor is braked by being asked
         for other, side in SIDES.items():
             if other != number and _probe(line, other, timeout, 1, sleep) is not None:
                 return f"{line.path}: motor {other} answers, which is the {side} one"
-    if garbled:
+    if line.statistics.damaged or line.statistics.stray:
         return f"{line.path}: something answers, but no intact frames (another device or rate?)"
     return f"{line.path}: no answer"
 

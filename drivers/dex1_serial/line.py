@@ -128,7 +128,7 @@ class MotorLine:
                     break
                 data = self._read(fd)
                 if not data:
-                    raise HandLost(f"the port {self.path} reports data but has none")
+                    raise HandLost(f"the port {self.path} has gone away: no data")
                 for frame in parser.feed(data):
                     assert isinstance(frame, MotorData)
                     if frame.id == number:

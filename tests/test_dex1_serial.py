@@ -1,0 +1,547 @@
+"""The Dex1-1's driver against its emulated motor on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dexkit.backends import BackendOptions
+from dexkit.backends import backend as find_backend
+from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings, discovery, find_motor
+from dexkit.drivers.dex1_serial import line as line_module
+from dexkit.drivers.dex1_serial.line import MotorLine, acquire, is_shared
+from dexkit.emulators.m4010 import Dex1Motors, Dex1Process, Firmware
+from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout, UsageError
+from dexkit.hand import Hand, HandCommand, HandState, JointMode, MotorError, Side
+from dexkit.wire.m4010 import MotorCmd
+
+BRAKE = HandCommand.brake(1)
+OPEN = HandCommand.position(5.4)
+CLOSE = HandCommand.position(0.3)
+LIMP = HandCommand.position(5.0, kp=0.0, kd=0.0)
+TIMEOUT = 0.3  # s; this machine may be busy with other tests
+
+
+@contextmanager
+def opened(
+    motors: Dex1Motors | Dex1Process, side: Side = Side.LEFT, **configuration: object
+) -> Iterator[Dex1Serial]:
+    values: dict[str, object] = {"device": motors.path, "timeout": TIMEOUT, **configuration}
+    with Dex1Serial(side, Dex1Settings(**values)) as hand:  # type: ignore[arg-type]
+        yield hand
+
+
+def drive(
+    hand: Dex1Serial, command: HandCommand, until: Callable[[HandState], bool], timeout: float = 8.0
+) -> HandState:
+    end = time.monotonic() + timeout
+    while True:
+        state = hand.exchange(command)
+        if until(state):
+            return state
+        assert time.monotonic() < end, f"still at {state.q[0]:.2f} rad"
+        time.sleep(0.002)
+
+
+def wait_for(condition: Callable[[], object], timeout: float = 8.0) -> None:
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def moving(state: HandState) -> bool:
+    return abs(float(state.dq[0])) > 1.0
+
+
+# --- driving
+
+
+def test_it_follows_measures_and_brakes_at_the_end() -> None:
+    with Dex1Motors() as motors:
+        with opened(motors) as hand:
+            assert isinstance(hand, Hand)
+            assert motors.motor.body.mode is JointMode.BRAKE
+            start = hand.exchange(BRAKE)
+            assert float(start.q[0]) == pytest.approx(1.08, abs=1e-3)
+            assert start.mode[0] == JointMode.BRAKE
+            way = drive(hand, OPEN, moving)
+            assert way.mode[0] == JointMode.FOC
+            assert float(way.tau_est[0]) > 0
+            end = drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
+            assert float(end.temperature[0]) == pytest.approx(25, abs=5)
+            assert end.winding_temperature is not None
+            assert float(end.voltage[0]) == 24.0
+            assert end.fault[0] == 0
+            assert 0 <= time.monotonic() - end.stamp < 1
+            assert motors.motor.body.joint.q == pytest.approx(float(end.q[0]), abs=0.05)
+            drive(hand, CLOSE, moving)
+        assert motors.motor.body.mode is JointMode.BRAKE
+        hand.close()
+        with pytest.raises(HandLost, match="not open"):
+            hand.exchange(BRAKE)
+
+
+def test_opening_and_closing_move_nothing_and_limp_neither() -> None:
+    with Dex1Motors() as motors:
+        before = motors.motor.body.joint.q
+        with opened(motors) as hand:
+            hand.open()  # again: nothing happens
+            for _ in range(50):
+                hand.exchange(LIMP)
+        assert motors.motor.body.joint.q == before
+
+
+def test_both_hands_on_one_line_take_turns() -> None:
+    with Dex1Motors(tuple(Side)) as motors:
+        with opened(motors, Side.LEFT) as left, opened(motors, Side.RIGHT) as right:
+            targets = {left: 4.0, right: 2.0}
+
+            def run(hand: Dex1Serial) -> None:
+                for _ in range(300):
+                    hand.exchange(HandCommand.position(targets[hand]))
+                    time.sleep(0.001)
+                drive(
+                    hand,
+                    HandCommand.position(targets[hand]),
+                    lambda s: abs(float(s.q[0]) - targets[hand]) < 0.1,
+                )
+
+            threads = [threading.Thread(target=run, args=(hand,)) for hand in targets]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(20)
+            assert motors.motors[Side.LEFT].q == pytest.approx(4.0, abs=0.1)
+            assert motors.motors[Side.RIGHT].q == pytest.approx(2.0, abs=0.1)
+            assert left.line_statistics is right.line_statistics
+            assert left.line_statistics.foreign == 0
+            left.close()
+            right.exchange(BRAKE)  # the line stays for the other one
+            with pytest.raises(HandRefused, match="6000000 baud already"):
+                acquire(motors.path, 4_000_000)
+        assert line_module._lines == {}
+
+
+# --- finding it
+
+
+def test_it_is_looked_for_on_every_port(tmp_path: Path) -> None:
+    links = {Side.LEFT: tmp_path / "ttyB", Side.RIGHT: tmp_path / "ttyA"}
+    (tmp_path / "ttyC").write_text("no port")
+    ports = (str(tmp_path / "tty*"), str(tmp_path / "none*"))
+    with Dex1Motors(tuple(Side), links=links):
+        for side, link in links.items():
+            with Dex1Serial(side, Dex1Settings(ports=ports, timeout=TIMEOUT)) as hand:
+                assert hand.path == str(link)
+        assert line_module._lines == {}
+
+
+def test_what_is_not_there_is_said(tmp_path: Path) -> None:
+    nothing = Dex1Settings(ports=(str(tmp_path / "tty*"),), timeout=0.05)
+    with pytest.raises(HandNotFound, match="nothing matches"):
+        Dex1Serial(Side.LEFT, nothing).open()
+    with pytest.raises(HandNotFound, match="there is no device"):
+        Dex1Serial(Side.LEFT, Dex1Settings(device=str(tmp_path / "tty"))).open()
+    links = {Side.RIGHT: tmp_path / "tty1"}
+    with Dex1Motors((Side.RIGHT,), links=links) as motors:
+        with pytest.raises(HandNotFound, match=r"motor 1 \(the left one\) does not") as found:
+            Dex1Serial(Side.LEFT, nothing).open()
+        assert "motor 0 answers, which is the right one" in found.value.hint
+        with pytest.raises(HandNotFound):
+            Dex1Serial(Side.RIGHT, Dex1Settings(device=motors.path, id=7, timeout=0.02)).open()
+        with Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, id=0, timeout=TIMEOUT)):
+            pass  # who says so knows better
+        motors.inject("stray:before=3")
+        wait_for(lambda: motors.bus(Side.RIGHT).schedule.active)
+        with Dex1Serial(Side.RIGHT, Dex1Settings(device=motors.path, timeout=TIMEOUT)) as hand:
+            hand.exchange(BRAKE)
+            assert hand.line_statistics.stray >= 6
+        motors.inject("corrupt")
+        wait_for(lambda: len(motors.bus(Side.RIGHT).schedule.active) == 2)
+        with pytest.raises(HandNotFound) as garbled:
+            Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, timeout=0.05)).open()
+        assert "no intact frames" in garbled.value.hint
+
+
+def test_two_motors_with_one_id_are_not_chosen_from(tmp_path: Path) -> None:
+    link, other = {Side.LEFT: tmp_path / "tty1"}, {Side.LEFT: tmp_path / "tty2"}
+    with Dex1Motors(links=link), Dex1Motors(links=other):
+        settings = Dex1Settings(ports=(str(tmp_path / "tty*"),), timeout=TIMEOUT)
+        with pytest.raises(HandRefused, match="more than one port") as found:
+            Dex1Serial(Side.LEFT, settings).open()
+        assert "tty1, " in found.value.message
+        with Dex1Motors((Side.RIGHT,), links={Side.RIGHT: tmp_path / "tty3"}):
+            line, _ = find_motor(settings, 0)
+            line.release()
+    assert line_module._lines == {}
+
+
+def test_a_port_that_another_program_has(tmp_path: Path) -> None:
+    links = {Side.LEFT: tmp_path / "tty1"}
+    with Dex1Motors(links=links) as motors:
+        code = (
+            "import serial, sys; p = serial.Serial(sys.argv[1], 6000000, exclusive=True);"
+            "print('ready', flush=True); sys.stdin.read()"
+        )
+        holder = subprocess.Popen(
+            [sys.executable, "-c", code, motors.path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"ready\n"
+            with pytest.raises(HandRefused, match="another program"), opened(motors):
+                pass
+            settings = Dex1Settings(ports=(str(tmp_path / "tty*"),))
+            with pytest.raises(HandNotFound) as found:
+                Dex1Serial(Side.LEFT, settings).open()
+            assert "another program" in found.value.hint
+        finally:
+            holder.communicate()
+
+
+def test_it_tries_three_times_with_pauses_as_the_vendors_service() -> None:
+    pauses: list[float] = []
+    with Dex1Motors((Side.RIGHT,)) as motors:
+        with pytest.raises(HandNotFound):
+            find_motor(Dex1Settings(device=motors.path, timeout=0.01), 1, pauses.append)
+        assert pauses == [discovery.PAUSE] * 2 == [0.05] * 2
+
+
+def test_a_motor_that_wakes_up_late_is_found() -> None:
+    with Dex1Motors(faults=("silent:for=100ms",)) as motors, opened(motors, timeout=0.1) as hand:
+        hand.exchange(BRAKE)
+
+
+# --- what goes wrong on the line
+
+
+@pytest.mark.parametrize(
+    ("spec", "fails"),
+    [
+        ("short:for=150ms", True),
+        ("drop:for=150ms", True),
+        ("corrupt:for=150ms", True),
+        ("delay:ms=60,for=150ms", True),
+        ("pause:ms=60,for=150ms", True),
+        ("pause:ms=5,for=150ms", False),
+        ("stray:before=1,for=150ms", False),
+        ("stray:before=0,after=2,for=150ms", False),
+    ],
+)
+def test_a_damaged_answer_costs_its_own_exchange_only(spec: str, fails: bool) -> None:
+    """What puts the vendor's library out of step for good (facts G) passes without trace."""
+    with Dex1Motors(start_pct=50.0) as motors, opened(motors) as hand:
+        hand.exchange(BRAKE)
+        patient = hand.configuration
+        if fails:
+            hand.configuration = replace(patient, timeout=0.04)
+        motors.inject(spec)
+        schedule = motors.bus(Side.LEFT).schedule
+        wait_for(lambda: schedule.active)
+        failed = 0
+        while schedule.active:
+            try:
+                state = hand.exchange(OPEN)
+                assert 2.6 < float(state.q[0]) < 5.6
+            except HandTimeout:
+                failed += 1
+        assert bool(failed) == fails
+        hand.configuration = patient
+        # at once, or after what is still late
+        for left in reversed(range(4)):
+            try:
+                hand.exchange(BRAKE)
+                break
+            except HandTimeout:
+                assert left
+        # and in step: each answer belongs to its own command
+        drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
+        for command, mode in ((BRAKE, 0), (OPEN, 1)) * 5:
+            assert hand.exchange(command).mode[0] == mode
+
+
+def test_an_answer_that_is_late_is_not_taken_for_the_next() -> None:
+    with Dex1Motors() as motors, opened(motors) as hand:
+        patient = hand.configuration
+        hand.configuration = replace(patient, timeout=0.03)
+        motors.inject("delay:ms=36")
+        schedule = motors.bus(Side.LEFT).schedule
+        wait_for(lambda: schedule.active)
+        with pytest.raises(HandTimeout, match="motor 1 on"):
+            hand.exchange(BRAKE)
+        hand.configuration = patient
+        assert hand.exchange(LIMP).mode[0] == JointMode.FOC  # and not that of the brake
+
+
+def test_an_exchange_is_bounded_in_time() -> None:
+    with Dex1Motors() as motors, opened(motors, timeout=0.1) as hand:
+        motors.inject("silent")
+        wait_for(lambda: motors.motor.silent)
+        for _ in range(5):
+            begin = time.monotonic()
+            with pytest.raises(HandTimeout):
+                hand.exchange(BRAKE)
+            assert time.monotonic() - begin < hand.spec.exchange_timeout + 0.2
+        assert hand.line_statistics.timeouts >= 5
+
+
+# --- errors, protection
+
+
+def test_errors_are_in_the_state_and_pass(caplog: pytest.LogCaptureFixture) -> None:
+    with Dex1Motors() as motors, opened(motors) as hand:
+        with caplog.at_level(logging.WARNING):
+            motors.inject("overcurrent:for=100ms")
+            drive(hand, OPEN, lambda s: s.fault[0] == MotorError.OVERCURRENT)
+            state = drive(hand, OPEN, lambda s: s.fault[0] == 0)
+        motors.inject("overheat:c=130,for=50ms")
+        hot = drive(hand, BRAKE, lambda s: s.fault[0] == MotorError.WINDING_OVERTEMPERATURE)
+        assert hot.winding_temperature is not None
+        assert hot.winding_temperature[0] == 130
+        assert state.q.shape == (1,)
+        assert hand.statistics.faults == 2
+        assert "reports: overcurrent" in caplog.text
+        assert "no error any more" in caplog.text
+
+
+def test_a_pause_trips_the_protection_and_work_goes_on() -> None:
+    quick = Firmware(command_timeout=0.2)
+    with Dex1Motors(firmware=quick) as motors, opened(motors) as hand:
+        drive(hand, OPEN, moving)
+        wait_for(lambda: motors.motor.tripped)
+        assert motors.motor.body.mode is JointMode.BRAKE
+        found = hand.exchange(CLOSE)
+        assert found.fault[0] & MotorError.MOTOR_SAW_HOST_TIMEOUT
+        cleared = hand.exchange(CLOSE)
+        assert cleared.fault[0] == 0
+        drive(hand, CLOSE, lambda s: float(s.q[0]) < 0.5)
+        assert hand.statistics.trips >= 1
+
+
+def test_protection_can_be_left_off() -> None:
+    quick = Firmware(command_timeout=0.1)
+    with Dex1Motors(firmware=quick) as motors, opened(motors, protect=False) as hand:
+        hand.exchange(OPEN)
+        time.sleep(0.3)
+        assert not motors.motor.tripped
+        assert motors.motor.body.mode is JointMode.FOC
+
+
+@pytest.mark.parametrize("where", ["write", "read"])
+def test_ctrl_c_in_an_exchange_brakes(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+    with Dex1Motors(start_pct=100.0) as motors:
+        with opened(motors) as hand:
+            drive(hand, CLOSE, moving)
+            real = os.write
+
+            def interrupt(fd: int, data: bytes) -> int:
+                patched.undo()
+                if where == "read":
+                    real(fd, data)  # the command is out, its answer on its way
+                raise KeyboardInterrupt
+
+            with monkeypatch.context() as patched:
+                patched.setattr(line_module.os, "write", interrupt)
+                with pytest.raises(KeyboardInterrupt):
+                    hand.exchange(CLOSE)
+            assert motors.motor.body.mode is JointMode.FOC
+        assert motors.motor.body.mode is JointMode.BRAKE
+
+
+def test_a_killed_driver_leaves_nothing_moving() -> None:
+    code = (
+        "import sys, time\n"
+        "from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings\n"
+        "from dexkit.hand import HandCommand, Side\n"
+        "hand = Dex1Serial(Side.LEFT, Dex1Settings(device=sys.argv[1], timeout=0.3))\n"
+        "hand.open()\n"
+        "while True:\n"
+        "    hand.exchange(HandCommand.position(5.4, kp=0.0, kd=0.5, dq=0.5))\n"
+        "    print(flush=True)\n"
+        "    time.sleep(0.002)\n"
+    )
+    with Dex1Motors() as motors:
+        driver = subprocess.Popen([sys.executable, "-c", code, motors.path], stdout=subprocess.PIPE)
+        assert driver.stdout is not None
+        driver.stdout.readline()
+        wait_for(lambda: motors.motor.body.joint.dq > 0.2)
+        driver.send_signal(signal.SIGKILL)
+        driver.communicate()
+        wait_for(lambda: motors.motor.tripped, 3.0)
+        wait_for(lambda: motors.motor.body.joint.dq == 0.0)
+        with opened(motors) as hand:  # and whoever comes next can drive
+            drive(hand, OPEN, moving)
+
+
+# --- the cable
+
+
+def test_unplugged_in_motion_and_plugged_in_again() -> None:
+    with Dex1Motors() as motors, opened(motors) as hand:
+        drive(hand, OPEN, moving)
+        motors.inject("unplug:for=300ms")
+        with pytest.raises(HandLost, match="gone away"):
+            drive(hand, OPEN, lambda s: False)
+        with pytest.raises(HandLost):
+            hand.exchange(OPEN)
+        hand.close()
+        with pytest.raises((HandNotFound, HandLost)):
+            hand.open()
+        wait_for(lambda: os.path.exists(motors.path))
+        hand.open()
+        assert motors.motor.body.mode is JointMode.BRAKE
+        drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
+    assert line_module._lines == {}
+
+
+def test_a_shared_line_is_lost_and_found_by_both() -> None:
+    with Dex1Motors(tuple(Side)) as motors:
+        hands = [
+            Dex1Serial(side, Dex1Settings(device=motors.path, timeout=TIMEOUT)) for side in Side
+        ]
+        for hand in hands:
+            hand.open()
+        motors.inject("unplug:for=100ms")
+        with pytest.raises(HandLost):
+            drive(hands[0], BRAKE, lambda s: False)
+        hands[0].close()
+        wait_for(lambda: os.path.exists(motors.path))
+        hands[0].open()  # a new line, while the other still has the old one
+        with pytest.raises(HandLost):
+            hands[1].exchange(BRAKE)
+        hands[1].close()
+        hands[1].open()
+        assert hands[0].line_statistics is hands[1].line_statistics
+        for hand in hands:
+            hand.exchange(BRAKE)
+            hand.close()
+    assert line_module._lines == {}
+
+
+def test_closing_a_hand_that_is_gone_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    for protect, says in ((True, "stops by itself"), (False, "cut its power")):
+        with Dex1Motors() as motors:
+            hand = Dex1Serial(
+                Side.LEFT, Dex1Settings(device=motors.path, timeout=TIMEOUT, protect=protect)
+            )
+            hand.open()
+        hand.close()
+        assert says in caplog.text
+
+
+# --- calibrating
+
+
+def test_calibration_makes_closed_the_zero_once() -> None:
+    with Dex1Motors(start_pct=0.0, zero_error=1.5) as motors, opened(motors) as hand:
+        assert float(hand.exchange(BRAKE).q[0]) == pytest.approx(1.5, abs=1e-3)
+        assert hand.calibrate() == pytest.approx(0.0, abs=1e-3)
+        assert float(hand.exchange(BRAKE).q[0]) == pytest.approx(0.0, abs=1e-3)
+        with pytest.raises(HandRefused, match="before since power-up"):
+            hand.calibrate()
+        hand.close()
+        with pytest.raises(HandLost, match="not open"):
+            hand.calibrate()
+
+
+def test_silence_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The vendor's library says "successful" (facts G)."""
+    monkeypatch.setattr("dexkit.drivers.dex1_serial.hand._FLASH_TIME", 0.05)
+    with Dex1Motors() as motors, opened(motors) as hand:
+        motors.inject("silent:for=100ms")
+        wait_for(lambda: motors.motor.silent)
+        with pytest.raises(HandTimeout):
+            hand.calibrate()
+        wait_for(lambda: not motors.motor.silent)
+        monkeypatch.undo()
+        with pytest.raises(HandRefused, match="time is 0"):
+            hand.calibrate(time=lambda: 0.0)
+    with (
+        Dex1Motors(firmware=Firmware(calibration_enabled=False)) as motors,
+        opened(motors) as hand,
+        pytest.raises(HandRefused, match="not enabled"),
+    ):
+        hand.calibrate()
+
+
+# --- the backend
+
+
+def test_the_backend_reads_its_settings() -> None:
+    backend = find_backend("dex1-serial")
+    assert backend.model == "dex1-1"
+    settings = {
+        "ports": "/dev/a*, /dev/b",
+        "id": "3",
+        "baudrate": "4000000",
+        "protect": "off",
+        "timeout": "0.05",
+    }
+    assert set(settings) == set(backend.settings)
+    hand = backend.create(BackendOptions(Side.RIGHT, "/dev/x", settings))
+    assert isinstance(hand, Dex1Serial)
+    assert hand.configuration == Dex1Settings(
+        "/dev/x", ("/dev/a*", "/dev/b"), 3, 4_000_000, False, 0.05
+    )
+    assert hand.id == 3
+    assert Dex1Serial(Side.RIGHT).id == 0
+    assert Dex1Serial(Side.LEFT).id == 1
+    spec = Dex1Serial(Side.LEFT).spec
+    assert (spec.io_rate, spec.simulated) == (500.0, False)
+    assert spec.exchange_timeout <= 0.1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"ports": ""},
+        {"id": "15"},
+        {"id": "left"},
+        {"baudrate": "0"},
+        {"protect": "yes"},
+        {"timeout": "0"},
+        {"speed": "1"},
+    ],
+)
+def test_senseless_settings_are_refused(wrong: dict[str, str]) -> None:
+    with pytest.raises(UsageError):
+        find_backend("dex1-serial").create(BackendOptions(Side.LEFT, None, wrong))
+
+
+def test_what_is_no_port_of_a_motor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(HandNotFound, match="not a serial port"):
+        MotorLine(str(tmp_path / "file"), 6_000_000)
+
+    def refuse(*args: object, **options: object) -> None:
+        raise ValueError("Failed to set custom baud rate (6000000): [Errno 22] Invalid argument")
+
+    monkeypatch.setattr(line_module.serial, "Serial", refuse)
+    with pytest.raises(HandRefused, match="does not do 6000000 baud"):
+        MotorLine("/dev/null", 6_000_000)
+
+
+def test_asking_who_else_is_there_leaves_a_hand_alone_that_is_driven() -> None:
+    with Dex1Motors(tuple(Side)) as motors, opened(motors, Side.RIGHT) as right:
+        drive(right, OPEN, moving)
+        motors.inject("silent:id=1")
+        wait_for(lambda: motors.motors[Side.LEFT].silent)
+        with pytest.raises(HandNotFound), opened(motors, timeout=0.01):
+            pass
+        assert motors.motors[Side.RIGHT].body.mode is JointMode.FOC
+        line = acquire(motors.path, 6_000_000)
+        assert is_shared(line)
+        assert line.exchange(MotorCmd(0).pack(), 0, TIMEOUT).id == 0
+        line.release()
