@@ -210,7 +210,8 @@ def _areas(result: RunResult) -> str:
         )
         rows.append(
             f'<tr><th scope="row"><a href="#{_anchor(area)}">{escape(area)}</a></th>'
-            f'<td><span class="bar" aria-hidden="true">{bar}</span>{told}</td></tr>'
+            f'<td><div class="tally"><span class="bar" aria-hidden="true">{bar}</span>'
+            f"<span>{told}</span></div></td></tr>"
         )
     return (
         '<h2>By area</h2><table class="areas"><thead class="hidden"><tr><th scope="col">area</th>'
