@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -14,18 +14,20 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError
-from dexkit.hand import Side
+from dexkit.hand import Floats, Side
 from dexkit.models import DEX3_1, DIALECTS, MODELS
 from dexkit.teleop import (
     PROFILES,
     Dex1Client,
     Dex3Client,
+    JointCommand,
     Operator,
     Pose,
     Release,
     StateReceiver,
     StickyFilter,
     client_for,
+    feel,
     profile,
     profiles_for,
     recorded,
@@ -45,8 +47,8 @@ def recording(name: str) -> Recording:
     return Recording.of(open_trace(sample_path(name)))
 
 
-def q_of(commands: dict[Side, tuple[object, ...]], side: Side) -> float:
-    return commands[side][0].q  # type: ignore[attr-defined, no-any-return]
+def q_of(commands: Mapping[Side, tuple[JointCommand, ...]], side: Side) -> float:
+    return commands[side][0].q
 
 
 # ------------------------------------------------------------------------ the receiving thread
@@ -463,7 +465,7 @@ def test_the_client_gets_the_input_at_thirty_hertz() -> None:
 def test_an_object_squeezes_the_profile() -> None:
     operator = Operator(profile("full-stroke", "dex1-1"), GO, most={RIGHT: 0.5})
     assert operator.intent(0.6, LEFT) == (0.0,)
-    assert operator.intent(0.6, RIGHT) == (pytest.approx(2.7),)
+    assert operator.intent(0.6, RIGHT) == pytest.approx((2.7,))
     assert operator.intent(2.6, RIGHT) == (5.4,)
 
 
@@ -494,21 +496,20 @@ def test_a_profile_of_the_other_model_is_refused_with_the_names_that_there_are()
 
 
 def first_order(
-    wanted: object, *, delay: float, tau: float, end: float, dt: float = 0.002
-) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
-    t = np.arange(0.0, end, dt)
-    q = np.empty_like(t)
+    wanted: Callable[[float], float], *, delay: float, tau: float, end: float
+) -> tuple[Floats, Floats]:
+    """Times and positions of a hand that follows with a delay and a time constant."""
+    t: Floats = np.asarray(np.arange(0.0, end, 0.002))
+    q: Floats = np.empty_like(t)
     here = 0.0
     for i, now in enumerate(t):
-        goal = wanted(now - delay)  # type: ignore[operator]
-        here += (goal - here) * dt / tau if tau else goal - here
+        goal = wanted(float(now) - delay)
+        here += (goal - here) * 0.002 / tau if tau else goal - here
         q[i] = here
     return t, q
 
 
 def test_the_time_of_a_stroke_is_what_a_first_order_hand_needs() -> None:
-    from dexkit.teleop import feel
-
     def wanted(t: float) -> float:
         return 5.4 if t >= 1.0 else 0.0
 
@@ -521,8 +522,6 @@ def test_the_time_of_a_stroke_is_what_a_first_order_hand_needs() -> None:
 
 
 def test_a_delay_is_found_as_lag_and_as_reaction() -> None:
-    from dexkit.teleop import feel
-
     def slow(t: float) -> float:
         return 2.7 + 2.0 * math.sin(1.5 * t)
 
@@ -537,9 +536,7 @@ def test_a_delay_is_found_as_lag_and_as_reaction() -> None:
 
 
 def test_a_hand_that_stays_gives_an_infinite_stroke_and_no_lag() -> None:
-    from dexkit.teleop import feel
-
-    t = np.arange(0.0, 4.0, 0.002)
+    t: Floats = np.asarray(np.arange(0.0, 4.0, 0.002))
     still = feel(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
     assert still.stroke_s == math.inf
     assert math.isnan(still.reaction_s)
@@ -551,8 +548,6 @@ def test_a_hand_that_stays_gives_an_infinite_stroke_and_no_lag() -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))
 def test_any_hand_has_figures_that_are_not_negative(values: list[float], goal: float) -> None:
-    from dexkit.teleop import feel
-
-    t = np.arange(len(values)) * 0.05
+    t: Floats = np.asarray(np.arange(len(values)) * 0.05)
     found = feel(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
     assert all(x >= 0.0 for x in found.figures().values())
