@@ -540,6 +540,7 @@ class Writer(_Handle):
         self.timeouts = 0
         self._write = _cyclone().layer.ddspy_write
         self._write_ts = _cyclone().layer.ddspy_write_ts
+        self._registered = False
 
     def _matched_status(self) -> Any:
         return _cyclone().dds_get_publication_matched_status
@@ -571,6 +572,12 @@ class Writer(_Handle):
             if len(data) < 4:
                 raise EncodeError(f"{len(data)} bytes are too short for a sample")
             data = data + bytes(-len(data) % 4)  # the wire unit is 4 bytes
+        if not self._registered:
+            # Our types have no key, so a topic has one instance. Unless it is registered,
+            # CycloneDDS makes and frees it with each sample that nobody must acknowledge, and
+            # at 2000 samples a second its collector takes 5 % of a processor.
+            self._registered = True
+            _cyclone().layer.ddspy_register_instance(self._ref, data)
         if source_timestamp_ns is None:
             code = self._write(self._ref, data)
         else:

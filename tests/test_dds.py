@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, interfaces, type_hash
+from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, _cyclone, interfaces, type_hash
 from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError, WireError
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
@@ -40,6 +40,20 @@ def test_a_sample_travels_unchanged_with_its_timestamp(dds_node: DdsNode) -> Non
         writer.write(message)
         (sample,) = take_until(reader, bool)
         assert before <= sample.source_timestamp_ns <= sample.reception_ns
+
+
+def test_a_writer_keeps_its_one_instance(dds_node: DdsNode) -> None:
+    """Otherwise CycloneDDS makes and frees it with each sample."""
+    lookup = _cyclone().layer.ddspy_lookup_instance
+    messages = [MotorCmds_([MotorCmd_(q=q)]) for q in (1.0, 2.0, 3.0)]
+    handles = set()
+    with dds_node.writer("rt/instance", CMDS) as writer:
+        for message in messages:
+            writer.write(message)
+            time.sleep(0.05)  # its collector works some milliseconds later
+            handles |= {lookup(writer._ref, message_type(CMDS).encode(m)) for m in messages}
+    (handle,) = handles
+    assert handle > 0
 
 
 def test_depth_and_order(dds_node: DdsNode) -> None:
