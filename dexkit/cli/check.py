@@ -120,7 +120,7 @@ def command(
     if html_path:
         from dexkit.conformance.report.html import write_html
 
-        write_html(result, view, html_path)
+        write_html(result, view, html_path, recording=recording)
         console.print(f"report: {html_path}", highlight=False)
     if result.judged == 0:
         raise ConformanceError(
