@@ -20,6 +20,7 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from functools import cache
 from typing import NamedTuple, TypeAlias
 
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
@@ -28,6 +29,7 @@ from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb.layout import BROADCAST_ID, Field, Structure, ris_mode
 from dexkit.wire.dex3_usb.units import (
     MOTOR_VOLTAGE,
+    NUDGE,
     POSITION,
     TEMPERATURE,
     WINDING_TEMPERATURE,
@@ -83,6 +85,7 @@ VELOCITY = Scale(
 TORQUE = Scale("torque", ("tor_des", "torque"), "N·m", 2560.0, -0x8000, 0x7FFF, power=-1)
 STIFFNESS = Scale("stiffness", ("k_pos",), "N·m/rad", 12800.0, 0, 0xFFFF, power=-2)
 DAMPING = Scale("damping", ("k_spd",), "N·m·s/rad", 12800.0, 0, 0xFFFF, power=-2)
+_COMMAND_SCALES = (TORQUE, VELOCITY, POSITION, STIFFNESS, DAMPING)
 _CALIBRATION_ANGLE = Scale("angle", ("position", "range"), "rad", POSITION.counts, 0, 0xFFFF)
 
 COMMAND = Structure(
@@ -138,6 +141,9 @@ class Status(IntEnum):
     CALIBRATE = 6
 
 
+_FOC = int(Status.FOC)
+
+
 class CalibrationProblem(IntFlag):
     """MError bits of the answer to a calibration (facts G "Calibration"); the lowest wins."""
 
@@ -167,6 +173,19 @@ class Feedback(NamedTuple):
     q: float
     dq: float
     tau: float
+
+
+@cache
+def _command_factors(ratio: float) -> tuple[float, float, float, float, float]:
+    """Counts per SI unit of tau, dq, q, kp and kd at the joint."""
+    tau, dq, q, kp, kd = (scale.factor(ratio) * NUDGE for scale in _COMMAND_SCALES)
+    return tau, dq, q, kp, kd
+
+
+def _mode(number: int, status: int, timeout: bool) -> int:
+    if 0 <= number <= 15 and 0 <= status <= 7:
+        return number | status << 4 | (0x80 if timeout else 0)
+    return ris_mode(number, status, timeout)  # which says what is wrong
 
 
 def _sealed(structure: Structure, *values: int | bytes) -> bytes:
@@ -232,15 +251,20 @@ class MotorCmd:
         :param number: id of the motor.
         :raises EncodeError: NaN or infinity.
         """
+        if not math.isfinite(q + dq + tau + kp + kd):
+            for value, scale in zip((tau, dq, q, kp, kd), _COMMAND_SCALES, strict=True):
+                scale.encode(value, ratio)  # which says what is wrong
+        # what Scale.encode does, for all five at once
+        per_tau, per_dq, per_q, per_kp, per_kd = _command_factors(ratio)
         return cls(
             number,
-            Status.FOC,
+            _FOC,
             timeout,
-            TORQUE.encode(tau, ratio),
-            VELOCITY.encode(dq, ratio),
-            POSITION.encode(q, ratio),
-            STIFFNESS.encode(kp, ratio),
-            DAMPING.encode(kd, ratio),
+            int(min(max(tau * per_tau, -0x8000), 0x7FFF)),
+            int(min(max(dq * per_dq, -0x8000), 0x7FFF)),
+            int(min(max(q * per_q, -0x80000000), 0x7FFFFFFF)),
+            int(min(max(kp * per_kp, 0), 0xFFFF)),
+            int(min(max(kd * per_kd, 0), 0xFFFF)),
         )
 
     def joint(self, ratio: float = GEAR_RATIO) -> Setpoint:
@@ -258,7 +282,7 @@ class MotorCmd:
 
         :raises EncodeError: a value does not fit.
         """
-        mode = ris_mode(self.id, self.status, self.timeout)
+        mode = _mode(self.id, self.status, self.timeout)
         values = (self.tor_des, self.spd_des, self.pos_des, self.k_pos, self.k_spd)
         return _sealed(COMMAND, mode, self.res, *values)
 
@@ -349,7 +373,7 @@ class MotorData:
 
         :raises EncodeError: a value does not fit.
         """
-        mode = ris_mode(self.id, self.status, self.timeout)
+        mode = _mode(self.id, self.status, self.timeout)
         heat = (self.temp, self.winding, self.vol)
         motion = (self.torque, self.speed, self.pos)
         rest = (self.merror, self.ex_sensor1, self.ex_sensor2)
@@ -502,8 +526,15 @@ class FrameParser:
     def feed(self, data: Bytes) -> list[Frame]:
         """Take ``data`` and return the frames that are now complete."""
         buffer = self._buffer
-        buffer += data
         frames: list[Frame] = []
+        if not buffer and len(data) == self.kinds[0].size:  # a whole frame, as nearly always
+            try:
+                frames.append(_KINDS[self.kinds[0].name].parse(data))
+                self.frames += 1
+                return frames
+            except WireError:
+                pass  # or something else, or damaged: look closely
+        buffer += data
         start = 0  # of what is not yet consumed
         while len(buffer) - start >= 2:
             places = [

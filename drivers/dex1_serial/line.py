@@ -123,9 +123,8 @@ class MotorLine:
         deadline = time.monotonic() + timeout
         skipped, errors = parser.skipped, parser.crc_errors
         try:
-            while (left := deadline - time.monotonic()) > 0:
-                if not select.select([fd], [], [], left)[0]:
-                    break
+            # a look after the deadline, too: the answer may be there, and this process was late
+            while select.select([fd], [], [], max(0.0, deadline - time.monotonic()))[0]:
                 data = self._read(fd)
                 if not data:
                     raise HandLost(f"the port {self.path} has gone away: no data")
