@@ -56,7 +56,8 @@ class Emulation:
 _CLOSED_AT = "1510"  # encoder tick of the emulated zero: told to both, so nothing has to move
 EMULATED: dict[str, Emulation] = {
     "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), True, {"zero": _CLOSED_AT}),
-    "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True),
+    # an emulated motor shares the machine with all the rest, and may be late
+    "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.1"}),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }
 """Backends whose device the kit can start itself."""
