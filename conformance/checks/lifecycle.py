@@ -108,15 +108,15 @@ def last_word(ctx: Context) -> Outcome:
     """The mode of the last state before the service ended."""
     begin, end = ctx.span(ctx.phases()[-1])
     modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]
-    modes = modes[np.isfinite(modes).all(axis=1)].astype(np.intp)
+    status = modes[np.isfinite(modes).all(axis=1)].astype(np.intp)
     if ctx.recording.model.name == DEX3_1.name:
-        modes = modes >> 4 & 7
-    if len(modes) < 2 or not (modes[0] == JointMode.FOC).all():
+        status = np.bitwise_and(np.right_shift(status, 4), 7)
+    if len(status) < 2 or not (status[0] == JointMode.FOC).all():
         return ctx.absent("the mode of this hand does not tell whether it is driven")
-    if not modes[-1].any():
+    if not status[-1].any():
         return ctx.passed("brakes", "its last state says that it is not driven any more")
     return ctx.failed(
         "driven",
-        f"its last state says mode {int(modes[-1].max())}: driven",
+        f"its last state says mode {int(status[-1].max())}: driven",
         ctx.at(ctx.states.topic, float(ctx.states.t[ctx.states.between(begin - 0.2, end)][-1])),
     )

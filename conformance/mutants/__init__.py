@@ -82,7 +82,7 @@ def _dex1(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
 def _dex3(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
     name = service.__name__
     sides = tuple(Side) if name in dex3.BOTH else LEFT
-    brief = hasattr(shared, name) or name in dex3.TOLD
+    brief = name in dex3.TOLD or (hasattr(shared, name) and name not in dex3.DILUTED)
     return Mutant(name, DEX3_1.name, service, kills, also, sides, brief)
 
 

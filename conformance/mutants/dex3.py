@@ -108,8 +108,9 @@ class _Filled(Dex3Service):
             (self.packet, message.press_sensor_state),
             (self.whole, [message]),
         ):
-            for part in parts if change else []:
-                setattr(part, *change)
+            if change is not None:
+                for part in parts:
+                    setattr(part, change[0], change[1])
         return message
 
 
@@ -333,7 +334,7 @@ class _Creeps(Dex3Hand):
     def move(self, dt: float, pull: list[float]) -> None:
         if self.now - self.since > 0.2 and self.law_on[6] and self.law_kp[6] > 1.0:
             left = self.law_q[6] - self.q[6]
-            if 0.02 < abs(left) < 0.14:
+            if 0.02 < abs(left) < 0.1:
                 wanted = math.copysign(0.045, left)
                 pull[6] = self.law_kd[6] * wanted + math.copysign(self.coulomb, left)
         super().move(dt, pull)
@@ -435,7 +436,7 @@ class MilliNewtonMetres(Dex3Service):
 class _NegativeGains(Dex3Hand):
     def take(self, rows: Floats, mode: Ints) -> None:
         super().take(rows, mode)
-        self.kp, self.kd = rows[3].copy(), rows[4].copy()
+        self.kp = rows[3].copy()
 
 
 class NegativeGains(Dex3Service):
@@ -729,3 +730,5 @@ TOLD = (
     *("FaultForAStatus", "CountsInReserve", "HotSensors", "UnsetLost", "MilliNewtonMetres"),
 )
 """What tells wrongly of a hand that does everything right."""
+DILUTED = ("StuttersUnderLoad", "FreezesOnce")
+"""What would weigh too much in a short run."""

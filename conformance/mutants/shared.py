@@ -399,11 +399,11 @@ class DropsOldStamps(Service):
 class StuttersUnderLoad(Service):
     """Publishes one state in three while commands come faster than every 4 ms."""
 
-    tick = period = 0.0025
+    tick = period = 0.002
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
-        self.came: dict[Side, tuple[float, float]] = {s: (-1.0, -1.0) for s in self.sides}
+        self.came: dict[Side, tuple[float, float]] = dict.fromkeys(self.sides, (-1.0, -1.0))
         self.cycle = 0
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:

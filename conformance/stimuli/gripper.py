@@ -155,9 +155,9 @@ class GripperScript(Script):
             ]
             yield from self._burst(name, far, 0.5)
         elif name == "negative":
-            gains = {"kp": -self._model.client_gains[0], "kd": -self._model.client_gains[1]}
-            aside = [(self._middle(s) + 0.1 * self._stroke) for s in sides]
-            wrong = {s: (Motor(q=q, **gains),) for s, q in zip(sides, aside, strict=True)}
+            kp, kd = self._model.client_gains
+            aside = {s: self._middle(s) + 0.1 * self._stroke for s in sides}
+            wrong = {s: (Motor(q=q, kp=-kp, kd=-kd),) for s, q in aside.items()}
             yield from self._burst(name, [self._wire.encode(wrong)], 0.4)
         else:
             yield from self._burst(name, [self._wire.encode_empty(sides)], 0.5)

@@ -28,6 +28,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("dexkit.cli.doctor", "Say why a client and a hand do not meet."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, on a pseudo-terminal or USB/IP."),
     "info": ("dexkit.cli.info", "Say what is in a recording."),
+    "mutants": ("dexkit.cli.mutants", "Prove the checks on deliberately wrong hands."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),
     "report": ("dexkit.cli.report", "Write the reports of a result again."),

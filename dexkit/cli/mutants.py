@@ -1,0 +1,65 @@
+"""``dexkit mutants``: prove the checks on deliberately wrong hands."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from dexkit.cli.common import stop_on_signals
+from dexkit.models import MODELS
+
+
+@click.command("mutants")
+@click.option("--model", type=click.Choice(list(MODELS)), help="Only wrong hands of this model.")
+@click.option(
+    "--require",
+    multiple=True,
+    metavar="PREFIX",
+    help="Only requirements whose id begins so (DEX1-SAFE). May be given several times.",
+)
+@click.option(
+    "--json", "json_path", type=click.Path(path_type=Path), help="Write the score as JSON."
+)
+@click.option("--jobs", type=click.IntRange(1), help="Processes. Default: one a processor.")
+@click.option("-v", "--verbose", is_flag=True, help="Say what every wrong hand does wrong.")
+def command(
+    model: str | None,
+    require: tuple[str, ...],
+    json_path: Path | None,
+    jobs: int | None,
+    verbose: bool,
+) -> None:
+    """Try the conformance checks on hands that are known to be wrong.
+
+    Each wrong hand (a mutant) changes one thing of a hand that does everything right. The checks
+    must catch it by the requirement that it breaks, and find no other fault with it. It runs on a
+    virtual clock: no device, no DDS.
+
+    Exit code: 0 every requirement is proven by a wrong hand, 1 one is missed, wrongly blamed or
+    has no wrong hand, 2 there is nothing to try.
+    """
+    from dexkit.conformance.mutants.matrix import Score, chosen
+
+    console = Console()
+    requirements, trials = chosen(model, require)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with (
+        stop_on_signals() as stop,
+        Progress(*columns, console=Console(stderr=True), transient=True) as progress,
+    ):
+        task = progress.add_task(f"{len(trials)} wrong hands", total=len(trials))
+        score = Score(requirements)
+        for outcome in score.run(trials, stop, jobs):
+            done = len(score.outcomes)
+            text = f"{done} of {len(trials)}: {outcome.name}"
+            progress.update(task, advance=1, description=text)
+        if stop:
+            raise click.Abort
+    score.print(console, verbose=verbose)
+    if json_path:
+        score.write_json(json_path)
+    sys.exit(0 if score.perfect else 1)
