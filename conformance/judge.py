@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
 
-from dexkit.conformance.checks import Check, Context, all_checks
+from dexkit.conformance.checks import Check, Context, Outcome, all_checks
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
@@ -17,6 +18,9 @@ from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
 __all__ = ["judge"]
+
+_SILENT = 0.5
+"""Seconds without state, before the end of what a failure is about, that are no mere gap."""
 
 
 def judge(
@@ -82,8 +86,26 @@ def _judge_one(
     if missing:
         return judgement.not_applicable(missing)
     return judgement.blocked() or judgement.of(
-        lambda: checks[requirement.id](context),
+        lambda: _in_silence(context, checks[requirement.id](context)),
         lambda outcome: excuse(recording, requirement, outcome, (0.0, recording.duration)),
+    )
+
+
+def _in_silence(context: Context, outcome: Outcome) -> Outcome:
+    """The outcome; a failure where the hand had fallen silent for good has that as its cause."""
+    states, commands = context.states, context.commands
+    ends = [e.end_s for e in outcome.evidence if e.end_s is not None]
+    if not ends and len(commands):  # no state, so no place either
+        ends = [float(commands.t[-1])]
+    if outcome.met is not False or not len(states) or not ends:
+        return outcome
+    last = float(states.t[-1])
+    if max(ends) < last + _SILENT:
+        return outcome
+    return replace(
+        outcome,
+        cause=f"The hand fell silent for good at {last:.1f} s: has its service ended, or does it "
+        "hang? Its own log may say why.",
     )
 
 

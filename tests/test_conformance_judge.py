@@ -196,6 +196,17 @@ def test_a_state_that_stops_for_good_is_a_gap() -> None:
     assert ("DEX1-RATE-03", "left") in failed(judged(trace))
 
 
+def test_a_hand_that_dies_is_the_cause_of_what_fails_afterwards() -> None:
+    trace = copy_of(short_run())
+    trace.rows[STATE] = trace.rows[STATE][: len(trace.rows[STATE]) // 2]
+    found = [r for r in judged(trace).results if r.verdict is Verdict.FAIL]
+    assert "DEX1-WDOG-02" in [r.requirement.id for r in found]
+    assert all("fell silent for good" in r.cause for r in found), found
+    early = copy_of(short_run())
+    del early.rows[STATE][1000:1100]  # a gap, and on it goes
+    assert "silent for good" not in of(judged(early), "DEX1-RATE-03").cause
+
+
 def test_a_check_that_breaks_is_the_kits_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(context: object) -> None:
         raise ZeroDivisionError("1/0")
