@@ -55,6 +55,8 @@ def operate(script: Script) -> Steps:
     from dexkit.conformance.stimuli.script import Send  # which loads this module when it is used
 
     plan = script.plan
+    if plan.dialect.name == "unitree_hg":
+        return  # no client of Unitree's speaks it, and none of the requirements applies
     script._say("an operator at Unitree's client: full strokes, steps, slow motion")
     phase = script._begin(OPERATOR, plan.sides, profile=PROFILE)
     phase.params.update({f"most_{s}": f"{_most(plan, s):.6g}" for s in plan.sides})
