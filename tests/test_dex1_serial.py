@@ -15,9 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from dexkit.backends import BackendOptions
 from dexkit.backends import backend as find_backend
+from dexkit.cli.calibrate import command as calibrate_command
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings, discovery, find_motor
 from dexkit.drivers.dex1_serial import line as line_module
 from dexkit.drivers.dex1_serial.line import MotorLine, acquire, is_shared
@@ -545,3 +547,47 @@ def test_asking_who_else_is_there_leaves_a_hand_alone_that_is_driven() -> None:
         assert is_shared(line)
         assert line.exchange(MotorCmd(0).pack(), 0, TIMEOUT).id == 0
         line.release()
+
+
+# --- the command line
+
+
+def calibrate(*arguments: str) -> tuple[int, str]:
+    process = subprocess.run(
+        [sys.executable, "-m", "dexkit", "calibrate", *arguments],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    return process.returncode, process.stdout + process.stderr
+
+
+def test_calibration_on_the_command_line() -> None:
+    with Dex1Motors((Side.RIGHT,), start_pct=0.0, zero_error=1.5) as motors:
+        where = ("dex1-serial", "--side", "right", "--device", motors.path)
+        code, said = calibrate(*where, "--dry-run")
+        assert (code, "jaws are at 1.500 rad" in said) == (0, True), said
+        code, said = calibrate(*where)
+        assert (code, "give --yes" in said) == (2, True), said
+        assert motors.motor.zero_error == 1.5
+        code, said = calibrate(*where, "--yes")
+        assert (code, "stored in the motor" in said) == (0, True), said
+        assert motors.motor.q == pytest.approx(0.0, abs=1e-3)
+        code, said = calibrate(*where, "--yes")
+        assert (code, "before since power-up" in said) == (1, True), said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["dex1-serial"], "say which hand"),
+        (["dex1-serial", "--side", "left", "--speed"], "--speed means nothing for dex1-serial"),
+        (["ezgripper", "--side", "left"], "--side means nothing for ezgripper"),
+    ],
+)
+def test_options_of_the_other_gripper_are_refused(arguments: list[str], says: str) -> None:
+    result = CliRunner().invoke(calibrate_command, arguments)
+    assert isinstance(result.exception, UsageError)
+    assert says in result.exception.message

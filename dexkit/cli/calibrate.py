@@ -42,8 +42,13 @@ class _IdOrAuto(click.ParamType):  # type: ignore[type-arg]
 
 
 @click.command()
-@click.argument("gripper", type=click.Choice(["ezgripper"]), default="ezgripper")
+@click.argument("gripper", type=click.Choice(["ezgripper", "dex1-serial"]), default="ezgripper")
 @click.option("--device", metavar="PATH|SERIAL", help="Serial port, or its USB serial number.")
+@click.option(
+    "--side",
+    type=click.Choice(["left", "right"]),
+    help="Whose motor; only for dex1-serial, and needed there.",
+)
 @click.option(
     "--id", "servo_id", type=_IdOrAuto(), default=1, show_default=True, help="Servo id, or auto."
 )
@@ -83,9 +88,12 @@ class _IdOrAuto(click.ParamType):  # type: ignore[type-arg]
 @click.option("--dry-run", is_flag=True, help="Only look: nothing moves, nothing is written.")
 @click.option("--yes", is_flag=True, help="Do not ask whether the gripper is empty.")
 @click.option("--show", is_flag=True, help="Print what is stored, and stop.")
+@click.pass_context
 def command(
+    ctx: click.Context,
     gripper: str,
     device: str | None,
+    side: str | None,
     servo_id: int | str,
     baudrate: int | str,
     effort: float,
@@ -103,7 +111,18 @@ def command(
     The gripper MOVES: it closes until it is stopped, then opens. It must be empty and free. The
     result is stored under the adapter's USB serial number (or the path, where there is none), so
     that it is found again whatever port it is plugged into.
+
+    GRIPPER dex1-serial is another matter: you hold the jaws closed, nothing moves, and the motor
+    itself stores that as its zero. Of the options only --device, --side, --dry-run and --yes
+    apply.
     """
+    if gripper == "dex1-serial":
+        from dexkit.cli.calibrate_dex1 import calibrate_dex1
+
+        _refuse_foreign(ctx, {"gripper", "device", "side", "dry_run", "yes"}, gripper)
+        calibrate_dex1(device, side, dry_run=dry_run, yes=yes)
+        return
+    _refuse_foreign(ctx, set(ctx.params) - {"side"}, gripper)
     store = Store(config)
     if show:
         _show(store)
@@ -147,6 +166,18 @@ def command(
             hand.close()
         store.write(hand.key, record)
     console.print(f"stored for {hand.key} in {store.path}")
+
+
+def _refuse_foreign(ctx: click.Context, known: set[str], gripper: str) -> None:
+    """Refuse options that mean nothing for that gripper.
+
+    :raises UsageError: naming the first of them.
+    """
+    for parameter in ctx.command.params:
+        name = parameter.name or ""
+        source = ctx.get_parameter_source(name)
+        if name not in known and source is not click.core.ParameterSource.DEFAULT:
+            raise UsageError(f"{parameter.opts[0]} means nothing for {gripper}")
 
 
 def _zero_and_speed(
