@@ -244,6 +244,21 @@ def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
     assert "too busy" in rate.reason
 
 
+def test_a_speed_is_not_judged_by_a_few_samples() -> None:
+    recording = run_virtual(ReferenceDevice(Side.LEFT))
+    hand = recording.sides[Side.LEFT]
+    gone = {
+        t.done_ns
+        for phase in hand.phases("move")
+        for t in hand.during(phase)
+        if 15e6 < t.submitted_ns - phase.begin_ns < 120e6
+    }
+    few = replace(hand, transfers=[t for t in hand.transfers if t.done_ns not in gone])
+    results = judge_usb(replace(recording, sides={Side.LEFT: few}), usb())
+    (unit,) = [r for r in results if r.requirement.id == "DEX3USB-UNIT-01"]
+    assert (unit.verdict, unit.reason) == (Verdict.NOT_APPLICABLE, "no motion to judge by")
+
+
 # ------------------------------------------------------------------------------ on a real socket
 
 

@@ -684,9 +684,11 @@ class TestLateAnswers:
             hand.exchange(GO)
             fake.next_late = late
             before = time.monotonic()
-            with pytest.raises(HandTimeout):
-                hand.exchange(GO)
-            assert time.monotonic() - before >= 0.09
+            try:  # a machine that wakes it late may find the answer there already
+                state = hand.exchange(GO)
+                assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
+            except HandTimeout:
+                assert time.monotonic() - before >= 0.09
             until = time.monotonic() + 0.4
             good = 0
             while time.monotonic() < until:

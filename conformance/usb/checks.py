@@ -28,6 +28,8 @@ __all__ = ["CHECKS", "UsbCheck", "UsbContext"]
 
 _ORDINARY = ("exchange", "burst", "move", "lock", "pause", "drive", "tripped", "clear")
 """Phases in which every command is a good one, followed by a wait for its answer."""
+_COARSEST = 0.03
+"""s between two answers over which a speed is integrated; most of a move takes 0.1 s."""
 _DAMAGED = ("malformed", "broadcast", "short")
 """Phases that begin with something odd; good commands follow."""
 
@@ -527,7 +529,9 @@ def _speed_unit(c: UsbContext) -> Outcome:
         t = np.array([at for at, _ in points])
         q = np.array([m.position for _, m in points]) / scale.q
         dq = np.array([m.speed for _, m in points]) / scale.dq
-        if len(points) > 2 and abs(q[-1] - q[0]) > 0.05:
+        # an integral over samples that are far apart says nothing, whoever was late
+        close = len(points) > 2 and np.diff(t).max() <= _COARSEST
+        if close and abs(q[-1] - q[0]) > 0.05:
             way = float(np.sum((dq[1:] + dq[:-1]) / 2 * np.diff(t)))
             ratios[c.hand.joints[joint].name] = way / float(q[-1] - q[0])
     return _ratio(c, ratios, "the integrated speed is {:.2f} of the way of {}")
