@@ -19,6 +19,7 @@ from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, his
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence, Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
+from dexkit.conformance.usb.frames import NO_VALUE
 from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.view import Recording, SideView
@@ -161,11 +162,15 @@ def _by_kind(scene: _Scene) -> list[str]:
         return _session(scene)
     if need.phase == OPERATOR:
         return [_operated(scene)]
+    if need.capability == "pressure" or scene.result.observed.startswith("pressure"):
+        return [_pressure(scene), _follow(scene)]
+    if need.area in ("Fields", "Sensors"):
+        return [_field(scene), _follow(scene)]
     if any("tau" in name for name in (*limits, *values)):
         return [_follow(scene), _torque(scene), _torque_by_position(scene)]
     if any(p.targets.get(scene.hand.side) for p in scene.phases):
         return [_steps(scene), _follow(scene)]
-    if need.area in ("Fields", "Sensors", "Mode byte"):
+    if need.area == "Mode byte":
         return [_field(scene), _follow(scene)]
     return [_follow(scene)]
 
@@ -343,6 +348,7 @@ def _steps(scene: _Scene) -> str:
         Line("the step in question" if bad else "other steps", "bad" if bad else "faint", s.x, s.y)
         for bad, s in sorted(pairs, key=lambda p: p[0])
     ]
+    count = f"{len(lines)} steps" if len(lines) > 1 else "1 step"
     ranges = []
     for name, text in (("max_error_stroke", "tolerance"), ("max_ripple_stroke", "ripple allowed")):
         if name in limits:
@@ -351,7 +357,7 @@ def _steps(scene: _Scene) -> str:
     if "max_overshoot_stroke" in limits:
         ranges.append(Range(-np.inf, 100 * limits["max_overshoot_stroke"], "overshoot allowed"))
     return chart(
-        f"{hand.side} hand, {len(lines)} steps laid over each other: distance to the target, "
+        f"{hand.side} hand, {count} laid over each other: distance to the target, "
         "in % of the stroke (above 0: beyond it), over seconds after the step",
         lines,
         y_unit="%",
@@ -549,6 +555,30 @@ def _field(scene: _Scene) -> str:
     )
 
 
+def _pressure(scene: _Scene) -> str:
+    """What each sensor packet feels: the sum over its elements."""
+    hand, span = scene.hand, scene.window()
+    if hand.states.columns is None:
+        return ""
+    count = int(hand.states.columns.count("press_sensor_state").max(initial=0))
+    lines = []
+    for i in range(count):
+        values = hand.states.columns[f"press_sensor_state[{i}].pressure"]
+        there = np.where(np.isfinite(values) & (values < NO_VALUE), values, 0.0)
+        lines.append(Line("each packet", "force", hand.states.t, there.sum(axis=1)))
+    if not lines:
+        return ""
+    return chart(
+        f"{hand.side} hand: pressure, summed over each of {count} sensor packets",
+        lines,
+        y_unit="",
+        span=span,
+        bands=phase_bands(scene.view, hand.side) + scene.alarms,
+        include=(0.0,),
+        height=150,
+    )
+
+
 def _member(scene: _Scene) -> tuple[str, Floats] | None:
     """(name, a value for each state): the member that the finding names, or its requirement."""
     states, need, told = scene.hand.states, scene.need, scene.result.observed
@@ -559,6 +589,8 @@ def _member(scene: _Scene) -> tuple[str, Floats] | None:
     if re.search(r"\b(decodes?|length|packets)\b", text) and need.area == "Fields":
         return "motors in the sequence", np.asarray(states.length, dtype=np.float64)
     columns = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
+    if "quaternion" in told and (column := _column(scene, "imu_state.quaternion")) is not None:
+        return "first of imu_state.quaternion", column
     # what it speaks of first is what it is about
     named = re.search(rf"\b({'|'.join(columns)})\b", told) or re.search(
         rf"\b({'|'.join(columns)})\b", text
