@@ -551,3 +551,40 @@ def test_any_hand_has_figures_that_are_not_negative(values: list[float], goal: f
     t: Floats = np.asarray(np.arange(len(values)) * 0.05)
     found = feel(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
     assert all(x >= 0.0 for x in found.figures().values())
+
+
+# --------------------------------------------------------------- what the rate of states does
+
+
+@pytest.mark.parametrize(
+    ("rate", "seconds"), [(30.0, 2.24), (200.0, 0.565)], ids=["30 Hz", "200 Hz"]
+)
+def test_a_stroke_takes_as_long_as_an_earlier_study_found(rate: float, seconds: float) -> None:
+    """The emulated EZGripper behind the service, in virtual time; docs/service.md."""
+    feedback = pytest.importorskip("benchmarks.bench_feedback")
+    from dexkit.clock import ManualClock
+    from dexkit.hand import HandCommand
+    from dexkit.models import DEX1_1
+    from dexkit.service.core import Estimation, HandCore
+
+    clock = ManualClock()
+    gripper = feedback.VirtualGripper(clock)
+    spec = DEX1_1.spec(LEFT, io_rate=rate)
+    core = HandCore(spec, DEX1_1, clock, estimation=Estimation.OFF, soft_start=False)
+    core.opened(spec, None)
+    client = Dex1Client(sides=[LEFT])
+    client.receive(clock.now(), {LEFT: (gripper.q,)})
+    every = {hz: round(1.0 / hz / feedback._TICK) for hz in (rate, DEX1_1.state_rate, client.rate)}
+
+    def step(i: int) -> None:
+        if i % every[rate] == 0:
+            core.measured(gripper.exchange(core.next_command()))
+        if i % every[DEX1_1.state_rate] == 0:
+            view = core.view()
+            assert view is not None
+            client.receive(clock.now(), {LEFT: tuple(view.state.q.tolist())})
+        if i % every[client.rate] == 0:
+            command = client.step(clock.now(), {}, {LEFT: (PINCH_MAX,)})[LEFT][0]
+            core.submit(HandCommand.position(command.q))
+
+    assert feedback._stroke_time(clock, gripper, step) == pytest.approx(seconds, abs=0.03)
