@@ -35,7 +35,7 @@ class AcmeGripper:
         host, _, port = self._address.rpartition(":")
         try:
             self._socket = socket.create_connection((host, int(port)), timeout=1.0)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             hint = "is it switched on, on this network?"
             raise HandNotFound(f"no gripper at {self._address}: {error}", hint=hint) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
