@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +19,7 @@ from dexkit.emulators.dex3_mcu import emulated_dex3
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
+from dexkit.service import real_time
 from tests.dds_helpers import dds_domain, dds_node
 from tests.test_service_cli import serving
 
@@ -136,3 +141,24 @@ def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
         code, _, log = service.end(signal.SIGTERM)
         assert code == 0
         assert "Traceback" not in log
+
+
+def test_an_emulator_with_the_priority_of_a_service() -> None:
+    with real_time() as permitted:
+        pass
+    arguments = ["emulate", "dex3-usb", "--port", "0", "--real-time"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "dexkit", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: usbip://127.0.0.1:")
+        threads = [int(entry.name) for entry in Path(f"/proc/{process.pid}/task").iterdir()]
+        policies = {os.sched_getscheduler(thread) for thread in threads}
+        process.send_signal(signal.SIGTERM)
+        _, log = process.communicate(timeout=15)
+    assert process.returncode == 0
+    assert (os.SCHED_RR in policies) == permitted  # a library's threads may be older
+    assert ("no real-time priority" in log) == (not permitted)
