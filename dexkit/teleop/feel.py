@@ -34,6 +34,7 @@ _SETTLE = 0.6  # seconds that a step must be held before it is looked at
 _AT_REST = 0.01  # of the stroke: movement of a hand that rests
 _STEADY = 10.0  # strokes a second: an operator who is faster has jumped
 _SEARCH = 0.6  # seconds of lag looked for
+_FOLLOWS = 0.3  # part of the operator's way that a hand goes that follows, however late
 _LAG_LEAST = 1.0  # seconds of steady motion needed for it
 
 
@@ -208,6 +209,8 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
     use = use[use >= back]
     if len(use) * GRID < _LAG_LEAST:
         return math.nan, math.nan
+    if float(np.ptp(position[use])) < _FOLLOWS * float(np.ptp(goal[use])):
+        return math.nan, math.nan  # it does not follow at all
     best = (math.nan, math.inf)
     for shift in range(back + 1):
         rms = math.sqrt(float(np.mean((position[use] - goal[use - shift]) ** 2)))
