@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from dexkit.backends import BackendOptions
+from dexkit.conformance.session import SuiteOptions
 from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
 from dexkit.hand import Hand, HandCommand, Side
 from tests.dds_helpers import free_domain
@@ -193,3 +194,35 @@ def test_a_service_without_dexkit_meets_every_must(tmp_path: Path) -> None:
         verdicts = judged(domain, tmp_path)
     assert set(verdicts.values()) <= {"pass", "not applicable"}
     assert list(verdicts.values()).count("pass") > 30
+
+
+# --------------------------------------------------------------------- the suite at a vendor's
+
+
+def test_a_hand_class_needs_no_name_to_be_judged() -> None:
+    options = SuiteOptions.make(backend="tests.service_helpers:ScriptedHand", side="left")
+    assert options.dialect.name == "unitree_go"
+    assert {r.model for r in options.requirements} == {"dex1-1"}
+
+
+def test_a_kit_that_fails_says_so_once_and_blames_nobody(tmp_path: Path) -> None:
+    (tmp_path / "spoilt.py").write_text(
+        "import dexkit.conformance.session as session\n"
+        "def run_suite(options, say): raise IndexError('a bug of the kit')\n"
+        "session.run_suite = run_suite\n"
+    )
+    run = subprocess.run(
+        [
+            *(sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "spoilt"),
+            *("--pyargs", "dexkit.conformance", "--backend", "sim-dex1"),
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+    assert run.returncode == 2, run.stdout + run.stderr
+    assert run.stdout.count("a bug of the kit") <= 2  # the exception, and its source line
+    assert "the kit itself has failed, which says nothing about the hand" in run.stdout
+    assert "FAILED" not in run.stdout
