@@ -157,6 +157,49 @@ class SlowToWake(_SlowToWake, ReferenceService):
     """Sleeps when its target rests, and needs 0.2 s to wake."""
 
 
+class _OpenEnd(_PerJoint):
+    """Does something else near the open end of a joint."""
+
+    near = 0.08
+    """Part of the joint's closing that counts as that."""
+
+    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+        side, index = joint
+        spec = DEX3_1.joints[side][index]
+        if not spec.closing:
+            return q
+        closed = spec.q_max if spec.closing > 0 else spec.q_min
+        return closed * self.close(joint, q / closed, here / closed)
+
+    def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
+        """How far it closes in place of ``goal``, 0 to 1."""
+        raise AssertionError  # overridden
+
+
+class SlowToLeave(_OpenEnd, Dex3Service):
+    """Leaves the open end of a joint at a tenth of its range a second."""
+
+    speed = 0.1
+
+    def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
+        taken = goal
+        if here < self.near and goal > here:
+            before, since = self.told.get(joint, (here, self.now))
+            taken = min(goal, max(before, 0.0) + self.speed * (self.now - since))
+        self.told[joint] = (taken, self.now)
+        return taken
+
+
+class Springs(_OpenEnd, Dex3Service):
+    """Goes a quarter too far for half a second when it comes from the open end of a joint."""
+
+    def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
+        if here < self.near:
+            self.told[joint] = (here, self.now)
+        _, left = self.told.get(joint, (here, -1.0))
+        return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
+
+
 class LateFingers(shared.Delayed, Dex3Service):
     """Carries out each command 0.15 s late."""
 
@@ -171,7 +214,9 @@ ZOO: dict[str, tuple[tuple[type[Service], str, tuple[str, ...]], ...]] = {
         (SlowToWake, "DEX1-OPER-05", ()),
     ),
     DEX3_1.name: (
+        (SlowToLeave, "DEX3-OPER-01", ("DEX3-OPER-05",)),
         (FingerDeadBand, "DEX3-OPER-02", ()),
+        (Springs, "DEX3-OPER-03", ()),
         (CoarseFingers, "DEX3-OPER-04", ("DEX3-MOVE-04",)),
         (LateFingers, "DEX3-OPER-05", ("DEX3-TRACK-02",)),
     ),
