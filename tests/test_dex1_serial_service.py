@@ -1,0 +1,117 @@
+"""``dex1-serial`` under the service: what it publishes, and a cable that is pulled."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
+from dexkit.emulators.m4010 import Dex1Motors
+from dexkit.hand import HandCommand, JointMode, MotorError, Side
+from dexkit.messages import encode, message_type, unitree_go
+from dexkit.models import dialect
+from dexkit.service import HandService
+from tests.service_helpers import FakeNode, wait_until
+
+LOST = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+GO = dialect("unitree_go")
+STATES = message_type(GO.state_type)
+
+
+def message(q: float) -> bytes:
+    return encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05)]))
+
+
+def hand_at(path: str, side: Side) -> Dex1Serial:
+    return Dex1Serial(side, Dex1Settings(device=path, timeout=0.15))
+
+
+def newest(node: FakeNode, side: Side) -> unitree_go.MotorState_:
+    topic = GO.topics(side)[1]
+    payload = next(data for name, data in reversed(node.sent) if name == topic)
+    return STATES.decode(payload).states[0]  # type: ignore[no-any-return]
+
+
+def test_unplugged_in_motion_it_says_so_and_moves_for_nothing_stale() -> None:
+    node = FakeNode()
+    side = Side.LEFT
+    command = GO.topics(side)[0]
+    with Dex1Motors() as motors:
+        motor = motors.motor
+        with HandService(hand_at(motors.path, side), node=node, state_rate=200.0) as service:  # type: ignore[arg-type]
+            core = service.cores[side]
+            wait_until(lambda: node.sent)
+            state = newest(node, side)
+            assert state.q == pytest.approx(1.08, abs=0.01)
+            assert (state.temperature, state.lost) == (25, 0)
+            node.deliver(command, message(5.4))
+            wait_until(lambda: motor.q > 1.5)
+            motors.inject("unplug:for=1500ms")
+            wait_until(lambda: not core.connected, 5.0, "the loss")
+            sent = len(node.sent)
+            wait_until(lambda: len(node.sent) > sent + 10)
+            state = newest(node, side)
+            assert state.lost > 0
+            assert state.reserve[0] & LOST
+            # the motor stops by itself; the last command does not count when the cable is back
+            wait_until(lambda: motor.tripped, 3.0, "the protection")
+            node.deliver(command, message(0.5))
+            wait_until(lambda: core.connected, 8.0, "the reconnection")
+            done = core.counters.exchanges
+            wait_until(lambda: core.counters.exchanges > done + 20, 5.0)
+            assert not core.driving
+            assert motor.body.mode is JointMode.BRAKE
+            assert not motor.tripped
+            node.deliver(command, message(2.0))
+            wait_until(lambda: core.driving)
+            assert core.counters.reconnects >= 1
+        assert motor.body.mode is JointMode.BRAKE
+
+
+def test_a_fault_is_published_with_the_temperatures() -> None:
+    node = FakeNode()
+    with Dex1Motors((Side.RIGHT,)) as motors:
+        hand = hand_at(motors.path, Side.RIGHT)
+        with HandService(hand, node=node, state_rate=200.0):  # type: ignore[arg-type]
+            motors.inject("overcurrent:for=5s")
+
+            def shown() -> bool:
+                return bool(
+                    node.sent and newest(node, Side.RIGHT).reserve[0] & MotorError.OVERCURRENT
+                )
+
+            wait_until(shown, 5.0)
+            assert newest(node, Side.RIGHT).temperature == 25
+
+
+def test_two_hands_on_one_line_in_one_process(tmp_path: Path) -> None:
+    link = tmp_path / "tty"
+    nodes = {side: FakeNode() for side in Side}
+    with Dex1Motors(tuple(Side), links=dict.fromkeys(Side, link)) as motors:
+        services = [
+            HandService(hand_at(str(link), side), node=nodes[side], state_rate=200.0)  # type: ignore[arg-type]
+            for side in Side
+        ]
+        for service in services:
+            service.start()
+        try:
+            goals = {Side.LEFT: 4.0, Side.RIGHT: 0.4}
+
+            def there() -> bool:
+                for side, goal in goals.items():
+                    nodes[side].deliver(GO.topics(side)[0], message(goal))
+                time.sleep(0.01)
+                return all(abs(motors.motors[s].q - goal) < 0.15 for s, goal in goals.items())
+
+            wait_until(there, 15.0)
+            for side, goal in goals.items():
+                wait_until(lambda s=side, g=goal: abs(newest(nodes[s], s).q - g) < 0.15, 5.0)
+        finally:
+            for service in services:
+                service.stop()
+        assert all(m.body.mode is JointMode.BRAKE for m in motors.motors.values())
+        for side in Side:
+            with hand_at(str(link), side) as hand:  # the port is free again
+                hand.exchange(HandCommand.brake(1))
