@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from dexkit.errors import TraceUnreadable, TraceUnsupported, UsageError
 from dexkit.messages import Columns, MessageType, message_type
+from dexkit.messages.columns import Packed
 from dexkit.traces import schemas
 from dexkit.traces.names import USB, dds_topic, dds_type, select_topics
 
@@ -59,6 +60,13 @@ _MAX_WARNINGS = 50
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<QHIQQ")  # record length, channel, sequence, log time, publish time
+# the same with its opcode, for many at once
+_MESSAGES = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "sequence", "log", "publish"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+    }
+)
 _SKIPPED = frozenset(
     {
         Opcode.ATTACHMENT,
@@ -141,7 +149,7 @@ class SampleArray:
     type_name: str
     log_time_ns: Times
     publish_time_ns: Times
-    payloads: list[bytes]
+    payloads: Sequence[bytes]
     problem: str = ""
 
     def __len__(self) -> int:
@@ -174,10 +182,14 @@ class _Segment:
 
 @dataclass
 class _Sink:
-    """What is collected of one channel."""
+    """What is collected of one channel, piece by piece.
 
-    log: list[int] = field(default_factory=list)
-    publish: list[int] = field(default_factory=list)
+    :param payloads: the payloads of each piece one behind the other; None if they are not wanted.
+    """
+
+    log: list[NDArray[np.uint64]] = field(default_factory=list)
+    publish: list[NDArray[np.uint64]] = field(default_factory=list)
+    sizes: list[NDArray[np.int64]] = field(default_factory=list)
     payloads: list[bytes] | None = field(default_factory=list)
 
 
@@ -273,11 +285,10 @@ class Trace:
         segments = sorted(self._segments, key=lambda s: s.start_ns)
         pending: list[TraceMessage] = []
         names = {i: self._info[i] for i in wanted}
-        sinks = {i: _Sink() for i in wanted}  # only their keys matter here
         with self.path.open("rb") as file:
             for position, segment in enumerate(segments):
                 found: list[tuple[int, int, int, bytes]] = []
-                self._parse(self._unpack(file, segment), segment, sinks, ordered=found)
+                self._parse(self._unpack(file, segment), segment, found, names.keys())
                 pending += [
                     TraceMessage(names[i].topic, names[i].type_name, log, publish, data)
                     for i, log, publish, data in found
@@ -317,7 +328,7 @@ class Trace:
         with self.path.open("rb") as file:
             for segment in self._segments:
                 if segment.counts is None or not sinks.keys().isdisjoint(segment.counts):
-                    self._parse(self._unpack(file, segment), segment, sinks)
+                    self._collect(self._unpack(file, segment), segment, sinks)
         return {
             topic: _columns(info, [s for i, s in sinks.items() if self._info[i].topic == topic])
             for topic, info in sorted(chosen.items())
@@ -511,7 +522,7 @@ class Trace:
 
     def _survey(self, file: BinaryIO, segment: _Segment) -> None:
         counts: dict[int, list[int]] = {}
-        self._parse(self._unpack(file, segment), segment, {}, survey=counts)
+        self._parse(self._unpack(file, segment), segment, survey=counts)
         segment.counts = counts
         if counts:
             segment.start_ns = min(c[1] for c in counts.values())
@@ -549,15 +560,14 @@ class Trace:
         self,
         data: bytes,
         segment: _Segment,
-        sinks: dict[int, _Sink],
+        found: list[tuple[int, int, int, bytes]] | None = None,
+        wanted: Collection[int] = (),
         *,
         survey: dict[int, list[int]] | None = None,
-        ordered: list[tuple[int, int, int, bytes]] | None = None,
     ) -> None:
         """Go through the records in ``data``.
 
-        Messages of the channels in ``sinks`` go there, or into ``ordered`` as they come; others
-        are counted in ``survey``.
+        Messages of the ``wanted`` channels go into ``found``; others are counted in ``survey``.
         """
         at, end = 0, len(data)
         unpack = _MESSAGE.unpack_from
@@ -570,16 +580,8 @@ class Trace:
                     stop = at + 9 + length
                     if stop > end or length < 22:
                         raise ValueError("a message is longer than what is left")
-                    sink = sinks.get(channel_id)
-                    if sink is not None:
-                        if ordered is not None:
-                            ordered.append((channel_id, log, publish, data[at + 31 : stop]))
-                            at = stop
-                            continue
-                        sink.log.append(log)
-                        sink.publish.append(publish)
-                        if sink.payloads is not None:
-                            sink.payloads.append(data[at + 31 : stop])
+                    if found is not None and channel_id in wanted:
+                        found.append((channel_id, log, publish, data[at + 31 : stop]))
                     elif survey is not None:
                         entry = survey.get(channel_id)
                         if entry is None:
@@ -600,6 +602,47 @@ class Trace:
         except (struct.error, ValueError) as error:
             if not segment.cut:
                 self._warn(f"records at byte {segment.offset} go wrong after {at} bytes ({error})")
+
+    def _collect(self, data: bytes, segment: _Segment, sinks: dict[int, _Sink]) -> None:
+        """Put the messages of the channels in ``sinks`` there; as :meth:`_parse`, but in bulk."""
+        starts: list[int] = []
+        at, end = 0, len(data)
+        unpack, message = _HEAD.unpack_from, int(Opcode.MESSAGE)
+        try:
+            while at < end:
+                opcode, length = unpack(data, at)
+                stop = at + 9 + length
+                if opcode == message:
+                    if stop > end or length < 22:
+                        raise ValueError("a message is longer than what is left")
+                    starts.append(at)
+                elif stop > end:
+                    raise ValueError("a record is longer than what is left")
+                at = stop
+        except (struct.error, ValueError) as error:
+            if not segment.cut:
+                self._warn(f"records at byte {segment.offset} go wrong after {at} bytes ({error})")
+        if not starts:
+            return
+        every = _rows(data, np.array(starts), _MESSAGES.itemsize).view(_MESSAGES)[:, 0]
+        for channel_id, sink in sinks.items():
+            mine = np.flatnonzero(every["channel"] == channel_id)
+            if not len(mine):
+                continue
+            heads = every[mine]
+            sink.log.append(heads["log"])
+            sink.publish.append(heads["publish"])
+            if sink.payloads is None:
+                continue
+            begins = np.array(starts)[mine] + _MESSAGES.itemsize
+            sizes = heads["length"].astype(np.int64) - 22
+            sink.sizes.append(sizes)
+            if (sizes == sizes[0]).all():
+                sink.payloads.append(_rows(data, begins, int(sizes[0])).tobytes())
+            else:
+                ends = (begins + sizes).tolist()
+                pieces = (data[a:b] for a, b in zip(begins.tolist(), ends, strict=True))
+                sink.payloads.append(b"".join(pieces))
 
     def _describe(self) -> None:
         totals: dict[int, list[int]] = {}
@@ -715,21 +758,33 @@ def _unzstd(packed: bytes, size: int, cut: bool) -> bytes:
         return reader.read(size)
 
 
+def _rows(data: bytes, starts: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
+    """``size`` bytes from each start, shape (n, size)."""
+    if not size:
+        return np.empty((len(starts), 0), dtype=np.uint8)
+    every = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, dtype=np.uint8), size)
+    return np.asarray(every[starts])
+
+
 def _columns(info: ChannelInfo, sinks: list[_Sink]) -> SampleArray:
     log = _times([t for s in sinks for t in s.log])
     publish = _times([t for s in sinks for t in s.publish])
-    payloads = [p for s in sinks if s.payloads is not None for p in s.payloads]
+    sizes = np.concatenate([np.empty(0, np.int64), *(z for s in sinks for z in s.sizes)])
+    starts = np.cumsum(sizes) - sizes
+    buffer = b"".join(p for s in sinks if s.payloads is not None for p in s.payloads)
     if len(log) > 1 and (np.diff(log) < 0).any():
         order = np.argsort(log, kind="stable")
         log, publish = log[order], publish[order]
-        if payloads:
-            payloads = [payloads[i] for i in order]
+        if len(sizes):
+            starts, sizes = starts[order], sizes[order]
+    payloads = Packed(buffer, starts, sizes)
     return SampleArray(info.topic, info.type_name, log, publish, payloads, info.problem)
 
 
-def _times(values: list[int]) -> Times:
+def _times(pieces: list[NDArray[np.uint64]]) -> Times:
     # times are unsigned in the file; beyond the year 2262 they are not times
-    return np.minimum(np.array(values, np.uint64), np.uint64(2**63 - 1)).astype(np.int64)
+    times = np.concatenate([np.empty(0, np.uint64), *pieces])
+    return np.asarray(np.minimum(times, np.uint64(2**63 - 1)), dtype=np.int64)
 
 
 def _check_layout(type_name: str, schema: Schema) -> tuple[str, list[str]]:

@@ -42,6 +42,20 @@ def in_contact(ctx: Context) -> Outcome:
     return ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
 
 
+def _still(ctx: Context) -> list[float]:
+    """Begins of the windows, one after the other while commands come, in which q stands."""
+    window, asked = ctx.tolerance("min_rest_s"), ctx.commands.t
+    begins = np.arange(float(asked[0]), float(asked[-1]) - window, window)
+    starts, ends = np.searchsorted(ctx.states.t, [begins, begins + window])
+    full = ends - starts >= 5
+    begins, edges = begins[full], np.column_stack([starts[full], ends[full]]).ravel()
+    if not len(begins):
+        return []
+    q = np.append(ctx.states.q[:, 0], np.nan)  # an end may lie behind the last row
+    high, low = (f.reduceat(q, edges)[::2] for f in (np.maximum, np.minimum))
+    return [float(b) for b in begins[high - low <= ctx.tolerance("max_ripple_stroke")]]
+
+
 @check("DEX1-FORCE-02")
 def at_rest(ctx: Context) -> Outcome:
     """tau_est where the gripper stands at its target, free."""
@@ -51,8 +65,7 @@ def at_rest(ctx: Context) -> Outcome:
     window = ctx.tolerance("min_rest_s")
     known = ctx.recording.stimulus is not None
     taus: list[tuple[float, float]] = []
-    begin = float(commands.t[0])
-    while begin + window <= float(commands.t[-1]):
+    for begin in _still(ctx):
         end = begin + window
         rows = states.between(begin, end)
         asked = slice(*np.searchsorted(commands.t, [begin, end]))
@@ -70,7 +83,6 @@ def at_rest(ctx: Context) -> Outcome:
         )
         if free:
             taus.append((float(np.median(np.abs(tau))), begin))
-        begin = end
     if not taus:
         return ctx.skipped("the gripper never rests at its target in this recording")
     # the middle of all rests: one of them may be a touch that nobody announced

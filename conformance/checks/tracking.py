@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
@@ -72,27 +73,32 @@ def _measure(ctx: Context, joint: int, span: tuple[float, float], search: float)
     free = _free(ctx, joint, at, goal) & np.isfinite(q)
     if free.sum() * _GRID < 1.0:
         return "the hand is blocked for nearly the whole session"
-    best: tuple[float, float, Floats] | None = None
-    raw = 0.0
-    for delay in np.arange(0.0, search + _GRID / 2, _GRID):
-        shifted = cq[np.clip(np.searchsorted(ct, grid - delay, "right") - 1, 0, None)]
-        error = (q - shifted)[free]
-        rms = float(np.sqrt(np.mean(error**2)))
-        if delay == 0.0:
-            raw = rms
-        if best is None or rms < best[1]:
-            best = (float(delay), rms, error)
-    assert best is not None
-    worst = int(np.argmax(np.abs(best[2])))
+    # Delays are steps of the grid: the commands are looked up once, on a grid that begins earlier.
+    most = round(search / _GRID)
+    longer = np.concatenate([grid[0] - _GRID * np.arange(most, 0, -1), grid])
+    asked = cq[np.clip(np.searchsorted(ct, longer, "right") - 1, 0, None)]
+    # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
+    weight = free.astype(np.float64)
+    middle = float(q[free].mean())
+    seen, asked = np.where(free, q - middle, 0.0), asked - middle
+    n = len(grid)
+    late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, asked**2))  # by delay
+    # einsum, for BLAS would start threads for this
+    errors = np.einsum("i,i", seen, seen) + np.einsum("ki,i->k", late2, weight)
+    errors -= 2.0 * np.einsum("ki,i->k", late, seen)
+    rms = np.sqrt(np.maximum(errors, 0.0) / weight.sum())
+    best = int(np.argmin(rms))
+    error = np.abs((seen - late[best])[free])
+    worst = int(np.argmax(error))
     return Tracking(
         joint=joint,
         begin=begin,
         end=end,
-        delay=best[0],
-        rms=best[1],
-        peak=float(np.abs(best[2][worst])),
+        delay=best * _GRID,
+        rms=float(rms[best]),
+        peak=float(error[worst]),
         peak_at=float(grid[free][worst]),
-        raw=raw,
+        raw=float(rms[0]),
         blocked=float((~free).mean()),
     )
 

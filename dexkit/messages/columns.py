@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,69 @@ from dexkit.errors import UsageError, WireError
 from dexkit.messages.codec import check_count, check_end, is_big, truncated
 from dexkit.messages.layout import Field, Primitive, Struct, max_size
 
-__all__ = ["Columns"]
+__all__ = ["Columns", "Packed"]
 
 _STEP = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\[(?P<index>\d*)\])?")
 _UINT32 = (struct.Struct("<I"), struct.Struct(">I"))
+
+
+class Packed(Sequence[bytes]):
+    """Payloads in one buffer: many samples without an object for each.
+
+    :param starts: where each begins in ``buffer``, shape (n,).
+    :param sizes: how long each is, shape (n,).
+    """
+
+    def __init__(self, buffer: bytes, starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> None:
+        self._buffer = buffer
+        self._bytes = np.frombuffer(buffer, dtype=np.uint8)
+        self._starts = starts
+        self._sizes = sizes
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    @overload
+    def __getitem__(self, at: int) -> bytes: ...
+    @overload
+    def __getitem__(self, at: slice) -> Packed: ...
+    def __getitem__(self, at: int | slice) -> bytes | Packed:
+        if isinstance(at, slice):
+            return Packed(self._buffer, self._starts[at], self._sizes[at])
+        start = int(self._starts[at])
+        return self._buffer[start : start + int(self._sizes[at])]
+
+    def __iter__(self) -> Iterator[bytes]:
+        for start, size in zip(self._starts.tolist(), self._sizes.tolist(), strict=True):
+            yield self._buffer[start : start + size]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Sequence) or isinstance(other, (str, bytes)):
+            return NotImplemented
+        return len(self) == len(other) and all(a == b for a, b in zip(self, other, strict=True))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def alike(self) -> list[NDArray[np.intp]]:
+        """Rows of equal length and equal first two bytes, those that come first first."""
+        known = self._sizes >= 2
+        head = np.zeros(len(self), dtype=np.int64)
+        first = self._starts[known]
+        head[known] = self._bytes[first] | self._bytes[first + 1].astype(np.int64) << 8
+        keys, which = np.unique(self._sizes << 16 | head, return_inverse=True)
+        groups = [np.flatnonzero(which == i) for i in range(len(keys))]
+        return sorted(groups, key=lambda rows: int(rows[0]))
+
+    def table(self, rows: NDArray[np.intp]) -> NDArray[np.uint8]:
+        """Payloads of one length, shape (n, length)."""
+        size = int(self._sizes[rows[0]])
+        starts = self._starts[rows]
+        if len(rows) > 1 and (np.diff(starts) == size).all():  # as they lie: no copy
+            begin = int(starts[0])
+            return self._bytes[begin : begin + size * len(rows)].reshape(len(rows), size)
+        if not size:
+            return np.empty((len(rows), 0), dtype=np.uint8)
+        return np.lib.stride_tricks.sliding_window_view(self._bytes, size)[starts]
 
 
 class Columns:
@@ -44,28 +103,28 @@ class Columns:
         self._groups: list[tuple[NDArray[np.intp], tuple[int, ...], NDArray[Any]]] = []
         # Samples of one length nearly always have one shape: parse one of them, compare the
         # others' sequence lengths with it in bulk, and parse singly only those that differ.
-        sizes: dict[tuple[bytes, int], list[int]] = {}
-        for row, data in enumerate(payloads):
-            sizes.setdefault((data[:2], len(data)), []).append(row)
         odd: list[int] = []
-        for rows in sizes.values():
+        for rows in _alike(payloads):
             at, shape = self._first_good(rows, payloads)
             if shape is None:
                 continue
-            rest = np.array(rows[at:], dtype=np.intp)
-            joined = b"".join(payloads[i] for i in rest)
-            table = np.frombuffer(joined, dtype=np.uint8).reshape(len(rest), -1)
+            rest = rows[at:]
+            table = _table(payloads, rest)
             where = _count_bytes(kind, shape[1])
             same = (table[:, where] == table[0, where]).all(axis=1)
-            self._add(shape, rest[same], payloads)
-            odd += rest[~same].tolist()
+            if same.all():
+                self._add(shape, rest, table)
+            else:
+                self._add(shape, rest[same], table[same])
+                odd += rest[~same].tolist()
         shapes: dict[tuple[bool, tuple[int, ...], int], list[int]] = {}
         for row in odd:
             shape = self._shape_of(row, payloads)
             if shape is not None:
                 shapes.setdefault((*shape, len(payloads[row])), []).append(row)
-        for (big, counts, _), rows in shapes.items():
-            self._add((big, counts), np.array(rows, dtype=np.intp), payloads)
+        for (big, counts, _), found in shapes.items():
+            rows = np.array(found, dtype=np.intp)
+            self._add((big, counts), rows, _table(payloads, rows))
 
     def _shape_of(self, row: int, payloads: Sequence[bytes]) -> tuple[bool, tuple[int, ...]] | None:
         data = payloads[row]
@@ -77,10 +136,10 @@ class Columns:
             return None
 
     def _first_good(
-        self, rows: list[int], payloads: Sequence[bytes]
+        self, rows: NDArray[np.intp], payloads: Sequence[bytes]
     ) -> tuple[int, tuple[bool, tuple[int, ...]] | None]:
         for at, row in enumerate(rows):
-            shape = self._shape_of(row, payloads)
+            shape = self._shape_of(int(row), payloads)
             if shape is not None:
                 return at, shape
         return len(rows), None
@@ -89,12 +148,11 @@ class Columns:
         self,
         shape: tuple[bool, tuple[int, ...]],
         rows: NDArray[np.intp],
-        payloads: Sequence[bytes],
+        table: NDArray[np.uint8],
     ) -> None:
         big, counts = shape
-        dtype = _dtype(self._kind, counts, ">" if big else "<", len(payloads[rows[0]]))
-        table = np.frombuffer(b"".join(payloads[i] for i in rows), dtype=dtype)
-        self._groups.append((rows, counts, table))
+        dtype = _dtype(self._kind, counts, ">" if big else "<", table.shape[1])
+        self._groups.append((rows, counts, np.ascontiguousarray(table).view(dtype)[:, 0]))
 
     def __len__(self) -> int:
         return self._n
@@ -183,6 +241,22 @@ class Columns:
             if index is None and member.array is not None:
                 return (member.array,)
         return ()
+
+
+def _alike(payloads: Sequence[bytes]) -> list[NDArray[np.intp]]:
+    if isinstance(payloads, Packed):
+        return payloads.alike()
+    sizes: dict[tuple[bytes, int], list[int]] = {}
+    for row, data in enumerate(payloads):
+        sizes.setdefault((data[:2], len(data)), []).append(row)
+    return [np.array(rows, dtype=np.intp) for rows in sizes.values()]
+
+
+def _table(payloads: Sequence[bytes], rows: NDArray[np.intp]) -> NDArray[np.uint8]:
+    if isinstance(payloads, Packed):
+        return payloads.table(rows)
+    joined = b"".join(payloads[i] for i in rows)
+    return np.frombuffer(joined, dtype=np.uint8).reshape(len(rows), -1)
 
 
 def _counts(kind: Struct, data: bytes, big: bool) -> tuple[int, ...]:
