@@ -16,7 +16,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
 from dexkit.conformance.report.evidence import evidence
 from dexkit.conformance.report.html import render
-from dexkit.conformance.report.plots import Line, chart, nice_ticks, pieces, thin
+from dexkit.conformance.report.plots import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
@@ -282,3 +282,10 @@ def test_ticks_lie_within_and_are_few(low: float, width: float) -> None:
 def test_a_curve_is_cut_where_samples_are_missing() -> None:
     x = np.concatenate((np.arange(0, 1, 0.01), np.arange(3, 4, 0.01)))
     assert [len(p[0]) for p in pieces(x, x)] == [100, 100]
+
+
+def test_a_curve_of_nothing_but_gaps_stays_small() -> None:
+    x = (np.arange(3000) + np.repeat(np.arange(1000) * 100, 3)) * 0.001
+    assert len(pieces(x, x)) == MAX_GAPS + 1
+    figure = chart("t", [Line("a", "state", x, np.sin(x))], y_unit="", span=(0, float(x[-1])))
+    assert len(figure) < 25_000

@@ -22,9 +22,12 @@ from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.session import SuiteOptions, judge_recording
 from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError
+from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
+from tests.conformance_helpers import short_run
 from tests.report_helpers import HOSTILE, result_of_every_kind, run_named
 
 # ------------------------------------------------------------------------------- Markdown
@@ -205,6 +208,23 @@ def test_models_are_not_mixed() -> None:
         Comparison([run_named("a", "1"), other])
     with pytest.raises(UsageError, match="two results or more"):
         Comparison([run_named("a", "1")])
+
+
+# ------------------------------------------------------------------------- from the suite
+
+
+def test_the_suite_writes_the_files_that_were_asked_for(tmp_path: Path) -> None:
+    options = SuiteOptions.make(
+        backend="sim-dex1",
+        side="left",
+        markdown=tmp_path / "r.md",
+        report=tmp_path / "r.html",
+    )
+    judge_recording(options, Recording.of(short_run(), sides=(Side.LEFT,)))
+    assert (tmp_path / "r.md").read_text().startswith("## ")
+    assert "simulated" in (tmp_path / "r.html").read_text()
+    with pytest.raises(UsageError, match="no such directory"):
+        SuiteOptions.make(backend="sim-dex1", markdown=tmp_path / "missing" / "r.md")
 
 
 # ----------------------------------------------------------------------------- commands

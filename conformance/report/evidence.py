@@ -195,12 +195,18 @@ def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band
     return merged if label else [Band("", b.begin, b.end) for b in merged]
 
 
-def _busy(view: Recording) -> list[Band]:
-    """When the kit's own machine was short of processor time: what is late then proves little."""
+def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
+    """When the kit's own machine was short of processor time: what is late then proves little.
+
+    Stretches that a plot of ``span`` could not show apart are taken together.
+    """
+    least = max(0.02, (span[1] - span[0]) / 300)
     merged: list[Band] = []
     for stall in view.stimulus.stalls if view.stimulus else ():
         a, b = view.seconds(stall.begin_ns), view.seconds(stall.end_ns)
-        if merged and a - merged[-1].end < 0.02:
+        if b < span[0] or a > span[1]:
+            continue
+        if merged and a - merged[-1].end < least:
             merged[-1] = Band("", merged[-1].begin, max(b, merged[-1].end), "busy")
         else:
             merged.append(Band("", a, b, "busy"))
@@ -228,7 +234,7 @@ def operated(view: Recording, hand: SideView, joint: int, span: tuple[float, flo
         [*([wanted] if wanted else []), *command_and_state(hand, joint)],
         y_unit="rad",
         span=span,
-        bands=_busy(view),
+        bands=_busy(view, span),
         height=190,
         include=_room(hand, joint, span),
     )
@@ -263,7 +269,7 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
     if span is None:
         span = scene.window()
     hand = scene.hand
-    bands = _busy(scene.view) + phase_bands(scene.view, hand.side)
+    bands = _busy(scene.view, span) + phase_bands(scene.view, hand.side)
     bands += [b for b in scene.alarms if b.end - b.begin < 0.85 * (span[1] - span[0])]
     return "".join(
         chart(
@@ -409,12 +415,13 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
     t, steps = _milliseconds(scene)
     if not len(t):
         return ""
+    shown = span or (0.0, max(scene.view.duration, 0.1))
     return chart(
         f"{scene.hand.side} hand: time from each state to the next",
         [Line("each state", "state", t, steps, "stems" if span else "dots")],
         y_unit="ms",
-        span=span or (0.0, max(scene.view.duration, 0.1)),
-        bands=_busy(scene.view) + scene.alarms,
+        span=shown,
+        bands=_busy(scene.view, shown) + scene.alarms,
         levels=_interval_levels(scene.need),
         include=(0.0,),
         height=150,
@@ -549,7 +556,7 @@ def _field(scene: _Scene) -> str:
         [Line(name, "force", hand.states.t, column)],
         y_unit=_FIELDS.get(name, ""),
         span=span,
-        bands=_busy(scene.view) + scene.alarms,
+        bands=_busy(scene.view, span) + scene.alarms,
         include=(0.0,),
         height=150,
     )

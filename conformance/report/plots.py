@@ -34,6 +34,8 @@ GRID = (2000, 500)
 """Units across and down; finer than a page's pixels."""
 MAX_POINTS = 900
 """Points of a plot, all its curves together."""
+MAX_GAPS = 100
+"""Gaps of a curve that are shown as such."""
 _DESK, _PHONE = 680, 290
 """Pixels across a plot for which labels are placed: paper or desk, and phone."""
 _LETTER = 6.6
@@ -98,13 +100,18 @@ def thin(x: Floats, y: Floats, points: int = MAX_POINTS) -> tuple[Floats, Floats
 
 
 def pieces(x: Floats, y: Floats) -> list[tuple[Floats, Floats]]:
-    """The curve cut where samples are missing: a line across a gap would be invented."""
+    """The curve cut where samples are missing: a line across a gap would be invented.
+
+    At most at the :data:`MAX_GAPS` widest ones, for a recording of nothing but gaps.
+    """
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good], y[good]
     if len(x) < 3:
         return [(x, y)] if len(x) else []
     steps = np.diff(x)
     cuts = np.flatnonzero(steps > max(0.05, 8 * float(np.median(steps)))) + 1
+    if len(cuts) > MAX_GAPS:
+        cuts = np.sort(cuts[np.argsort(-steps[cuts - 1], kind="stable")[:MAX_GAPS]])
     return list(zip(np.split(x, cuts), np.split(y, cuts), strict=True))
 
 
