@@ -31,6 +31,7 @@ squeeze        close on the object, if there is one
 drive          without protection: as guard-drive
 silence        the commands stop for longer than the time-out
 resume         a step after the silence
+operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
 shutdown       the service is told to end, and started again

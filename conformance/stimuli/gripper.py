@@ -22,6 +22,7 @@ squeeze        close on the object, if there is one, by xr_teleoperate's lead
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
 silence        ... the commands stop for two command time-outs
 resume         a step after the silence
+operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
 shutdown       the service is told to end, and started again
