@@ -70,6 +70,7 @@ class AcmeGripper:
             dq=speed * RADIANS,
             tau_est=force * NEWTON_METRES,
             temperature=celsius,
+            mode=int(command.mode[0]),  # it brakes, or is driven, as it was told
             stamp=time.monotonic(),
         )
 
