@@ -552,31 +552,32 @@ def test_asking_who_else_is_there_leaves_a_hand_alone_that_is_driven() -> None:
 # --- the command line
 
 
-def calibrate(*arguments: str) -> tuple[int, str]:
-    process = subprocess.run(
-        [sys.executable, "-m", "dexkit", "calibrate", *arguments],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
+def calibrate(*arguments: str) -> tuple[object, str]:
+    """(what was raised, or None; what was said)"""
+    result = CliRunner().invoke(calibrate_command, arguments)
+    return (
+        result.exception,
+        f"{result.output}{result.exception}{getattr(result.exception, 'hint', '')}",
     )
-    return process.returncode, process.stdout + process.stderr
 
 
 def test_calibration_on_the_command_line() -> None:
     with Dex1Motors((Side.RIGHT,), start_pct=0.0, zero_error=1.5) as motors:
         where = ("dex1-serial", "--side", "right", "--device", motors.path)
-        code, said = calibrate(*where, "--dry-run")
-        assert (code, "jaws are at 1.500 rad" in said) == (0, True), said
-        code, said = calibrate(*where)
-        assert (code, "give --yes" in said) == (2, True), said
+        error, said = calibrate(*where, "--dry-run")
+        assert error is None
+        assert "jaws are at 1.500 rad" in said
+        error, said = calibrate(*where)
+        assert isinstance(error, UsageError)
+        assert "give --yes" in said
         assert motors.motor.zero_error == 1.5
-        code, said = calibrate(*where, "--yes")
-        assert (code, "stored in the motor" in said) == (0, True), said
+        error, said = calibrate(*where, "--yes")
+        assert error is None
+        assert "stored in the motor" in said
         assert motors.motor.q == pytest.approx(0.0, abs=1e-3)
-        code, said = calibrate(*where, "--yes")
-        assert (code, "before since power-up" in said) == (1, True), said
+        error, said = calibrate(*where, "--yes")
+        assert isinstance(error, HandRefused)
+        assert "before since power-up" in said
 
 
 @pytest.mark.parametrize(
@@ -588,6 +589,6 @@ def test_calibration_on_the_command_line() -> None:
     ],
 )
 def test_options_of_the_other_gripper_are_refused(arguments: list[str], says: str) -> None:
-    result = CliRunner().invoke(calibrate_command, arguments)
-    assert isinstance(result.exception, UsageError)
-    assert says in result.exception.message
+    error, said = calibrate(*arguments)
+    assert isinstance(error, UsageError)
+    assert says in said
