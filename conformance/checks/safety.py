@@ -305,7 +305,8 @@ def burst(ctx: Context) -> Outcome:
             a, b = silent[0]
             return ctx.failed("state stops", f"no state from {a:.3f} s on", ctx.at(topic, a, b))
         before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
-        q = ctx.states.q[ctx.states.between(begin + wait, end)]
+        sent = begin + (phase.observed.get("sent_s") or 0.0)
+        q = ctx.states.q[ctx.states.between(sent + wait, end)]
         if not len(before) or not len(q):
             return ctx.skipped("no state around the burst")
         away = np.abs(q - np.median(before, axis=0)).max(axis=0)
@@ -319,7 +320,7 @@ def burst(ctx: Context) -> Outcome:
                         f"{away[joint]:.2f} rad away",
                         joint,
                     ),
-                    ctx.at(topic, begin + wait, end),
+                    ctx.at(topic, sent + wait, end),
                     motion_rad=float(away[joint]),
                 )
     return ctx.passed(

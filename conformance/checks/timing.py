@@ -160,8 +160,9 @@ def not_frozen(ctx: Context) -> Outcome:
         # what was sent, not what was missed: a gap in the state is RATE-03's finding
         sent = np.diff(changes)
         held = t[changes[1:] - 1] - t[changes[:-1]]
+        usual = 2 * float(np.percentile(jump, 99))  # a hand that is measured rarely always jumps
         at_once = t[changes[1:]] - t[changes[1:] - 1] < 0.05
-        frozen = (jump >= ctx.tolerance("min_jump_stroke", joint)) & at_once
+        frozen = (jump >= max(ctx.tolerance("min_jump_stroke", joint), usual)) & at_once
         frozen &= sent >= ctx.tolerance("min_samples")
         if not frozen.any():
             continue

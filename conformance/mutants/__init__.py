@@ -61,9 +61,13 @@ class Mutant:
         if "-OPER-" not in self.kills:
             # eleven seconds that show an operator what the other phases show already
             full = replace(full, phases=full.phases - {OPERATOR})
-        if not self.brief:
-            return full
-        wanted = select(catalogue(self.model), prefixes=[self.kills])
+        return self.short_plan if self.brief else full
+
+    @property
+    def short_plan(self) -> Plan:
+        """No more than what shows it."""
+        full = plan_for(self.dialect or model(self.model).dialects[0].name, sides=self.sides)
+        wanted = select(catalogue(self.model), prefixes=[self.kills, *self.also])
         return replace(full, phases=phases_for(wanted) | {SCRIPTS[self.model].motion})
 
     @property
@@ -82,7 +86,7 @@ def _dex1(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
 def _dex3(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
     name = service.__name__
     sides = tuple(Side) if name in dex3.BOTH else LEFT
-    brief = name in dex3.TOLD or (hasattr(shared, name) and name not in dex3.DILUTED)
+    brief = name in dex3.TOLD or (hasattr(shared, name) and name not in shared.DILUTED)
     return Mutant(name, DEX3_1.name, service, kills, also, sides, brief)
 
 

@@ -730,5 +730,3 @@ TOLD = (
     *("FaultForAStatus", "CountsInReserve", "HotSensors", "UnsetLost", "MilliNewtonMetres"),
 )
 """What tells wrongly of a hand that does everything right."""
-DILUTED = ("StuttersUnderLoad", "FreezesOnce")
-"""What would weigh too much in a short run."""

@@ -18,6 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dexkit.conformance import mutants as dds
+from dexkit.conformance.mutants import shared
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.conformance.usb import mutants as usb
 from dexkit.models import DEX1_1, DEX3_1
@@ -107,15 +108,19 @@ def essential(given: Sequence[Trial]) -> tuple[Trial, ...]:
     return tuple(found.values())
 
 
-def try_one(trial: Trial) -> Outcome:
-    """Run a wrong hand on a virtual clock, and judge it by everything."""
+def try_one(trial: Trial, *, short: bool = False) -> Outcome:
+    """Run a wrong hand on a virtual clock, and judge it by everything.
+
+    :param short: go through no more phases than show it, where that is fair.
+    """
     if trial.layer == "usb":
         wrong = next(m for m in usb.MUTANTS if (m.name, m.kills) == (trial.name, trial.kills))
         _, blamed = usb.try_mutant(wrong.device, catalogue(trial.model, "usb"))
         due = {trial.kills, *trial.also}
         return Outcome(trial, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
     mutant = next(m for m in dds.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
-    found = dds.trial(mutant, dds.run_mutant(mutant.service, mutant.plan))
+    plan = mutant.short_plan if short and mutant.name not in shared.DILUTED else mutant.plan
+    found = dds.trial(mutant, dds.run_mutant(mutant.service, plan))
     return Outcome(trial, tuple(sorted(found["missed"])), tuple(sorted(found["wrongly"])))
 
 

@@ -541,3 +541,7 @@ class Delayed(Service):
             _, side, motors = self.queue.pop(0)
             super().motors(side, motors)
         super().live(dt)
+
+
+DILUTED = ("StuttersUnderLoad", "FreezesOnce")
+"""What would weigh too much in the mean of a short run."""

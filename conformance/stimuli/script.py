@@ -452,6 +452,7 @@ class Script(ABC):
         )
         phase = self._begin("burst", self.plan.sides)
         self._obs = yield Send(far * (FLOOD - 1), 0)
+        phase.observed = {"sent_s": self._elapsed(phase)}
         yield from self._hold(0.8)
         self._end(phase)
 
