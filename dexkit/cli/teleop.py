@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 _HINT_AFTER = 5.0  # seconds of waiting
-_SILENT = 0.5  # seconds without state at the end
+_SILENT = 1.0  # seconds without state at the end: the command time-out of the family
 _MS = 1e3
 
 
