@@ -53,5 +53,5 @@ def run_named(name: str, when: str, **verdicts: Verdict) -> RunResult:
         for k, v in verdicts.items()
     ]
     base = result_of_every_kind()
-    subject = {"model": "dex1-1", "dialect": "unitree_go", "name": name, "backend": "x"}
+    subject = {"model": "dex1-1", "dialect": "unitree_go", "hand": name, "backend": "x"}
     return replace(base, subject=subject, results=results, recorded_at=when)

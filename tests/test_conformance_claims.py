@@ -12,6 +12,7 @@ import dexkit.conformance
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
+from dexkit.conformance.report.wording import hand_name
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.verdicts import Judgement
@@ -87,6 +88,7 @@ def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
     nothing = judge(recording, claims=Claims.parse('[hand]\nname = "X"\nfirmware = "1"'))
     assert of(nothing, VELOCITY.id).verdict is Verdict.NOT_CLAIMED
     assert (nothing.subject["hand"], nothing.subject["firmware"]) == ("X", "1")
+    assert hand_name(nothing) == "X 1"  # and the reports call it so
 
 
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:

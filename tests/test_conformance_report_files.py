@@ -100,7 +100,7 @@ def test_a_badge_claims_no_more_than_was_shown(
     verdicts: tuple[Verdict, ...], subject: dict[str, str], text: str
 ) -> None:
     run = run_named("h", "", **dict(zip(("TOPIC_01", "TOPIC_02"), verdicts, strict=False)))
-    run.subject.pop("name")
+    run.subject.pop("hand")
     run.subject.update(subject)
     assert badge_text(run) == ("Dex1-1 drop-in", text)
 

@@ -121,7 +121,7 @@ class Comparison:
         hands: dict[str, list[int]] = {}
         for index, run in enumerate(self.runs):
             # without a name or a backend nobody knows whether it is the same hand
-            who = run.subject.get("name") or run.subject.get("backend")
+            who = run.subject.get("hand") or run.subject.get("backend")
             if who:
                 hands.setdefault(who, []).append(index)
         pairs = []

@@ -110,8 +110,8 @@ def model_title(result: RunResult) -> str:
 def hand_name(result: RunResult) -> str:
     """What the hand is called: its vendor's name for it, the backend, or the recording."""
     about = result.subject
-    name = about.get("name") or about.get("backend") or about.get("recording") or "unnamed hand"
-    if about.get("name") and about.get("firmware"):
+    name = about.get("hand") or about.get("backend") or about.get("recording") or "unnamed hand"
+    if about.get("hand") and about.get("firmware"):
         name += f" {about['firmware']}"
     return name
 
