@@ -33,9 +33,10 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
     for name in dict.fromkeys(r.model for r in requirements):
         needs: dict[frozenset[str], list[str]] = {}
         for r in requirements:
-            own = phases_for([r])
-            if (r.model, r.layer, r.level) == (name, "dds", Level.MUST) and "replay" not in own:
-                needs.setdefault(own, []).append(r.id)
+            if (r.model, r.layer, r.level) == (name, "dds", Level.MUST):
+                own = phases_for([r])
+                if "replay" not in own:
+                    needs.setdefault(own, []).append(r.id)
         least = length(name, frozenset()) - 0.1  # s; what needs no stimulus comes first
         phases: frozenset[str] = frozenset()
         for own in sorted(needs, key=lambda o: (length(name, o) - least) / len(needs[o])):

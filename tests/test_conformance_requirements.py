@@ -10,6 +10,7 @@ from dexkit.conformance.checks import all_checks
 from dexkit.conformance.mutants import MUTANTS
 from dexkit.conformance.requirements import Level, catalogue, models, parse, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
+from dexkit.conformance.selection import quick
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.errors import UsageError
@@ -123,3 +124,9 @@ def test_the_documented_catalogue_is_the_data() -> None:
     assert page == catalogue_page().strip(), (
         "docs/conformance.md is out of date: python -m dexkit.conformance.requirements.page"
     )
+
+
+def test_what_is_quick_can_be_told_of_every_hand_at_once() -> None:
+    everything = catalogue(layer=None)
+    assert {r.layer for r in everything} == {"dds", "usb"}
+    assert quick(everything) == (*quick(catalogue("dex1-1")), *quick(catalogue("dex3-1")))
