@@ -436,11 +436,11 @@ class MilliNewtonMetres(Dex3Service):
 class _NegativeGains(Dex3Hand):
     def take(self, rows: Floats, mode: Ints) -> None:
         super().take(rows, mode)
-        self.kp = rows[3].copy()
+        self.kp, self.kd = rows[3].copy(), np.abs(rows[4])
 
 
 class NegativeGains(Dex3Service):
-    """Takes negative gains as they come."""
+    """Takes a negative stiffness as it comes."""
 
     hand = _NegativeGains
 
@@ -669,7 +669,7 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (UnsetLost, "SENS-06", ()),
     (NanGyroscope, "IMU-02", ()),
     (MilliNewtonMetres, "FORCE-02", ()),
-    (Creeps, "MOVE-07", ()),
+    (Creeps, "MOVE-07", ("MOVE-04",)),
     (NegativeGains, "SAFE-06", ()),
     (IndexFirst, "JOINT-01", ()),
     (CoupledFinger, "JOINT-01", ()),

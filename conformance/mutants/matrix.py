@@ -146,14 +146,17 @@ class Score:
         """
         context = multiprocessing.get_context("spawn")
         ordered = sorted(given, key=lambda t: -t.cost)
-        with ProcessPoolExecutor(jobs, context, _ignore_interrupts) as pool:
+        pool = ProcessPoolExecutor(jobs, context, _ignore_interrupts)
+        try:
             waiting = {pool.submit(try_one, trial) for trial in ordered}
             while waiting and not stop:
                 done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in done:
                     self.outcomes.append(future.result())
                     yield self.outcomes[-1]
-            pool.shutdown(wait=not waiting, cancel_futures=True)
+        finally:
+            # not as a context manager: that would run what is still waiting
+            pool.shutdown(cancel_futures=True)
 
     def killers(self, requirement: Requirement) -> list[Outcome]:
         """The trials that prove a requirement."""

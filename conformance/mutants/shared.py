@@ -397,22 +397,25 @@ class DropsOldStamps(Service):
 
 
 class StuttersUnderLoad(Service):
-    """Publishes one state in three while commands come faster than every 4 ms."""
+    """Publishes one state in three while four commands come within 11 ms."""
 
     tick = period = 0.002
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
-        self.came: dict[Side, tuple[float, float]] = dict.fromkeys(self.sides, (-1.0, -1.0))
+        self.came: dict[Side, list[float]] = {s: [] for s in self.sides}
         self.cycle = 0
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.came[side] = (self.came[side][1], self.now)
+        self.came[side] = [*self.came[side][-3:], self.now]
         super().motors(side, motors)
 
     def publish(self) -> list[Sample]:
         self.cycle += 1
-        busy = any(b - a < 0.004 and self.now - b < 0.01 for a, b in self.came.values())
+        busy = any(
+            len(times) == 4 and times[-1] - times[0] < 0.011 and self.now - times[-1] < 0.01
+            for times in self.came.values()
+        )
         return [] if busy and self.cycle % 3 else super().publish()
 
 
