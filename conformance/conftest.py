@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import signal
 import sys
 import traceback
+from typing import NoReturn
 
 import pytest
 
-from dexkit.conformance.plugin import OPTIONS_KEY, RESULT_KEY
+from dexkit.conformance.plugin import OPTIONS_KEY, RESULT_KEY, WHY_KEY
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.session import run_suite
 from dexkit.errors import DexkitError
+from dexkit.stopping import stop_on_signals
 
 
 @pytest.fixture(scope="session")
@@ -22,13 +25,25 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
         with capture.global_and_fixture_disabled():
             print(f"\n  ... {text}", end="", file=sys.stderr, flush=True)
 
-    try:
-        result = run_suite(options, say)
-    except DexkitError as error:
-        hint = f"\n{error.hint}" if error.hint else ""
-        pytest.exit(f"the kit cannot judge: {error.message}{hint}", returncode=2)
-    except Exception:  # once, instead of once for each requirement
-        text = "the kit itself has failed, which says nothing about the hand"
-        pytest.exit(f"{text}; please report this:\n{traceback.format_exc()}", returncode=2)
+    def end(why: str, returncode: int, more: str = "") -> NoReturn:
+        request.config.stash[WHY_KEY] = why
+        pytest.exit(f"{why}{more}", returncode=returncode)
+
+    # Whoever ends the run early must not leave a hand driven: services are ended in order.
+    with stop_on_signals() as stop:
+        try:
+            result = run_suite(options, say, stop.event)
+        except KeyboardInterrupt:
+            end("the run was interrupted", 130, "; nothing was judged, which is not a pass")
+        except DexkitError as error:
+            if not stop:
+                hint = f"\n{error.hint}" if error.hint else ""
+                end(f"the kit cannot judge: {error.message}", 2, hint)
+        except Exception:  # once, instead of once for each requirement
+            text = "the kit itself has failed, which says nothing about the hand"
+            end(text, 2, f"; please report this:\n{traceback.format_exc()}")
+    if stop:
+        why = f"the run was stopped ({signal.Signals(stop.signum).name})"
+        end(why, 128 + stop.signum, "; nothing was judged, which is not a pass")
     request.config.stash[RESULT_KEY] = result
     return result

@@ -18,12 +18,14 @@ if TYPE_CHECKING:
     from dexkit.conformance.session import SuiteOptions
     from dexkit.errors import DexkitError
 
-__all__ = ["OPTIONS_KEY", "REPORTED_KEY", "RESULT_KEY"]
+__all__ = ["OPTIONS_KEY", "REPORTED_KEY", "RESULT_KEY", "WHY_KEY"]
 
 OPTIONS_KEY: pytest.StashKey[SuiteOptions | None] = pytest.StashKey()
 RESULT_KEY: pytest.StashKey[RunResult] = pytest.StashKey()
 REPORTED_KEY: pytest.StashKey[list[Result]] = pytest.StashKey()
 """What the tests that ran have reported; ``-k`` can leave some out."""
+WHY_KEY: pytest.StashKey[str] = pytest.StashKey()
+"""Why there is no result, where a run came to none."""
 
 _MARK = "conformance"
 _TRACE = "--dexkit-trace"
@@ -209,7 +211,10 @@ def pytest_terminal_summary(
     terminalreporter.section("conformance")
     if result is None:
         text = "Nothing was judged, which is not a pass."
-        if config.stash[OPTIONS_KEY] is not None:
+        why = config.stash.get(WHY_KEY, "")
+        if why:
+            text = f"Nothing was judged, which is not a pass: {why}."
+        elif config.stash[OPTIONS_KEY] is not None:
             text += " No requirement was left to be judged."
         else:
             text += (

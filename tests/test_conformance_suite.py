@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -279,6 +280,38 @@ def test_a_run_can_be_stopped_and_leaves_nothing_behind(tmp_path: Path) -> None:
         ["pgrep", "-f", f"--domain {rig.domain} "], capture_output=True, text=True
     )
     assert left.stdout == ""
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+def test_whoever_ends_the_suite_early_ends_the_hand_in_order(
+    tmp_path: Path, signum: signal.Signals
+) -> None:
+    recording = tmp_path / "run.mcap"
+    run = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "conformance/"),
+            *("--backend", "sim-dex1", "--side", "left", "--recording", str(recording)),
+        ],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    assert run.stdout is not None
+    seen = ""
+    for line in run.stdout:
+        seen += line
+        if "moving slowly" in line or "large steps" in line:
+            run.send_signal(signum)
+            break
+    seen += run.communicate(timeout=30)[0]
+    assert run.returncode == 128 + signum, seen
+    assert f"the run was stopped ({signum.name}); nothing was judged, which is not a pass" in seen
+    # the record is written once every process has ended as it was asked to
+    (words,) = open_trace(recording).metadata["dexkit.tools"].items()
+    assert words[0].startswith("dexkit serve sim-dex1")
+    assert '"exchanges"' in words[1], words  # its counters, when it has braked
 
 
 def test_the_emulated_ezgripper_passes_as_a_user_runs_it(tmp_path: Path) -> None:

@@ -1,0 +1,62 @@
+"""Ending in good order when the user or the system asks for it: Ctrl-C, SIGTERM, SIGHUP.
+
+A program that dies at once leaves a hand driven by whatever it was told last.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["StopRequest", "stop_on_signals"]
+
+
+class StopRequest:
+    """Set when the user or the system asks the program to stop.
+
+    :ivar signum: the first signal received, or 0.
+    """
+
+    def __init__(self) -> None:
+        self.event = threading.Event()
+        self.signum = 0
+
+    def __bool__(self) -> bool:
+        return self.event.is_set()
+
+    def set(self) -> None:
+        """Ask for a stop from the program itself."""
+        self.event.set()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait for the request; True when it came."""
+        return self.event.wait(timeout)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[StopRequest]:
+    """Turn SIGINT, SIGTERM and SIGHUP into a :class:`StopRequest`.
+
+    A second SIGINT interrupts at once. SIGHUP, which comes when the terminal or its ssh connection
+    goes, is left alone where it is ignored (``nohup``).
+    """
+    request = StopRequest()
+
+    def handle(signum: int, frame: FrameType | None) -> None:
+        if request.event.is_set() and signum == signal.SIGINT:
+            raise KeyboardInterrupt
+        request.signum = request.signum or signum
+        request.event.set()
+
+    ending = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        ending.append(signal.SIGHUP)
+    previous = {s: signal.signal(s, handle) for s in ending}
+    try:
+        yield request
+    finally:
+        for signum, handler in previous.items():
+            signal.signal(signum, handler)
