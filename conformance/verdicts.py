@@ -19,6 +19,9 @@ STARVED = 0.5
 LATE = 0.5
 """Part of the time that a requirement allows by which the kit may be late itself."""
 
+MOST_PLACES = 5
+"""Places that a result names; all of them are looked at before a failure is excused."""
+
 _OPEN = (Verdict.FAIL, Verdict.BLOCKED, Verdict.ERROR)
 
 
@@ -103,7 +106,7 @@ class Judgement:
             figure=outcome.figure,
             observed=outcome.observed,
             reason=outcome.reason,
-            evidence=outcome.evidence,
+            evidence=outcome.evidence[:MOST_PLACES],
             values=outcome.values,
             cause=cause if verdict in (Verdict.FAIL, Verdict.WARN) else "",
             blocked_by=blocked_by,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -81,10 +82,17 @@ class States:
     def __len__(self) -> int:
         return len(self.t)
 
-    @property
+    @cached_property
     def clock(self) -> Floats:
-        """The times to judge the publisher by: source timestamps where the recording has them."""
-        return self.sent if len(self.sent) and np.isfinite(self.sent).all() else self.t
+        """The times to judge the publisher by: source timestamps where the recording has them.
+
+        They are of the publisher's clock, which on a robot may be hours off. What separates them
+        from reception in the middle of all samples is taken off, so that they can be compared
+        with the recording's times.
+        """
+        if not len(self.sent) or not np.isfinite(self.sent).all():
+            return self.t
+        return np.asarray(self.sent + np.median(self.t - self.sent))
 
     def between(self, begin: float, end: float) -> slice:
         """The samples received in [begin, end]."""

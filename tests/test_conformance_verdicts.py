@@ -13,10 +13,10 @@ from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import RECORD, Beats, Stimulus
+from dexkit.conformance.phases import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import TOO_BUSY, Evidence, Result, Verdict
-from dexkit.conformance.verdicts import Judgement, excuse
+from dexkit.conformance.verdicts import MOST_PLACES, Judgement, excuse
 from dexkit.conformance.view import Recording
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run
@@ -70,6 +70,27 @@ def test_every_place_of_a_failure_has_to_be_excused() -> None:
 
     assert excuse(Once(None), GAP, failure(2.0))
     assert not excuse(Once(None), GAP, failure(2.0, 4.0))
+
+
+def test_a_place_that_is_not_shown_counts_all_the_same() -> None:
+    """Six gaps: five while the machine was stalled, and one that is the hand's."""
+    trace = copy_of(short_run())
+    key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+    begin = trace.rows[key][0][0]
+    starts = [begin + round((0.2 + 0.25 * i) * 1e9) for i in range(6)]
+    trace.rows[key] = [
+        row for row in trace.rows[key] if not any(a < row[0] < a + 150_000_000 for a in starts)
+    ]
+    stimulus = Stimulus.from_metadata(trace.metadata[RECORD])
+    stimulus.stalls += [Stall(a, a + 150_000_000) for a in starts[:5]]
+    trace.metadata[RECORD] = stimulus.to_metadata()
+    found = of(judge(Recording.of(trace)), "DEX1-RATE-03")
+    assert found.verdict is Verdict.FAIL
+    assert found.values["gaps"] == 6
+    assert len(found.evidence) == MOST_PLACES
+    stimulus.stalls.append(Stall(starts[5], starts[5] + 150_000_000))
+    trace.metadata[RECORD] = stimulus.to_metadata()
+    assert of(judge(Recording.of(trace)), "DEX1-RATE-03").verdict is Verdict.BLOCKED
 
 
 def test_a_failure_without_a_place_is_excused_by_the_whole_run_if_at_all() -> None:

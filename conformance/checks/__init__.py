@@ -134,7 +134,7 @@ class Context:
 
     def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
         """It is not."""
-        return Outcome(False, figure, observed, evidence=places[:5], values=_plain(values))
+        return Outcome(False, figure, observed, evidence=places, values=_plain(values))
 
     def skipped(self, reason: str) -> Outcome:
         """It cannot be judged here."""

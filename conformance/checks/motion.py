@@ -353,9 +353,15 @@ def zero_gains(ctx: Context) -> Outcome:
 
 def not_pulled(ctx: Context, how: str) -> Outcome:
     """How far each joint moves towards a q that must not pull."""
-    found = [(float(np.max((s.q - s.start) * np.sign(s.size))), s) for s in steps(ctx)]
-    if not found:
+    given = steps(ctx)
+    if not given:
         return ctx.skipped("no state during this stimulus")
+    # one that is there already cannot be pulled there
+    limit = [2 * ctx.tolerance("max_motion_stroke", s.joint) for s in given]
+    away = [s for s, least in zip(given, limit, strict=True) if abs(s.size) > least]
+    found = [(float(np.max((s.q - s.start) * np.sign(s.size))), s) for s in away]
+    if not found:
+        return ctx.skipped("the hand already was where it must not be pulled to")
     towards, step = max(found, key=lambda f: f[0] / f[1].stroke)
     towards = max(0.0, towards)
     if towards <= ctx.tolerance("max_motion_stroke", step.joint):

@@ -9,7 +9,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.motion import Step, steps, steps_of
-from dexkit.conformance.checks.timing import gaps
+from dexkit.conformance.checks.timing import gaps, slow
 from dexkit.conformance.phases import Phase
 
 
@@ -387,7 +387,7 @@ def load(ctx: Context) -> Outcome:
                 ctx.at(ctx.states.topic, a, b),
                 rate_hz=rate,
             )
-        if rate < ctx.tolerance("min_rate_hz"):
+        if slow(ctx, rate):
             return ctx.failed(
                 f"{rate:.1f} Hz", text, ctx.at(ctx.states.topic, begin, end), rate_hz=rate
             )

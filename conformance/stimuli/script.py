@@ -44,6 +44,8 @@ DEFAULT_OBJECTS = {DEX1_1.name: {Side.RIGHT: 37.0}, DEX3_1.name: {Side.RIGHT: 60
 the shipped session closes."""
 SETTLED = 0.02
 """Part of a joint's range within which it counts as being where it should."""
+PATIENCE = 6.0
+"""Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
 FLOOD = 500
 """Commands of a burst."""
 LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
@@ -296,8 +298,13 @@ class Script(ABC):
     def _until_settled(
         self, phase: Phase | None, sides: Sequence[Side], *, least: float, most: float
     ) -> Steps:
-        """Hold the goals until the sides have stood near them for a while."""
-        begin = self._obs.now_ns
+        """Hold the goals until the sides have stood near them for a while.
+
+        :param most: seconds; a hand that still comes nearer then is slow, not wrong, and is given
+            up to :data:`PATIENCE` more.
+        """
+        begin = nearer_at = self._obs.now_ns
+        best = math.inf
         near_since: int | None = None
         low: dict[Side, Pose] = {}
         high: dict[Side, Pose] = {}
@@ -316,14 +323,23 @@ class Script(ABC):
                 if not all(self._near(s, low[s], high[s], 0.5) for s in sides):
                     near_since = None
             settled = near_since is not None and now - near_since >= self._settling * 1e9
+            left = sum(self._left(s, q[s]) for s in sides if s in q)
+            if left < best - 0.01:
+                best, nearer_at = left, now
             elapsed = (now - begin) / 1e9
-            if elapsed >= most or (settled and elapsed >= least):
+            comes = now - nearer_at < 0.3e9 and elapsed < most + PATIENCE
+            if (settled and elapsed >= least) or (elapsed >= most and not comes):
                 break
         if phase is not None:
             self._end(phase)
 
     _settling = 0.4
     """Seconds that a hand must stand near its goal."""
+
+    def _left(self, side: Side, here: Pose) -> float:
+        """How far a hand is from its goal, in parts of its joints' ranges."""
+        there, joints = self._goal[side], self._joints[side]
+        return sum(abs(a - b) / j.stroke for a, b, j in zip(here, there, joints, strict=True))
 
     def _near(self, side: Side, a: Pose, b: Pose, part: float = 1.0) -> bool:
         return all(

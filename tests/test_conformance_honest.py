@@ -1,0 +1,93 @@
+"""No false alarm: hands that differ from the reference in what no source forbids."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.results import Overall, RunResult, Verdict
+from dexkit.conformance.view import Recording
+from dexkit.conformance.virtual import Service, run_virtual
+from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
+from dexkit.hand import Side
+from tests.conformance_helpers import copy_of, of, short_run
+
+PHASES = frozenset({"step", "ends", "nan", "limp", "silence", "resume", "load", "burst"})
+
+
+class JustFastEnough(ReferenceService):
+    """State at 200 Hz, and not a sample more."""
+
+    tick = period = 0.005
+
+
+class Plain(ReferenceService):
+    """Measures its position, and nothing else; publishes best effort."""
+
+    writer_reliability = "best_effort"
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        return {"q": super().fields(side)["q"]}
+
+
+class _Unhurried(ReferenceHand):
+    def motor_torque(self) -> float:
+        if self.goal is None or self.goal.kp <= 0:
+            return super().motor_torque()
+        wanted = min(max(12.0 * (self.goal.q - self.q), -1.2), 1.2)
+        torque = min(max(0.5 * (wanted - self.dq) + self.viscous * wanted, -2.0), 2.0)
+        return 0.0 if self.braking else torque
+
+
+class Unhurried(ReferenceService):
+    """Takes four and a half seconds from one end to the other."""
+
+    hand = _Unhurried
+
+
+def judged(service: type[Service], claims: Claims | None = None) -> RunResult:
+    plan = replace(plan_for(sides=(Side.LEFT,)), phases=PHASES)
+    return judge(Recording.of(run_virtual(plan, service)), claims=claims)
+
+
+def blamed(result: RunResult) -> set[str]:
+    bad = (Verdict.FAIL, Verdict.WARN, Verdict.BLOCKED, Verdict.ERROR)
+    return {r.requirement.id for r in result.results if r.verdict in bad}
+
+
+@pytest.mark.parametrize(
+    ("service", "warned"),
+    [
+        (JustFastEnough, {"DEX1-RATE-02"}),
+        (Plain, {"DEX1-QOS-02"}),
+        # slow, and so it is told; but it arrives, opens, closes and obeys
+        (Unhurried, {"DEX1-MOVE-04", "DEX1-MOVE-07"}),
+    ],
+)
+def test_an_honest_hand_is_warned_at_most(service: type[Service], warned: set[str]) -> None:
+    result = judged(service)
+    assert blamed(result) == warned
+    assert result.overall is Overall.PASS
+
+
+def test_what_a_plain_hand_does_not_claim_is_not_held_against_it() -> None:
+    result = judged(Plain, Claims.parse('[hand]\nmodel = "dex1-1"'))
+    assert blamed(result) == {"DEX1-QOS-02"}
+    assert of(result, "DEX1-FIELD-04").verdict is Verdict.NOT_CLAIMED
+
+
+@pytest.mark.parametrize("off_s", [-3600.0, 0.4, 86400.0])
+def test_the_hands_clock_need_not_be_right(off_s: float) -> None:
+    right = judge(Recording.of(short_run()))
+    trace = copy_of(short_run())
+    topic = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+    trace.rows[topic] = [(t, s + round(off_s * 1e9), p) for t, s, p in trace.rows[topic]]
+    found = judge(Recording.of(trace))
+    assert [r.verdict for r in found.results] == [r.verdict for r in right.results]
+    gap, was = of(found, "DEX1-WDOG-02"), of(right, "DEX1-WDOG-02")
+    assert gap.values["max_gap_s"] == pytest.approx(was.values["max_gap_s"], abs=1e-6)
