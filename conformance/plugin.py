@@ -196,18 +196,27 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
         session.exitstatus = Overall.INCONCLUSIVE.exit_code
 
 
-@pytest.hookimpl(wrapper=True)
+@pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> Iterator[None]:
-    """The table that a person reads."""
+    """The table that a person reads, after everything else.
+
+    pytest's own lists of failures say the same again, each side by itself: they are left out, but
+    where they were asked for, or hold other tests.
+    """
     session = terminalreporter._session
+    result = config.stash.get(RESULT_KEY, None)
+    if result is not None and session is not None and len(_items(session)) == len(session.items):
+        if config.option.tbstyle == "auto":
+            config.option.tbstyle = "no"
+        if not any(a.startswith("-r") for a in config.invocation_params.args):
+            terminalreporter.reportchars = ""
     yield
     if session is None or config.option.collectonly:
         return
     if not _items(session) and config.stash[OPTIONS_KEY] is None:
         return
-    result = config.stash.get(RESULT_KEY, None)
     terminalreporter.section("conformance")
     if result is None:
         text = "Nothing was judged, which is not a pass."
@@ -233,7 +242,8 @@ def pytest_terminal_summary(
         width=width,
         force_terminal=terminalreporter._tw.hasmarkup,
     )
-    print_result(result, console)
+    verbose = config.option.verbose > 0
+    print_result(result, console, verbose=verbose, more="-v says why")
     for option, name in _FILES.items():
         path = config.getoption(f"dexkit_{option}")
         if path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from xml.etree import ElementTree
 
 import pytest
 from click.testing import CliRunner, Result
+from rich.console import Console
 
 from dexkit.cli import cli
 from dexkit.conformance.judge import judge
@@ -20,6 +22,7 @@ from dexkit.conformance.report.compare import (
 )
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
+from dexkit.conformance.report.terminal import print_result
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
@@ -299,6 +302,25 @@ def test_the_table_and_the_summary_go_to_the_terminal(judged: Path) -> None:
     assert "FAIL: a MUST is not met" in table.output
     assert "stage reached: left" in table.output
     assert run("report", judged / "result.json", "--markdown", "-").output.startswith("## ❌ Fail")
+
+
+def test_a_terminal_tells_once_what_holds_for_both_hands() -> None:
+    result = result_of_every_kind("a word " * 30)
+    out = io.StringIO()
+    print_result(result, Console(file=out, width=80), verbose=True)
+    lines = [line.rstrip() for line in out.getvalue().splitlines()]
+    assert max(map(len, lines)) <= 80
+    failed = next(r.requirement for r in result.results if r.verdict is Verdict.FAIL)
+    begin = lines.index(f"{failed.id} ({failed.level}) left and right: fail")
+    card = lines[begin + 1 : lines.index("", begin)]
+    labels = [line[:11].strip() for line in card if line[:11].strip()]
+    sides = ["observed:", "where:"] * 2
+    assert [label for label in labels if label != "expected:"] == (
+        ["required:", *sides, "cause:", "cause:", "try:", "source:"]
+    )
+    assert all(line.startswith(" " * 12) for line in card if not line[:11].strip())
+    unjudged = next(r.requirement for r in result.results if r.verdict is Verdict.NOT_APPLICABLE)
+    assert sum(line.startswith(f"  {unjudged.id} left and right: ") for line in lines) == 1
 
 
 def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) -> None:

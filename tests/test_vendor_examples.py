@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from dexkit.backends import BackendOptions
+from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.session import SuiteOptions
 from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
 from dexkit.hand import Hand, HandCommand, Side
@@ -208,7 +209,7 @@ def test_a_hand_class_needs_no_name_to_be_judged() -> None:
 def test_a_kit_that_fails_says_so_once_and_blames_nobody(tmp_path: Path) -> None:
     (tmp_path / "spoilt.py").write_text(
         "import dexkit.conformance.session as session\n"
-        "def run_suite(options, say): raise IndexError('a bug of the kit')\n"
+        "def run_suite(*args): raise IndexError('a bug of the kit')\n"
         "session.run_suite = run_suite\n"
     )
     run = subprocess.run(
@@ -223,6 +224,36 @@ def test_a_kit_that_fails_says_so_once_and_blames_nobody(tmp_path: Path) -> None
         env={**os.environ, "NO_COLOR": "1"},
     )
     assert run.returncode == 2, run.stdout + run.stderr
-    assert run.stdout.count("a bug of the kit") <= 2  # the exception, and its source line
+    assert 1 <= run.stdout.count("a bug of the kit") <= 2  # the exception, and its source line
     assert "the kit itself has failed, which says nothing about the hand" in run.stdout
     assert "FAILED" not in run.stdout
+
+
+def test_each_failure_is_told_once_and_the_verdict_comes_last(tmp_path: Path) -> None:
+    (tmp_path / "canned.py").write_text(
+        "import dexkit.conformance.session as session\n"
+        "from dexkit.conformance.judge import judge\n"
+        "from dexkit.conformance.view import Recording\n"
+        "from dexkit.traces import open_trace, sample_path\n"
+        "view = Recording.of(open_trace(sample_path('dex1_hand_dropout')))\n"
+        "def run_suite(options, *args): return judge(view, requirements=options.requirements)\n"
+        "session.run_suite = run_suite\n"
+    )
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "canned"]
+    command += ["--pyargs", "dexkit.conformance", "--backend", "external"]
+    advice = next(r.advice for r in catalogue() if r.id == "DEX1-RATE-03")[:40]
+    for more, times in ((), 1), (("-rf", "--tb=short"), 3):
+        run = subprocess.run(
+            [*command, *more],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env={**os.environ, "NO_COLOR": "1"},
+        )
+        assert run.returncode == 1, run.stdout + run.stderr
+        assert run.stdout.count(advice) == times
+        assert ("FAILED" in run.stdout) == bool(more)
+        told = run.stdout.index("FAIL: a MUST is not met")
+        assert told > run.stdout.rindex(advice) > run.stdout.index("DEX1-RATE-03 ")
+        assert "(-v says why)" in " ".join(run.stdout.split())

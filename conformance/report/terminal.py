@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Iterator, Sequence
+
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dexkit.conformance.report.wording import about_harness
+from dexkit.conformance.report.wording import about_harness, causes
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 
 __all__ = ["MARKS", "print_result"]
@@ -62,21 +65,23 @@ def print_result(
             "not shown"
             f"{f' ({more})' if more else ''}.[/dim]"
         )
-    troubles = [r for r in result.results if r.verdict in (Verdict.FAIL, Verdict.ERROR)]
-    warned = [r for r in result.results if r.verdict is Verdict.WARN]
-    for entry in troubles + warned:
-        console.print()
-        console.print(escape(entry.explain()), highlight=False)
+    for wanted in ((Verdict.FAIL, Verdict.ERROR), (Verdict.WARN,)):
+        for _, group in result.by_requirement():
+            troubles = [r for r in group if r.verdict in wanted]
+            if troubles:
+                console.print()
+                _print_trouble(troubles, console)
     _print_blocked(result, console)
     if verbose:
-        reasons = [r for r in result.results if r.verdict in _UNJUDGED]
+        reasons: dict[tuple[str, str], list[str]] = {}
+        for entry in result.results:
+            if entry.verdict in _UNJUDGED:
+                reasons.setdefault((entry.requirement.id, entry.reason), []).append(entry.side)
         if reasons:
             console.print("\n[dim]not judged:[/dim]")
-        for entry in reasons:
-            console.print(
-                f"[dim]  {entry.requirement.id} {entry.side}: {escape(entry.reason)}[/dim]",
-                highlight=False,
-            )
+        for (id_, reason), on in reasons.items():
+            text = _hung(console, f"  {id_} {' and '.join(on)}: ", reason)
+            console.print(f"[dim]{escape(text)}[/dim]", highlight=False, soft_wrap=True)
     stages = ", ".join(f"{side} {stage}" for side, stage in result.stage.items())
     if stages:
         console.print(f"[dim]stage reached: {escape(stages)}[/dim]", highlight=False)
@@ -88,6 +93,56 @@ def print_result(
     console.print(f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]", highlight=False)
 
 
+def _print_trouble(group: Sequence[Result], console: Console) -> None:
+    """What is wrong in one requirement; what holds for both sides is said once."""
+    need = group[0].requirement
+    sides = " and ".join(r.side for r in group)
+    console.print(
+        f"[bold]{need.id}[/] ({need.level}) {sides}: {worst(r.verdict for r in group)}",
+        highlight=False,
+    )
+    for name, text in _lines(group):
+        label = f"{name}:" if name else ""
+        console.print(
+            escape(_hung(console, f"  {label:<9} ", text)), highlight=False, soft_wrap=True
+        )
+
+
+def _lines(group: Sequence[Result]) -> Iterator[tuple[str, str]]:
+    """(what it is, text) of a requirement that failed alike on these sides."""
+    need = group[0].requirement
+    yield "required", need.sentence
+    if group[0].expected != need.sentence:
+        yield "expected", group[0].expected
+    for entry in group:
+        side = f"{entry.side}: " if len(group) > 1 else ""
+        if entry.observed:
+            yield "observed", side + entry.observed
+        if entry.reason:
+            yield "reason", side + entry.reason
+        for place in entry.evidence:
+            until = f" .. {place.end_s:.3f} s" if place.end_s is not None else ""
+            yield "where", f"{place.topic} at {place.time_s:.3f} s{until}"
+    found = causes(list(group))
+    for sides, cause in found:
+        yield "cause", f"{sides}: {cause}" if len(found) > 1 else cause
+    if group[0].verdict is not Verdict.ERROR:
+        yield "try", need.advice
+        yield "source", f"{need.source} ({need.confidence})"
+
+
+def _hung(console: Console, head: str, text: str) -> str:
+    """``text`` after ``head``, its further lines below its first one."""
+    return textwrap.fill(
+        text,
+        console.width,
+        initial_indent=head,
+        subsequent_indent=" " * min(len(head), 12),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
 def _print_blocked(result: RunResult, console: Console) -> None:
     """What was not judged because something else failed first, by what that was."""
     groups: dict[str, dict[str, None]] = {}
@@ -97,7 +152,8 @@ def _print_blocked(result: RunResult, console: Console) -> None:
     if groups:
         console.print()
     for reason, names in groups.items():
-        console.print(f"[magenta]{escape(reason)}[/]: {', '.join(names)}", highlight=False)
+        text = escape(_hung(console, "", f"{reason}: {', '.join(names)}"))
+        console.print(f"[magenta]{text}[/]", highlight=False, soft_wrap=True)
 
 
 def _cell(result: Result) -> str:
