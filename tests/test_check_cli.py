@@ -118,7 +118,7 @@ def test_claims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_verbose_says_what_was_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path("dex1_pick_place"), "-v") == 0
     out = capsys.readouterr().out
-    assert "DEX1-WDOG-01 left: needs the stimulus 'silence'" in out.replace("\n", " ")
+    assert "DEX1-WDOG-01 left and right: needs the stimulus 'silence'" in " ".join(out.split())
 
 
 def test_a_result_file_that_cannot_be_written_is_told(capsys: pytest.CaptureFixture[str]) -> None:
