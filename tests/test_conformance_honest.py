@@ -81,6 +81,14 @@ def test_what_a_plain_hand_does_not_claim_is_not_held_against_it() -> None:
     assert of(result, "DEX1-FIELD-04").verdict is Verdict.NOT_CLAIMED
 
 
+def test_the_kits_own_restart_of_the_service_is_no_gap_of_the_hand() -> None:
+    plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"shutdown", "service-restart"}))
+    found = judge(Recording.of(run_virtual(plan, ReferenceService)))
+    gap = of(found, "DEX1-RATE-03")
+    assert gap.verdict is Verdict.PASS
+    assert gap.values["max_gap_s"] < 0.1  # nor is it told as the longest
+
+
 @pytest.mark.parametrize("off_s", [-3600.0, 0.4, 86400.0])
 def test_the_hands_clock_need_not_be_right(off_s: float) -> None:
     right = judge(Recording.of(short_run()))

@@ -153,10 +153,10 @@ def empty(ctx: Context) -> Outcome:
     return stays(ctx, "empty commands")
 
 
-def _silences(ctx: Context) -> list[tuple[float, float]]:
-    """(last command, end) of each silence."""
+def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
+    """(last command, end) of each silence: the requirement's own phases, and those of ``names``."""
     found = []
-    for phase in ctx.phases():
+    for phase in (*ctx.phases(), *(p for name in names for p in ctx.phases(name))):
         begin, end = ctx.span(phase)
         sent = ctx.commands.t[ctx.commands.t <= end]
         last = float(sent[-1]) if len(sent) else begin
@@ -227,7 +227,9 @@ def brakes(ctx: Context) -> Outcome:
 def state_in_silence(ctx: Context) -> Outcome:
     """Gaps of the state while no command comes."""
     limit = ctx.tolerance("max_gap_s")
-    spans = [(a, b) for a, b in _silences(ctx) if b - a >= ctx.tolerance("min_silence_s")]
+    # a hand that has tripped has to tell of it
+    silences = _silences(ctx, "guard")
+    spans = [(a, b) for a, b in silences if b - a >= ctx.tolerance("min_silence_s")]
     if not spans:
         return ctx.skipped("no silence that was long enough")
     longest = 0.0

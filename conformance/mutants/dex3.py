@@ -619,6 +619,14 @@ class SlowToClear(Dex3Service):
     hand = _ForEver
 
 
+class QuietWhenTripped(Dex3Service):
+    """Publishes no state while its protection has tripped."""
+
+    def publish(self) -> list[Sample]:
+        tripped = any(hand.tripped.any() for hand in self.hands.values())
+        return [] if tripped else super().publish()
+
+
 _SHARED = {
     "TOPIC-01": (shared.OldTopic, shared.OtherStateType),
     "TOPIC-02": (shared.OtherCommandType,),
@@ -698,6 +706,7 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (NoLimits, "SAFE-02", ()),
     (FillsUpWithZeros, "SAFE-04", ()),
     (KeepsDriving, "WDOG-01", ()),
+    (QuietWhenTripped, "WDOG-02", ()),
     (StuckAfterSilence, "WDOG-03", ()),
     (LetsGo, "HOLD-01", ()),
     (HoldsWhenGuarded, "GUARD-01", ()),
