@@ -13,11 +13,15 @@ from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.judge import judge
+from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.mutants.operator import LateState
 from dexkit.conformance.phases import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import TOO_BUSY, Evidence, Result, Verdict
+from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.verdicts import MOST_PLACES, Judgement, excuse
 from dexkit.conformance.view import Recording
+from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run
 
@@ -116,6 +120,18 @@ def test_a_gap_no_longer_than_the_kits_own_lateness_is_not_blamed_on_the_hand() 
     assert result.disturbed
     assert result.harness["jitter_p50_ms"] == pytest.approx(0.1)
     assert result.harness["jitter_p99_ms"] > 100
+
+
+def test_a_client_that_could_not_keep_its_rate_blames_no_hand() -> None:
+    plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", OPERATOR}))
+    trace = run_virtual(plan, LateState)
+    lag = of(judge(Recording.of(trace)), "DEX1-OPER-02")
+    assert lag.verdict is Verdict.WARN
+    commands = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
+    trace.rows[commands] = trace.rows[commands][::2]
+    starved = of(judge(Recording.of(trace)), "DEX1-OPER-02")
+    assert starved.verdict is Verdict.NOT_APPLICABLE
+    assert "of 200 commands a second" in starved.reason
 
 
 def test_what_a_failure_blocks_names_it() -> None:
