@@ -22,7 +22,7 @@ from dexkit.conformance.report.compare import (
 )
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
-from dexkit.conformance.report.terminal import print_result
+from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
@@ -79,6 +79,12 @@ def test_a_run_without_results_says_so() -> None:
     text = render_markdown(replace(result_of_every_kind(), results=[]))
     assert "Inconclusive" in text
     assert "nothing was judged" in text
+
+
+def test_a_verdict_has_one_name_in_all_reports() -> None:
+    for verdict in Verdict:
+        assert VERDICTS[verdict].text == str(verdict)
+        assert MARKS[verdict][0].lower() == str(verdict)
 
 
 # ---------------------------------------------------------------------------------- badge

@@ -469,7 +469,7 @@ def _glossary(result: RunResult) -> str:
         ("topic", "a named channel on the network (DDS); who uses another name is not heard."),
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
         ("tau_est, N m", "torque that the motor feels: what the hand knows of touch."),
-        ("not judged", "this recording or hand gave no occasion for it; the row says why."),
+        ("not applicable", "this recording or hand gave no occasion for it; the row says why."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]
     if result.claims is not None:

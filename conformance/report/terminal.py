@@ -19,7 +19,7 @@ MARKS = {
     Verdict.FAIL: ("FAIL", "bold red"),
     Verdict.WARN: ("warn", "yellow"),
     Verdict.NOT_CLAIMED: ("not claimed", "dim"),
-    Verdict.NOT_APPLICABLE: ("n/a", "dim"),
+    Verdict.NOT_APPLICABLE: ("not applicable", "dim"),
     Verdict.BLOCKED: ("blocked", "magenta"),
     Verdict.ERROR: ("ERROR", "bold magenta"),
 }

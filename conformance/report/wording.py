@@ -42,9 +42,9 @@ VERDICTS = {
     Verdict.FAIL: Word("fail", "bad", "❌"),
     Verdict.WARN: Word("warn", "warn", "⚠️"),
     Verdict.NOT_CLAIMED: Word("not claimed", "na", "➖"),
-    Verdict.NOT_APPLICABLE: Word("not judged", "na", "➖"),
+    Verdict.NOT_APPLICABLE: Word("not applicable", "na", "➖"),
     Verdict.BLOCKED: Word("blocked", "open", "⛔"),
-    Verdict.ERROR: Word("kit error", "open", "💥"),
+    Verdict.ERROR: Word("error", "open", "💥"),
 }
 ANSWERS = {
     Overall.PASS: Word("Pass", "ok", "✅"),
