@@ -17,9 +17,10 @@ from click.testing import CliRunner, Result
 from dexkit.cli import cli
 from dexkit.conformance.view import Recording
 from dexkit.dds import DdsNode
-from dexkit.errors import DexkitError
+from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
+from dexkit.teleop import profile
 from dexkit.traces import open_trace
 from tests.dds_helpers import free_domain, take_until
 
@@ -123,7 +124,7 @@ def test_the_hint_comes_after_five_seconds_once(capsys: pytest.CaptureFixture[st
     from dexkit.cli.teleop import _Waiting
 
     with DdsNode(domain=free_domain(), interface="lo") as node:
-        waiting = _Waiting(node, None)
+        waiting = _Waiting(node, DIALECTS["unitree_go"], None)
         for seconds in (0.0, 1.0, 4.9):
             waiting({LEFT: "", RIGHT: "every q is exactly 0"}, seconds)
         assert capsys.readouterr().err == (
@@ -134,6 +135,13 @@ def test_the_hint_comes_after_five_seconds_once(capsys: pytest.CaptureFixture[st
         said = capsys.readouterr().err
         assert said.count("waiting for state of left ...") == 1
         assert said.count(f"'dexkit doctor --domain {node.domain}' says what is wrong") == 1
+
+
+def test_hands_that_speak_another_dialect_are_named(dex3: int) -> None:
+    result = teleop("full-stroke", "--domain", dex3, "--wait", 1.0)
+    assert isinstance(result.exception, DexkitError)
+    assert result.exception.exit_code == 1
+    assert result.exception.hint == "there are hands that speak dex3: --dialect dex3"
 
 
 def test_when_interrupted_it_locks_a_dex3_where_it_is(dex3: int) -> None:
@@ -170,6 +178,9 @@ def test_the_profiles_are_listed_without_any_hand() -> None:
     unknown = teleop("juggle")
     assert unknown.exit_code != 0
     assert unknown.exception is not None
+    with pytest.raises(UsageError) as caught:
+        profile("pinch", "dex1-1")
+    assert str(caught.value.hint).startswith("--dialect dex3 has it; there are: full-stroke, ")
 
 
 def test_a_recording_is_an_operator(dex1: int) -> None:

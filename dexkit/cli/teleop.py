@@ -37,6 +37,8 @@ __all__ = ["command"]
 
 _HINT_AFTER = 5.0  # seconds of waiting
 _SILENT = 1.0  # seconds without state at the end: the command time-out of the family
+_SLOW = 0.9
+"""Part of the nominal rate below which the figures are not the hand's."""
 _MS = 1e3
 
 
@@ -149,7 +151,7 @@ def command(
         if not force:
             LiveClient.refuse_company(node, spoken, sides)
         live = LiveClient(node, client)
-        waiting = _Waiting(node, patience)
+        waiting = _Waiting(node, spoken, patience)
         if not live.wait_ready(stop.event, waiting):
             return 130
         _say(f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s")
@@ -160,7 +162,7 @@ def command(
             show.clear()
             live.leave()
         stopped = bool(stop)
-    _report(session, operator, as_json=as_json)
+    _report(session, operator, 1 / client.period, as_json=as_json)
     silent = [] if stopped else _silent(session, seconds)
     for side in silent:
         _say(f"{side}: no state in the end; the genuine client goes on with what it last read")
@@ -219,8 +221,9 @@ def _record(stack: ExitStack, path: Path, spoken: Dialect, domain: int, interfac
 class _Waiting:
     """Says what the client waits for, as the genuine one does, and where to look for help."""
 
-    def __init__(self, node: DdsNode, patience: float | None) -> None:
+    def __init__(self, node: DdsNode, spoken: Dialect, patience: float | None) -> None:
         self._node = node
+        self._spoken = spoken
         self._patience = patience
         self._said: Mapping[Side, str] | None = None
         self._helped = False
@@ -234,7 +237,7 @@ class _Waiting:
         if self._patience is not None and seconds >= self._patience:
             error = DexkitError(
                 f"no usable state of {what} after {seconds:.0f} s on domain {self._node.domain}",
-                hint=self._doctor,
+                hint=self._advice,
             )
             error.exit_code = 1
             raise error
@@ -243,10 +246,18 @@ class _Waiting:
             self._said = dict(missing)
         if seconds >= _HINT_AFTER and not self._helped:
             self._helped = True
-            _say(f"  {self._doctor}")
+            _say(f"  {self._advice}")
 
     @property
-    def _doctor(self) -> str:
+    def _advice(self) -> str:
+        seen = {(e.topic, e.type_name) for e in self._node.endpoints() if e.kind == "writer"}
+        others = [
+            d.name
+            for d in DIALECTS.values()
+            if d != self._spoken and any((d.topics(s)[1], d.state_type) in seen for s in Side)
+        ]
+        if others:
+            return f"there are hands that speak {', '.join(others)}: --dialect {others[0]}"
         where = "" if self._node.interface == "lo" else f" --interface {self._node.interface}"
         return f"'dexkit doctor --domain {self._node.domain}{where}' says what is wrong"
 
@@ -276,7 +287,7 @@ def _silent(session: Session, end: float) -> list[Side]:
     return [s for s in session.sides if last.get(s, -math.inf) < end - _SILENT]
 
 
-def _report(session: Session, operator: Operator, *, as_json: bool) -> None:
+def _report(session: Session, operator: Operator, nominal: float, *, as_json: bool) -> None:
     model = model_by_name(operator.dialect.model)
     found: dict[str, Any] = {}
     for side in session.sides:
@@ -293,7 +304,13 @@ def _report(session: Session, operator: Operator, *, as_json: bool) -> None:
         click.echo(json.dumps(_finite(data), indent=2))
         return
     for name_of_side, measured in found.items():
-        click.echo(f"{name_of_side}: the client ran at {measured['client_hz']:.0f} Hz")
+        hertz = measured["client_hz"]
+        note = (
+            "" if hertz > _SLOW * nominal else f" of {nominal:.0f}: what follows is this machine's"
+        )
+        click.echo(f"{name_of_side}: the client ran at {hertz:.0f} Hz{note}")
+        if not measured["joints"]:
+            click.echo("  no occasion to measure anything")
         for name, values in measured["joints"].items():
             text = sentence(values) or "no occasion to measure anything"
             click.echo(f"  {text}" if model.name == DEX1_1.name else f"  {name}: {text}")

@@ -282,10 +282,12 @@ def profile(name: str, hand_model: str) -> Profile:
     """
     found = [p for p in profiles_for(hand_model) if p.name == name]
     if not found:
+        owner = next((model(p.model) for p in PROFILES if p.name == name), None)
+        its = f"--dialect {owner.dialects[0].name} has it; " if owner else ""
         raise UsageError(
             f"a {model(hand_model).title} has no profile {name!r}",
-            hint=f"there are: {', '.join(p.name for p in profiles_for(hand_model))}, or give a "
-            "recording: FILE.mcap",
+            hint=f"{its}there are: {', '.join(p.name for p in profiles_for(hand_model))}, or give "
+            "a recording: FILE.mcap",
         )
     return found[0]
 
