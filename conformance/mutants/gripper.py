@@ -159,7 +159,8 @@ class OtherScale(ReferenceService):
 
 class _Hunts(ReferenceHand):
     def motor_torque(self) -> float:
-        shake = 0.0 if self.braking else 0.8 * math.sin(2 * math.pi * 8.0 * self.now)
+        held = self.goal is not None and self.goal.kp > 0 and not self.braking
+        shake = 0.8 * math.sin(2 * math.pi * 8.0 * self.now) if held else 0.0
         return super().motor_torque() + shake
 
 
