@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -147,6 +148,10 @@ class SuiteOptions:
         for file in (json, report, markdown, recording):
             if file is not None and not file.absolute().parent.is_dir():
                 raise UsageError(f"cannot write {file}: there is no such directory")
+            if file is not None and file.is_dir():
+                raise UsageError(f"cannot write {file}: it is a directory")
+            if file is not None and not os.access(file.absolute().parent, os.W_OK):
+                raise UsageError(f"cannot write {file}: its directory is read-only")
         every = catalogue(chosen.model)
         if backend in ON_USB:
             every += catalogue(chosen.model, "usb")

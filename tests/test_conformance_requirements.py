@@ -11,6 +11,7 @@ from dexkit.conformance.mutants import MUTANTS
 from dexkit.conformance.requirements import Level, catalogue, models, parse, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.selection import quick
+from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.errors import UsageError
@@ -130,3 +131,13 @@ def test_what_is_quick_can_be_told_of_every_hand_at_once() -> None:
     everything = catalogue(layer=None)
     assert {r.layer for r in everything} == {"dds", "usb"}
     assert quick(everything) == (*quick(catalogue("dex1-1")), *quick(catalogue("dex3-1")))
+
+
+def test_what_cannot_be_written_is_told_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UsageError, match="it is a directory"):
+        SuiteOptions.make(backend="sim-dex1", report=tmp_path)
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(UsageError, match="its directory is read-only"):
+        SuiteOptions.make(backend="sim-dex1", json=tmp_path / "r.json")

@@ -41,7 +41,8 @@ def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSp
         return "q looks like percent, not radians."
     widest = max(max(-j.q_min, j.q_max) for j in joints)
     if np.abs(q).max() > 3 * widest and within(joints, 180 / np.pi):
-        return "q looks like degrees, not radians."
+        also = "percent or " if low.min() >= -1.0 and high.max() <= 20.0 else ""
+        return f"q looks like {also}degrees, not radians."
     if np.abs(q).max() > 100.0:
         return "q looks like the device's own counts, or the rotor's angle before the gear."
     return ""

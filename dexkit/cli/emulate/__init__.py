@@ -23,7 +23,7 @@ _DEVICES = {
     "mx64": (
         "dexkit.cli.emulate.mx64",
         "emulate_mx64",
-        "Emulate a MX-64 with an EZGripper on a pseudo-terminal.",
+        "Emulate an MX-64 with an EZGripper on a pseudo-terminal.",
     ),
 }
 
