@@ -190,7 +190,7 @@ class _Sink:
     log: list[NDArray[np.uint64]] = field(default_factory=list)
     publish: list[NDArray[np.uint64]] = field(default_factory=list)
     sizes: list[NDArray[np.int64]] = field(default_factory=list)
-    payloads: list[bytes] | None = field(default_factory=list)
+    payloads: list[NDArray[np.uint8]] | None = field(default_factory=list)
 
 
 class Trace:
@@ -624,9 +624,12 @@ class Trace:
                 self._warn(f"records at byte {segment.offset} go wrong after {at} bytes ({error})")
         if not starts:
             return
-        every = _rows(data, np.array(starts), _MESSAGES.itemsize).view(_MESSAGES)[:, 0]
+        begins = np.array(starts)
+        every = _rows(data, begins, _MESSAGES.itemsize).view(_MESSAGES)[:, 0]
+        channels = every["channel"]
+        begins += _MESSAGES.itemsize
         for channel_id, sink in sinks.items():
-            mine = np.flatnonzero(every["channel"] == channel_id)
+            mine = np.flatnonzero(channels == channel_id)
             if not len(mine):
                 continue
             heads = every[mine]
@@ -634,15 +637,14 @@ class Trace:
             sink.publish.append(heads["publish"])
             if sink.payloads is None:
                 continue
-            begins = np.array(starts)[mine] + _MESSAGES.itemsize
             sizes = heads["length"].astype(np.int64) - 22
             sink.sizes.append(sizes)
             if (sizes == sizes[0]).all():
-                sink.payloads.append(_rows(data, begins, int(sizes[0])).tobytes())
+                sink.payloads.append(_rows(data, begins[mine], int(sizes[0])).reshape(-1))
             else:
-                ends = (begins + sizes).tolist()
-                pieces = (data[a:b] for a, b in zip(begins.tolist(), ends, strict=True))
-                sink.payloads.append(b"".join(pieces))
+                ends = (begins[mine] + sizes).tolist()
+                pieces = [data[a:b] for a, b in zip(begins[mine].tolist(), ends, strict=True)]
+                sink.payloads.append(np.frombuffer(b"".join(pieces), dtype=np.uint8))
 
     def _describe(self) -> None:
         totals: dict[int, list[int]] = {}
@@ -762,8 +764,9 @@ def _rows(data: bytes, starts: NDArray[np.int64], size: int) -> NDArray[np.uint8
     """``size`` bytes from each start, shape (n, size)."""
     if not size:
         return np.empty((len(starts), 0), dtype=np.uint8)
-    every = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, dtype=np.uint8), size)
-    return np.asarray(every[starts])
+    # one item for each place where it may begin, for whole items are copied quickly
+    every: NDArray[np.void] = np.ndarray((len(data) - size + 1,), f"V{size}", data, strides=(1,))
+    return every[starts].view(np.uint8).reshape(len(starts), size)
 
 
 def _columns(info: ChannelInfo, sinks: list[_Sink]) -> SampleArray:
@@ -771,13 +774,13 @@ def _columns(info: ChannelInfo, sinks: list[_Sink]) -> SampleArray:
     publish = _times([t for s in sinks for t in s.publish])
     sizes = np.concatenate([np.empty(0, np.int64), *(z for s in sinks for z in s.sizes)])
     starts = np.cumsum(sizes) - sizes
-    buffer = b"".join(p for s in sinks if s.payloads is not None for p in s.payloads)
+    blocks = [p for s in sinks if s.payloads is not None for p in s.payloads]
     if len(log) > 1 and (np.diff(log) < 0).any():
         order = np.argsort(log, kind="stable")
         log, publish = log[order], publish[order]
         if len(sizes):
             starts, sizes = starts[order], sizes[order]
-    payloads = Packed(buffer, starts, sizes)
+    payloads = Packed(blocks, starts, sizes)
     return SampleArray(info.topic, info.type_name, log, publish, payloads, info.problem)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.hand import Floats
@@ -47,6 +48,18 @@ def _values(ctx: Context, path: str) -> Floats:
     return found[path]
 
 
+def _distinct(ctx: Context, path: str) -> Floats:
+    """The same; a single row, shape (1, length), where it stands for all."""
+    assert ctx.states.columns is not None
+    row = ctx.states.columns.constant(path)
+    return _values(ctx, path) if row is None else row.reshape(1, -1)
+
+
+def _within(values: Floats, low: float, high: float, or_zero: bool) -> NDArray[np.bool_]:
+    good = (values >= low) & (values <= high)
+    return good | (values == 0) if or_zero else good
+
+
 def _at(ctx: Context, row: int) -> float:
     assert ctx.states.columns is not None
     return float(ctx.states.t[ctx.states.columns.ok][row])
@@ -57,19 +70,18 @@ def _outside(
 ) -> Outcome | None:
     """Failed if a value is not within [low, high]; None if all are."""
     for path in paths:
+        if _within(_distinct(ctx, path), low, high, or_zero).all():
+            continue
         values = _values(ctx, path)
-        good = (values >= low) & (values <= high)
-        if or_zero:
-            good |= values == 0
-        if not good.all():
-            row, place = (int(i) for i in np.argwhere(~good)[0])
-            name = path if values.shape[1] == 1 else f"{path}[{place}]"
-            value = values[row, place]
-            return ctx.failed(
-                f"{value:g}",
-                f"{name} = {value:g} in {int((~good).any(axis=1).sum())} states",
-                ctx.at(ctx.states.topic, _at(ctx, row)),
-            )
+        good = _within(values, low, high, or_zero)
+        row, place = (int(i) for i in np.argwhere(~good)[0])
+        name = path if values.shape[1] == 1 else f"{path}[{place}]"
+        value = values[row, place]
+        return ctx.failed(
+            f"{value:g}",
+            f"{name} = {value:g} in {int((~good).any(axis=1).sum())} states",
+            ctx.at(ctx.states.topic, _at(ctx, row)),
+        )
     return None
 
 
@@ -77,7 +89,7 @@ def _span(ctx: Context, paths: Iterable[str]) -> str:
     """What the values are, for a verdict that says so."""
     low, high = np.inf, -np.inf
     for path in paths:
-        values = _values(ctx, path)
+        values = _distinct(ctx, path)
         low, high = min(low, float(values.min())), max(high, float(values.max()))
     return f"{low:g}" if low == high else f"{low:g} .. {high:g}"
 
@@ -186,7 +198,7 @@ def reserved(ctx: Context) -> Outcome:
         paths += [*_packets(ctx, "reserve"), "reserve"]
     most = (0, "")
     for path in paths:
-        values = _values(ctx, path)
+        values = _distinct(ctx, path)
         for place in range(values.shape[1]):
             most = max(most, (len(np.unique(values[:, place])), f"{path}[{place}]"))
     count, path = most
@@ -259,7 +271,7 @@ def sensor_temperature(ctx: Context) -> Outcome:
     # a slot without an element holds the code for that in its temperature, too
     wrong = None
     for path in paths:
-        values = _values(ctx, path)
+        values = _distinct(ctx, path)
         good = ((values >= low) & (values <= high)) | (values == ctx.tolerance("no_value"))
         if not good.all():
             wrong = wrong or _outside(ctx, [path], low, high)

@@ -1,0 +1,131 @@
+"""Payloads in a few buffers, and columns of them: the same as payloads one by one."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dexkit.messages import message_type
+from dexkit.messages.columns import Columns, Packed
+from tests.messages_helpers import messages
+
+PATHS = {
+    "unitree_go::msg::dds_::MotorStates_": (
+        "states",
+        ["states[0].q", "states[2].temperature", "states[].mode", "states[0].reserve"],
+    ),
+    "unitree_hg::msg::dds_::HandState_": (
+        "motor_state",
+        [
+            *("motor_state[1].q", "motor_state[].mode", "motor_state[0].temperature"),
+            *("press_sensor_state[0].pressure", "press_sensor_state[].lost"),
+            *("imu_state.quaternion", "imu_state.temperature", "error", "power_v"),
+        ],
+    ),
+}
+
+
+def packed(payloads: list[bytes], cuts: list[int], order: list[int]) -> Packed:
+    """``payloads`` in blocks that begin at ``cuts``, given in ``order``."""
+    edges = sorted({0, *(c for c in cuts if c < len(payloads)), len(payloads)})
+    blocks = [np.frombuffer(b"".join(payloads[a:b]), dtype=np.uint8) for a, b in pairwise(edges)]
+    sizes = np.array([len(p) for p in payloads], dtype=np.int64)
+    starts = np.cumsum(sizes) - sizes
+    which = np.array(order, dtype=np.intp)
+    return Packed(blocks, starts[which], sizes[which])
+
+
+def damaged(payload: bytes, at: int, value: int) -> bytes:
+    """``payload`` with one byte written over."""
+    at %= len(payload)
+    return payload[:at] + bytes([value]) + payload[at + 1 :]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.binary(max_size=9), max_size=12), st.data())
+def test_payloads_are_given_as_they_were_put_in(payloads: list[bytes], data: st.DataObject) -> None:
+    cuts = data.draw(st.lists(st.integers(0, 12), max_size=4))
+    order = data.draw(st.permutations(range(len(payloads))))
+    wanted = [payloads[i] for i in order]
+    given_ = packed(payloads, cuts, order)
+    groups = given_.alike()
+    tables = [(rows, given_.tables(rows)) for rows in groups]
+    found = {
+        int(row): table[at].tobytes()
+        for rows, pieces in tables
+        for table, begin in zip(pieces, np.cumsum([0, *map(len, pieces)]), strict=False)
+        for at, row in enumerate(rows[begin : begin + len(table)])
+    }
+    assert found == dict(enumerate(wanted))
+    for rows in groups:
+        found_kinds = {(len(w), w[:2] if len(w) > 1 else b"") for w in (wanted[i] for i in rows)}
+        assert len(found_kinds) == 1
+    assert [int(rows[0]) for rows in groups] == sorted(int(rows[0]) for rows in groups)
+    assert given_ == wanted
+    assert given_[1:] == wanted[1:]
+    assert [given_[i] for i in range(len(wanted))] == wanted
+    assert [packed(payloads, cuts, order)[i] for i in range(len(wanted))] == wanted
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.sampled_from(sorted(PATHS)), st.data())
+def test_columns_of_packed_payloads_are_those_of_single_ones(
+    name: str, data: st.DataObject
+) -> None:
+    mt = message_type(name)
+    sequence, paths = PATHS[name]
+    whole = [mt.encode(m) for m in data.draw(st.lists(messages(name, 3), min_size=1, max_size=3))]
+    kinds = st.one_of(
+        st.sampled_from(whole),
+        st.builds(damaged, st.sampled_from(whole), st.integers(0), st.integers(0, 255)),
+        st.builds(lambda p, n: p[: n % len(p)], st.sampled_from(whole), st.integers(0)),
+    )
+    payloads = data.draw(st.lists(kinds, max_size=20))
+    cuts = data.draw(st.lists(st.integers(0, 20), max_size=4))
+    order = (
+        list(range(len(payloads)))
+        if data.draw(st.booleans())
+        else data.draw(st.permutations(range(len(payloads))))
+    )
+    bulk = mt.columns(packed(payloads, cuts, order))
+    single = [mt.columns([payloads[i]]) for i in order]
+    assert {i: str(e) for i, e in bulk.errors.items()} == {
+        i: str(one.errors[0]) for i, one in enumerate(single) if one.errors
+    }
+    counts = [int(one.count(sequence)[0]) for one in single]
+    assert bulk.count(sequence).tolist() == counts
+    for path in paths:
+        _same(bulk, single, path)
+
+
+def _same(bulk: Columns, single: list[Columns], path: str) -> None:
+    column = bulk[path]
+    assert len(column) == len(single)
+    for row, one in enumerate(single):
+        value = one[path][0]
+        wide = np.full(column.shape[1:], np.nan)
+        wide[tuple(slice(n) for n in value.shape)] = value
+        assert np.array_equal(column[row], wide, equal_nan=True)
+    constant = bulk.constant(path)
+    if constant is not None:
+        assert not bulk.errors
+        assert constant.shape == (1, *column.shape[1:])
+        assert (column == constant).all() or np.isnan(constant).any()
+
+
+def test_a_member_that_never_changes_is_known_to() -> None:
+    mt = message_type("unitree_hg::msg::dds_::HandState_")
+    payloads = []
+    for i in range(1500):  # more than are taken at once, and the change comes late
+        message = mt.cls()
+        message.power_v = 24.0
+        message.power_a = 1.0 if i == 1400 else 0.0
+        payloads.append(mt.encode(message))
+    columns = mt.columns(payloads)
+    assert columns.constant("power_v") == [24.0]
+    assert columns.constant("power_a") is None
+    assert np.flatnonzero(columns["power_a"]).tolist() == [1400]
+    assert columns["power_v"].tolist() == [24.0] * 1500
