@@ -332,7 +332,8 @@ def _joints(columns: Columns, wire: Wire, side: Side, sequence: str, name: str) 
     """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
     first = wire.dialect.index[side]
     places = range(first, first + wire.joints)
-    return np.column_stack([columns[f"{sequence}[{i}].{name}"] for i in places])
+    # a joint's values lie together, for checks go joint by joint
+    return np.stack([columns[f"{sequence}[{i}].{name}"] for i in places]).T
 
 
 def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> Commands:
