@@ -129,3 +129,18 @@ def test_a_member_that_never_changes_is_known_to() -> None:
     assert columns.constant("power_a") is None
     assert np.flatnonzero(columns["power_a"]).tolist() == [1400]
     assert columns["power_v"].tolist() == [24.0] * 1500
+
+
+def test_one_odd_sample_leaves_the_small_members_of_the_others() -> None:
+    mt = message_type("unitree_hg::msg::dds_::HandState_")
+    payloads = []
+    for i in range(6):
+        message = mt.cls()
+        message.imu_state.temperature = i
+        payloads.append(mt.encode(message))
+    payloads[3] = damaged(payloads[3], 4, 200)  # of equal length, but it says 200 motors
+    columns = mt.columns(packed(payloads, [2], list(range(6))))
+    assert list(columns.errors) == [3]
+    seen = columns["imu_state.temperature"]
+    assert np.isnan(seen[3])
+    assert np.delete(seen, 3).tolist() == [0, 1, 2, 4, 5]

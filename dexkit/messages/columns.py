@@ -329,7 +329,8 @@ class _Words:
     def only(self, rows: NDArray[np.bool_]) -> _Words:
         """Some of the samples, the first among them."""
         out = copy(self)
-        out._columns = self._columns[: len(self._changing), rows]
+        # in order of columns, as they were: their bytes are looked at as other numbers
+        out._columns = np.ascontiguousarray(self._columns[: len(self._changing), rows])
         return out
 
     def varies(self, at: int) -> bool:
