@@ -661,6 +661,9 @@ _SHARED = {
     "TRACK-02": (shared.Delayed,),
 }
 
+# a velocity cannot be derived twice from states that come in bursts
+_SHARED_ALSO: dict[type, tuple[str, ...]] = {shared.Bursts: ("DEX3-FIELD-05",)}
+
 _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (NoLowRate, "TOPIC-03", ()),
     (LowRateIsFull, "TOPIC-03", ()),
@@ -683,16 +686,16 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (CoupledFinger, "JOINT-01", ()),
     (OneJointBackwards, "MOVE-01", ()),
     (OtherScale, "MOVE-02", ()),
-    (Hunts, "MOVE-03", ()),
+    (Hunts, "MOVE-03", ("SAFE-06",)),
     (Slow, "MOVE-04", ()),
     (Undamped, "MOVE-05", ()),
-    (Coupled, "SIDE-01", ()),
+    (Coupled, "SIDE-01", ("MOVE-07",)),
     # a hand that answers to the other side's topic does not answer to its own
     (of(shared.Swapped, Dex3Service), "SIDE-01", ("JOINT-01",)),
     (DefaultsForZeroGains, "GAIN-01", ()),
     (OwnStiffness, "GAIN-02", ()),
     (IdsFromOne, "MODE-01", ()),
-    (AlwaysDriven, "MODE-02", ()),
+    (AlwaysDriven, "MODE-02", ("LIFE-05",)),
     (IgnoresStatus, "MODE-03", ("MODE-02",)),
     (GoesById, "MODE-04", ()),
     (OddPackets, "SENS-01", ()),
@@ -717,7 +720,7 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
 
 ZOO: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     *(
-        (of(mixin, Dex3Service), f"DEX3-{kills}", ())
+        (of(mixin, Dex3Service), f"DEX3-{kills}", _SHARED_ALSO.get(mixin, ()))
         for kills, mixins in _SHARED.items()
         for mixin in mixins
     ),

@@ -546,5 +546,5 @@ class Delayed(Service):
         super().live(dt)
 
 
-DILUTED = ("StuttersUnderLoad", "FreezesOnce")
-"""What would weigh too much in the mean of a short run."""
+DILUTED = ("StuttersUnderLoad", "FreezesOnce", "StaleState", "Hunts")
+"""What would weigh too much in the mean of a short run, or shows elsewhere by chance of its phase."""
