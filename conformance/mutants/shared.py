@@ -547,4 +547,4 @@ class Delayed(Service):
 
 
 DILUTED = ("StuttersUnderLoad", "FreezesOnce", "StaleState", "Hunts")
-"""What would weigh too much in the mean of a short run, or shows elsewhere by chance of its phase."""
+"""What weighs too much in the mean of a short run, or shows elsewhere by chance of its phase."""
