@@ -19,6 +19,7 @@ import logging
 import math
 import os
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
@@ -48,6 +49,9 @@ _counters_log = logging.getLogger("dexkit.service.counters")
 
 _DISCOVERY = 0.3  # seconds to look for another publisher of the state topic
 _JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-out
+# seconds between the last state and the good-bye: a busy reader that learns of the good-bye
+# first drops the state, as from nobody, and goes on believing that the hand is driven
+_LAST_WORDS = 0.05
 
 
 class _Writer(Protocol):
@@ -243,6 +247,8 @@ class HandService:
             self._receiving.join()
         if self._writer is not None and self._receiving is not None:
             self._publish(self._compose(), low_rate=True)
+            if self.clients:
+                time.sleep(_LAST_WORDS)
         for entity in (self._reader, self._writer, self._low_rate_writer):
             if entity is not None:
                 entity.close()
