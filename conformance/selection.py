@@ -12,7 +12,7 @@ from dexkit.models import DEX1_1, DEX3_1, model
 
 __all__ = ["QUICK", "length", "print_selection", "quick"]
 
-QUICK = {DEX1_1.name: 6.0, DEX3_1.name: 15.0}
+QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0}
 """Seconds of stimulus of a quick run; starting a pair of hands and judging take some more."""
 
 
