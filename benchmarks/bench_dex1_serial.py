@@ -23,8 +23,8 @@ from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
 from dexkit.emulators.m4010 import emulated_dex1
 from dexkit.hand import HandCommand, Side
 from dexkit.wire import m4010
-from dexkit.wire.dex3_usb.units import NUDGE
 from dexkit.wire.m4010 import MotorCmd, MotorData
+from dexkit.wire.ris import NUDGE
 
 _SECONDS = 3.0
 _WANTED = 500.0

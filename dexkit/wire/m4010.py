@@ -26,14 +26,17 @@ from typing import NamedTuple, TypeAlias
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
 from dexkit.models import DEX1_1
 from dexkit.wire.crc32 import crc32_words
-from dexkit.wire.dex3_usb.layout import BROADCAST_ID, Field, Structure, ris_mode
-from dexkit.wire.dex3_usb.units import (
+from dexkit.wire.ris import (
+    BROADCAST_ID,
     MOTOR_VOLTAGE,
     NUDGE,
     POSITION,
     TEMPERATURE,
     WINDING_TEMPERATURE,
+    Field,
     Scale,
+    Structure,
+    ris_mode,
 )
 
 __all__ = [

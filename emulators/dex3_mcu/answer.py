@@ -23,6 +23,7 @@ from dexkit.wire.dex3_usb import (
     BusMap,
     units,
 )
+from dexkit.wire.ris import NUDGE
 
 __all__ = ["AnswerWriter"]
 
@@ -42,7 +43,7 @@ class AnswerWriter:
         self._model = model
         self._factors = [
             tuple(
-                scale.factor(joint.gear_ratio) * units.NUDGE
+                scale.factor(joint.gear_ratio) * NUDGE
                 for scale in (units.TORQUE, units.VELOCITY, units.POSITION)
             )
             for joint in DEX3_1.joints[body.side]
@@ -127,7 +128,7 @@ class AnswerWriter:
         self._pressure = key
         scale = units.PRESSURE
         with np.errstate(invalid="ignore"):
-            counts = np.clip(pressure * (scale.factor() * units.NUDGE), scale.low, scale.high)
+            counts = np.clip(pressure * (scale.factor() * NUDGE), scale.low, scale.high)
             counts = np.floor(counts)
         counts[counts == units.NO_VALUE] += 1.0  # a real reading is never "no value"
         counts[np.isnan(pressure)] = units.NO_VALUE

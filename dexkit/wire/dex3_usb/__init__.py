@@ -8,7 +8,6 @@
 
 from dexkit.wire.dex3_usb.codec import DEFAULT_BUS_MAP, BusMap, DecodedCommand, HandCodec
 from dexkit.wire.dex3_usb.layout import (
-    BROADCAST_ID,
     COMMAND_734,
     COMMAND_1234,
     COMMAND_HEAD,
@@ -19,14 +18,12 @@ from dexkit.wire.dex3_usb.layout import (
     N_BUSES,
     PRODUCT,
     PRODUCT_ID,
-    RIS_MODE,
     SENSOR_STATE,
     STATE,
     STATE_BUS_SIZE,
     STATE_HEAD,
     VENDOR_ID,
     CommandLayout,
-    ris_mode,
 )
 from dexkit.wire.dex3_usb.packets import (
     FROM_HAND,
@@ -45,6 +42,7 @@ from dexkit.wire.dex3_usb.packets import (
     scan_bus,
 )
 from dexkit.wire.dex3_usb.units import NO_VALUE, SCALES, Scale
+from dexkit.wire.ris import BROADCAST_ID, RIS_MODE, ris_mode
 
 __all__ = [
     "BROADCAST_ID",

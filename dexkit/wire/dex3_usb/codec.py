@@ -33,7 +33,6 @@ from dexkit.hand import (
 from dexkit.wire.crc32 import crc32_swapped
 from dexkit.wire.dex3_usb import units
 from dexkit.wire.dex3_usb.layout import (
-    BROADCAST_ID,
     COMMAND_1234,
     COMMAND_HEAD,
     MOTOR_CMD,
@@ -43,8 +42,6 @@ from dexkit.wire.dex3_usb.layout import (
     STATE,
     STATE_BUS_SIZE,
     CommandLayout,
-    Structure,
-    ris_mode,
 )
 from dexkit.wire.dex3_usb.packets import (
     FROM_HAND,
@@ -62,6 +59,7 @@ from dexkit.wire.dex3_usb.packets import (
     parse_command,
     scan_bus,
 )
+from dexkit.wire.ris import BROADCAST_ID, NUDGE, Structure, ris_mode
 
 __all__ = ["DEFAULT_BUS_MAP", "BusMap", "DecodedCommand", "HandCodec"]
 
@@ -431,7 +429,7 @@ class _CommandEncoder:
         self._ones = np.ones(5 * n)
         self._counts = np.zeros((5, n))
         ordered = [ratios[i] for i in order]
-        self._factors = np.array([[s.factor(r) * units.NUDGE for r in ordered] for s in scales])
+        self._factors = np.array([[s.factor(r) * NUDGE for r in ordered] for s in scales])
         self._low = np.array([[float(s.low)] * n for s in scales])
         self._high = np.array([[float(s.high)] * n for s in scales])
         self._short_counts = self._counts[:4].reshape(2, 2, n).transpose(2, 0, 1)

@@ -29,9 +29,8 @@ from dexkit.wire.dex3_usb.layout import (
     STATE,
     STATE_BUS_SIZE,
     CommandLayout,
-    Structure,
-    ris_mode,
 )
+from dexkit.wire.ris import Structure, ris_mode
 
 __all__ = [
     "CommandFrame",

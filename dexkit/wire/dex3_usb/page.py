@@ -24,13 +24,11 @@ from dexkit.wire.dex3_usb.layout import (
     N_BUSES,
     PRODUCT,
     PRODUCT_ID,
-    RIS_MODE,
     SENSOR_STATE,
     STATE,
     STATE_BUS_SIZE,
     VENDOR_ID,
     CommandLayout,
-    Structure,
 )
 from dexkit.wire.dex3_usb.packets import (
     CommandFrame,
@@ -39,6 +37,7 @@ from dexkit.wire.dex3_usb.packets import (
     SensorState,
     pack_command,
 )
+from dexkit.wire.ris import RIS_MODE, Structure
 
 __all__ = ["BLOCKS", "PAGE", "fill", "main", "worked_example"]
 

@@ -10,9 +10,14 @@ damping go with 1 / ratio².
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-from dexkit.errors import EncodeError
+from dexkit.wire.ris import (
+    MOTOR_VOLTAGE,
+    POSITION,
+    TEMPERATURE,
+    WINDING_TEMPERATURE,
+    Scale,
+)
 
 __all__ = [
     "ACCELERATION",
@@ -40,56 +45,9 @@ _INT16 = (-0x8000, 0x7FFF)
 _UINT16 = (0, 0xFFFF)
 
 
-@dataclass(frozen=True)
-class Scale:
-    """How a quantity is counted.
-
-    :param counts: per SI unit, on the rotor's side where ``power`` is not 0.
-    :param power: of the gear ratio by which the counts of a joint's SI unit grow.
-    :param low: lowest count; -32768 and so on, or 0 for what must not be negative.
-    :param high: highest count.
-    """
-
-    name: str
-    fields: tuple[str, ...]
-    unit: str
-    counts: float
-    low: int
-    high: int
-    power: int = 0
-
-    def factor(self, ratio: float = 1.0) -> float:
-        """Counts per SI unit of a joint with that gear ratio."""
-        return self.counts * ratio**self.power
-
-    def encode(self, value: float, ratio: float = 1.0) -> int:
-        """Counts of ``value``: toward zero (as the vendor's library, facts C.9), saturated.
-
-        :raises EncodeError: ``value`` is NaN or infinite.
-        """
-        if not math.isfinite(value):
-            raise EncodeError(f"{self.name} = {value} cannot be sent")
-        return int(min(max(value * self.factor(ratio) * NUDGE, self.low), self.high))
-
-    def decode(self, count: int, ratio: float = 1.0) -> float:
-        """SI value of ``count``."""
-        return count / self.factor(ratio)
-
-    def limits(self, ratio: float = 1.0) -> tuple[float, float]:
-        """Lowest and highest SI value that the wire holds."""
-        return self.decode(self.low, ratio), self.decode(self.high, ratio)
-
-
-NUDGE = 1 + 2**-50
-"""Makes up for the rounding of a division and a multiplication, so that a decoded count encodes
-to itself and not to its neighbour; far below one count otherwise."""
-
 _FULL_SCALE = 65536.0
 _ADC = 3.3
 
-POSITION = Scale(
-    "position", ("pos_des", "pos"), "rad", 32768 / (2 * math.pi), -(2**31), 2**31 - 1, 1
-)
 VELOCITY = Scale(
     "velocity", ("spd_des", "speed"), "rad/s", 256 / (2 * math.pi) / 100, *_INT16, power=1
 )
@@ -98,9 +56,6 @@ TORQUE = Scale("torque", ("tor_des", "torque"), "N·m", 256e3, *_INT16, power=-1
 STIFFNESS = Scale("stiffness", ("k_pos",), "N·m/rad", 1280e3, 0, 0x7FFF, power=-2)
 DAMPING = Scale("damping", ("k_spd",), "N·m·s/rad", 1280e3 * 100, 0, 0x7FFF, power=-2)
 
-TEMPERATURE = Scale("temperature", ("temp", "temperature"), "°C", 1.0, -128, 127)
-WINDING_TEMPERATURE = Scale("winding temperature", ("sensor",), "°C", 1.0, 0, 255)
-MOTOR_VOLTAGE = Scale("motor voltage", ("vol",), "V", 2.0, 0, 255)
 PRESSURE = Scale("pressure", ("pressure",), "Pa", 1 / 8, *_UINT16)
 # vin_v stands beside the formula of the current in the manual; by its name it is a voltage
 VOLTAGE = Scale("voltage", ("pin_v", "vin_v", "vm_v"), "V", _FULL_SCALE / (_ADC * 21.0), *_UINT16)
