@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import ctypes
 import math
-import shutil
-import subprocess
 import tempfile
 import threading
 import time
 import timeit
 from collections.abc import Callable
-from pathlib import Path
 
 from benchmarks import Result
+from benchmarks.native import compiled
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
 from dexkit.emulators.m4010 import emulated_dex1
 from dexkit.hand import HandCommand, Side
@@ -81,16 +79,11 @@ def _codec() -> list[Result]:
         lambda n: timeit.timeit(pack, number=n),
         lambda n: timeit.timeit(parse, number=n),
     ]
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        best = [*_best(*ours), math.nan, math.nan]
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            target = Path(folder) / "m4010.so"
-            source = Path(__file__).with_name("m4010.c")
-            subprocess.run([compiler, "-O2", "-shared", "-fPIC", "-o", target, source], check=True)
-            library = ctypes.CDLL(str(target))
-            library.prepare()
+    with tempfile.TemporaryDirectory() as folder:
+        library = compiled("m4010", folder)
+        if library is None:
+            best = [*_best(*ours), math.nan, math.nan]
+        else:
             scales = (m4010.TORQUE, m4010.VELOCITY, m4010.POSITION, m4010.STIFFNESS, m4010.DAMPING)
             factors = (ctypes.c_double * 5)(*(s.factor(m4010.GEAR_RATIO) * NUDGE for s in scales))
             given, out = (ctypes.c_double * 5)(*values), (ctypes.c_double * 3)()

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import ctypes
 import math
-import shutil
 import struct
-import subprocess
 import tempfile
 import time
 import timeit
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks import Result
+from benchmarks.native import compiled
 from dexkit.hand import HandCommand, HandState, ImuState, Side, SupplyState
 from dexkit.models import DEX3_1
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP, HandCodec, units
+from dexkit.wire.ris import NUDGE
 
 C_PEER = "C, table CRC (-O2)"
 PYTHON_PEER = "Python, table CRC"
@@ -81,19 +80,6 @@ def plain_decode(data: bytes) -> tuple[list[tuple[int, ...]], list[tuple[int, ..
     return motors, sensors
 
 
-def _compiled(folder: str) -> ctypes.CDLL | None:
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        return None
-    target = Path(folder) / "dex3_crc.so"
-    source = Path(__file__).with_name("dex3_crc.c")
-    subprocess.run([compiler, "-O2", "-shared", "-fPIC", "-o", target, source], check=True)
-    library = ctypes.CDLL(str(target))
-    library.crc_words.restype = ctypes.c_uint32
-    library.prepare()
-    return library
-
-
 def _best(*functions: Callable[[int], object]) -> list[float]:
     """Best time of one call of each, in µs; short runs in turn get past a busy machine."""
     numbers = []
@@ -141,7 +127,7 @@ def run() -> list[Result]:
     answer = codec.encode_state(state)
     fields = ("tau", "dq", "q", "kp", "kd")
     rows = np.array([[getattr(command, name)[i] for name in fields] for i in range(7)])
-    factors = np.array([[s.factor(j.gear_ratio) * units.NUDGE for s in ORDER] for j in JOINTS])
+    factors = np.array([[s.factor(j.gear_ratio) * NUDGE for s in ORDER] for j in JOINTS])
     row_list, factor_list = rows.tolist(), factors.tolist()
     assert plain_encode(row_list, factor_list) == codec.encode(command, True)
     assert len(plain_decode(answer)[0]) == 7
@@ -168,7 +154,7 @@ def run() -> list[Result]:
         ("CRC of a motor command, 16 bytes", "", 0.0),
     ]
     with tempfile.TemporaryDirectory() as folder:
-        library = _compiled(folder)
+        library = compiled("dex3_crc", folder)
         theirs = _c_loops(library, codec, command, state, answer, rows, factors) if library else []
         best = _best(*ours, *plain, *theirs)
     results = []

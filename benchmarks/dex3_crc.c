@@ -1,7 +1,6 @@
 /* The Dex3-1's frames in C, as a C++ program after the manual would do them: the peer of
  * bench_dex3_usb_codec.py. Written from docs/dex3-protocol.md; little-endian hosts only. */
-#include <stdint.h>
-#include <string.h>
+#include "motor_crc.h"
 
 enum { BUSES = 5, MOTORS = 7, SENSORS = 9, BUFFER = 240, COMMAND = 1234, STATE = 1270 };
 
@@ -10,32 +9,7 @@ static const int motor_id[MOTORS] = {0, 1, 2, 0, 1, 0, 1};
 static const int sensor_bus[SENSORS] = {0, 0, 1, 1, 2, 2, 3, 3, 3};
 static const int sensor_id[SENSORS] = {0, 1, 0, 1, 0, 1, 0, 1, 2};
 
-static uint32_t table[256];
-
-void prepare(void) {
-    for (uint32_t i = 0; i < 256; i++) {
-        uint32_t c = i << 24;
-        for (int bit = 0; bit < 8; bit++) c = c & 0x80000000u ? (c << 1) ^ 0x04C11DB7u : c << 1;
-        table[i] = c;
-    }
-}
-
-uint32_t crc_words(const uint8_t *data, int words) {
-    uint32_t crc = 0xFFFFFFFFu;
-    for (int i = 0; i < words; i++) {
-        uint32_t word;
-        memcpy(&word, data + 4 * i, 4);
-        for (int shift = 24; shift >= 0; shift -= 8)
-            crc = (crc << 8) ^ table[((crc >> 24) ^ (word >> shift)) & 0xFF];
-    }
-    return crc;
-}
-
 static void put(uint8_t *at, const void *value, int size) { memcpy(at, value, size); }
-
-static int32_t within(double value, double low, double high) {
-    return (int32_t)(value < low ? low : value > high ? high : value);
-}
 
 /* values: tau, dq, q, kp, kd of each motor; factors: their counts per SI unit */
 void encode(const double *values, const double *factors, int status, int timeout, uint8_t *out) {
