@@ -9,8 +9,10 @@ import tempfile
 import time
 import timeit
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks import Result
 from benchmarks.native import compiled
@@ -99,7 +101,7 @@ def _best(*functions: Callable[[int], object]) -> list[float]:
     return best
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
@@ -185,8 +187,8 @@ def _c_loops(
     command: HandCommand,
     state: HandState,
     answer: bytes,
-    rows: np.ndarray,
-    factors: np.ndarray,
+    rows: NDArray[np.float64],
+    factors: NDArray[np.float64],
 ) -> list[Callable[[int], object]]:
     """The C functions, checked against ours first."""
     out = np.zeros(1234, np.uint8)

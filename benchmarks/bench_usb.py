@@ -73,7 +73,7 @@ def _measure(exchange: Callable[[], object], rate: float | None = None) -> _Figu
 # --- the peer
 
 
-class _Pipes(Interface):
+class _Pipes(Interface):  # type: ignore[misc]
     out = Out(_OUT, "bulk", mps=512)
     into = In(_IN, "bulk", mps=512)
 

@@ -12,15 +12,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import RECORD, Stall, Stimulus
+from dexkit.conformance.phases import RECORD, Phase, Stall, Stimulus
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Verdict, read_json, worst
 from dexkit.conformance.view import Recording, detect_dialect, sides_of
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.hand import Side
+from dexkit.messages import message_type
 from dexkit.models import dialect
-from dexkit.traces import open_trace, sample_labels, sample_path
+from dexkit.traces import Recorder, open_trace, sample_labels, sample_path
 from tests.conformance_helpers import copy_of, failed, of, short_run
 
 STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
@@ -29,6 +30,21 @@ CMD = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
 
 def judged(trace: MemoryTrace) -> RunResult:
     return judge(Recording.of(trace))
+
+
+@pytest.mark.parametrize("sent", [(Side.LEFT,), ()])
+def test_only_somebody_elses_second_type_is_worth_a_note(
+    tmp_path: Path, sent: tuple[Side, ...]
+) -> None:
+    path = tmp_path / "two.mcap"
+    stimulus = Stimulus(phases=[Phase("foreign", sent, 1)] if sent else [])
+    with Recorder(path) as recorder:
+        recorder.add_metadata(RECORD, stimulus.to_metadata())
+        for kind in (CMD[1], "unitree_hg::msg::dds_::HandCmd_"):
+            message = message_type(kind)
+            recorder.put(CMD[0], kind, message.encode(message.cls()), log_time_ns=1)
+    notes = Recording.of(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)).notes
+    assert any("carries 2 types" in note for note in notes) is not bool(sent)
 
 
 # ------------------------------------------------------------------------- genuine recordings
