@@ -380,6 +380,7 @@ def test_watching_says_when_a_client_would_start() -> None:
             _gripper(world, world.node("watch"))
             world.start()
             assert any("a client would now start" in line for line in lines)
+        assert any("DDS-NOBODY" in line for line in lines)
         process.send_signal(2)
         process.stdout.read()
-        assert process.wait(20) == 0
+        assert process.wait(20) == 1  # as the last look found

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from dexkit.doctor import DIAGNOSES, Observations, Severity, Wish, diagnose, readiness, verdict
 from dexkit.doctor.catalogue import table
@@ -22,6 +24,7 @@ from dexkit.doctor.observations import (
     Stream,
     UsbDevice,
 )
+from dexkit.doctor.report import print_report
 from dexkit.doctor.topics import nearly
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
@@ -309,3 +312,12 @@ def test_a_name_of_its_own(topic: str) -> None:
 def test_the_docs_have_the_table() -> None:
     page = Path(__file__).parent.parent / "docs" / "doctor.md"
     assert table() in page.read_text(), "python -m dexkit.doctor.catalogue prints the table"
+
+
+def test_topics_are_whole_in_a_narrow_terminal() -> None:
+    seen = _seen(_legacy())
+    text = io.StringIO()
+    console = Console(file=text, width=80)
+    print_report(console, seen, [], verdict(seen, [], Wish()), [])
+    assert "…" not in text.getvalue()
+    assert all(e.topic in text.getvalue() for view in seen.domains for e in view.endpoints)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 _REFRESH = 1.0  # seconds between looks
+_MODEL_NAMES = {name.partition("-")[0]: name for name in MODELS}
 
 
 def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int]:
@@ -62,7 +63,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     help="Look at this network interface as well as at lo; may be repeated.",
 )
 @click.option(
-    "--model", type=click.Choice(["dex1", "dex3"]), help="Only this hand counts.  [default: any]"
+    "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand counts.  [default: any]"
 )
 @click.option("--dialect", type=click.Choice(list(DIALECTS)), help="Only this dialect counts.")
 @click.option(
@@ -99,7 +100,8 @@ def command(
     stays on this machine unless --interface names a network. A servo on a named serial port is
     asked who it is, and nothing else.
 
-    Exit codes: 0 healthy, 1 problems found, 2 it could not look, 130 interrupted.
+    Exit codes: 0 healthy, 1 problems found, 2 it could not look, 130 interrupted. Ctrl-C ends a
+    watch with the code of its last complete look.
     """
     from dexkit.doctor import Wish, diagnose, readiness, verdict
     from dexkit.doctor.environment import environment
@@ -109,7 +111,7 @@ def command(
     wish = Wish(domain, _dialects(model, dialect), bool(devices) and domain is None)
     with stop_on_signals() as stop, ThreadPoolExecutor(1) as beside:
         env = beside.submit(environment)  # it starts processes, which takes a second
-        first = True
+        last: int | None = None
         before = ""
         while True:
             seen = _look(
@@ -119,11 +121,10 @@ def command(
                 seconds,
                 env.result,
                 stop,
-                _progress(quiet=as_json or not first),
+                _progress(quiet=as_json or last is not None),
             )
             if stop:
-                # a watch is ended like this; a single look is cut short
-                return 0 if watch and not first else 130
+                return 130 if last is None else last
             findings = diagnose(seen, wish)
             states = readiness(seen, wish)
             said = verdict(seen, findings, wish)
@@ -137,23 +138,22 @@ def command(
             else:
                 key = json.dumps([[f.id, f.where] for f in findings] + [str(s) for s in states])
                 if key != before:
-                    _print(seen, findings, said, states, watch=watch, first=first)
+                    _print(seen, findings, said, states, watch=watch, first=last is None)
                 before = key
-            first = False
+            last = 0 if said.healthy else 1
             if not watch:
-                return 0 if said.healthy else 1
+                return last
             stop.wait(_REFRESH)
 
 
 def _dialects(model: str | None, dialect: str | None) -> tuple[Dialect, ...]:
-    names = {"dex1": "dex1-1", "dex3": "dex3-1"}
     if dialect is not None:
         chosen = DIALECTS[dialect]
-        if model is not None and chosen.model != names[model]:
-            raise UsageError(f"--dialect {dialect} is not one of {names[model]}")
+        if model is not None and chosen.model != _MODEL_NAMES[model]:
+            raise UsageError(f"--dialect {dialect} is not one of {_MODEL_NAMES[model]}")
         return (chosen,)
     # every dialect of a model would be one too many: which it is shows when it is seen
-    return MODELS[names[model]].dialects if model is not None else ()
+    return MODELS[_MODEL_NAMES[model]].dialects if model is not None else ()
 
 
 def _look(

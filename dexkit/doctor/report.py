@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
@@ -77,8 +77,16 @@ def print_report(
     for state in states:
         text = "a client gets past its wait" if state.ready else f"a client waits: {state.missing}"
         console.print(f"\ndomain {state.domain}, {state.dialect}: {escape(text)}", highlight=False)
+    # topics are compared letter for letter, so they are never cut: other columns give way
     table = Table(
-        "domain", "topic", "type", "what", "Hz", "process", box=None, padding=(0, 2, 0, 0)
+        "domain",
+        Column("topic", no_wrap=True),
+        Column("type", overflow="fold"),
+        Column("what", no_wrap=True),
+        Column("Hz", no_wrap=True),
+        Column("process", overflow="fold"),
+        box=None,
+        padding=(0, 2, 0, 0),
     )
     for view in seen.domains:
         for endpoint in view.endpoints:
