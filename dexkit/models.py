@@ -15,6 +15,7 @@ from dexkit.hand import HandSpec, JointSpec, Side
 __all__ = [
     "DEX1_1",
     "DEX3_1",
+    "DEX5_1",
     "DIALECTS",
     "MODELS",
     "Dialect",
@@ -36,6 +37,7 @@ class Dialect:
     :param q_open: q of a fully open gripper, rad, where 0 is closed; NaN for hands whose joints
         have no such scale.
     :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
+    :param torque_units: N·m in one unit of a motor's tau and tau_est; empty where all are in N·m.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Dialect:
     q_open: float
     summary: str
     low_rate_topic: str = ""
+    torque_units: tuple[float, ...] = ()
 
     def topics(self, side: Side) -> tuple[str, str]:
         """(command topic, state topic) of a side."""
@@ -76,11 +79,14 @@ class HandModel:
     :param command_rate: Hz at which xr_teleoperate sends commands.
     :param command_timeout: seconds without a command after which the vendor's service brakes.
     :param vendor_ids: id on the vendor's bus, for a hand of one motor.
-    :param client_gains: kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends.
+    :param client_gains: kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends, to every
+        joint that ``joint_gains`` does not name.
+    :param joint_gains: those that it sends to some joints, by index.
     :param rest_q: where a simulated hand rests at first, per side, rad; never all zero, because
         clients wait for a position that is not.
     :param sensors: pressure sensor packets of a state, in order.
     :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
+    :param shared_motors: joints that one motor moves, by index; the others have one each.
     """
 
     name: str
@@ -96,6 +102,21 @@ class HandModel:
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
     low_rate: float = 0.0
+    joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
+    shared_motors: tuple[tuple[int, ...], ...] = ()
+
+    @property
+    def gains(self) -> tuple[tuple[float, float], ...]:
+        """(kp, kd) that xr_teleoperate sends to each joint."""
+        count = len(self.joints[Side.LEFT])
+        return tuple(self.joint_gains.get(i, self.client_gains) for i in range(count))
+
+    @property
+    def motors(self) -> tuple[tuple[int, ...], ...]:
+        """The joints of each motor, by index, in the order of the joints."""
+        shared = {i: group for group in self.shared_motors for i in group}
+        count = len(self.joints[Side.LEFT])
+        return tuple(dict.fromkeys(shared.get(i, (i,)) for i in range(count)))
 
     def spec(
         self,
@@ -177,6 +198,21 @@ DIALECTS: dict[str, Dialect] = {
             summary="Dex3-1 of G1: 7 motors in the order of the IDL, RIS_Mode in the mode byte",
             # F A.1: the only state topic to which the vendor's C++ example subscribes
             low_rate_topic="rt/lf/dex3/{side}/state",
+        ),
+        Dialect(
+            name="dex5",
+            model="dex5-1",
+            cmd_topic="rt/dex5/{side}/cmd",
+            state_topic="rt/dex5/{side}/state",
+            cmd_type="unitree_hg::msg::dds_::HandCmd_",
+            state_type="unitree_hg::msg::dds_::HandState_",
+            index={Side.LEFT: 0, Side.RIGHT: 0},
+            length=20,
+            q_open=math.nan,
+            summary="Dex5-1: 20 joints, fingers first, thumb last; mode 1 is position control",
+            # F B.5: a comment in xr_teleoperate says that fingers report in mN m, the thumb in
+            # N m. Uncertain; the only statement there is.
+            torque_units=(0.001,) * 16 + (1.0,) * 4,
         ),
     )
 }
@@ -271,7 +307,88 @@ DEX3_1 = HandModel(
     low_rate=20.0,  # inferred: the sources give a topic and no rate (F A.1)
 )
 
-MODELS: dict[str, HandModel] = {m.name: m for m in (DEX1_1, DEX3_1)}
+
+def _dex5_joints(side: Side) -> tuple[JointSpec, ...]:
+    """The 20 joints in the order of the IDL: index, middle, ring and little finger, thumb.
+
+    Everything about this hand is from a pull request to xr_teleoperate that was open when it was
+    read, and from Unitree's URDF (F B.5). Names are the URDF's without the side's letter; the
+    left URDF calls joint 41 Link_41L. Limits: URDF; only Roll_12 is mirrored. dq_max and tau_max:
+    the left URDF, for both sides: the right one has zeros for torques and for the fingers'
+    sideways joints.
+    """
+    letter = "L" if side is Side.LEFT else "R"
+    across = -1 if side is Side.LEFT else 1
+
+    def joint(
+        name: str, low: float, high: float, flexing: int, dq_max: float, urdf: str = ""
+    ) -> JointSpec:
+        return JointSpec(
+            name,
+            q_min=low,
+            q_max=high,
+            dq_max=dq_max,
+            tau_max=0.93,
+            closing=flexing,
+            urdf=f"{urdf or name}{letter}",
+        )
+
+    fingers = [
+        spec
+        for finger in (2, 3, 4, 5)
+        for spec in (
+            joint(
+                f"Roll_{finger}1",
+                -0.38397,
+                0.38397,
+                0,
+                0.76794,
+                "Link_41" if (finger, side) == (4, Side.LEFT) else "",
+            ),
+            joint(f"Pitch_{finger}2", 0.0, 1.5708, 1, 3.1416),
+            joint(f"Pitch_{finger}3", 0.0, 1.68424, 1, 3.3685),
+            joint(f"Pitch_{finger}4", 0.0, 1.3963, 1, 2.7925),
+        )
+    ]
+    low, high = sorted((0.0, across * 1.8151))
+    return (
+        *fingers,
+        joint("Yaw_11", -0.5867, 0.6803, 0, 4.18),
+        joint("Roll_12", low, high, across, 4.18),
+        joint("Pitch_13", 0.0, 1.7652, 1, 4.18),
+        joint("Pitch_14", 0.0, 1.6406, 1, 4.18),
+    )
+
+
+# half relaxed, clear of all stops
+_DEX5_FINGER_REST = (0.03, 0.31, 0.34, 0.28)
+_DEX5_THUMB_REST = (0.05, 0.36, 0.35, 0.33)
+
+DEX5_1 = HandModel(
+    name="dex5-1",
+    title="Dex5-1 hand",
+    joints={side: _dex5_joints(side) for side in Side},
+    dialects=tuple(d for d in DIALECTS.values() if d.model == "dex5-1"),
+    # inferred: no source gives a rate; a client polls every 2 ms (F B.1)
+    state_rate=500.0,
+    min_state_rate=200.0,  # inferred: twice the client's command rate, as for the others
+    command_rate=100.0,  # F B.1
+    command_timeout=1.0,  # inferred: that of its relatives
+    client_gains=(0.10, 0.001),  # F B.1, the fingers
+    joint_gains=dict.fromkeys(range(16, 20), (1.0, 0.02)),  # F B.1, the thumb
+    rest_q={
+        side: (
+            *(4 * _DEX5_FINGER_REST),
+            *(-q if (i, side) == (1, Side.LEFT) else q for i, q in enumerate(_DEX5_THUMB_REST)),
+        )
+        for side in Side
+    },
+    # derived: 16 motors for 20 joints (F B.5) leave four each for thumb and fingers less one in
+    # each finger, and what a finger of four joints shares is its two outer ones. Uncertain.
+    shared_motors=((2, 3), (6, 7), (10, 11), (14, 15)),
+)
+
+MODELS: dict[str, HandModel] = {m.name: m for m in (DEX1_1, DEX3_1, DEX5_1)}
 
 
 def model(name: str) -> HandModel:
