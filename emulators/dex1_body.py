@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dexkit.emulators.mechanics import Joint, Wall
 from dexkit.errors import UsageError
-from dexkit.hand import JointMode, Side
+from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX1_1
 from dexkit.wire.m4010 import STROKE
 
@@ -89,6 +89,33 @@ class Dex1Body:
         """Obey the motor's law from here on; SI units."""
         self.mode = JointMode.FOC
         self._q, self._dq, self._tau, self._kp, self._kd = q, dq, tau, kp, kd
+
+    def stop(self) -> None:
+        """Stand still at once."""
+        self.joint.dq = 0.0
+
+    def use(self, command: HandCommand) -> None:
+        """Obey a command for its one joint."""
+        if not command.mode[0]:
+            self.brake()
+            return
+        self.drive(
+            float(command.q[0]),
+            float(command.dq[0]),
+            float(command.tau[0]),
+            float(command.kp[0]),
+            float(command.kd[0]),
+        )
+
+    def state(self, stamp: float) -> HandState:
+        """What can be seen, measured at ``stamp``; heat and voltage are not modelled: NaN."""
+        return HandState.of(
+            self.joint.q,
+            dq=self.joint.dq,
+            tau_est=self.torque,
+            mode=self.mode,
+            stamp=stamp,
+        )
 
     def step(self, n: int = 1) -> None:
         """Live ``n`` steps."""

@@ -59,7 +59,14 @@ backend = Backend(summary="A hand of mine", model="dex1-1", make=lambda o: Scrip
 class TestByName:
     def test_the_built_in_ones(self) -> None:
         names = {row.name: row for row in list_backends()}
-        assert {"dex1-serial", "ezgripper", "sim-dex1", "sim-dex3", "dex3-usb"} <= names.keys()
+        assert {
+            "dex1-serial",
+            "ezgripper",
+            "sim-dex1",
+            "sim-dex3",
+            "sim-dex5",
+            "dex3-usb",
+        } <= names.keys()
         for row in names.values():
             if row.origin.startswith("dexkit "):
                 assert row.backend is not None, row.error

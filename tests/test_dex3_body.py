@@ -9,14 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.emulators.dex3_body import (
-    AMBIENT,
-    F_1515_108,
-    F_1515_214,
-    STEP,
-    Dex3Body,
-    MotorModel,
-)
+from dexkit.emulators.dex3_body import F_1515_108, F_1515_214, Dex3Body
+from dexkit.emulators.finger_body import AMBIENT, STEP, MotorModel
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1

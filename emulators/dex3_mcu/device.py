@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.clock import Clock, RealClock
-from dexkit.emulators.dex3_body import AMBIENT, STEP, Dex3Body
+from dexkit.emulators.dex3_body import Dex3Body
 from dexkit.emulators.dex3_mcu.answer import AnswerWriter
 from dexkit.emulators.dex3_mcu.command import CommandReader, MotorCommand
 from dexkit.emulators.dex3_mcu.settings import Firmware
 from dexkit.emulators.faults import Fault, FaultSchedule
+from dexkit.emulators.finger_body import AMBIENT, STEP
 from dexkit.errors import ChecksumError, WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.models import DEX3_1

@@ -1,0 +1,93 @@
+"""A hand that is only a body, with no device or wire around it.
+
+The command in force stays in force until the next one, as in a real motor.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from dexkit.backends import BackendOptions
+from dexkit.clock import Clock, RealClock
+from dexkit.emulators.mechanics import FixedSteps
+from dexkit.errors import HandLost, UsageError
+from dexkit.hand import HandCommand, HandSpec, HandState
+
+__all__ = ["Body", "SimulatedHand", "number"]
+
+
+class Body(Protocol):
+    """Mechanics on steps instead of a clock."""
+
+    def brake(self) -> None:
+        """Brake every joint."""
+
+    def stop(self) -> None:
+        """Stand still at once."""
+
+    def step(self, n: int = 1) -> None:
+        """Live ``n`` steps."""
+
+    def use(self, command: HandCommand) -> None:
+        """Obey ``command`` from here on."""
+
+    def state(self, stamp: float) -> HandState:
+        """What can be seen, measured at ``stamp``."""
+
+
+class SimulatedHand:
+    """A body on a clock.
+
+    :param step: seconds of one step of the body.
+    :param clock: real time unless given; with a manual clock the hand is deterministic. A pause
+        of the caller of more than half a second is not lived through.
+    """
+
+    def __init__(self, spec: HandSpec, body: Body, step: float, clock: Clock | None = None) -> None:
+        self._spec = spec
+        self._body = body
+        self._clock: Clock = clock or RealClock()
+        self._steps = FixedSteps(step, most=0.5)
+        self._open = False
+
+    @property
+    def spec(self) -> HandSpec:
+        """What this hand is."""
+        return self._spec
+
+    def open(self) -> None:
+        """Start to live; brakes until the first command."""
+        self._body.brake()
+        self._steps.restart(self._clock.now())
+        self._open = True
+
+    def close(self) -> None:
+        """Stop where it is."""
+        self._open = False
+        self._body.stop()
+
+    def exchange(self, command: HandCommand) -> HandState:
+        """Live up to now under the command before, take this one, and say where the hand is.
+
+        :raises HandLost: the hand is not open.
+        """
+        if not self._open:
+            raise HandLost("the simulated hand is not open")
+        now = self._clock.now()
+        self._body.step(self._steps.due(now))
+        self._body.use(command)
+        return self._body.state(now)
+
+
+def number(options: BackendOptions, key: str) -> float | None:
+    """A setting that is a number; None where it is not given.
+
+    :raises UsageError: it is not one.
+    """
+    text = options.settings.get(key)
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{key}={text} is not a number") from None
