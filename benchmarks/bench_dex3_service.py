@@ -28,7 +28,7 @@ from dexkit.errors import DexkitError
 from dexkit.hand import Floats, HandCommand, Side
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, dialect
-from dexkit.service.dex3_state import Dex3StateEncoder
+from dexkit.service.finger_state import FingerStateEncoder
 from dexkit.service.realtime import precise_timers, real_time
 
 _DEX3 = dialect("dex3")
@@ -157,7 +157,7 @@ def _encoder() -> list[Result]:
     hand = SimDex3(Side.LEFT)
     hand.open()
     state = hand.exchange(HandCommand.brake(hand.spec.n_joints))
-    encoder = Dex3StateEncoder(hand.spec)
+    encoder = FingerStateEncoder(hand.spec)
     kind = message_type(_DEX3.state_type)
     fault = (0,) * hand.spec.n_joints
     message = kind.decode(encoder.encode(state, fault))

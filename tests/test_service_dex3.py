@@ -31,8 +31,8 @@ from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import HandService, Publisher
 from dexkit.service.core import HandCore
-from dexkit.service.dex3_state import Dex3StateEncoder
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.service.finger_state import FingerStateEncoder
 from tests.service_helpers import FakeNode, wait_until
 
 DEX3 = dialect("dex3")
@@ -227,8 +227,8 @@ class TestState:
             assert packet.pressure[0] == pytest.approx(reading, abs=0.003)
 
     def test_one_state_leaves_nothing_in_the_next(self) -> None:
-        encoder = Dex3StateEncoder(spec())
-        fresh = Dex3StateEncoder(spec()).encode(HandState.of([0.1] * N, stamp=0.0), (0,) * N)
+        encoder = FingerStateEncoder(spec())
+        fresh = FingerStateEncoder(spec()).encode(HandState.of([0.1] * N, stamp=0.0), (0,) * N)
         encoder.encode(full_state(), self.VIEW.fault, 3, self.VIEW.tripped)
         assert encoder.encode(HandState.of([0.1] * N, stamp=0.0), (0,) * N) == fresh
 

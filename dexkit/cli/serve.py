@@ -70,8 +70,9 @@ _LONELY = 10.0  # seconds without a client before a hint
 @click.option(
     "--dialect",
     type=click.Choice(list(DIALECTS)),
-    help="Topics, types and units.  [default: the model's first: unitree_go for a Dex1-1, "
-    "dex3 for a Dex3-1]",
+    help="Topics, types and units.  [default: the model's first: "
+    + ", ".join(f"{m.dialects[0].name} for a {m.name}" for m in MODELS.values())
+    + "]",
 )
 @dds_options(default_domain=None)
 @click.option(

@@ -32,7 +32,9 @@ _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
 _DRIVER_BAUD = 1_000_000
 _DURABILITY = ("volatile", "transient_local", "transient", "persistent")
 # xr_teleoperate v1.1 and every client of a Dex3-1 wait for a q that is not 0 (F B.1)
-_ZERO_IS_NO_STATE = frozenset({"unitree_actuator", "dex3"})
+_ZERO_IS_NO_STATE = frozenset({"unitree_actuator", "dex3", "dex5"})
+# whose client is two processes, of which one sends: readers that come late hear nothing of it
+_FORKING = frozenset({"dex3-1", "dex5-1"})
 
 
 @dataclass(frozen=True)
@@ -396,7 +398,7 @@ def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
                 domain=view.number,
                 topic=topic,
             )
-        elif part.role.dialect.model == "dex3-1" and not (stream and stream.samples):
+        elif part.role.dialect.model in _FORKING and not (stream and stream.samples):
             late = _late(view, part.endpoint, readers)
             if late:
                 yield _finding(

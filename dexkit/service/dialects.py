@@ -11,6 +11,8 @@ unitree_hg         seed 000: q runs to 2 pi; a command at or below 0.1 closes, a
                    are those of xr_teleoperate; tau_est of the state is grip strength, not signed.
 dex3               seven motors in the order of the IDL, all values as they are; the mode byte is
                    RIS_Mode (seed 002): id, status (0 lock, 1 FOC) and the time-out bit.
+dex5               20 joints in the order of the IDL; mode 1 is position control (B.5), 0 brakes;
+                   the fingers' tau and tau_est are in mN·m, as a comment in the only client says.
 =================  ================================================================================
 
 **What a state holds.** ``Fill.VENDOR`` fills what the reference fills and leaves the rest 0:
@@ -33,7 +35,8 @@ the last good one
 q is predicted          reserve[1] = 1               reserve[0] = 1
 ======================  ===========================  ==============================================
 
-The state of dex3 is described in docs/dex3.md; :mod:`dexkit.service.dex3_state` encodes it.
+The states of dex3 and dex5 are described in docs/dex3.md and docs/dex5.md;
+:mod:`dexkit.service.finger_state` encodes them.
 
 ``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more (A.7).
 What a backend does not know (NaN) is sent as 0.
@@ -64,7 +67,7 @@ from dexkit.hand import (
 )
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect
-from dexkit.service.dex3_state import Dex3StateEncoder
+from dexkit.service.finger_state import FingerStateEncoder
 
 __all__ = ["DialectMap", "Fill", "Remark", "StateView", "dialect_map"]
 
@@ -155,7 +158,7 @@ class DialectMap(ABC):
         return HandCommand(
             q=np.array([self._q_in(m.q, j) for m, j in zip(motors, spec.joints, strict=True)]),
             dq=self._feed_forward([m.dq for m in motors]),
-            tau=self._feed_forward([m.tau for m in motors]),
+            tau=self._torques([m.tau for m in motors]),
             kp=self._gains([m.kp for m in motors], _KP),
             kd=self._gains([m.kd for m in motors], _KD),
             mode=np.full(len(motors), JointMode.FOC, dtype=np.uint8),
@@ -188,6 +191,9 @@ class DialectMap(ABC):
 
     def _feed_forward(self, values: list[float]) -> Floats:
         return np.array(values)
+
+    def _torques(self, values: list[float]) -> Floats:
+        return self._feed_forward(values)
 
     def _gains(self, values: list[float], default: float) -> Floats:
         return np.array(values)
@@ -286,45 +292,21 @@ class _HgMap(DialectMap):
         return _zero_where_finite(values) + default
 
 
-class _Dex3Map(DialectMap):
-    """Mode bytes are RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (seed 002)."""
+class _FingerMap(DialectMap):
+    """Hands of several joints: all values as they are, but for the mode byte."""
+
+    _ids = True
 
     def __init__(
         self, dialect: Dialect, specs: Mapping[Side, HandSpec], fill: Fill = Fill.KNOWN
     ) -> None:
         super().__init__(dialect, specs, fill)
         ((_, spec),) = specs.items()
-        self._encoder = Dex3StateEncoder(spec, known=fill is Fill.KNOWN)
-
-    def command(self, message: Any, side: Side) -> HandCommand | None:
-        command = super().command(message, side)
-        if command is None:
-            return None
-        modes = [m.mode for m in self._motor_commands(message)[: len(command.q)]]
-        foc = [(mode >> 4) & 7 == JointMode.FOC for mode in modes]
-        # a status that is neither lock nor FOC brakes: nothing moves that was not understood
-        return replace(
-            command,
-            mode=np.where(foc, JointMode.FOC, JointMode.BRAKE).astype(np.uint8),
-            timeout=np.array([mode & 0x80 != 0 for mode in modes]),
+        units = dialect.torque_units
+        self._torque_units = np.array(units or (1.0,) * spec.n_joints)
+        self._encoder = FingerStateEncoder(
+            spec, known=fill is Fill.KNOWN, ids=self._ids, torque_units=units
         )
-
-    def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
-        found: dict[str, Remark] = {}
-        for i, motor in enumerate(self._motor_commands(message)[: self._specs[side].n_joints]):
-            if motor.mode & 0x6F == i:  # its own id, and status 0 or 1
-                continue
-            mode, status = motor.mode, (motor.mode >> 4) & 7
-            says = f"mode byte {mode:#04x} of motor {i} says id {mode & 15}, status {status}"
-            right = f"send {0x10 | i:#04x} (0x10 | index) to drive motor {i}, {i:#04x} to lock it"
-            if mode & 15 != i:
-                does = "; status 0 locks it" if status == JointMode.BRAKE else ""
-                text = f"{says}: the id is not its index{does}. Motors go by index; {right}"
-                found.setdefault("wrong_ids", Remark("wrong_ids", text))
-            if status not in (JointMode.BRAKE, JointMode.FOC):
-                text = f"{says}: neither 0 (lock) nor 1 (FOC), so it is locked; {right}"
-                found.setdefault("unknown_status", Remark("unknown_status", text))
-        return tuple(found.values())
 
     def state(self, views: Mapping[Side, StateView]) -> Any:
         return self._state_type.decode(self.encode(views))
@@ -337,12 +319,79 @@ class _Dex3Map(DialectMap):
         motors: list[Any] = message.motor_cmd
         return motors
 
+    def _modes(self, message: Any, side: Side) -> list[int]:
+        """The mode bytes of a side's motors."""
+        return [m.mode for m in self._motor_commands(message)[: self._specs[side].n_joints]]
+
+    def _torques(self, values: list[float]) -> Floats:
+        return np.asarray(self._torque_units * values)
+
+
+class _Dex3Map(_FingerMap):
+    """Mode bytes are RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (seed 002)."""
+
+    def command(self, message: Any, side: Side) -> HandCommand | None:
+        command = super().command(message, side)
+        if command is None:
+            return None
+        modes = self._modes(message, side)
+        foc = [(mode >> 4) & 7 == JointMode.FOC for mode in modes]
+        # a status that is neither lock nor FOC brakes: nothing moves that was not understood
+        return replace(
+            command,
+            mode=np.where(foc, JointMode.FOC, JointMode.BRAKE).astype(np.uint8),
+            timeout=np.array([mode & 0x80 != 0 for mode in modes]),
+        )
+
+    def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
+        found: dict[str, Remark] = {}
+        for i, mode in enumerate(self._modes(message, side)):
+            if mode & 0x6F == i:  # its own id, and status 0 or 1
+                continue
+            status = (mode >> 4) & 7
+            says = f"mode byte {mode:#04x} of motor {i} says id {mode & 15}, status {status}"
+            right = f"send {0x10 | i:#04x} (0x10 | index) to drive motor {i}, {i:#04x} to lock it"
+            if mode & 15 != i:
+                does = "; status 0 locks it" if status == JointMode.BRAKE else ""
+                text = f"{says}: the id is not its index{does}. Motors go by index; {right}"
+                found.setdefault("wrong_ids", Remark("wrong_ids", text))
+            if status not in (JointMode.BRAKE, JointMode.FOC):
+                text = f"{says}: neither 0 (lock) nor 1 (FOC), so it is locked; {right}"
+                found.setdefault("unknown_status", Remark("unknown_status", text))
+        return tuple(found.values())
+
+
+class _Dex5Map(_FingerMap):
+    """Mode bytes are plain numbers: 1 is position control (facts/unitree-dex B.5, D 26)."""
+
+    _ids = False
+
+    def command(self, message: Any, side: Side) -> HandCommand | None:
+        command = super().command(message, side)
+        if command is None:
+            return None
+        driven = np.array(self._modes(message, side)) == JointMode.FOC
+        # no source tells of another mode: nothing moves that was not understood
+        return replace(
+            command, mode=np.where(driven, JointMode.FOC, JointMode.BRAKE).astype(np.uint8)
+        )
+
+    def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
+        for i, mode in enumerate(self._modes(message, side)):
+            if mode not in (JointMode.BRAKE, JointMode.FOC):
+                text = f"mode byte {mode:#04x} of joint {i} is unknown, so it is locked"
+                if mode & 0x70:
+                    text += "; a Dex5-1 has no RIS_Mode with ids, as a Dex3-1 has"
+                return (Remark("unknown_status", f"{text}; send 1 to drive it, 0 to lock it"),)
+        return ()
+
 
 _MAPS: dict[str, type[DialectMap]] = {
     "unitree_go": _GoMap,
     "unitree_actuator": _GoMap,
     "unitree_hg": _HgMap,
     "dex3": _Dex3Map,
+    "dex5": _Dex5Map,
 }
 
 

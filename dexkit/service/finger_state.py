@@ -1,10 +1,10 @@
-"""The state of a Dex3-1 as the bytes of a ``HandState_``, fast enough for 1000 Hz.
+"""The state of a hand of several joints as the bytes of a ``HandState_``, fast enough for 1000 Hz.
 
-Seven motors and nine sensor packets are some 340 values, 1000 times a second for each hand. Here
-they are copied into the bytes of a message that was encoded once, array by array; a message object
-for each state would have to be filled value by value.
+The seven motors and nine sensor packets of a Dex3-1 are some 340 values, 1000 times a second for
+each hand. Here they are copied into the bytes of a message that was encoded once, array by array;
+a message object for each state would have to be filled value by value.
 
-What each field holds is in docs/dex3.md.
+What each field holds is in docs/dex3.md, and for the Dex5-1 in docs/dex5.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dexkit.hand import Floats, HandSpec, HandState, ImuState, MotorError, SupplyState
 from dexkit.messages import message_type, unitree_hg
 
-__all__ = ["NO_VALUE", "Dex3StateEncoder"]
+__all__ = ["NO_VALUE", "FingerStateEncoder"]
 
 NO_VALUE = 30000.0  #: the pressure of a slot without a sensor element (seed 002)
 
@@ -59,15 +59,27 @@ _SENSOR = np.dtype(
 _REST = Struct("<13fh2x4f4I")
 
 
-class Dex3StateEncoder:
+class FingerStateEncoder:
     """Encodes states of one hand. May be called from several threads.
 
     :param known: also what the vendor's service does not say: ddq, missed exchanges, whether q
         is predicted.
+    :param ids: the mode byte is RIS_Mode, with id and time-out bit (facts/unitree-dex B.4);
+        else it is the bare status.
+    :param torque_units: N·m in one unit of each motor's tau_est; empty for N·m throughout.
     """
 
-    def __init__(self, spec: HandSpec, *, known: bool = True) -> None:
+    def __init__(
+        self,
+        spec: HandSpec,
+        *,
+        known: bool = True,
+        ids: bool = True,
+        torque_units: Sequence[float] = (),
+    ) -> None:
         n, sensors = spec.n_joints, spec.n_sensors
+        self._ids = ids
+        self._torque_units = np.array(torque_units) if torque_units else None
         blank = unitree_hg.HandState_(
             [unitree_hg.MotorState_() for _ in range(n)],
             [unitree_hg.PressSensorState_() for _ in range(sensors)],
@@ -123,7 +135,7 @@ class Dex3StateEncoder:
         floats[0] = s.q
         floats[1] = s.dq
         floats[2] = s.ddq if self._known else 0.0
-        floats[3] = s.tau_est
+        floats[3] = s.tau_est if self._torque_units is None else s.tau_est / self._torque_units
         floats[4] = s.voltage
         floats[5] = s.temperature
         floats[6] = s.winding_temperature if s.winding_temperature is not None else 0.0
@@ -142,12 +154,15 @@ class Dex3StateEncoder:
         if flags == self._flags:
             return
         self._flags = flags
-        self._mode[:] = [
-            i | (status & 7) << 4 | (0x80 if bits & _TRIPPED else 0)
-            for i, (status, bits) in enumerate(zip(modes, fault, strict=True))
-        ]
-        if any(tripped):
-            self._mode[np.array(tripped, dtype=bool)] |= 0x80
+        if self._ids:
+            self._mode[:] = [
+                i | (status & 7) << 4 | (0x80 if bits & _TRIPPED else 0)
+                for i, (status, bits) in enumerate(zip(modes, fault, strict=True))
+            ]
+            if any(tripped):
+                self._mode[np.array(tripped, dtype=bool)] |= 0x80
+        else:
+            self._mode[:] = list(modes)
         self._motorstate[:] = [bits & _U32 for bits in fault]
         if self._known:
             self._predicted[:] = 0 if s.measured else 1
