@@ -21,6 +21,7 @@ __all__ = ["cli", "main"]
 _COMMANDS: dict[str, tuple[str, str]] = {
     "backends": ("dexkit.cli.backends", "List the hands that can be served."),
     "badge": ("dexkit.cli.badge", "Draw a badge of a result."),
+    "bridge": ("dexkit.cli.bridge", "Let a client of one dialect meet a gripper of another."),
     "calibrate": ("dexkit.cli.calibrate", "Find a gripper's zero and speed and store them."),
     "check": ("dexkit.cli.check", "Judge a recording against the requirements."),
     "compare": ("dexkit.cli.compare", "Put several results side by side."),
@@ -28,6 +29,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("dexkit.cli.doctor", "Say why a client and a hand do not meet."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, on a pseudo-terminal or USB/IP."),
     "info": ("dexkit.cli.info", "Say what is in a recording."),
+    "models": ("dexkit.cli.models", "Print hands and bodies: joints, limits, topics, rates."),
     "mutants": ("dexkit.cli.mutants", "Prove the checks on deliberately wrong hands."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),

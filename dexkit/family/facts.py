@@ -1,0 +1,221 @@
+"""A model as plain data: what ``dexkit models --json`` prints and the page is made of.
+
+SI units, named in the keys; what a model does not have is ``None`` or an empty list.
+
+A hand::
+
+    {"name", "title", "kind": "hand",
+     "sides": {"left" | "right": {"vendor_id", "joints": [JOINT], "rest_q_rad": [...]}},
+     "dialects": [{"name", "summary", "command_type", "state_type", "length", "q_open_rad",
+                   "torque_units_nm": [...],
+                   "sides": {"left" | "right": {"command_topic", "state_topic",
+                                                "low_rate_topic", "first_index"}}}],
+     "rates_hz": {"state", "state_at_least", "low_rate_state", "command"},
+     "command_timeout_s", "client_gains": [{"kp_nm_per_rad", "kd_nms_per_rad"}],
+     "shared_motors": [[index, ...]],
+     "pressure_sensors": [{"packet", "place", "slots": [...]}],
+     "backends": [{"name", "summary", "needs"}]}
+
+A body::
+
+    {"name", "title", "kind": "body", "slots", "mode_machine", "weight_slot",
+     "joints": [JOINT and "enable_mode", "on_arm_topic"], "rest_q_rad": [...],
+     "command_topic", "state_topic", "arm_topic", "command_type", "state_type", "emulator",
+     "rates_hz": {"state", "command", "teleop_command"}, "command_timeout_s",
+     "client_gains": [...]}
+
+JOINT::
+
+    {"index", "name", "urdf", "q_min_rad", "q_max_rad", "q_min_deg", "q_max_deg",
+     "dq_max_rad_s", "tau_max_nm", "closing": -1 | 0 | 1, "gear_ratio"}
+
+``closing`` is the sign of dq that closes the hand, 0 where neither does. ``index`` is the place
+in the message; a body's ``joints`` and ``client_gains`` leave out the slots without a joint, its
+``rest_q_rad`` does not. ``client_gains`` are those that xr_teleoperate sends, joint by joint.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from dexkit.backends import list_backends
+from dexkit.bodies import BODIES, BodyModel
+from dexkit.errors import UsageError
+from dexkit.hand import JointSpec, Side
+from dexkit.models import MODELS, Dialect, HandModel
+
+__all__ = ["describe", "gain_groups", "indices", "names", "short_type", "torque_units"]
+
+_OWN = "dexkit "  # the origin of a built-in backend, before its version
+
+
+def names() -> list[str]:
+    """All models: hands, then bodies."""
+    return [*MODELS, *BODIES]
+
+
+def describe(name: str, *, plugins: bool = True) -> dict[str, Any]:
+    """The model called ``name``, hand or body.
+
+    :param plugins: whether the backends of other packages are listed as well.
+    :raises UsageError: there is none.
+    """
+    if name in MODELS:
+        return _hand(MODELS[name], plugins)
+    if name in BODIES:
+        return _body(BODIES[name])
+    raise UsageError(f"no model {name!r}", hint=f"known: {', '.join(names())}")
+
+
+def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
+    return {
+        "name": model.name,
+        "title": model.title,
+        "kind": "hand",
+        "sides": {
+            str(side): {
+                "vendor_id": model.vendor_ids.get(side),
+                "joints": [_joint(i, joint) for i, joint in enumerate(model.joints[side])],
+                "rest_q_rad": list(model.rest_q[side]),
+            }
+            for side in Side
+        },
+        "dialects": [_dialect(d) for d in model.dialects],
+        "rates_hz": {
+            "state": model.state_rate,
+            "state_at_least": model.min_state_rate,
+            "low_rate_state": model.low_rate or None,
+            "command": model.command_rate,
+        },
+        "command_timeout_s": model.command_timeout,
+        "client_gains": [_gains(*pair) for pair in model.gains],
+        "shared_motors": [list(group) for group in model.shared_motors],
+        "pressure_sensors": [
+            {"packet": i, "place": sensor.place, "slots": list(sensor.slots)}
+            for i, sensor in enumerate(model.sensors)
+        ],
+        "backends": _backends(model.name, plugins),
+    }
+
+
+def _body(model: BodyModel) -> dict[str, Any]:
+    return {
+        "name": model.name,
+        "title": model.title,
+        "kind": "body",
+        "slots": model.slots,
+        "mode_machine": model.mode_machine,
+        "weight_slot": model.weight_slot,
+        "joints": [
+            {
+                **_joint(i, model.joint(i)),
+                "enable_mode": model.enable[i],
+                "on_arm_topic": i in model.arm_slots,
+            }
+            for i in model.used
+        ],
+        "rest_q_rad": list(model.rest_q),
+        "command_topic": model.cmd_topic,
+        "state_topic": model.state_topic,
+        "arm_topic": model.arm_topic,
+        "command_type": model.cmd_type,
+        "state_type": model.state_type,
+        "emulator": f"dexkit emulate {model.name}",
+        "rates_hz": {
+            "state": model.state_rate,
+            "command": model.command_rate,
+            "teleop_command": model.teleop_rate,
+        },
+        "command_timeout_s": model.command_timeout,
+        "client_gains": [_gains(*model.client_gains[i]) for i in model.used],
+    }
+
+
+def _joint(index: int, joint: JointSpec) -> dict[str, Any]:
+    return {
+        "index": index,
+        "name": joint.name,
+        "urdf": joint.urdf or None,
+        "q_min_rad": joint.q_min,
+        "q_max_rad": joint.q_max,
+        "q_min_deg": round(math.degrees(joint.q_min), 2),
+        "q_max_deg": round(math.degrees(joint.q_max), 2),
+        "dq_max_rad_s": joint.dq_max,
+        "tau_max_nm": joint.tau_max,
+        "closing": joint.closing,
+        "gear_ratio": joint.gear_ratio,
+    }
+
+
+def _gains(kp: float, kd: float) -> dict[str, float]:
+    return {"kp_nm_per_rad": kp, "kd_nms_per_rad": kd}
+
+
+def _dialect(dialect: Dialect) -> dict[str, Any]:
+    return {
+        "name": dialect.name,
+        "summary": dialect.summary,
+        "command_type": dialect.cmd_type,
+        "state_type": dialect.state_type,
+        "length": dialect.length,
+        "q_open_rad": dialect.q_open if math.isfinite(dialect.q_open) else None,
+        "torque_units_nm": list(dialect.torque_units),
+        "sides": {
+            str(side): {
+                "command_topic": dialect.topics(side)[0],
+                "state_topic": dialect.topics(side)[1],
+                "low_rate_topic": dialect.low_rate_topic.format(side=side) or None,
+                "first_index": dialect.index[side],
+            }
+            for side in Side
+        },
+    }
+
+
+def _backends(model: str, plugins: bool) -> list[dict[str, str]]:
+    return [
+        {"name": row.name, "summary": row.backend.summary, "needs": row.backend.needs}
+        for row in list_backends()
+        if row.backend is not None
+        and row.backend.model == model
+        and (plugins or row.origin.startswith(_OWN))
+    ]
+
+
+# -- how they are said, in the terminal and on the page -------------------------------------
+
+
+def indices(values: Sequence[int]) -> str:
+    """Indices as text, neighbours together: ``0 to 4, 6``."""
+    runs: list[list[int]] = []
+    for value in values:
+        if runs and value == runs[-1][-1] + 1:
+            runs[-1].append(value)
+        else:
+            runs.append([value])
+    return ", ".join(f"{r[0]} to {r[-1]}" if len(r) > 2 else ", ".join(map(str, r)) for r in runs)
+
+
+def gain_groups(data: dict[str, Any]) -> list[tuple[str, float, float]]:
+    """(which joints, kp, kd) of a described model; joints of equal gains together."""
+    joints = data["joints"] if data["kind"] == "body" else data["sides"]["left"]["joints"]
+    groups: dict[tuple[float, float], list[int]] = {}
+    for joint, gains in zip(joints, data["client_gains"], strict=True):
+        pair = (gains["kp_nm_per_rad"], gains["kd_nms_per_rad"])
+        groups.setdefault(pair, []).append(joint["index"])
+    return [(indices(group), kp, kd) for (kp, kd), group in groups.items()]
+
+
+def torque_units(dialect: dict[str, Any]) -> list[tuple[str, float]]:
+    """(which joints, N·m in a unit of their torques) of a described dialect, none if all are 1."""
+    groups: dict[float, list[int]] = {}
+    for i, unit in enumerate(dialect["torque_units_nm"]):
+        groups.setdefault(unit, []).append(i)
+    return [(indices(group), unit) for unit, group in groups.items()]
+
+
+def short_type(name: str) -> str:
+    """A DDS type without its inner namespaces: ``unitree_hg HandCmd_``."""
+    return name.replace("::msg::dds_::", " ")
