@@ -36,11 +36,12 @@ def _cyclone(reference: str, struct: Struct, message: Any) -> Any:
             inner = member.type
             value = (
                 [_cyclone(reference, inner, v) for v in value]
-                if member.sequence
+                if member.sequence or member.is_structs
                 else _cyclone(reference, inner, value)
             )
         elif member.array is not None:
-            value = list(value)
+            # CycloneDDS reads bytes where the IDL has uint8, and takes lists, too
+            value = bytes(value) if member.type.code == "B" else list(value)
         fields[member.name] = value
     return _class(reference, struct.dds_name)(**fields)
 

@@ -59,6 +59,10 @@ def test_golden_states() -> None:
         (_hand_state(7, 7), 1220),
         (_hand_state(7, 9), 1428),
         (_hand_state(20, 0), 1220),
+        (go.LowCmd_(), 812),
+        (go.LowState_(), 1180),
+        (hg.LowCmd_(), 1004),
+        (hg.LowState_(), 2092),
     ],
     ids=lambda v: type(v).__name__ if not isinstance(v, int) else str(v),
 )
@@ -75,7 +79,7 @@ def test_names() -> None:
     assert mt.cls is hg.HandState_
     with pytest.raises(UsageError, match="unknown message type"):
         message_type("unitree_hg::msg::dds_::Nothing_")
-    assert len(message_types()) == 10
+    assert len(message_types()) == 17
 
 
 def test_hostile_sequence_length_allocates_nothing() -> None:
@@ -125,6 +129,17 @@ def test_trailing_bytes() -> None:
         (go.MotorCmds_(None), "not a sequence"),  # type: ignore[arg-type]
         (go.MotorCmds_([go.MotorCmd_()] * (MAX_ELEMENTS + 1)), "at most 1024"),
         (hg.HandState_(imu_state=hg.IMUState_(rpy=(0.0,))), r"imu_state.rpy has 1 elements"),
+        (go.LowCmd_(motor_cmd=[]), "motor_cmd has 0 elements, not 20"),
+        (go.LowCmd_(motor_cmd=None), "not a sequence"),  # type: ignore[arg-type]
+        (hg.LowState_(motor_state=[hg.MotorState_()] * 34), "motor_state has 34 elements, not 35"),
+        (
+            hg.LowState_(motor_state=[hg.MotorState_()] * 34 + [hg.MotorState_(sensor=(0,))]),
+            r"motor_state\[34\].sensor has 1 elements, not 2",
+        ),
+        (
+            hg.LowState_(motor_state=[hg.MotorState_(sensor=(0,))] * 35),
+            r"motor_state\[0\].sensor has 1 elements, not 2",
+        ),
         (3, "is not a message"),
     ],
 )

@@ -174,6 +174,40 @@ def test_columns_agree_with_decoding_one_by_one(data: st.DataObject) -> None:
         assert error[row] == message.error[1]
 
 
+@settings(max_examples=20)
+@given(st.data())
+def test_columns_of_fixed_arrays_of_structs(data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from(["unitree_go/msg/LowState", "unitree_hg/msg/LowState"]))
+    mt = message_type(name)
+    samples = [mt.encode(m) for m in data.draw(st.lists(messages(mt.name), max_size=2))]
+    samples += [_swapped(mt.name, sample) for sample in samples]
+    payloads = [*samples, *(sample[:-1] for sample in samples), *samples]
+    columns = mt.columns(payloads)
+    temperature = "temperature" if name.startswith("unitree_go") else "temperature[1]"
+    q, third = columns["motor_state[].q"], columns[f"motor_state[2].{temperature}"]
+    first, every = columns["motor_state[0].reserve"], columns[f"motor_state[].{temperature}"]
+    assert len(q) == len(payloads)
+    for row, payload in enumerate(payloads):
+        problem = _problem(name, payload)
+        if problem is not None:
+            assert str(columns.errors[row]) == str(problem)
+            assert np.isnan(q[row]).all()
+            continue
+        message = mt.decode(payload)
+        motors = message.motor_state
+        warmth = [np.atleast_1d(m.temperature)[-1] for m in motors]
+        assert columns.ok[row]
+        assert q[row].tolist() == [m.q for m in motors]
+        assert every[row].tolist() == warmth
+        assert third[row] == warmth[2]
+        assert tuple(first[row]) == motors[0].reserve
+        assert columns["crc"][row] == message.crc
+    with pytest.raises(UsageError, match="elements"):
+        columns[f"motor_state[{35 if mt.layout.scope[0] == 'unitree_hg' else 20}].q"]
+    with pytest.raises(UsageError, match="two open dimensions"):
+        columns["motor_state[].reserve"]
+
+
 def test_columns_of_equal_length_but_other_shape() -> None:
     # 13 motors without a sensor are as long as none with 7 sensors: 13 x 56 = 7 x 104
     mt = message_type("unitree_hg/msg/HandState")

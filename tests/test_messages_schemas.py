@@ -31,6 +31,23 @@ MESSAGES = [
         error=(1, 2),
         reserve=(3, 4),
     ),
+    go.LowCmd_(motor_cmd=[go.MotorCmd_(mode=1, q=float(i)) for i in range(20)], crc=5),
+    go.LowState_(
+        imu_state=go.IMUState_((1.0, 2.0, 3.0, 4.0), temperature=5),
+        motor_state=[go.MotorState_(mode=1, q=float(i), lost=i) for i in range(20)],
+        bms_state=go.BmsState_(soc=6, current=-7, cell_vol=tuple(range(15))),
+        foot_force=(-1, 2, 3, 4),
+        tick=8,
+        crc=9,
+    ),
+    hg.LowCmd_(1, 2, [hg.MotorCmd_(mode=1, q=float(i)) for i in range(35)], crc=5),
+    hg.LowState_(
+        mode_machine=3,
+        imu_state=hg.IMUState_((1.0, 2.0, 3.0, 4.0), temperature=-5),
+        motor_state=[hg.MotorState_(mode=1, q=float(i), vol=i) for i in range(35)],
+        wireless_remote=tuple(range(40)),
+        crc=9,
+    ),
 ]
 
 
@@ -39,8 +56,9 @@ def _same(kind: Struct, mine: Any, theirs: Any) -> None:
     for member in kind.fields:
         a, b = getattr(mine, member.name), getattr(theirs, member.name)
         if isinstance(member.type, Primitive):
+            b = list(b) if isinstance(b, bytes) else b  # what mcap_ros2 makes of uint8[n]
             assert np.array_equal(np.asarray(a), np.asarray(b)), member.name
-        elif member.sequence:
+        elif member.sequence or member.is_structs:
             assert len(a) == len(b) > 0
             for x, y in zip(a, b, strict=True):
                 _same(member.type, x, y)
@@ -102,6 +120,8 @@ def test_recorded_payloads_survive_decoding_and_encoding() -> None:
 def test_our_omgidl_reads_back_as_the_same_layout() -> None:
     classic = {
         "octet": "uint8",
+        "unsigned short": "uint16",
+        "long": "int32",
         "unsigned long": "uint32",
         "short": "int16",
     }
@@ -125,7 +145,15 @@ HEAD, TAIL = "module a { module msg { module dds_ { ", " }; }; };"
         ("@final struct X { };", "no members"),
         ("@final struct X { double a; };", "unknown type 'double'"),
         ("@final struct X { sequence<uint8> a; };", "sequences of structs"),
-        ("@final struct E { uint8 a; }; @final struct X { E a[2]; };", "arrays of structs"),
+        ("@final struct E { uint8 a; }; @final struct X { E a[2]; };", "uneven layout"),
+        (
+            "@final struct E { uint8 a[4]; }; @final struct X { uint8 z; E a[2]; };",
+            "uneven layout",
+        ),
+        (
+            "@final struct E { uint32 a; }; @final struct F { E a[2]; };@final struct X { F a; };",
+            "nested arrays of structs",
+        ),
         ("@final struct E { uint8 a; }; @final struct X { sequence<E> a; };", "uneven layout"),
         (
             "@final struct E { uint32 a; }; @final struct F { sequence<E> a; };"

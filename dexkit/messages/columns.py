@@ -374,18 +374,29 @@ class _Group(NamedTuple):
 
     def places(self, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
         """Type, and first byte of each number, of what a path names; none that it lacks."""
-        places = [0]
-        here = self.dtype
-        for member, index in steps:
-            assert here.fields is not None
-            here, offset = here.fields[member.name][:2]
-            places = [at + offset for at in places]
-            if here.subdtype is None:
-                continue
-            here, (length, *_) = here.subdtype
+        return _places(self.dtype, 0, steps)
+
+
+def _places(here: np.dtype[Any], start: int, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
+    if not steps:
+        return here, [start]
+    (member, index), *rest = steps
+    names = [member.name]
+    if member.is_structs:
+        names = member.places()[slice(None) if index is None else slice(index, index + 1)]
+    leaf, places = here, []
+    assert here.fields is not None
+    for name in names:
+        kind, offset = here.fields[name][:2]
+        starts = [start + offset]
+        if kind.subdtype is not None:
+            kind, (length, *_) = kind.subdtype
             indices = range(length) if index is None else range(index, min(index + 1, length))
-            places = [at + i * here.itemsize for at in places for i in indices]
-        return here, places
+            starts = [starts[0] + i * kind.itemsize for i in indices]
+        for at in starts:
+            leaf, more = _places(kind, at, tuple(rest))
+            places += more
+    return leaf, places
 
 
 def _steps(kind: Struct, path: str) -> _Steps:
@@ -469,6 +480,15 @@ def _dtype(kind: Struct, counts: tuple[int, ...], order: str, size: int) -> np.d
     remaining = list(counts)
     at = 0
     for member in kind.fields:
+        if member.is_structs:
+            # a member for each: the first may lie otherwise than the rest
+            assert isinstance(member.type, Struct)
+            for name in member.places():
+                names.append(name)
+                formats.append(_element(member.type, at, order))
+                offsets.append(at + 4)
+                at = member.type.end(at)
+            continue
         names.append(member.name)
         if member.sequence:
             assert isinstance(member.type, Struct)

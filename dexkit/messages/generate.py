@@ -40,11 +40,11 @@ def _member_leaves(member: Field) -> list[Leaf]:
 
 
 def _segments(struct: Struct) -> list[tuple[list[Field], Field | None]]:
-    """Split at the sequences: (fixed members, the sequence that follows or None)."""
+    """Split at what holds many structs: (fixed members, the sequence or array that follows)."""
     out: list[tuple[list[Field], Field | None]] = []
     fixed: list[Field] = []
     for member in struct.fields:
-        if member.sequence:
+        if member.sequence or member.is_structs:
             out.append((fixed, member))
             fixed = []
         else:
@@ -56,7 +56,7 @@ def _segments(struct: Struct) -> list[tuple[list[Field], Field | None]]:
 
 def _annotation(member: Field) -> str:
     name = member.type.python if isinstance(member.type, Primitive) else member.type.name
-    if member.sequence:
+    if member.sequence or member.is_structs:
         return f"list[{name}]"
     return name if member.array is None else f"tuple[{name}, ...]"
 
@@ -65,6 +65,9 @@ def _default(member: Field) -> str:
     if member.sequence:
         return "field(default_factory=list)"
     if isinstance(member.type, Struct):
+        if member.is_structs:
+            name = member.type.name
+            return f"field(default_factory=lambda: [{name}() for _ in range({member.array})])"
         return f"field(default_factory={member.type.name})"
     zero = "0.0" if member.type.python == "float" else "0"
     if member.array is None:
@@ -143,69 +146,95 @@ def _codec(struct: Struct) -> list[str]:
     segments = _segments(struct)
     fixed_only = len(segments) == 1 and segments[0][1] is None
 
-    for index, (members, sequence) in enumerate(segments):
+    for index, (members, many) in enumerate(segments):
         leaves = [leaf for m in members for leaf in _member_leaves(m)]
-        wire: list[Leaf | None] = [*leaves, *([None] if sequence else [])]
+        wire: list[Leaf | None] = list(leaves)
+        if many and many.sequence:
+            wire.append(None)
+        elif many:
+            # the first of an array may lie otherwise than the rest; it goes with what precedes
+            first = Field(f"{many.name}[0]", many.type)
+            members = [*members, first]
+            leaves += _member_leaves(first)
+            wire = list(leaves)
+            encode += [
+                f"    if len(m.{many.name}) != {many.array}:",
+                "        raise ArrayLengthError",
+            ]
         code, end = _padded(wire, offset)
         size = end - offset
         part = f"{stem}_{index}"
         constants.append(f'{part} = (Struct("<{code}"), Struct(">{code}"))')
         values = _values(leaves, "m")
-        if sequence:
-            values = f"{values}, len(m.{sequence.name})" if values else f"len(m.{sequence.name})"
+        if many and many.sequence:
+            values = f"{values}, len(m.{many.name})" if values else f"len(m.{many.name})"
         encode += _array_checks(leaves, "m", "    ")
         pieces.append(f"{part}[0].pack({values})")
         at = "4" if index == 0 else "at"
         if index == 0:
-            decode.append(f"    if len(data) < {4 + size}:")
-            decode.append(f'        raise truncated("{struct.name}", {4 + size}, len(data))')
-        else:
+            need = 4 + (struct.end(0) if struct.is_fixed else size)
+            decode.append(f"    if len(data) < {need}:")
+            decode.append(f'        raise truncated("{struct.name}", {need}, len(data))')
+        elif not struct.is_fixed:
             decode.append(f"    if len(data) < at + {size}:")
             decode.append(f'        raise truncated("{struct.name}", at + {size}, len(data))')
         decode.append(f"    v = {part}[big].unpack_from(data, {at})")
         for name, text in _fold(leaves, "v", members).items():
-            if fixed_only or sequence is None:
+            if fixed_only or many is None:
                 bound[name] = text
+            elif many.is_structs and name == f"{many.name}[0]":
+                decode.append(f"    {many.name} = [{text}]")
             else:
                 decode.append(f"    {name} = {text}")
                 bound[name] = name
         decode.append(f"    at = {4 + size}" if index == 0 else f"    at += {size}")
         offset = end % 4
-        if sequence is None:
+        if many is None:
             continue
-        assert isinstance(sequence.type, Struct)
-        element = sequence.type
+        assert isinstance(many.type, Struct)
+        element = many.type
         inner = list(element.leaves())
         e = f"e{index}"  # loop variables keep one type each in the whole function
         code, stride = _padded(inner, 0)
-        item = f"{stem}_{sequence.name}"
+        item = f"{stem}_{many.name}"
         constants.append(f'{item} = (Struct("<{code}"), Struct(">{code}"))')
+        if many.sequence:
+            encode += [
+                f"    if len(m.{many.name}) > MAX_ELEMENTS:",
+                "        raise ArrayLengthError",
+            ]
         encode += [
-            f"    if len(m.{sequence.name}) > MAX_ELEMENTS:",
-            "        raise ArrayLengthError",
             f"    pack = {item}[0].pack",
-        ]
-        encode += [
-            f"    {sequence.name} = []",
-            f"    for {e} in m.{sequence.name}:",
+            f"    {many.name} = []",
+            f"    for {e} in m.{many.name}{'' if many.sequence else '[1:]'}:",
             *_array_checks(inner, e, "        "),
-            f"        {sequence.name}.append(pack({_values(inner, e)}))",
+            f"        {many.name}.append(pack({_values(inner, e)}))",
         ]
-        pieces.append(f"*{sequence.name}")
-        count = sum(leaf.count for leaf in leaves)
+        pieces.append(f"*{many.name}")
         names, assign = _assignments(inner, element)
+        if many.sequence:
+            count = sum(leaf.count for leaf in leaves)
+            decode += [
+                f"    end = at + {stride} * v[{count}]",
+                f"    if end > len(data) or v[{count}] > MAX_ELEMENTS:",
+                f'        check_count("{struct.name}.{many.name}", v[{count}], end, len(data))',
+                f"    {many.name} = []",
+            ]
+        else:
+            decode.append(f"    end = at + {stride * ((many.array or 1) - 1)}")
+            if not struct.is_fixed:
+                decode += [
+                    "    if end > len(data):",
+                    f'        raise truncated("{struct.name}", end, len(data))',
+                ]
         decode += [
-            f"    end = at + {stride} * v[{count}]",
-            f"    if end > len(data) or v[{count}] > MAX_ELEMENTS:",
-            f'        check_count("{struct.name}.{sequence.name}", v[{count}], end, len(data))',
-            f"    {sequence.name} = []",
             f"    for {names} in {item}[big].iter_unpack(data[at:end]):",
             f"        {e} = new({element.name})",
             *(f"        {e}.{line}" for line in assign),
-            f"        {sequence.name}.append({e})",
+            f"        {many.name}.append({e})",
             "    at = end",
         ]
-        bound[sequence.name] = sequence.name
+        bound[many.name] = many.name
 
     arguments = ", ".join(bound[m.name] for m in struct.fields)
     return [

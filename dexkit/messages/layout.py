@@ -4,7 +4,8 @@ The generator, the schema texts, the error messages, the bulk decoder and the Cy
 are all made from :data:`STRUCTS`, so a layout is written down once, in ``idl/*.idl``.
 
 The subset of IDL that is read: nested modules, ``@final`` structs of numeric members,
-one-dimensional arrays of them, members that are structs, and unbounded sequences of structs.
+one-dimensional arrays of them, members that are structs, unbounded sequences of structs, and (in
+structs that no other contains) one-dimensional arrays of structs.
 Anything else is refused when it is read, not when it is used.
 """
 
@@ -85,6 +86,17 @@ class Field:
     sequence: bool = False
     doc: str = ""
 
+    @property
+    def is_structs(self) -> bool:
+        """Whether it is a fixed array of structs."""
+        return self.array is not None and isinstance(self.type, Struct)
+
+    def places(self) -> list[str]:
+        """How its values are written in a path: ``q``, or ``motor_cmd[0]`` to ``motor_cmd[19]``."""
+        if not self.is_structs:
+            return [self.name]
+        return [f"{self.name}[{i}]" for i in range(self.array or 0)]
+
 
 @dataclass(frozen=True)
 class Struct:
@@ -126,8 +138,9 @@ class Struct:
         for member in self.fields:
             assert not member.sequence
             if isinstance(member.type, Struct):
-                for leaf in member.type.leaves():
-                    yield Leaf((member.name, *leaf.path), leaf.type, leaf.array)
+                for name in member.places():
+                    for leaf in member.type.leaves():
+                        yield Leaf((name, *leaf.path), leaf.type, leaf.array)
             else:
                 yield Leaf((member.name,), member.type, member.array)
 
@@ -161,11 +174,8 @@ def max_size(struct: Struct) -> int:
         if member.sequence:
             assert isinstance(member.type, Struct)
             size += 4 + MAX_ELEMENTS * member.type.end(0)
-        elif isinstance(member.type, Struct):
-            size = member.type.end(size)
         else:
-            count = 1 if member.array is None else member.array
-            size = -(-size // member.type.size) * member.type.size + count * member.type.size
+            size = Struct((), "", (member,)).end(size)
     return size + (-size % 4)
 
 
@@ -264,8 +274,6 @@ class _Parser:
         self._next(";")
         if sequence and (array is not None or not isinstance(kind, Struct)):
             raise IdlError(f"IDL line {line}: only plain sequences of structs are supported")
-        if array is not None and isinstance(kind, Struct):
-            raise IdlError(f"IDL line {line}: arrays of structs are not supported")
         return Field(name, kind, array, sequence, self._docs.get(line, ""))
 
     def _type(self, scope: tuple[str, ...]) -> Primitive | Struct:
@@ -278,16 +286,22 @@ class _Parser:
         return self.structs[name]
 
     def _check(self, struct: Struct) -> None:
+        at = 0
         for member in struct.fields:
-            if not member.sequence:
-                if isinstance(member.type, Struct) and not member.type.is_fixed:
-                    raise IdlError(f"{struct.name}.{member.name}: nested sequences")
-                continue
-            assert isinstance(member.type, Struct)
-            # Elements start right after a uint32. When each also ends on a multiple of 4, all
-            # have one layout and the sequence can be packed as a block.
-            if not member.type.is_fixed or member.type.end(0) % 4:
-                raise IdlError(f"{struct.name}.{member.name}: elements of uneven layout")
+            where = f"{struct.name}.{member.name}"
+            inner = member.type
+            if isinstance(inner, Struct):
+                if not inner.is_fixed:
+                    raise IdlError(f"{where}: nested sequences")
+                if any(f.is_structs for f in inner.fields):
+                    raise IdlError(f"{where}: nested arrays of structs")
+                # Elements of a sequence start right after a uint32. When each also ends on a
+                # multiple of 4, all have one layout and can be packed as a block. So have those
+                # of an array, except that the first may start anywhere.
+                many = member.sequence or member.is_structs
+                if many and (inner.end(0) % 4 or (member.is_structs and inner.end(at) % 4)):
+                    raise IdlError(f"{where}: elements of uneven layout")
+            at = 0 if member.sequence else Struct((), "", (member,)).end(at)
 
 
 def parse(text: str) -> dict[str, Struct]:

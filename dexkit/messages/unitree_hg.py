@@ -30,6 +30,8 @@ __all__ = [
     "HandCmd_",
     "HandState_",
     "IMUState_",
+    "LowCmd_",
+    "LowState_",
     "MotorCmd_",
     "MotorState_",
     "PressSensorState_",
@@ -125,6 +127,38 @@ class HandState_:
     device_v: float = 0.0  # V
     error: tuple[int, ...] = (0,) * 2
     reserve: tuple[int, ...] = (0,) * 2
+
+
+@dataclass(slots=True)
+class LowCmd_:
+    """Command of a body: all motors at once.
+
+    DDS type ``unitree_hg::msg::dds_::LowCmd_``.
+    """
+
+    mode_pr: int = 0  # ankles: 0 pitch and roll, 1 motors A and B
+    mode_machine: int = 0  # as the state says
+    motor_cmd: list[MotorCmd_] = field(default_factory=lambda: [MotorCmd_() for _ in range(35)])
+    reserve: tuple[int, ...] = (0,) * 4
+    crc: int = 0  # over the C struct (facts/unitree-dex A.7)
+
+
+@dataclass(slots=True)
+class LowState_:
+    """State of a body.
+
+    DDS type ``unitree_hg::msg::dds_::LowState_``.
+    """
+
+    version: tuple[int, ...] = (0,) * 2
+    mode_pr: int = 0  # ankles: 0 pitch and roll, 1 motors A and B
+    mode_machine: int = 0  # which machine this is
+    tick: int = 0  # ms
+    imu_state: IMUState_ = field(default_factory=IMUState_)
+    motor_state: list[MotorState_] = field(default_factory=lambda: [MotorState_() for _ in range(35)])
+    wireless_remote: tuple[int, ...] = (0,) * 40
+    reserve: tuple[int, ...] = (0,) * 4
+    crc: int = 0  # over the C struct (facts/unitree-dex A.7)
 
 
 _MotorCmd_0 = (Struct("<B3x5fI"), Struct(">B3x5fI"))
@@ -334,3 +368,105 @@ def decode_HandState_(data: Buffer, big: bool) -> HandState_:
     if at != len(data):
         check_end("HandState_", data, at)
     return HandState_(motor_state, press_sensor_state, IMUState_(v[0:4], v[4:7], v[7:10], v[10:13], v[13]), v[14], v[15], v[16], v[17], v[18:20], v[20:22])
+
+
+_LowCmd_0 = (Struct("<3Bx5fI"), Struct(">3Bx5fI"))
+_LowCmd_motor_cmd = (Struct("<B3x5fI"), Struct(">B3x5fI"))
+_LowCmd_1 = (Struct("<5I"), Struct(">5I"))
+
+
+def encode_LowCmd_(m: LowCmd_) -> bytes:
+    """Encapsulation header and little-endian data of a LowCmd_."""
+    if len(m.motor_cmd) != 35:
+        raise ArrayLengthError
+    pack = _LowCmd_motor_cmd[0].pack
+    motor_cmd = []
+    for e0 in m.motor_cmd[1:]:
+        motor_cmd.append(pack(e0.mode, e0.q, e0.dq, e0.tau, e0.kp, e0.kd, e0.reserve))
+    if len(m.reserve) != 4:
+        raise ArrayLengthError
+    return b"".join((HEADER, _LowCmd_0[0].pack(m.mode_pr, m.mode_machine, m.motor_cmd[0].mode, m.motor_cmd[0].q, m.motor_cmd[0].dq, m.motor_cmd[0].tau, m.motor_cmd[0].kp, m.motor_cmd[0].kd, m.motor_cmd[0].reserve), *motor_cmd, _LowCmd_1[0].pack(*m.reserve, m.crc)))
+
+
+def decode_LowCmd_(data: Buffer, big: bool) -> LowCmd_:
+    """The LowCmd_ after the encapsulation header of ``data``."""
+    if len(data) < 1004:
+        raise truncated("LowCmd_", 1004, len(data))
+    v = _LowCmd_0[big].unpack_from(data, 4)
+    mode_pr = v[0]
+    mode_machine = v[1]
+    motor_cmd = [MotorCmd_(v[2], v[3], v[4], v[5], v[6], v[7], v[8])]
+    at = 32
+    end = at + 952
+    for x0, x1, x2, x3, x4, x5, x6 in _LowCmd_motor_cmd[big].iter_unpack(data[at:end]):
+        e0 = new(MotorCmd_)
+        e0.mode = x0
+        e0.q = x1
+        e0.dq = x2
+        e0.tau = x3
+        e0.kp = x4
+        e0.kd = x5
+        e0.reserve = x6
+        motor_cmd.append(e0)
+    at = end
+    v = _LowCmd_1[big].unpack_from(data, at)
+    at += 20
+    if at != len(data):
+        check_end("LowCmd_", data, at)
+    return LowCmd_(mode_pr, mode_machine, motor_cmd, v[0:4], v[4])
+
+
+_LowState_0 = (Struct("<2I2B2xI13fhBx4f2hf7I"), Struct(">2I2B2xI13fhBx4f2hf7I"))
+_LowState_motor_state = (Struct("<B3x4f2hf7I"), Struct(">B3x4f2hf7I"))
+_LowState_1 = (Struct("<40B5I"), Struct(">40B5I"))
+
+
+def encode_LowState_(m: LowState_) -> bytes:
+    """Encapsulation header and little-endian data of a LowState_."""
+    if len(m.motor_state) != 35:
+        raise ArrayLengthError
+    if len(m.version) != 2 or len(m.imu_state.quaternion) != 4 or len(m.imu_state.gyroscope) != 3 or len(m.imu_state.accelerometer) != 3 or len(m.imu_state.rpy) != 3 or len(m.motor_state[0].temperature) != 2 or len(m.motor_state[0].sensor) != 2 or len(m.motor_state[0].reserve) != 4:
+        raise ArrayLengthError
+    pack = _LowState_motor_state[0].pack
+    motor_state = []
+    for e0 in m.motor_state[1:]:
+        if len(e0.temperature) != 2 or len(e0.sensor) != 2 or len(e0.reserve) != 4:
+            raise ArrayLengthError
+        motor_state.append(pack(e0.mode, e0.q, e0.dq, e0.ddq, e0.tau_est, *e0.temperature, e0.vol, *e0.sensor, e0.motorstate, *e0.reserve))
+    if len(m.wireless_remote) != 40 or len(m.reserve) != 4:
+        raise ArrayLengthError
+    return b"".join((HEADER, _LowState_0[0].pack(*m.version, m.mode_pr, m.mode_machine, m.tick, *m.imu_state.quaternion, *m.imu_state.gyroscope, *m.imu_state.accelerometer, *m.imu_state.rpy, m.imu_state.temperature, m.motor_state[0].mode, m.motor_state[0].q, m.motor_state[0].dq, m.motor_state[0].ddq, m.motor_state[0].tau_est, *m.motor_state[0].temperature, m.motor_state[0].vol, *m.motor_state[0].sensor, m.motor_state[0].motorstate, *m.motor_state[0].reserve), *motor_state, _LowState_1[0].pack(*m.wireless_remote, *m.reserve, m.crc)))
+
+
+def decode_LowState_(data: Buffer, big: bool) -> LowState_:
+    """The LowState_ after the encapsulation header of ``data``."""
+    if len(data) < 2092:
+        raise truncated("LowState_", 2092, len(data))
+    v = _LowState_0[big].unpack_from(data, 4)
+    version = v[0:2]
+    mode_pr = v[2]
+    mode_machine = v[3]
+    tick = v[4]
+    imu_state = IMUState_(v[5:9], v[9:12], v[12:15], v[15:18], v[18])
+    motor_state = [MotorState_(v[19], v[20], v[21], v[22], v[23], v[24:26], v[26], v[27:29], v[29], v[30:34])]
+    at = 128
+    end = at + 1904
+    for x0, x1, x2, x3, x4, x5, x6, x7, x8, x9, x10, x11, x12, x13, x14 in _LowState_motor_state[big].iter_unpack(data[at:end]):
+        e0 = new(MotorState_)
+        e0.mode = x0
+        e0.q = x1
+        e0.dq = x2
+        e0.ddq = x3
+        e0.tau_est = x4
+        e0.temperature = (x5, x6)
+        e0.vol = x7
+        e0.sensor = (x8, x9)
+        e0.motorstate = x10
+        e0.reserve = (x11, x12, x13, x14)
+        motor_state.append(e0)
+    at = end
+    v = _LowState_1[big].unpack_from(data, at)
+    at += 60
+    if at != len(data):
+        check_end("LowState_", data, at)
+    return LowState_(version, mode_pr, mode_machine, tick, imu_state, motor_state, v[0:40], v[40:44], v[44])
