@@ -20,6 +20,16 @@ _DEVICES = {
         "emulate_dex3_usb",
         "Emulate a Dex3-1 hand on USB (USB/IP).",
     ),
+    "g1": (
+        "dexkit.cli.emulate.body",
+        "emulate_g1",
+        "Emulate the body of a G1 (rt/lowcmd, rt/lowstate, unitree_hg).",
+    ),
+    "h1": (
+        "dexkit.cli.emulate.body",
+        "emulate_h1",
+        "Emulate the body of an H1 (rt/lowcmd, rt/lowstate, unitree_go).",
+    ),
     "mx64": (
         "dexkit.cli.emulate.mx64",
         "emulate_mx64",

@@ -1,0 +1,202 @@
+"""``dexkit emulate h1`` and ``dexkit emulate g1``: an emulated robot body on Unitree's topics."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import sys
+import time
+from contextlib import nullcontext
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.bodies import G1, H1, BodyModel
+from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.cli.emulate.stdin import read_faults
+from dexkit.errors import DdsError
+
+if TYPE_CHECKING:
+    from dexkit.emulators.body import EmulatedBody
+
+__all__ = ["emulate_g1", "emulate_h1"]
+
+_STATUS_PERIOD = 0.5  # seconds
+_JSON_PERIOD = 1.0
+
+
+def _command(model: BodyModel) -> click.Command:
+    """The command of one body."""
+
+    def emulate(
+        domain: int,
+        interface: str,
+        duration: float | None,
+        remote: str,
+        remote_from_stdin: bool,
+        lenient: bool,
+        noise: float,
+        seed: int,
+        force: bool,
+        real_time: bool,
+        as_json: bool,
+        quiet: bool,
+        mode_machine: int | None = None,
+    ) -> None:
+        from dexkit.emulators.body import EmulatedBody, Remote, Settings
+        from dexkit.service.realtime import prepare_process
+        from dexkit.service.realtime import real_time as real_time_priority
+
+        held = Remote.parse(remote)
+        chosen = dataclasses.replace(model, mode_machine=mode_machine or model.mode_machine)
+        settings = Settings(lenient=lenient, noise=noise, seed=seed)
+        status = sys.stderr.isatty() and not quiet
+        clear = "\r\x1b[K" if status else ""  # the status line is written over
+        logging.basicConfig(level=logging.WARNING, format=f"{clear}%(levelname)s %(message)s")
+        robot = EmulatedBody(
+            chosen, domain=domain, interface=interface, settings=settings, force=force
+        )
+        robot.body.remote = held
+        with (
+            # before its thread is started, which inherits it
+            real_time_priority() if real_time else nullcontext(True),
+            stop_on_signals() as stop,
+            robot,
+        ):
+            prepare_process()
+            if remote_from_stdin:
+
+                def press(text: str) -> None:
+                    robot.body.remote = Remote.parse("" if text == "release" else text)
+
+                read_faults(press, stop)
+            click.echo(
+                f"ready: {chosen.name} on {chosen.cmd_topic} and {chosen.state_topic} "
+                f"({chosen.family}, {len(chosen.used)} joints in {chosen.slots} slots), "
+                f"{chosen.state_rate:g} Hz, domain {domain}, {interface}"
+            )
+            sys.stdout.flush()
+            _watch(robot, stop, duration, status=status, as_json=as_json)
+        if robot.failure is not None:
+            raise DdsError(f"the {chosen.name} died: {robot.failure}") from robot.failure
+        if not as_json:
+            click.echo(f"stopped: {robot.body.counters.summary() or 'no state was published'}")
+
+    machine = f"\n    mode_machine is {model.mode_machine}, and commands must repeat it."
+    emulate.__doc__ = f"""Emulate the body of an {model.name.upper()} on Unitree's low-level topics.
+
+    {model.cmd_topic}, {model.arm_topic} and {model.state_topic} with {model.family} messages:
+    {len(model.used)} joints in {model.slots} motor slots on a fixed base, IMU, battery and remote.
+    Commands with a wrong CRC are ignored and reported.{machine if model.mode_machine else ""}
+
+    \b
+    Examples:
+      dexkit emulate {model.name}
+      dexkit emulate {model.name} --remote A,R1,lx=0.5
+      dexkit emulate {model.name} --domain 0 --interface eth0 --json
+
+    Prints "ready: ..." when the topics are up. Ctrl-C or SIGTERM ends it.
+    """
+    decorated = emulate
+    for option in reversed(_OPTIONS):
+        decorated = option(decorated)
+    if model.mode_machine is not None:
+        decorated = click.option(
+            "--mode-machine",
+            type=click.IntRange(1, 255),
+            default=model.mode_machine,
+            show_default=True,
+            help="Kind of machine that it says it is (the table is in unitree_ros).",
+        )(decorated)
+    return click.command(model.name)(dds_options(default_domain=1)(decorated))
+
+
+_OPTIONS = [
+    click.option("--duration", type=click.FloatRange(0), metavar="S", help="Stop after S seconds."),
+    click.option(
+        "--remote",
+        default="",
+        metavar="KEYS",
+        help="Keys held on the wireless remote and where its sticks stand, e.g. A,R1,lx=0.5.",
+    ),
+    click.option(
+        "--remote-from-stdin",
+        is_flag=True,
+        help="Also take such KEYS (or 'release') as lines of input, and stop at its end.",
+    ),
+    click.option(
+        "--lenient",
+        is_flag=True,
+        help="Obey any mode byte but 0, and commands with another mode_machine.",
+    ),
+    click.option(
+        "--noise",
+        type=click.FloatRange(0),
+        default=0.0,
+        show_default=True,
+        metavar="X",
+        help="Noise of the IMU; 1 is that of a plain one.",
+    ),
+    click.option("--seed", type=int, default=0, show_default=True, help="Of the noise."),
+    click.option("--force", is_flag=True, help="Even if another process publishes the state."),
+    click.option(
+        "--real-time/--no-real-time",
+        default=True,
+        show_default=True,
+        help="Run before ordinary processes where the system permits it (docs/service.md).",
+    ),
+    click.option("--json", "as_json", is_flag=True, help="A line of JSON each second."),
+    click.option("--quiet", is_flag=True, help="No status line."),
+]
+
+
+def _watch(
+    robot: EmulatedBody,
+    stop: StopRequest,
+    duration: float | None,
+    *,
+    status: bool,
+    as_json: bool,
+) -> None:
+    """Until told to stop: tell how it is doing."""
+    period = _JSON_PERIOD if as_json else _STATUS_PERIOD
+    end = None if duration is None else time.monotonic() + duration
+    counters = robot.body.counters
+    then, states, orders = time.monotonic(), counters.states, counters.commands
+    while robot.failure is None:
+        left = period if end is None else min(period, end - time.monotonic())
+        if left <= 0 or stop.wait(left):
+            break
+        now = time.monotonic()
+        span = now - then
+        state_rate = (counters.states - states) / span
+        command_rate = (counters.commands - orders) / span
+        then, states, orders = now, counters.states, counters.commands
+        if as_json:
+            line = {
+                "body": robot.model.name,
+                "state_hz": round(state_rate, 1),
+                "command_hz": round(command_rate, 1),
+                "driven": robot.body.driven,
+                "readers": robot.clients,
+                "commanders": robot.commanders,
+                "missed": robot.missed,
+                **dataclasses.asdict(counters),
+            }
+            click.echo(json.dumps(line))
+            sys.stdout.flush()
+        elif status:
+            what = "driven" if robot.body.driven else "damping"
+            ignored = counters.bad_crc + counters.bad_number + counters.bad_machine
+            text = (
+                f"{robot.model.name} {what}; state {state_rate:.0f} Hz, {robot.clients} readers; "
+                f"commands {command_rate:.0f} Hz of {robot.commanders}, {ignored} ignored"
+            )
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+    if status:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+emulate_h1 = _command(H1)
+emulate_g1 = _command(G1)

@@ -1,0 +1,356 @@
+"""The body of a robot: commands in, states out, as samples on an injected clock.
+
+No thread, no DDS: :class:`Body` is told the time and given bytes. :mod:`dexkit.emulators.body.run`
+puts it on the topics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.bodies import DQ_STOP, Q_STOP, BodyModel
+from dexkit.emulators.body.image import Image
+from dexkit.emulators.body.joints import Joints, Law
+from dexkit.emulators.body.settings import STEP, Remote, Settings
+from dexkit.emulators.body.supply import PERIOD, Supply
+from dexkit.emulators.mechanics import FixedSteps
+from dexkit.errors import WireError
+from dexkit.hand import MotorError
+
+__all__ = ["Body", "Counters"]
+
+Array = NDArray[np.float64]
+
+_GRAVITY = 9.81  # m/s²
+_IMU_TEMPERATURE = 60
+_GYRO_NOISE, _ACCELEROMETER_NOISE = 0.005, 0.05
+_BOARD_TEMPERATURE = 35
+_CYCLES = 10
+_LOW_LEVEL = [0xFE, 0xEF], 0xFF  # head and level_flag of unitree_go (F A.8)
+_REMOTE = struct.Struct("<2xH5f16x")  # head, keys, lx rx ry L2 ly, idle
+
+
+@dataclass
+class Counters:
+    """What a body has seen and done.
+
+    :ivar commands: obeyed.
+    :ivar arm_commands: obeyed, on the arm topic.
+    :ivar bad_crc: commands ignored because their CRC is wrong.
+    :ivar bad_number: commands ignored because a number is NaN or infinite.
+    :ivar bad_machine: commands ignored because their ``mode_machine`` is another robot's.
+    :ivar malformed: samples that are no such message at all.
+    :ivar wrong_mode: commands obeyed that hold a mode byte which its motor does not know.
+    :ivar timeouts: times the body began to damp because commands stopped.
+    :ivar states: published.
+    """
+
+    commands: int = 0
+    arm_commands: int = 0
+    bad_crc: int = 0
+    bad_number: int = 0
+    bad_machine: int = 0
+    malformed: int = 0
+    wrong_mode: int = 0
+    timeouts: int = 0
+    states: int = 0
+
+    def summary(self) -> str:
+        """Those that are not 0, in words."""
+        pairs = dataclasses.asdict(self).items()
+        return ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in pairs if n)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """A command in force."""
+
+    law: Law
+    following: NDArray[np.bool_]  # motors that are on
+    since: float
+    weight: float = 1.0
+
+
+class Body:
+    """An emulated H1 or G1: see docs/body.md for what is and what is not emulated.
+
+    :param now: seconds of any monotonic clock, the same as in the other calls.
+    :param report: told, in a sentence, of each kind of trouble once.
+
+    :ivar remote: the wireless remote; assign another to press keys.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        settings: Settings | None = None,
+        *,
+        now: float = 0.0,
+        report: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        self.model = model
+        self.settings = settings = settings or Settings()
+        self.counters = Counters()
+        self.remote = Remote()
+        self.joints = Joints(model, settings)
+        self.supply = Supply(model, self.joints, settings)
+        self.timeout = settings.command_timeout or model.command_timeout
+        self._report = report
+        self._said: set[str] = set()
+        self._steps = FixedSteps(STEP, most=0.1)
+        self._steps.restart(now)
+        self._start = now
+        self._lived = 0
+        self._used = np.array(model.used)
+        self._enable = np.array([model.enable[slot] for slot in model.used])
+        self._arm = np.isin(self._used, model.arm_slots)
+        self._damping = Law.damping(np.array([model.client_gains[slot][1] for slot in model.used]))
+        self._law = self._damping
+        self._order: _Order | None = None
+        self._arm_order: _Order | None = None
+        self._lost = False
+        self._mode_pr = 0
+        self._random = np.random.default_rng(settings.seed)
+        self._cmd = Image(model.cmd_type)
+        self._state = Image(model.state_type)
+        self._orders = self._cmd.floats("motor_cmd", "q", 5)  # q dq tau kp kd
+        self._motion = self._state.floats("motor_state", "q", 4)  # q dq ddq tau_est
+        self._raw = (
+            self._state.floats("motor_state", "q_raw", 3) if model.mode_machine is None else None
+        )
+        self._prepare_state()
+
+    @property
+    def driven(self) -> bool:
+        """Whether commands are in force; otherwise it damps."""
+        return self._order is not None or self._arm_order is not None
+
+    @property
+    def slots(self) -> dict[str, int]:
+        """Motor slots by joint name."""
+        return {self.model.joint(slot).name: slot for slot in self.model.used}
+
+    def position(self, slot: int) -> float:
+        """Where a joint is, rad."""
+        return float(self.joints.q[self.model.used.index(slot)])
+
+    # commands
+
+    def command(self, data: bytes, now: float) -> bool:
+        """Take a sample of the command topic; whether it is obeyed."""
+        order = self._read(data, now, self.model.cmd_topic)
+        if order is None:
+            return False
+        self.counters.commands += 1
+        self._order = order
+        self._lost = False
+        self._settle()
+        return True
+
+    def arm_command(self, data: bytes, now: float) -> bool:
+        """Take a sample of the arm topic; whether it is obeyed.
+
+        Unitree's arm examples set neither CRC nor mode bytes (unitree_sdk2
+        ``g1_arm7_sdk_dds_example.cpp``), so a CRC of 0 counts as none, and all modes as on.
+        """
+        order = self._read(data, now, self.model.arm_topic)
+        if order is None:
+            return False
+        self.counters.arm_commands += 1
+        self._arm_order = order
+        self._settle()
+        return True
+
+    def _read(self, data: bytes, now: float, topic: str) -> _Order | None:
+        arm = topic == self.model.arm_topic
+        image, counters = self._cmd, self.counters
+        try:
+            image.read(data)
+        except WireError as error:
+            counters.malformed += 1
+            self._say("malformed", f"{topic}: no {self.model.cmd_type}: {error}; ignored")
+            return None
+        message = image.message
+        crc, right = int(message["crc"][0]), image.crc()
+        if crc != right and not (arm and crc == 0):
+            counters.bad_crc += 1
+            self._say(
+                "crc",
+                f"{topic}: the CRC is 0x{crc:08X} and should be 0x{right:08X}; such commands are "
+                "ignored" + (" (it was never set)" if crc == 0 else ""),
+            )
+            return None
+        machine = self.model.mode_machine
+        if machine is not None and not arm and not self.settings.lenient:
+            sent = int(message["mode_machine"][0])
+            if sent != machine:
+                counters.bad_machine += 1
+                self._say(
+                    "machine",
+                    f"{topic}: mode_machine is {sent} and should be {machine}, as in "
+                    f"{self.model.state_topic}; such commands are ignored",
+                )
+                return None
+        motors = message["motor_cmd"][0]
+        mode = motors["mode"][self._used]
+        numbers = self._orders[self._used].astype(np.float64)
+        weight = float(self._orders[self.model.weight_slot, 0]) if arm else 1.0
+        # a sum finds what is not finite: of some singles, in double precision, it cannot overflow
+        if not math.isfinite(numbers.sum() + weight):
+            counters.bad_number += 1
+            self._say("number", f"{topic}: NaN or infinity; such commands are ignored")
+            return None
+        following = self._following(mode, topic) if not arm else self._arm
+        q, dq, tau, kp, kd = numbers.T
+        kp = (following & (np.abs(q) < Q_STOP)) * np.maximum(kp, 0.0)
+        kd = (following & (np.abs(dq) < DQ_STOP)) * np.maximum(kd, 0.0)
+        bias = following * tau + kp * q + kd * dq
+        if machine is not None:
+            self._mode_pr = int(message["mode_pr"][0]) if not arm else self._mode_pr
+            if self._mode_pr:
+                self._say(
+                    "mode_pr",
+                    f"{topic}: mode_pr {self._mode_pr}: motors A and B are taken for pitch and "
+                    "roll",
+                )
+        elif not arm and (message["head"][0].tolist(), message["level_flag"][0]) != _LOW_LEVEL:
+            self._say("head", f"{topic}: head and level_flag are not FE EF FF; obeyed all the same")
+        return _Order(Law(bias, kp, kd), following, now, min(max(weight, 0.0), 1.0))
+
+    def _following(self, mode: NDArray[np.uint8], topic: str) -> NDArray[np.bool_]:
+        """The motors that their mode bytes turn on."""
+        known: NDArray[np.bool_] = mode == self._enable
+        if self.settings.lenient:
+            known = mode != 0
+        unknown = ~known & (mode != 0)
+        if unknown.any():
+            self.counters.wrong_mode += 1
+            first = int(np.argmax(unknown))
+            slot = self.model.used[first]
+            self._say(
+                "mode",
+                f"{topic}: mode 0x{int(mode[first]):02X} for motor {slot} "
+                f"({self.model.joint(slot).name}), which takes 0x{self.model.enable[slot]:02X}; "
+                "motors with a wrong mode stay off",
+            )
+        return known
+
+    def _settle(self) -> None:
+        """Find the law of the motors from the commands in force."""
+        law = self._order.law if self._order is not None else self._damping
+        if self._arm_order is not None:
+            law = law.blend(self._arm_order.law, np.where(self._arm, self._arm_order.weight, 0.0))
+        self._law = law
+
+    def _say(self, kind: str, text: str) -> None:
+        if kind not in self._said:
+            self._said.add(kind)
+            self._report(text)
+
+    # time
+
+    def advance(self, now: float) -> None:
+        """Live until ``now``; after a pause of more than 0.1 s, only its last 0.1 s."""
+        for order in (self._order, self._arm_order):
+            if order is not None and now - order.since > self.timeout:
+                self._expire(order)
+        for _ in range(self._steps.due(now)):
+            self.joints.step(self._law)
+            self._lived += 1
+            if self._lived % round(PERIOD / STEP) == 0:
+                self.supply.step()
+                self._show_supply()
+
+    def _expire(self, order: _Order) -> None:
+        self.counters.timeouts += 1
+        if order is self._order:
+            self._order = None
+            self._lost = True
+            topic = self.model.cmd_topic
+        else:
+            self._arm_order = None
+            topic = self.model.arm_topic
+        self._settle()
+        self._say(
+            f"timeout {topic}", f"{topic}: no command for {self.timeout:g} s; its motors damp"
+        )
+
+    # states
+
+    def _prepare_state(self) -> None:
+        """What never changes in a state, and where the rest stands."""
+        message = self._state.message
+        imu = message["imu_state"][0]
+        imu["quaternion"] = 1.0, 0.0, 0.0, 0.0
+        imu["accelerometer"] = 0.0, 0.0, _GRAVITY
+        imu["temperature"] = _IMU_TEMPERATURE
+        if self.model.mode_machine is None:
+            message["head"], message["level_flag"] = _LOW_LEVEL
+            message["bms_state"]["cycle"] = _CYCLES
+            message["bms_state"]["version_high"] = 1
+            message["bms_state"]["bq_ntc"] = _BOARD_TEMPERATURE
+            message["bms_state"]["mcu_ntc"] = _BOARD_TEMPERATURE
+            message["temperature_ntc1"] = message["temperature_ntc2"] = _BOARD_TEMPERATURE
+        else:
+            message["mode_machine"] = self.model.mode_machine
+        self._show_supply()
+
+    def _show_supply(self) -> None:
+        message, supply = self._state.message, self.supply
+        motors = message["motor_state"][0]
+        warm = np.rint(supply.temperature).astype(np.int16)
+        if self.model.mode_machine is None:
+            motors["temperature"][self._used] = warm
+            bms = message["bms_state"]
+            bms["soc"] = round(supply.charge)
+            bms["current"] = -round(1000 * supply.current)
+            bms["cell_vol"] = (round(1000 * supply.cell_voltage),) * supply.cells
+            message["power_v"] = supply.voltage
+            message["power_a"] = supply.current
+        else:
+            motors["temperature"][self._used] = warm[:, None]  # case and winding alike
+            motors["vol"][self._used] = supply.voltage
+
+    def state(self, now: float) -> bytes:
+        """The state as it is, as a sample with its CRC."""
+        message, joints, used = self._state.message, self.joints, self._used
+        motors = message["motor_state"][0]
+        following = np.zeros(len(used), bool)
+        if self._order is not None:
+            following |= self._order.following
+        if self._arm_order is not None and self._arm_order.weight > 0:
+            following |= self._arm
+        motors["mode"][used] = np.where(following, self._enable, 0)
+        motion = np.array((joints.q, joints.dq, joints.ddq, joints.tau)).T
+        self._motion[used] = motion
+        if self._raw is not None:
+            self._raw[used] = motion[:, :3]
+        else:
+            message["mode_pr"] = self._mode_pr
+            error = MotorError.MOTOR_SAW_HOST_TIMEOUT if self._lost else MotorError.NONE
+            motors["motorstate"][used] = int(error)
+        if self.settings.noise:
+            self._shake(message["imu_state"][0])
+        message["tick"] = int((now - self._start) * 1000.0) & 0xFFFFFFFF
+        message["wireless_remote"] = np.frombuffer(self._remote_bytes(), np.uint8)
+        self.counters.states += 1
+        return self._state.seal()
+
+    def _shake(self, imu: Any) -> None:
+        noise = self.settings.noise * self._random.standard_normal((2, 3))
+        imu["gyroscope"] = _GYRO_NOISE * noise[0]
+        imu["accelerometer"] = _ACCELEROMETER_NOISE * noise[1] + (0.0, 0.0, _GRAVITY)
+
+    def _remote_bytes(self) -> bytes:
+        sticks = self.remote.sticks
+        lx, rx, ry, ly = (sticks.get(name, 0.0) for name in Remote.STICKS)
+        l2 = 1.0 if "L2" in self.remote.keys else 0.0
+        return _REMOTE.pack(self.remote.bits, lx, rx, ry, l2, ly)

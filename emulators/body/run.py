@@ -1,0 +1,197 @@
+"""A body on Unitree's topics: state at a fixed rate, commands as they come.
+
+with EmulatedBody(G1, domain=1) as robot:   # a thread of this process
+    ...
+    robot.body.position(18)
+
+stop = threading.Event()
+run_body(H1, domain=1, stop=stop)           # in a thread or process of the caller's
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from types import TracebackType
+
+from dexkit.bodies import BodyModel
+from dexkit.clock import Clock, RealClock
+from dexkit.dds import DdsNode, Reader, Writer
+from dexkit.emulators.body.body import Body
+from dexkit.emulators.body.settings import Settings
+from dexkit.errors import DdsError, EmulatorError, TopicConflict
+from dexkit.service import Publisher
+
+__all__ = ["EmulatedBody", "run_body"]
+
+log = logging.getLogger("dexkit.body")
+
+_DISCOVERY = 0.3  # seconds to look for another publisher of the state
+_DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
+_WATCH = 0.2  # seconds between looks whether it still lives
+
+
+class EmulatedBody:
+    """A body that lives in a thread of this process, on one domain.
+
+    :param node: where its topics are; without one, it makes one on ``domain`` and ``interface``.
+    :param publisher: whose thread it lives in, at the model's state rate; without one, its own.
+    :param force: start even if somebody else publishes the state.
+
+    :ivar body: the body itself. It belongs to that thread: read it, and assign ``body.remote``.
+    :ivar failure: what ended it, if anything did.
+
+    Troubles of clients are logged once each, as warnings of the logger ``dexkit.body``, and
+    counted in ``body.counters``.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        *,
+        node: DdsNode | None = None,
+        domain: int = 1,
+        interface: str = "lo",
+        settings: Settings | None = None,
+        publisher: Publisher | None = None,
+        force: bool = False,
+        clock: Clock | None = None,
+    ) -> None:
+        self.model = model
+        self.domain = node.domain if node is not None else domain
+        self.interface = node.interface if node is not None else interface
+        self._clock: Clock = clock or RealClock()
+        self.body = Body(model, settings, now=self._clock.now(), report=log.warning)
+        self.failure: BaseException | None = None
+        self.missed = 0
+        self._node = node
+        self._own_node: DdsNode | None = None
+        self._publisher = publisher or Publisher(model.state_rate, self._clock)
+        self._force = force
+        self._writer: Writer | None = None
+        self._commands: Reader | None = None
+        self._arm_commands: Reader | None = None
+
+    @property
+    def clients(self) -> int:
+        """Readers of the state."""
+        return self._writer.matched if self._writer is not None else 0
+
+    @property
+    def commanders(self) -> int:
+        """Writers of the two command topics."""
+        readers = (self._commands, self._arm_commands)
+        return sum(reader.matched for reader in readers if reader is not None)
+
+    def start(self) -> EmulatedBody:
+        """Publish states and obey commands from now on.
+
+        :raises TopicConflict: somebody else publishes the state (unless ``force``).
+        :raises DdsError: the topics cannot be made.
+        """
+        if self._writer is not None:
+            raise EmulatorError(f"this {self.model.name} has been started already")
+        node = self._node
+        if node is None:
+            node = self._own_node = DdsNode(self.domain, self.interface)
+        try:
+            if not self._force:
+                self._refuse_conflict(node)
+            model = self.model
+            self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
+            self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
+            self._writer = node.writer(model.state_topic, model.state_type)
+        except BaseException:
+            self._close()
+            raise
+        self._publisher.add(self._tick)
+        return self
+
+    def stop(self) -> None:
+        """Publish no more. May be called twice."""
+        self._publisher.remove(self._tick)
+        self._close()
+
+    def __enter__(self) -> EmulatedBody:
+        return self.start()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def _close(self) -> None:
+        for handle in (self._commands, self._arm_commands, self._writer):
+            if handle is not None:
+                handle.close()
+        self._commands = self._arm_commands = self._writer = None
+        if self._own_node is not None:
+            self._own_node.close()
+            self._own_node = None
+
+    def _refuse_conflict(self, node: DdsNode) -> None:
+        def others() -> list[str]:
+            return [
+                e.process or "somebody"
+                for e in node.endpoints()
+                if e.topic == self.model.state_topic and e.kind == "writer" and not e.own
+            ]
+
+        node.discovery.wait(lambda endpoints: others(), _DISCOVERY)
+        if found := sorted(set(others())):
+            raise TopicConflict(
+                f"{', '.join(found)} already publishes {self.model.state_topic} on domain "
+                f"{self.domain}",
+                hint="stop the other robot, choose another --domain, or add --force",
+            )
+
+    def _tick(self, missed: int) -> None:
+        if self.failure is not None:
+            return
+        try:
+            self._live(missed)
+        except Exception as error:  # the thread may be somebody else's as well
+            self.failure = error
+            log.error("the %s died: %s: %s", self.model.name, type(error).__name__, error)
+
+    def _live(self, missed: int) -> None:
+        body, now = self.body, self._clock.now()
+        assert self._writer is not None
+        assert self._commands is not None
+        assert self._arm_commands is not None
+        self.missed += missed
+        for sample in self._commands.take():
+            body.command(sample.data, now)
+        for sample in self._arm_commands.take():
+            body.arm_command(sample.data, now)
+        body.advance(now)
+        self._writer.write_raw(body.state(now))
+
+
+def run_body(
+    model: BodyModel,
+    *,
+    domain: int = 1,
+    interface: str = "lo",
+    stop: threading.Event,
+    ready: threading.Event | None = None,
+    settings: Settings | None = None,
+    force: bool = False,
+) -> None:
+    """Be a body until ``stop`` is set.
+
+    :param ready: set when its topics are up.
+    :raises TopicConflict: somebody else publishes the state (unless ``force``).
+    :raises DdsError: the topics cannot be made, or writing to them failed.
+    """
+    with EmulatedBody(
+        model, domain=domain, interface=interface, settings=settings, force=force
+    ) as robot:
+        if ready is not None:
+            ready.set()
+        while not stop.wait(_WATCH):
+            if robot.failure is not None:
+                raise DdsError(f"the {model.name} died: {robot.failure}") from robot.failure

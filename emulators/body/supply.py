@@ -1,0 +1,65 @@
+"""What the work of the motors does to temperatures and the battery, ten times a second."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.bodies import BodyModel
+from dexkit.emulators.body.joints import Joints
+from dexkit.emulators.body.settings import Settings
+
+__all__ = ["Supply"]
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.1
+"""Seconds between two looks."""
+_CELLS = {"unitree_go": 15, "unitree_hg": 13}
+# of the battery: as many as H1's state has room for (F A.2); the G1's datasheet
+_CELL_FULL, _CELL_EMPTY = 4.15, 3.3  # V
+_COPPER_LOSS = 60.0  # W that a motor turns into heat at full torque
+
+
+class Supply:
+    """Temperatures of the motors and the state of the battery.
+
+    :ivar cells: of the battery, in series.
+    :ivar temperature: shape (n,), degrees Celsius.
+    :ivar charge: percent.
+    :ivar power: W drawn at the last look.
+    """
+
+    def __init__(self, model: BodyModel, joints: Joints, settings: Settings) -> None:
+        self.cells = _CELLS[model.family]
+        self._joints = joints
+        self._settings = settings
+        self.temperature: Array = np.full(len(joints.q), settings.ambient)
+        self.charge = settings.charge
+        self.power = settings.idle_power
+
+    def step(self) -> None:
+        """Live :data:`PERIOD` seconds with the torques of now."""
+        joints, s = self._joints, self._settings
+        load = np.square(joints.tau / joints.tau_max)
+        goal = s.ambient + s.heating * load
+        self.temperature += (goal - self.temperature) * (PERIOD / s.warm_up)
+        mechanical = float(np.maximum(joints.tau * joints.dq, 0.0).sum())
+        self.power = s.idle_power + _COPPER_LOSS * float(load.sum()) + mechanical
+        used = self.power * PERIOD / 3600.0  # W·h
+        self.charge = max(0.0, self.charge - 100.0 * used / s.capacity)
+
+    @property
+    def cell_voltage(self) -> float:
+        """V."""
+        return _CELL_EMPTY + (_CELL_FULL - _CELL_EMPTY) * self.charge / 100.0
+
+    @property
+    def voltage(self) -> float:
+        """V of the battery."""
+        return self.cells * self.cell_voltage
+
+    @property
+    def current(self) -> float:
+        """A drawn from the battery."""
+        return self.power / self.voltage
