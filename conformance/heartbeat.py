@@ -20,13 +20,15 @@ _PSI = Path("/proc/pressure/cpu")
 
 
 class Heartbeat:
-    """Notes when the machine lacked processor time: then it is late, not the hand.
+    """Notes by how much the kit's own timer is late, and when programs wait for a processor.
 
-    Shown by this thread being woken late, and by Linux' pressure stall information: the time for
-    which some task could have run but had no processor. Without the latter (no Linux, or a
-    kernel without it) only the former is known.
+    The first, :attr:`beats`, is what the machine demonstrably did to who runs on it. The second
+    comes from Linux' pressure stall information too: the time for which some task could have run
+    but had no processor. It says nothing of how long any of them waited, or which: two programs
+    in the background fill it, and leave the hand alone. What each of them excuses is said in
+    :mod:`~dexkit.conformance.verdicts`.
 
-    :ivar stalls: when the machine lacked processor time.
+    :ivar stalls: when programs waited for most of the time, or this thread was woken late.
     """
 
     def __init__(self) -> None:

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 
 from dexkit.errors import TraceUnsupported
-from dexkit.hand import Side
+from dexkit.hand import Floats, Side
 
-__all__ = ["RECORD", "Beats", "Phase", "Stall", "Stimulus"]
+__all__ = ["IDLE", "RECORD", "Beats", "Lost", "Phase", "Stall", "Stimulus"]
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
+IDLE = 1e-3
+"""Seconds by which timers are late on a machine that has nothing else to do."""
 
 
 @dataclass
@@ -45,10 +47,26 @@ class Phase:
 
 @dataclass(frozen=True)
 class Stall:
-    """A stretch in which the kit's own machine lacked processor time."""
+    """A stretch in which programs waited for a processor."""
 
     begin_ns: int
     end_ns: int
+
+
+@dataclass(frozen=True)
+class Lost:
+    """By how much the kit's own timer was late in a stretch, beyond what an idle machine's is.
+
+    :param total: all of it, seconds: what one thing that happened then may have waited.
+    :param mean: of each time, seconds: what a thing that happens again and again waited.
+    :param p99: 99th percentile, seconds: what one in a hundred waited.
+    :param best: of the best quarter, seconds: machines are busy by fits.
+    """
+
+    total: float
+    mean: float
+    p99: float
+    best: float = 0.0
 
 
 @dataclass
@@ -66,13 +84,25 @@ class Beats:
 
     def lateness(self, begin_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Median and 99th percentile of it in [begin, end], seconds; None if it is not known."""
-        t, late = np.array(self.t_us), np.array(self.late_us)
-        begin, end = (begin_ns - self.begin_ns) / 1e3, (end_ns - self.begin_ns) / 1e3
-        there = late[(t >= begin) & (t - late <= end)] / 1e6  # due before its end, fired in it
+        there = self._in(begin_ns, end_ns)
         if not len(there):
             return None
         median, high = np.percentile(there, [50, 99])
         return float(median), float(high)
+
+    def lost(self, begin_ns: int, end_ns: int) -> Lost | None:
+        """What was lost in [begin, end]; None if that is not known."""
+        there = np.maximum(self._in(begin_ns, end_ns) - IDLE, 0.0)
+        if not len(there):
+            return None
+        best, p99 = np.percentile(there, [25, 99])
+        return Lost(float(there.sum()), float(there.mean()), float(p99), float(best))
+
+    def _in(self, begin_ns: int, end_ns: int) -> Floats:
+        """Lateness, seconds, of the beats that were due before the end and came after the begin."""
+        t, late = np.array(self.t_us), np.array(self.late_us)
+        begin, end = (begin_ns - self.begin_ns) / 1e3, (end_ns - self.begin_ns) / 1e3
+        return np.asarray(late[(t >= begin) & (t - late <= end)] / 1e6)
 
 
 @dataclass
@@ -82,7 +112,7 @@ class Stimulus:
     :param phases: in order of time.
     :param objects: where each side touches its object, or None where there is none: rad for a
         hand of one joint, percent of closing for others.
-    :param stalls: when the machine lacked processor time, so that the hand is not blamed for it.
+    :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
     """
 

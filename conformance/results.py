@@ -29,6 +29,7 @@ from dexkit.conformance.requirements import Level, Requirement
 from dexkit.errors import UsageError
 
 __all__ = [
+    "BUSY",
     "FORMAT",
     "TOO_BUSY",
     "Evidence",
@@ -44,6 +45,9 @@ __all__ = [
 ]
 
 TOO_BUSY = "the machine was too busy"
+"""How the reason of a result begins that a busy machine may have caused."""
+BUSY = "the machine was busy"
+"""How the reason of a failure begins that was seen on a busy machine, but is larger than that."""
 FORMAT = "dexkit-conformance-result"
 VERSION = 2
 
@@ -211,7 +215,7 @@ class RunResult:
     :param notes: remarks on the recording.
     :param harness: how fair the kit's own machine was, where it made the run: ``jitter_p50_ms``
         and ``jitter_p99_ms``, by which it was late itself, and ``starved``, the part of the run,
-        0 to 1, in which it lacked processor time.
+        0 to 1, in which programs waited for a processor.
     :param claims: by unit, whether the vendor claims it; None where nothing is said.
     """
 
@@ -227,7 +231,7 @@ class RunResult:
 
     @property
     def starved(self) -> float:
-        """Part of the run, 0 to 1, in which the kit's own machine lacked processor time."""
+        """Part of the run, 0 to 1, in which programs waited for a processor on its machine."""
         return self.harness.get("starved", 0.0)
 
     def counts(self) -> dict[Verdict, int]:
@@ -249,7 +253,12 @@ class RunResult:
 
     @property
     def disturbed(self) -> bool:
-        """Whether a MUST is open only because the kit's own machine was too busy."""
+        """Whether the run should be done again, because the kit's own machine was busy: a MUST is
+        open only for that, or all that failed was seen while it was so.
+        """
+        failed = [r for r in self.results if r.verdict is Verdict.FAIL]
+        if failed:
+            return all(r.reason.startswith(BUSY) for r in failed)
         return self.overall is Overall.INCONCLUSIVE and any(
             r.verdict is Verdict.BLOCKED and r.reason.startswith(TOO_BUSY) for r in self.results
         )

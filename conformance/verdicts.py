@@ -1,23 +1,61 @@
-"""From a requirement and what its check found to a verdict; the same for topics and USB."""
+"""From a requirement and what its check found to a verdict; the same for topics and USB.
+
+**Whose fault is it?** A machine that is short of processor time makes a good hand look late. Only
+requirements of real time can suffer from it, and only as far as the machine is shown to have been
+late while it was judged:
+
+1. Each failure has a size: the seconds by which a good hand would have had to be late to look like
+   it (:class:`~dexkit.conformance.checks.Late`). A rate of 150 Hz where 200 are asked for is 1.7 ms
+   late each time; 50 Hz is 15 ms; a gap of 0.3 s where 0.1 s are allowed is 0.2 s late once.
+2. The kit's own timer is measured all the time (:mod:`~dexkit.conformance.heartbeat`). What it was
+   late by at the failure's place, beyond what is usual on an idle machine, is what the machine has
+   demonstrably lost.
+3. The hand's process may have been hit harder: up to :data:`HARDEST` times that, and up to twice as
+   much again in proportion to the time in which programs waited for a processor (Linux' pressure
+   stall information). Pressure alone excuses nothing: it only scales what was lost.
+4. Machines are busy by fits: a hand that is too slow at its best, too, is slow by itself. Of what
+   happens again and again, the best quarter must be explained by the kit's own best quarter.
+5. On a machine that is overloaded, where the kit's own timer is late by :data:`OVERLOADED` on
+   average over the whole run, nothing can be told of single events or of motion: a process that
+   computes is hit there without any measure. What 4 refuses, and what is wrong without moving,
+   fails all the same.
+6. A failure that is no larger than that at any of its places is *blocked*: the run is done again.
+   A larger one is the hand's, and its result says what the machine does not explain. A run that
+   fails by nothing but such results is done again as well, and then believed.
+
+So a gross failure fails on a busy machine, too; one at the border is blocked there; every failure
+fails on an idle machine.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.phases import IDLE, Lost
 from dexkit.conformance.requirements import Level, Requirement
-from dexkit.conformance.results import TOO_BUSY, Result, Verdict
+from dexkit.conformance.results import BUSY, TOO_BUSY, Result, Verdict
 from dexkit.hand import Side
 
-__all__ = ["Judgement", "Machine", "excuse"]
+__all__ = ["Excuse", "Judgement", "Machine", "excuse"]
 
-STARVED = 0.5
-"""Part of a failure's time that must be starved for it not to be blamed on the hand."""
-LATE = 0.5
-"""Part of the time that a requirement allows by which the kit may be late itself."""
+HARDEST = 2.0
+"""How many times as late as the kit's own timer a hand's process may have been: it has more than
+one thread, and waits for its device."""
+BUSY_SHARE = 0.5
+"""Part of a failure's time with programs waiting for a processor that makes a machine busy."""
+OVERLOADED = 3e-3
+"""Seconds by which the kit's own timer, of 10 ms, is late on average on an overloaded machine."""
+_STILL = ("nothing", "endpoints", "state")
+"""What requirements need that a hand cannot fail for lack of time, unless they are of real time."""
+NOTABLE = 0.1
+"""Part of a failure that the machine must explain to be mentioned."""
+SHORT = 1.0
+"""Seconds before a failure that has no end, in which the machine may have caused it."""
 
 MOST_PLACES = 5
 """Places that a result names; all of them are looked at before a failure is excused."""
@@ -29,12 +67,26 @@ class Machine(Protocol):
     """What a recording says of the machine that the kit ran on."""
 
     def starved(self, begin: float, end: float) -> float:
-        """Part of [begin, end], 0 to 1, in which it lacked processor time."""
+        """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         ...
 
-    def lateness(self, begin: float, end: float) -> tuple[float, float] | None:
-        """Median and 99th percentile, seconds, by which the kit was late; None if not known."""
+    def lost(self, begin: float, end: float) -> Lost | None:
+        """By how much the kit's own timer was late in it; None if that is not known."""
         ...
+
+
+@dataclass(frozen=True)
+class Excuse:
+    """What the machine has to do with a failure.
+
+    :param excused: it can have caused all of it.
+    :param text: what it was like, where it was not idle; else empty.
+    :param final: no load, however heavy, makes a good hand look like this.
+    """
+
+    excused: bool
+    text: str = ""
+    final: bool = False
 
 
 def excuse(
@@ -42,43 +94,87 @@ def excuse(
     requirement: Requirement,
     outcome: Outcome,
     whole: tuple[float, float] | None = None,
-) -> str:
-    """Why a failure is not blamed on the hand, or nothing: at every place of it the machine was
-    starved, or the kit's own timers were as late as the hand is blamed for.
+) -> Excuse:
+    """Whether the machine that the kit ran on can have caused a failure; see the module.
 
     :param whole: the run, for failures that have no place.
     """
+    overloaded = _overloaded(machine, whole)
     if not requirement.realtime:
-        return ""
-    spans = [(e.time_s, e.end_s) for e in outcome.evidence if e.end_s is not None]
+        moving = requirement.needs not in _STILL
+        return Excuse(bool(overloaded) and moving, overloaded if moving else "")
+    spans = [
+        (e.time_s, e.end_s) if e.end_s is not None else (e.time_s - SHORT, e.time_s)
+        for e in outcome.evidence
+    ]
     if whole is not None and not spans:
         spans = [whole]
-    reasons = [_excuse(machine, requirement, *span) for span in spans]
-    if not reasons or not all(reasons):
-        return ""
-    return f"{TOO_BUSY} to tell: {reasons[0]}; run again"
+    sizes = _sizes(outcome, spans)
+    how = outcome.late.how if outcome.late else "total"
+    best = outcome.late.best if outcome.late else 0.0
+    found = [_at(machine, size, best, how, *s) for size, s in zip(sizes, spans, strict=True)]
+    if not found:
+        return Excuse(False)
+    # the place that is hardest to explain decides
+    least = min(found, key=lambda e: e.excused)
+    if overloaded and not least.final:
+        return Excuse(True, overloaded)
+    return least
 
 
-def _excuse(machine: Machine, requirement: Requirement, begin: float, end: float) -> str:
-    share = machine.starved(begin, end)
-    if share >= STARVED:
-        return f"it lacked processor time for {share:.0%} of it"
-    late = machine.lateness(begin, end)
-    if late is None:
+def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> str:
+    """That the machine was overloaded, or nothing."""
+    lost = machine.lost(*whole) if whole is not None else None
+    if lost is None or lost.mean < OVERLOADED:
         return ""
-    # what is late now and then moves the extremes; a mean rate suffers only from what is typical
-    for name, limit in requirement.tolerances.items():
-        extreme = name.startswith("max_") and name.endswith("_s")
-        if not extreme and name != "min_rate_hz":
-            continue
-        allowed, by = (limit, late[1]) if extreme else (1 / limit, late[0])
-        if by > LATE * allowed:
-            which = "99th percentile" if extreme else "median"
-            return (
-                f"the kit was itself late by {by * 1e3:.1f} ms ({which}), where "
-                f"{allowed * 1e3:.1f} ms are allowed"
-            )
-    return ""
+    return (
+        f"{TOO_BUSY} to tell: the kit's own timer was late by {_ms(lost.mean)} each time, over the "
+        "whole run; run again"
+    )
+
+
+def _sizes(outcome: Outcome, spans: Sequence[tuple[float, float]]) -> Sequence[float]:
+    """How late a good hand would have to be at each place of a failure."""
+    if outcome.late is None:
+        return [end - begin for begin, end in spans]
+    sizes = outcome.late.seconds
+    return sizes if len(sizes) == len(spans) else [max(sizes)] * len(spans)
+
+
+_HOW = {"total": "in all", "mean": "each time", "p99": "one time in a hundred"}
+
+
+def _at(machine: Machine, size: float, best: float, how: str, begin: float, end: float) -> Excuse:
+    lost = machine.lost(begin, end)
+    share = min(machine.starved(begin, end), 1.0)
+    if lost is None:
+        return Excuse(False)
+    measured = {"total": lost.total, "mean": lost.mean, "p99": lost.p99}[how]
+    harder = HARDEST * (1.0 + share)
+    explained = harder * measured
+    busy = share >= BUSY_SHARE or explained >= NOTABLE * size
+    was = f"the kit's own timer was late by {_ms(measured)} {_HOW[how]} there"
+    if best > IDLE + harder * lost.best:
+        why = f"{BUSY}, but by fits, and the hand is {_ms(best)} late in its best quarter, too"
+        return Excuse(False, why if busy else "", final=True)
+    if measured > 0 and explained >= size:
+        return Excuse(
+            True,
+            f"{TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(size)} late; run again",
+        )
+    if not math.isfinite(size):
+        why = f"{BUSY}, but no delay makes a good hand look like this" if busy else ""
+        return Excuse(False, why, final=True)
+    if not busy:
+        return Excuse(False)
+    return Excuse(
+        False,
+        f"{BUSY}, but {was}, which explains at most {_ms(explained)} of {_ms(size)}",
+    )
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.3g} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
 class Judgement:
@@ -133,10 +229,10 @@ class Judgement:
                 return self.result(Verdict.BLOCKED, Outcome(None, reason=reason), before)
         return None
 
-    def of(self, check: Callable[[], Outcome], excuse: Callable[[Outcome], str]) -> Result:
+    def of(self, check: Callable[[], Outcome], excuse: Callable[[Outcome], Excuse]) -> Result:
         """What the check finds.
 
-        :param excuse: why a failure is not blamed on the hand, or empty.
+        :param excuse: what the machine has to do with a failure.
         """
         try:
             outcome = check()
@@ -152,7 +248,9 @@ class Judgement:
         if outcome.met:
             return self.result(Verdict.PASS, outcome)
         busy = excuse(outcome)
-        if busy:
-            return self.result(Verdict.BLOCKED, replace(outcome, reason=busy))
+        if busy.text:
+            outcome = replace(outcome, reason=busy.text)
+        if busy.excused:
+            return self.result(Verdict.BLOCKED, outcome)
         must = self.requirement.level is Level.MUST
         return self.result(Verdict.FAIL if must else Verdict.WARN, outcome)

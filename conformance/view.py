@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.phases import RECORD, Phase, Stimulus
+from dexkit.conformance.phases import RECORD, Lost, Phase, Stimulus
 from dexkit.conformance.usb.view import UsbRecording
 from dexkit.conformance.wire import Wire
 from dexkit.errors import ConformanceError, UsageError
@@ -248,7 +248,7 @@ class Recording:
         ]
 
     def starved(self, begin: float, end: float) -> float:
-        """Part of [begin, end], 0 to 1, in which the kit's own machine lacked processor time."""
+        """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         if self.stimulus is None or end <= begin:
             return 0.0
         seconds = sum(
@@ -264,6 +264,12 @@ class Recording:
         if self.stimulus is None:
             return None
         return self.stimulus.beats.lateness(self.log_time(begin), self.log_time(end))
+
+    def lost(self, begin: float, end: float) -> Lost | None:
+        """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
+        if self.stimulus is None:
+            return None
+        return self.stimulus.beats.lost(self.log_time(begin), self.log_time(end))
 
 
 def detect_dialect(trace: TraceLike) -> Dialect:

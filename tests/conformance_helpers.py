@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
 from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.phases import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.results import Result, RunResult, Verdict
+from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
@@ -25,6 +28,32 @@ def copy_of(trace: MemoryTrace) -> MemoryTrace:
         metadata={k: dict(v) for k, v in trace.metadata.items()},
         rows={k: list(v) for k, v in trace.rows.items()},
     )
+
+
+def with_beats(
+    trace: MemoryTrace,
+    stalls: Sequence[int] = (),
+    stall_s: float = 0.15,
+    *,
+    usual_us: int = 100,
+    pressed: bool = False,
+) -> Recording:
+    """The recording, of a machine that stood still from these log times on.
+
+    :param usual_us: by how much its timer was late otherwise.
+    :param pressed: whether programs waited for a processor all the time.
+    """
+    stimulus = Stimulus.from_metadata(trace.metadata[RECORD])
+    first = min(row[0] for rows in trace.rows.values() for row in rows)
+    beats = dict.fromkeys(range(0, 20_000_000, 10_000), usual_us)
+    for stall in stalls:
+        begin, length = (stall - first) // 1000, round(stall_s * 1e6)
+        beats = {t: x for t, x in beats.items() if not begin <= t < begin + length}
+        beats[begin + length] = length
+    stimulus.beats = Beats(first, sorted(beats), [beats[t] for t in sorted(beats)])
+    stimulus.stalls = [Stall(first, first + 60 * 10**9)] if pressed else []
+    trace.metadata[RECORD] = stimulus.to_metadata()
+    return Recording.of(trace)
 
 
 def of(result: RunResult, requirement: str, side: str = "left") -> Result:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
 
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import plan_for
-from dexkit.conformance.results import Overall, RunResult, Verdict
+from dexkit.conformance.mutants import gripper, plan_for
+from dexkit.conformance.results import BUSY, Overall, RunResult, Verdict
 from dexkit.conformance.view import Recording
-from dexkit.conformance.virtual import Service, run_virtual
+from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
-from tests.conformance_helpers import copy_of, of, short_run
+from tests.conformance_helpers import copy_of, of, short_run, with_beats
 
 PHASES = frozenset({"step", "ends", "nan", "limp", "silence", "resume", "load", "burst"})
 
@@ -24,6 +25,18 @@ class JustFastEnough(ReferenceService):
     """State at 200 Hz, and not a sample more."""
 
     tick = period = 0.005
+
+
+class Slowish(ReferenceService):
+    """State at 180 Hz."""
+
+    tick = period = 1 / 180
+
+
+class FarTooSlow(ReferenceService):
+    """State at 50 Hz."""
+
+    tick = period = 0.02
 
 
 class Plain(ReferenceService):
@@ -87,6 +100,58 @@ def test_the_kits_own_restart_of_the_service_is_no_gap_of_the_hand() -> None:
     gap = of(found, "DEX1-RATE-03")
     assert gap.verdict is Verdict.PASS
     assert gap.values["max_gap_s"] < 0.1  # nor is it told as the longest
+
+
+@pytest.mark.parametrize(
+    ("service", "usual_ms", "pressed", "verdict"),
+    [
+        (ReferenceService, 0.1, False, Verdict.PASS),
+        (ReferenceService, 5.0, True, Verdict.PASS),
+        (Slowish, 0.1, False, Verdict.FAIL),
+        (Slowish, 0.5, True, Verdict.FAIL),  # programs wait, and yet nothing is late
+        (Slowish, 2.0, True, Verdict.BLOCKED),
+        (FarTooSlow, 0.1, False, Verdict.FAIL),
+        (FarTooSlow, 2.0, True, Verdict.FAIL),
+        (FarTooSlow, 4.0, True, Verdict.FAIL),  # overloaded, and yet it is never fast
+        (FarTooSlow, 6.0, True, Verdict.BLOCKED),  # nothing is on time on such a machine
+    ],
+)
+def test_a_busy_machine_explains_as_much_as_it_was_late_by(
+    service: type[Service], usual_ms: float, pressed: bool, verdict: Verdict
+) -> None:
+    recording = with_beats(
+        copy_of(listened(service)), usual_us=int(usual_ms * 1e3), pressed=pressed
+    )
+    result = judge(recording)
+    found = of(result, "DEX1-RATE-01")
+    assert found.verdict is verdict
+    if verdict is Verdict.BLOCKED:
+        assert result.overall is Overall.INCONCLUSIVE
+        assert result.disturbed
+    elif verdict is Verdict.FAIL:
+        assert result.overall is Overall.FAIL
+        assert found.reason.startswith(BUSY) is pressed
+
+
+@pytest.mark.parametrize(("usual_ms", "verdict"), [(2.0, Verdict.FAIL), (6.0, Verdict.BLOCKED)])
+def test_nothing_is_told_of_motion_where_the_machine_was_overloaded(
+    usual_ms: float, verdict: Verdict
+) -> None:
+    trace = copy_of(listened(ReferenceService))
+    topic = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+    still = trace.rows[topic][0][2]
+    trace.rows[topic] = [(t, s, still) for t, s, _ in trace.rows[topic]]
+    result = judge(with_beats(trace, usual_us=int(usual_ms * 1e3)))
+    assert of(result, "DEX1-MOVE-01").verdict is verdict
+    assert of(result, "DEX1-FIELD-03").verdict is Verdict.PASS
+    percent = copy_of(listened(gripper.Percent))
+    found = of(judge(with_beats(percent, usual_us=int(usual_ms * 1e3))), "DEX1-FIELD-03")
+    assert found.verdict is Verdict.FAIL
+
+
+@cache
+def listened(service: type[Service]) -> MemoryTrace:
+    return run_virtual(replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"})), service)
 
 
 @pytest.mark.parametrize("off_s", [-3600.0, 0.4, 86400.0])

@@ -21,7 +21,7 @@ from dexkit.conformance.results import Evidence
 from dexkit.conformance.view import Commands, Recording, SideView, States
 from dexkit.hand import JointSpec, Side
 
-__all__ = ["Check", "Context", "Outcome", "all_checks", "check"]
+__all__ = ["Check", "Context", "Late", "Outcome", "all_checks", "check"]
 
 _MODULES = (
     "discovery",
@@ -38,12 +38,35 @@ _MODULES = (
 )
 
 
+STROKE_S = 1.0
+"""Seconds that a hand takes for a stroke, as Unitree's client leads it."""
+
+
+@dataclass(frozen=True)
+class Late:
+    """How late a good hand would have to be to look like a failure: the failure's size.
+
+    :param seconds: at each of the failure's places, or one for all of them; infinite where no
+        delay makes a good hand look so. Of a way that is missing, the seconds that a good hand
+        takes for it: :data:`STROKE_S` for a stroke.
+    :param how: ``total``: once, at that place; ``mean``: again and again, as a rate suffers;
+        ``p99``: one time in a hundred.
+    :param best: the same of the best quarter of what happened again and again; 0 if not known.
+    """
+
+    seconds: tuple[float, ...]
+    how: str = "total"
+    best: float = 0.0
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a check found.
 
     :param met: whether the requirement is met; None when it could not be judged.
     :param cause: the likely cause, where the check saw enough to tell; else the requirement's.
+    :param late: how late a good hand would have to be to look like this, where the check can
+        tell; else as late as the failure's place is long.
     :param absent: the hand does not do this at all: a failure of who claims the unit, whatever
         ``met`` is for others.
     """
@@ -55,11 +78,17 @@ class Outcome:
     evidence: tuple[Evidence, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
     cause: str = ""
+    late: Late | None = None
     absent: bool = False
 
     def because(self, cause: str) -> Outcome:
         """The same, with a cause that the check could tell from what it saw."""
         return replace(self, cause=cause)
+
+    def if_late(self, *seconds: float, how: str = "total", best: float = 0.0) -> Outcome:
+        """The same, with its size; see :class:`Late`."""
+        sizes = tuple(max(0.0, float(s)) for s in seconds)
+        return replace(self, late=Late(sizes, how, max(0.0, float(best))))
 
 
 @dataclass(frozen=True)

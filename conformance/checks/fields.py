@@ -138,4 +138,4 @@ def _velocity(ctx: Context, joint: int) -> Outcome:
         text + ("; its sign is turned" if turned else ""),
         ctx.at(states.topic, float(t[worst]), float(t[worst]) + window),
         relative_rms=error,
-    )
+    ).if_late((error - ctx.tolerance("max_relative_rms")) * window, how="mean")

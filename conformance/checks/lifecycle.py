@@ -53,7 +53,7 @@ def late_joiner(ctx: Context) -> Outcome:
         "nothing" if waited is None else f"{waited:.2f} s",
         f"a subscriber that joined at {begin:.2f} s received {text}",
         ctx.at(ctx.states.topic, begin, end),
-    )
+    ).if_late((end - begin if waited is None else waited) - limit)
 
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
@@ -65,7 +65,7 @@ def restarted_client(ctx: Context) -> Outcome:
 @check("DEX1-LIFE-03", "DEX3-LIFE-03")
 def restarted_service(ctx: Context) -> Outcome:
     """State and the step after the service came up again, with a client that stayed."""
-    begin, _ = ctx.span(ctx.phases()[-1])
+    begin, end = ctx.span(ctx.phases()[-1])
     later = ctx.states.t[ctx.states.t > begin]
     waited = float(later[0]) - begin if len(later) else np.inf
     if waited > ctx.tolerance("max_wait_s"):
@@ -73,8 +73,8 @@ def restarted_service(ctx: Context) -> Outcome:
         return ctx.failed(
             "no state",
             f"{what} after the service was ready again",
-            ctx.at(ctx.states.topic, begin),
-        )
+            ctx.at(ctx.states.topic, begin, min(begin + waited, end)),
+        ).if_late(waited - ctx.tolerance("max_wait_s"))
     return arrival(ctx, "after a restart of its service")
 
 
@@ -87,12 +87,19 @@ def leaves(ctx: Context) -> Outcome:
     place = ctx.at(ctx.states.topic, begin, end)
     if ended is None or ended > ctx.tolerance("max_exit_s"):
         seen = "had to be killed" if ended is None else f"took {ended:.1f} s to end"
-        return ctx.failed("does not end", f"told to end (SIGTERM) the service {seen}", place)
+        outcome = ctx.failed("does not end", f"told to end (SIGTERM) the service {seen}", place)
+        return outcome.if_late(
+            (end - begin if ended is None else ended) - ctx.tolerance("max_exit_s")
+        )
     if gone is None or gone > ctx.tolerance("max_gone_s"):
         seen = "is still announced" if gone is None else f"was announced for {gone:.1f} s"
-        return ctx.failed(
+        outcome = ctx.failed(
             "leaves no word", f"the state's publisher {seen} after the service had ended", place
-        ).because(
+        )
+        outcome = outcome.if_late(
+            (end - begin if gone is None else gone) - ctx.tolerance("max_gone_s")
+        )
+        return outcome.because(
             "the process ends without deleting its participant, so that its peers wait for the "
             "lease to run out"
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.phases import Phase
 from dexkit.hand import Floats
 
@@ -191,6 +191,7 @@ def speed(ctx: Context) -> Outcome:
         return ctx.skipped("no step of that size was finished")
     slowest, step = min(found, key=lambda f: f[0])
     text = f"{step.name}{slowest:.2f} rad/s in the slowest of {len(found)} large steps"
+    way = 0.8 * abs(step.size)
     if slowest >= ctx.tolerance("min_speed_rad_s"):
         return ctx.passed(f"{slowest:.1f} rad/s", text, speed_rad_s=slowest)
     return ctx.failed(
@@ -198,7 +199,7 @@ def speed(ctx: Context) -> Outcome:
         text,
         ctx.at(ctx.states.topic, step.begin, step.end),
         speed_rad_s=slowest,
-    )
+    ).if_late(way / slowest - way / ctx.tolerance("min_speed_rad_s"))
 
 
 @check("DEX1-MOVE-05", "DEX3-MOVE-05")
@@ -222,7 +223,7 @@ def overshoot(ctx: Context) -> Outcome:
         f"{step.name}{beyond:.2f} rad beyond the target {step.target:.2f} rad",
         ctx.at(ctx.states.topic, step.begin, step.end),
         overshoot_rad=beyond,
-    )
+    ).if_late(STROKE_S * beyond / step.stroke)
 
 
 @check("DEX1-MOVE-06", "DEX3-MOVE-06")
@@ -250,7 +251,7 @@ def monotonous(ctx: Context) -> Outcome:
         f"{back_by:.2f} rad",
         ctx.at(ctx.states.topic, at, step.end),
         back_rad=back_by,
-    )
+    ).if_late(STROKE_S * back_by / step.stroke)
 
 
 @check("DEX1-MOVE-07", "DEX3-MOVE-07")
@@ -275,7 +276,7 @@ def settling(ctx: Context) -> Outcome:
         f"{step}: after {longest:.2f} s it was still away from its target",
         ctx.at(ctx.states.topic, step.begin, step.begin + longest),
         settle_s=longest,
-    )
+    ).if_late(longest - ctx.tolerance("max_settle_s"))
 
 
 @check("DEX1-MOVE-08")

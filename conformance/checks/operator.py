@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.conformance.view import Recording
 from dexkit.hand import Side
@@ -98,7 +98,10 @@ def _judge(
     if of_step is not None:
         steps = [s for s in found.joints[joint].steps if not of_step(s) < worst]
         places = [ctx.at(ctx.states.topic, s.at, s.end) for s in steps] or places
-    return ctx.failed(text(worst), observed, *places, **values)
+    size, how = (worst - ctx.tolerance(limit, joint)), "total" if of_step else "mean"
+    if limit.endswith("_stroke"):
+        size *= STROKE_S / ctx.joints[joint].stroke
+    return ctx.failed(text(worst), observed, *places, **values).if_late(size, how=how)
 
 
 @check("DEX1-OPER-01", "DEX3-OPER-01")

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.checks.motion import Step, steps, steps_of
-from dexkit.conformance.checks.timing import gaps, slow
+from dexkit.conformance.checks.timing import gaps, slow, too_slow
 from dexkit.conformance.phases import Phase
 
 
@@ -34,7 +34,7 @@ def unharmed(ctx: Context, what: str) -> Outcome:
                 "state stops",
                 f"state stopped at {a:.3f} s, during {what}",
                 ctx.at(topic, a, b),
-            )
+            ).if_late(b - a - ctx.tolerance("max_gap_s"))
         step = _recovery(ctx, phase)
         if step is None:
             return ctx.failed(
@@ -46,7 +46,7 @@ def unharmed(ctx: Context, what: str) -> Outcome:
                 f"after {what}: {step}",
                 ctx.at(topic, step.begin, step.end),
                 error_rad=step.error,
-            )
+            ).if_late(STROKE_S * step.error / step.stroke)
     return Outcome(None)
 
 
@@ -82,7 +82,7 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
                     ctx.named(f"moved by {most:.2f} rad during {what}", joint),
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
                     motion_rad=most,
-                )
+                ).if_late(STROKE_S * most / ctx.joints[joint].stroke)
             far = max(far, (most / ctx.joints[joint].stroke, most, joint))
     _, most, joint = far
     return ctx.passed(
@@ -242,7 +242,7 @@ def state_in_silence(ctx: Context) -> Outcome:
                 f"no state from {a:.3f} s to {b:.3f} s, in the silence that began at {begin:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 max_gap_s=b - a,
-            )
+            ).if_late(b - a - limit)
         clock = ctx.states.clock
         inside = clock[(clock >= begin) & (clock <= end)]
         longest = max(longest, float(np.diff(inside).max()) if len(inside) > 1 else 0.0)
@@ -270,7 +270,7 @@ def arrival(ctx: Context, when: str) -> Outcome:
         f"{when}: {worst}",
         ctx.at(ctx.states.topic, worst.begin, worst.end),
         error_rad=worst.error,
-    )
+    ).if_late(STROKE_S * worst.error / worst.stroke)
 
 
 # ------------------------------------------------------------------------------ crowded topics
@@ -305,7 +305,8 @@ def burst(ctx: Context) -> Outcome:
         silent = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end)
         if silent:
             a, b = silent[0]
-            return ctx.failed("state stops", f"no state from {a:.3f} s on", ctx.at(topic, a, b))
+            outcome = ctx.failed("state stops", f"no state from {a:.3f} s on", ctx.at(topic, a, b))
+            return outcome.if_late(b - a - ctx.tolerance("max_gap_s"))
         before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
         sent = begin + (phase.observed.get("sent_s") or 0.0)
         q = ctx.states.q[ctx.states.between(sent + wait, end)]
@@ -324,7 +325,7 @@ def burst(ctx: Context) -> Outcome:
                     ),
                     ctx.at(topic, sent + wait, end),
                     motion_rad=float(away[joint]),
-                )
+                ).if_late(STROKE_S * float(away[joint]) / spec.stroke)
     return ctx.passed(
         f"{far[1]:.3f} rad",
         ctx.named(f"within {far[1]:.3f} rad {wait:g} s after the burst", far[2]),
@@ -388,9 +389,10 @@ def load(ctx: Context) -> Outcome:
                 f"{text}; silent from {a:.3f} to {b:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 rate_hz=rate,
-            )
+            ).if_late(b - a - limit)
         if slow(ctx, rate):
-            return ctx.failed(
+            outcome = ctx.failed(
                 f"{rate:.1f} Hz", text, ctx.at(ctx.states.topic, begin, end), rate_hz=rate
             )
+            return too_slow(ctx, outcome, rate, np.diff(inside))
     return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)

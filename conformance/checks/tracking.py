@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.hand import Floats
 
 _GRID = 0.005  # seconds; commands come at 200 Hz
@@ -146,7 +146,7 @@ def follows(ctx: Context) -> Outcome:
         ctx.at(ctx.states.topic, found.peak_at),
         ctx.at(ctx.states.topic, found.begin, found.end),
         **values,
-    )
+    ).if_late(STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin))
 
 
 @check("DEX1-TRACK-02", "DEX3-TRACK-02")
@@ -164,4 +164,4 @@ def delay(ctx: Context) -> Outcome:
         text,
         ctx.at(ctx.states.topic, found.begin, found.end),
         delay_s=found.delay,
-    )
+    ).if_late(found.delay - ctx.tolerance("max_delay_s"), how="mean")

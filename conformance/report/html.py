@@ -45,7 +45,7 @@ _STYLE = Path(__file__).with_name("report.css")
 _PLOT_BUDGET = 1_000_000
 """Bytes of plots on a page; beyond, failures are told in words only."""
 _BUSY = 0.2
-"""Part of a run without processor time from which on the page warns of itself."""
+"""Part of a run with programs waiting for a processor from which on the page says so."""
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
 _REALITY = {
     "emulated": "No real hand was involved: the device was an emulator at the far end of a wire. "
@@ -131,8 +131,8 @@ def _verdict(result: RunResult) -> str:
     caution = ""
     if result.starved > _BUSY:
         caution = (
-            f"<p><b>The testing machine was short of processor time for {result.starved:.0%} of "
-            "the run.</b> Run it again on one that is not busy before you rely on this.</p>"
+            f"<p><b>The testing machine was busy</b>: {escape(about_harness(result))}. What "
+            "this can have caused is blocked, not failed; on an idle machine more can be told.</p>"
         )
     stages = "".join(_stage(side, stage) for side, stage in result.stage.items())
     return (

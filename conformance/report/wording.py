@@ -138,7 +138,7 @@ def about_harness(result: RunResult) -> str:
             f"{figures['jitter_p99_ms']:.2f} ms (99 of 100)"
         )
     if "starved" in figures:
-        told.append(f"short of processor time for {figures['starved']:.1%} of the run")
+        told.append(f"programs waited for a processor in {figures['starved']:.1%} of the run")
     return "; ".join(told)
 
 

@@ -138,7 +138,7 @@ class SideRecord:
 class UsbRecord:
     """The whole record.
 
-    :param stalls: when the machine lacked processor time.
+    :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
     """
 

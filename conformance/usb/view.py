@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.phases import Beats, Stall
+from dexkit.conformance.phases import Beats, Lost, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -271,7 +271,7 @@ class UsbRecording:
         return UsbRecording(origin_ns, sides, self.stalls, self.beats)
 
     def starved(self, begin: float, end: float) -> float:
-        """Part of [begin, end], 0 to 1, in which the kit's own machine lacked processor time."""
+        """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         if end <= begin:
             return 0.0
         seconds = sum(
@@ -290,3 +290,8 @@ class UsbRecording:
         """
         times = (self.origin_ns + round(t * 1e9) for t in (begin, end))
         return self.beats.lateness(*times)
+
+    def lost(self, begin: float, end: float) -> Lost | None:
+        """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
+        times = (self.origin_ns + round(t * 1e9) for t in (begin, end))
+        return self.beats.lost(*times)
