@@ -6,20 +6,15 @@ The kit reaches backends only as a user would; nothing of them runs in its own p
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 import threading
-import time
-from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
+from dexkit import processes
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
@@ -28,8 +23,6 @@ __all__ = ["EMULATED", "EXTERNAL", "ON_USB", "SIMULATED", "Emulation", "Rig", "R
 
 EXTERNAL = "external"
 """The backend's name for a service that somebody else runs."""
-READY_TIMEOUT = 30.0
-STOP_TIMEOUT = 5.0
 
 
 @dataclass(frozen=True)
@@ -62,111 +55,20 @@ EMULATED: dict[str, Emulation] = {
 }
 """Backends whose device the kit can start itself."""
 
-# a kit that is killed takes its processes with it: SIGTERM when the parent dies (Linux)
-_ENTRY = """
-import ctypes, signal
-try:
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
-except (OSError, AttributeError):
-    pass
-from dexkit.cli import main
-main()
-"""
-
 ON_USB = ("dex3-usb",)
 """Backends whose device is judged on USB as well."""
 SIMULATED = ("sim-dex1", "sim-dex3")
 """Backends without a device, which are told of an object by the setting ``object``."""
 
 
-class Tool:
+class Tool(processes.Tool):
     """A ``dexkit`` command in a process of its own; a context manager.
 
-    :param arguments: of ``dexkit``.
     :raises ConformanceError: it ends, or says nothing, before it is ready; its last words are
         in the message.
     """
 
-    def __init__(self, *arguments: str) -> None:
-        self.arguments = arguments
-        self.ready = threading.Event()
-        self.place = ""
-        """The first word after ``ready:``."""
-        self._tail: deque[str] = deque(maxlen=40)
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _ENTRY, *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-            # a Ctrl-C in the terminal is the kit's to act upon: it stops its processes in order
-            start_new_session=True,
-        )
-        self._thread = threading.Thread(target=self._listen, name="tool", daemon=True)
-        self._thread.start()
-
-    def __repr__(self) -> str:
-        return f"dexkit {' '.join(self.arguments)}"
-
-    def _listen(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._tail.append(line.rstrip())
-            if line.startswith("ready:") and not self.place:
-                self.place = line.split()[1] if len(line.split()) > 1 else ""
-                self.ready.set()
-        self.ready.set()  # nothing more will come
-
-    @property
-    def running(self) -> bool:
-        """Whether it has not ended."""
-        return self._process.poll() is None
-
-    @property
-    def last_words(self) -> str:
-        """The last lines that it printed."""
-        return "\n".join(self._tail)
-
-    def wait_ready(self, stop: threading.Event, timeout: float = READY_TIMEOUT) -> None:
-        """Wait until it says that it is ready, or ``stop`` is set."""
-        end = time.monotonic() + timeout
-        while not (came := self.ready.wait(0.05)) and time.monotonic() < end:
-            if stop.is_set():
-                return
-        if not came or not any(line.startswith("ready:") for line in self._tail):
-            what = "is not ready" if came is False else "ended before it was ready"
-            raise ConformanceError(f"{self!r} {what}", hint=self.last_words)
-
-    def stop(self) -> bool:
-        """End it, politely at first. May be called twice.
-
-        :returns: whether it ended when it was asked to.
-        """
-        if self.running:
-            self._process.send_signal(signal.SIGTERM)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(STOP_TIMEOUT)
-        polite = not self.running
-        if not polite:
-            self._process.kill()
-            self._process.wait()
-        self._thread.join(STOP_TIMEOUT)
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-        return polite
-
-    def __enter__(self) -> Tool:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.stop()
+    error = ConformanceError
 
 
 @dataclass(frozen=True)

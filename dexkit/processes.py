@@ -1,0 +1,135 @@
+"""``dexkit`` commands as processes of this one: started, heard, stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+from typing import ClassVar
+
+from dexkit.errors import DexkitError
+
+__all__ = ["READY_TIMEOUT", "STOP_TIMEOUT", "Tool"]
+
+READY_TIMEOUT = 30.0
+STOP_TIMEOUT = 5.0
+
+# whoever starts it and is killed takes it along: SIGTERM when the parent dies (Linux)
+_ENTRY = """
+import ctypes, signal
+try:
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+except (OSError, AttributeError):
+    pass
+from dexkit.cli import main
+main()
+"""
+
+
+class Tool:
+    """A ``dexkit`` command in a process of its own; a context manager.
+
+    :param arguments: of ``dexkit``.
+    :param on_line: is given each line that it prints, in a thread that must not be kept long.
+
+    :cvar error: what is raised when it ends, or says nothing, before it is ready; its last words
+        are the hint.
+    """
+
+    error: ClassVar[type[DexkitError]] = DexkitError
+
+    def __init__(self, *arguments: str, on_line: Callable[[str], object] | None = None) -> None:
+        self.arguments = arguments
+        self.ready = threading.Event()
+        self.place = ""
+        """The first word after ``ready:``."""
+        self._on_line = on_line
+        self._tail: deque[str] = deque(maxlen=40)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _ENTRY, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            # a Ctrl-C in the terminal is the caller's to act upon: it stops its tools in order
+            start_new_session=True,
+        )
+        self._thread = threading.Thread(target=self._listen, name="tool", daemon=True)
+        self._thread.start()
+
+    def __repr__(self) -> str:
+        return f"dexkit {' '.join(self.arguments)}"
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._tail.append(line.rstrip())
+            if line.startswith("ready:") and not self.place:
+                self.place = line.split()[1] if len(line.split()) > 1 else ""
+                self.ready.set()
+            if self._on_line is not None:
+                self._on_line(line.rstrip())
+        self.ready.set()  # nothing more will come
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    @property
+    def exit_code(self) -> int | None:
+        """How it ended, negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def last_words(self) -> str:
+        """The last lines that it printed."""
+        return "\n".join(self._tail)
+
+    def wait_ready(self, stop: threading.Event, timeout: float = READY_TIMEOUT) -> None:
+        """Wait until it says that it is ready, or ``stop`` is set."""
+        end = time.monotonic() + timeout
+        while not (came := self.ready.wait(0.05)) and time.monotonic() < end:
+            if stop.is_set():
+                return
+        if not came or not any(line.startswith("ready:") for line in self._tail):
+            what = "is not ready" if came is False else "ended before it was ready"
+            raise self.error(f"{self!r} {what}", hint=self.last_words)
+
+    def stop(self) -> bool:
+        """End it, politely at first. May be called twice.
+
+        :returns: whether it ended when it was asked to.
+        """
+        if self.running:
+            self._process.send_signal(signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(STOP_TIMEOUT)
+        polite = not self.running
+        if not polite:
+            self._process.kill()
+            self._process.wait()
+        self._thread.join(STOP_TIMEOUT)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        return polite
+
+    def __enter__(self) -> Tool:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
