@@ -64,7 +64,7 @@ def messages(name: str, max_elements: int = 9) -> st.SearchStrategy[Any]:
     if any(member.is_structs for member in kind.fields):
         # hundreds of numbers take too long to draw one by one
         return st.integers(0, 2**32).map(lambda seed: _filled(kind, Random(seed)))
-    fields = {}
+    fields: dict[str, st.SearchStrategy[Any]] = {}
     for member in kind.fields:
         values = _values(member.type)
         if member.sequence:
