@@ -23,7 +23,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dexkit.errors import UsageError
 from dexkit.messages import encode, message_type
@@ -167,7 +166,7 @@ def verify(message: Any) -> bool:
     :raises UsageError: a type without a CRC.
     :raises EncodeError: a value that its type cannot hold.
     """
-    return crc_of(message) == message.crc
+    return bool(crc_of(message) == message.crc)
 
 
 def encode_with_crc(message: Any) -> bytes:
