@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -11,7 +14,17 @@ from dexkit.stopping import StopRequest, stop_on_signals
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-__all__ = ["StopRequest", "dds_options", "stop_on_signals"]
+__all__ = [
+    "STATUS_LINES",
+    "StatusLine",
+    "StopRequest",
+    "dds_options",
+    "log_to_stderr",
+    "stop_on_signals",
+]
+
+STATUS_LINES = "DEXKIT_STATUS_LINES"
+"""Environment variable: set by a command that starts others and shows what they are doing."""
 
 
 def dds_options(*, default_domain: int | None) -> Callable[[F], F]:
@@ -35,3 +48,46 @@ def dds_options(*, default_domain: int | None) -> Callable[[F], F]:
         )(function)
 
     return decorate
+
+
+def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
+    """Log to stderr for as long as the command runs.
+
+    :param quiet: warnings only.
+    :param status: a status line is kept at the bottom; log lines are written over it.
+    :param always: name of a logger that is heard however quiet: the counters at exit are wanted.
+    """
+    clear = "\r\x1b[K" if status else ""
+    level = logging.WARNING if quiet else logging.INFO
+    logging.basicConfig(level=level, format=f"{clear}%(levelname)s %(message)s", force=True)
+    logging.getLogger(always).setLevel(logging.INFO)
+
+
+class StatusLine:
+    """One line that says how a command is doing, renewed again and again.
+
+    At the bottom of a terminal; or, where :data:`STATUS_LINES` is set, lines ``status: ...`` of
+    the standard output; or nowhere.
+
+    :param quiet: nowhere at all.
+    """
+
+    def __init__(self, quiet: bool) -> None:
+        self._lines = bool(os.environ.get(STATUS_LINES)) and not quiet
+        #: whether it is at the bottom of a terminal, where other lines have to be written over it
+        self.on_terminal = sys.stderr.isatty() and not quiet and not self._lines
+
+    def __bool__(self) -> bool:
+        return self._lines or self.on_terminal
+
+    def show(self, text: str) -> None:
+        """Say this now."""
+        if self._lines:
+            print(f"status: {text}", flush=True)
+        elif self.on_terminal:
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+    def clear(self) -> None:
+        """Take it away."""
+        if self.on_terminal:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -13,7 +13,13 @@ from types import FrameType
 import click
 
 from dexkit.backends import BackendOptions, backend
-from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.cli.common import (
+    StatusLine,
+    StopRequest,
+    dds_options,
+    log_to_stderr,
+    stop_on_signals,
+)
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Hand, Side
 from dexkit.models import DIALECTS, MODELS, Dialect
@@ -139,8 +145,8 @@ def command(
                     hint="--usb is short for --set usb=URL, for all hands",
                 )
         settings = (*settings, f"usb={usb}")
-    status = sys.stderr.isatty() and not quiet
-    _log_to_stderr(logging.WARNING if quiet else logging.INFO, status)
+    status = StatusLine(quiet)
+    log_to_stderr(quiet, status.on_terminal, "dexkit.service.counters")
     kind = backend(backend_name)
     sides = list(Side) if side_name == "both" else [Side(side_name)]
     by_side = _devices(devices, sides)
@@ -267,14 +273,7 @@ def _on_sigusr1(running: ExitStack, services: Sequence[HandService]) -> None:
     running.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, handle))
 
 
-def _log_to_stderr(level: int, status: bool) -> None:
-    clear = "\r\x1b[K" if status else ""  # the status line is written over
-    logging.basicConfig(level=level, format=f"{clear}%(levelname)s %(message)s", force=True)
-    # the counters at exit are wanted, however quiet
-    logging.getLogger("dexkit.service.counters").setLevel(logging.INFO)
-
-
-def _watch(services: Sequence[HandService], stop: StopRequest, status: bool) -> None:
+def _watch(services: Sequence[HandService], stop: StopRequest, status: StatusLine) -> None:
     """Until told to stop: a status line, and hints about clients that cannot find us."""
     started = time.monotonic()
     said: set[str] = set()
@@ -294,12 +293,12 @@ def _watch(services: Sequence[HandService], stop: StopRequest, status: bool) -> 
             topics = ", ".join(service.state_topic for service in services)
             log.info("no client reads %s yet; is it on the same domain and interface?", topics)
         if status:
-            line = " | ".join(
-                _line(service, rate()) for service, rate in zip(services, rates, strict=True)
+            status.show(
+                " | ".join(
+                    _line(service, rate()) for service, rate in zip(services, rates, strict=True)
+                )
             )
-            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-    if status:
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    status.clear()
 
 
 def _mismatches(service: HandService) -> list[str]:

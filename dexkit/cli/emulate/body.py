@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.bodies import G1, H1, BodyModel
-from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.cli.common import StatusLine, StopRequest, dds_options, stop_on_signals
 from dexkit.cli.emulate.stdin import read_faults
 from dexkit.errors import DdsError
 
@@ -51,8 +51,8 @@ def _command(model: BodyModel) -> click.Command:
         held = Remote.parse(remote)
         chosen = dataclasses.replace(model, mode_machine=mode_machine or model.mode_machine)
         settings = Settings(lenient=lenient, noise=noise, seed=seed)
-        status = sys.stderr.isatty() and not quiet
-        clear = "\r\x1b[K" if status else ""  # the status line is written over
+        status = StatusLine(quiet)
+        clear = "\r\x1b[K" if status.on_terminal else ""  # the status line is written over
         logging.basicConfig(level=logging.WARNING, format=f"{clear}%(levelname)s %(message)s")
         robot = EmulatedBody(
             chosen, domain=domain, interface=interface, settings=settings, force=force
@@ -156,7 +156,7 @@ def _watch(
     stop: StopRequest,
     duration: float | None,
     *,
-    status: bool,
+    status: StatusLine,
     as_json: bool,
 ) -> None:
     """Until told to stop: tell how it is doing."""
@@ -193,9 +193,8 @@ def _watch(
                 f"{robot.model.name} {what}; state {state_rate:.0f} Hz, {robot.clients} readers; "
                 f"commands {command_rate:.0f} Hz of {robot.commanders}, {ignored} ignored"
             )
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-    if status:
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            status.show(text)
+    status.clear()
 
 
 emulate_h1 = _command(H1)
