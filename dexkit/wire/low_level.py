@@ -35,6 +35,7 @@ __all__ = [
     "crc_of",
     "crc_of_payload",
     "encode_with_crc",
+    "payload_of_struct",
     "struct_of_payload",
     "verify",
     "verify_payload",
@@ -80,6 +81,9 @@ class _Image:
             gap[at : at + size] = False
             wire += size
         self._wire_size = wire
+        self._back = np.zeros(wire, dtype=np.intp)  # where in the struct each byte comes from
+        self._back[source[~gap]] = np.flatnonzero(~gap)
+        self._header_and_gaps = np.setdiff1d(np.arange(wire), source[~gap])
         self._source, self._gaps = source, np.flatnonzero(gap)
         # all words but the last, the CRC itself, each turned round as the CRC wants them
         turned = np.arange(self.size - 4).reshape(-1, 4)[:, ::-1].reshape(-1)
@@ -98,6 +102,13 @@ class _Image:
         image = np.frombuffer(payload, dtype=np.uint8)[self._source]
         image[self._gaps] = 0
         return image.tobytes()
+
+    def payload(self, struct: Buffer) -> bytes:
+        """The sample, from the C struct."""
+        sample = np.frombuffer(struct, dtype=np.uint8)[self._back]
+        sample[self._header_and_gaps] = 0
+        sample[1] = 1  # plain CDR, little endian
+        return sample.tobytes()
 
     def crc(self, payload: Buffer) -> int:
         """The CRC that belongs into its last member."""
@@ -126,6 +137,18 @@ def struct_of_payload(name: str, payload: Buffer) -> bytes:
     """
     image = _of(name)
     return image.struct(image.little(payload))
+
+
+def payload_of_struct(name: str, struct: Buffer) -> bytes:
+    """The CDR sample of a C struct, whatever its gaps hold; the way back from the above.
+
+    :param name: DDS type name, one of :data:`LOW_LEVEL_TYPES`.
+    :raises UsageError: another type, or a struct of another size.
+    """
+    image = _of(name)
+    if len(struct) != image.size:
+        raise UsageError(f"the struct of a {name} has {image.size} bytes, not {len(struct)}")
+    return image.payload(struct)
 
 
 def crc_of_payload(name: str, payload: Buffer) -> int:
