@@ -1,0 +1,14 @@
+"""An old client meets a new gripper, and the reverse: one dialect's topics carried to another's.
+
+:class:`Bridge` is the thing to use. Its parts, each testable alone:
+:mod:`~dexkit.bridge.translate` (what one side's part of a message means in another dialect),
+:mod:`~dexkit.bridge.core` (which message follows from which, and when; no threads, no DDS).
+"""
+
+from __future__ import annotations
+
+from dexkit.bridge.bridge import Bridge, End
+from dexkit.bridge.core import Commands, Direction, States
+from dexkit.bridge.translate import Part, translator
+
+__all__ = ["Bridge", "Commands", "Direction", "End", "Part", "States", "translator"]

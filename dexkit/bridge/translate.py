@@ -1,0 +1,189 @@
+"""What one message says of one gripper, and the same in another dialect. Pure functions.
+
+A *part* is that: one motor of a ``MotorCmds_`` or ``MotorStates_``, or a whole ``HandCmd_`` or
+``HandState_``, which is of one gripper anyway. Between dialects of the same types a part passes
+as it is, every field. Between 0 .. 5.4 rad (``unitree_go``, ``unitree_actuator``) and 0 .. 2 pi
+(``unitree_hg``), with s = 2 pi / 5.4:
+
+=============  =====================================  =============================================
+what           to unitree_hg                          from unitree_hg
+=============  =====================================  =============================================
+q, dq, ddq     times s                                by s; a command at or below 0.1 closes, at
+                                                      or above 6.0 opens (seed 000)
+tau            as it is                               of a command: 0, it is unused (seed 000)
+kp, kd         by s                                   5.0 and 0.05, whatever the command says, as
+                                                      ``dexkit serve`` takes them
+tau_est        grip strength: without its sign        with the sign of closing
+temperature    0 (not filled) becomes 25 (seed 000)   the first of the two, 0 .. 127
+vol            12.0 (seed 000): there is no field     dropped
+mode           0: it means "position" (seed 000)      of a command 1 (drive), of a state 0
+fault, lost    motorstate and error                   reserve[0] and lost
+predicted      reserve[0]                             reserve[1]
+=============  =====================================  =============================================
+
+**Why gains shrink and torques do not.** Torques of both dialects are those of the joint that
+runs from 0 to 5.4 rad (``dexkit serve`` publishes one tau_est in both). A radian of unitree_hg is
+1 / s of that joint's, so a command that is to press as hard for the same displacement of the
+jaws, kp_hg * (s dq) = kp * dq, needs kp_hg = kp / s; likewise kd.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dexkit.hand import HandState, Side
+from dexkit.messages import MessageType, layout, message_type, unitree_go, unitree_hg
+from dexkit.models import Dialect, dialect, model
+from dexkit.service.dialects import StateView, dialect_map
+
+__all__ = ["Part", "Translator", "translator"]
+
+_FLOAT_MAX = (2 - 2**-23) * 2.0**127
+_U32 = 0xFFFFFFFF
+# of the numbers of a motor, those that are acted upon
+_NUMBERS = {
+    "cmd": ("q", "dq", "tau", "kp", "kd"),
+    "state": ("q", "dq", "ddq", "tau_est"),
+}
+
+Translator = Callable[[Any], Any]
+"""A part in one dialect to the same in another."""
+
+
+class Part:
+    """Takes a gripper's part out of a dialect's messages, and puts parts into one.
+
+    :param kind: ``"cmd"`` or ``"state"``.
+    """
+
+    def __init__(self, spoken: Dialect, kind: str) -> None:
+        self.type: MessageType = message_type(
+            spoken.cmd_type if kind == "cmd" else spoken.state_type
+        )
+        (sequence,) = (
+            f
+            for f in layout.STRUCTS[self.type.name].fields
+            if f.sequence and "Motor" in f.type.dds_name  # type: ignore[union-attr]
+        )
+        assert isinstance(sequence.type, layout.Struct)
+        self._sequence = sequence.name
+        self._motor: type[Any] = message_type(sequence.type.dds_name).cls
+        # the message has other members beside the motors
+        self._whole = len(layout.STRUCTS[self.type.name].fields) > 1
+        self._index = spoken.index
+        self._numbers = _NUMBERS[kind]
+        self.length = spoken.length
+
+    def count(self, message: Any) -> int:
+        """How many motors a message has."""
+        return len(getattr(message, self._sequence))
+
+    def take(self, message: Any, side: Side) -> Any | None:
+        """The side's part, or None where the message is too short for it."""
+        motors = getattr(message, self._sequence)
+        if len(motors) <= self._index[side]:
+            return None
+        return message if self._whole else motors[self._index[side]]
+
+    def put(self, parts: Mapping[Side, Any]) -> Any:
+        """A message of these parts; the place of a side that is not given is blank."""
+        if self._whole:
+            (part,) = parts.values()
+            return part
+        motors = [self.blank() for _ in range(self.length)]
+        for side, part in parts.items():
+            motors[self._index[side]] = part
+        return self.type.cls(motors)
+
+    def blank(self) -> Any:
+        """A motor of which nothing is said."""
+        return self._motor()
+
+    def is_finite(self, part: Any) -> bool:
+        """Whether every number that a peer acts upon is finite."""
+        motor = self.motor(part)
+        return all(math.isfinite(getattr(motor, name)) for name in self._numbers)
+
+    def motor(self, part: Any) -> Any:
+        """The motor in a part."""
+        return getattr(part, self._sequence)[0] if self._whole else part
+
+
+def translator(source: Dialect, target: Dialect, kind: str) -> Translator:
+    """The function that makes of a part in ``source`` the same in ``target``.
+
+    Parts must be finite (:meth:`Part.is_finite`).
+    """
+    if source.cmd_type == target.cmd_type:
+        return lambda part: part
+    if target.cmd_type == _HG.cmd_type:
+        return _command_to_hg if kind == "cmd" else _state_to_hg
+    return _command_from_hg if kind == "cmd" else _state_from_hg
+
+
+_HG = dialect("unitree_hg")
+_DEX1 = model(_HG.model)
+_JOINT = _DEX1.joints[Side.LEFT][0]  # both sides' are alike
+_SCALE = _HG.q_open / _JOINT.q_max
+_MAP = dialect_map(_HG, {Side.LEFT: _DEX1.spec(Side.LEFT, io_rate=_DEX1.state_rate)})
+
+
+def _command_to_hg(motor: unitree_go.MotorCmd_) -> unitree_hg.HandCmd_:
+    return unitree_hg.HandCmd_(
+        [
+            unitree_hg.MotorCmd_(
+                q=_fits(motor.q * _SCALE),
+                dq=_fits(motor.dq * _SCALE),
+                tau=motor.tau,
+                kp=motor.kp / _SCALE,
+                kd=motor.kd / _SCALE,
+            )
+        ]
+    )
+
+
+def _command_from_hg(message: unitree_hg.HandCmd_) -> unitree_go.MotorCmd_:
+    command = _MAP.command(message, Side.LEFT)
+    assert command is not None  # it has a motor: Part.take
+    return unitree_go.MotorCmd_(
+        mode=int(command.mode[0]),
+        q=float(command.q[0]),
+        dq=float(command.dq[0]),
+        tau=float(command.tau[0]),
+        kp=float(command.kp[0]),
+        kd=float(command.kd[0]),
+    )
+
+
+def _state_to_hg(motor: unitree_go.MotorState_) -> unitree_hg.HandState_:
+    state = HandState.of(
+        motor.q,
+        stamp=0.0,  # goes into no message
+        dq=motor.dq,
+        ddq=motor.ddq,
+        tau_est=motor.tau_est,
+        temperature=motor.temperature or math.nan,
+        measured=motor.reserve[1] != 1,
+    )
+    view = StateView(state, (motor.reserve[0],), motor.lost)
+    message: unitree_hg.HandState_ = _MAP.state({Side.LEFT: view})
+    return message
+
+
+def _state_from_hg(message: unitree_hg.HandState_) -> unitree_go.MotorState_:
+    motor = message.motor_state[0]
+    return unitree_go.MotorState_(
+        q=motor.q / _SCALE,
+        dq=motor.dq / _SCALE,
+        ddq=motor.ddq / _SCALE,
+        tau_est=_JOINT.closing * abs(motor.tau_est) + 0.0,  # no -0.0
+        temperature=min(max(motor.temperature[0], 0), 127),
+        lost=message.error[1],
+        reserve=(motor.motorstate, 1 if motor.reserve[0] == 1 else 0),
+    )
+
+
+def _fits(value: float) -> float:
+    return min(max(value, -_FLOAT_MAX), _FLOAT_MAX)

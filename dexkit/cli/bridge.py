@@ -1,0 +1,214 @@
+"""``dexkit bridge``: an old client meets a new gripper, and the reverse."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, nullcontext
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.common import StopRequest, dds_options, log_to_stderr, stop_on_signals
+from dexkit.errors import DexkitError, TopicConflict
+from dexkit.hand import Side
+from dexkit.models import DEX1_1, dialect
+from dexkit.service import prepare_process
+from dexkit.service import real_time as real_time_priority
+
+if TYPE_CHECKING:
+    from dexkit.bridge import Bridge
+
+__all__ = ["command"]
+
+_log = logging.getLogger("dexkit.bridge")
+
+_STATUS_PERIOD = 0.5  # seconds
+_LONELY = 5.0  # seconds without a peer before a hint
+_DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
+
+
+@click.command("bridge")
+@click.option("--from", "source", type=_DIALECTS, required=True, help="What the client speaks.")
+@click.option("--to", "target", type=_DIALECTS, required=True, help="What the gripper speaks.")
+@click.option(
+    "--side",
+    "side_name",
+    type=click.Choice(["left", "right", "both"]),
+    default="both",
+    show_default=True,
+    help="Which grippers there are.",
+)
+@dds_options(default_domain=1)
+@click.option(
+    "--to-domain",
+    type=click.IntRange(0, 230),
+    help="DDS domain of the gripper.  [default: that of the client]",
+)
+@click.option(
+    "--to-interface",
+    metavar="IF",
+    help="Network interface of the gripper.  [default: that of the client]",
+)
+@click.option(
+    "--duration",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="End after so many seconds.  [default: at Ctrl-C]",
+)
+@click.option(
+    "--force", is_flag=True, help="Even if another process publishes what the bridge publishes."
+)
+@click.option(
+    "--real-time/--no-real-time",
+    default=True,
+    show_default=True,
+    help="Run before ordinary processes where the system permits it (docs/service.md).",
+)
+@click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+def command(
+    source: str,
+    target: str,
+    side_name: str,
+    domain: int,
+    interface: str,
+    to_domain: int | None,
+    to_interface: str | None,
+    duration: float | None,
+    force: bool,
+    real_time: bool,
+    quiet: bool,
+) -> int:
+    r"""Carry a client's commands to a Dex1-1 of another dialect, and its states back.
+
+    \b
+    xr_teleoperate v1.1 (--sim) drives a gripper of today:
+      dexkit bridge --from unitree_actuator --to unitree_go
+    today's client on domain 1 drives a gripper of the DDS specification on the robot:
+      dexkit bridge --from unitree_go --to unitree_hg --to-domain 0 --to-interface eth0
+
+    Prints "ready: ..." when the topics are up. Nothing is repeated: when the client stops, the
+    gripper hears nothing and brakes (docs/bridge.md).
+    """
+    from dexkit.bridge import Bridge, End
+    from dexkit.dds import DdsNode
+
+    status = sys.stderr.isatty() and not quiet
+    log_to_stderr(quiet, status, "dexkit.bridge.counters")
+    far_domain = domain if to_domain is None else to_domain
+    far_interface = interface if to_interface is None else to_interface
+    with (
+        # before any thread is started: they inherit it
+        real_time_priority() if real_time else nullcontext(True),
+        stop_on_signals() as stop,
+        ExitStack() as nodes,
+    ):
+        near = nodes.enter_context(DdsNode(domain=domain, interface=interface))
+        far = near
+        if (far_domain, far_interface) != (domain, interface):
+            far = nodes.enter_context(DdsNode(domain=far_domain, interface=far_interface))
+        bridge = Bridge(
+            End(near, dialect(source)),
+            End(far, dialect(target)),
+            sides=list(Side) if side_name == "both" else [Side(side_name)],
+            force=force,
+        )
+        prepare_process()
+        with bridge:
+            click.echo(
+                f"ready: {bridge.client} -> {bridge.gripper}, "
+                f"{' and '.join(map(str, bridge.sides))}"
+            )
+            sys.stdout.flush()
+            trouble = _watch(bridge, stop, duration, status)
+        bridge.log_counters()
+    if bridge.failure is not None:
+        raise DexkitError(f"the bridge died: {bridge.failure}")
+    if trouble and not force:
+        raise TopicConflict(trouble, hint="stop it, or choose another domain for one end")
+    return 0
+
+
+def _watch(bridge: Bridge, stop: StopRequest, duration: float | None, status: bool) -> str | None:
+    """Until told to stop, or time is up: a status line, and hints.
+
+    :returns: who came and made the bridge a loop; then it ends, too.
+    """
+    started = time.monotonic()
+    said: set[str] = set()
+    rates = _rates(bridge)
+    while not stop:
+        left = None if duration is None else started + duration - time.monotonic()
+        if left is not None and left <= 0:
+            break
+        if stop.wait(_STATUS_PERIOD if left is None else min(left, _STATUS_PERIOD)):
+            break
+        if bridge.failure is not None:
+            break
+        if found := bridge.reverse():
+            return found
+        for text in _hints(bridge, time.monotonic() - started):
+            if text not in said:
+                said.add(text)
+                _log.warning("%s", text)
+        line = next(rates)
+        if status:
+            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+    if status:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    return None
+
+
+def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
+    commands, states = bridge.commands, bridge.states
+    if found := bridge.others():
+        yield f"{found}, too; the two fight"
+    for direction, who in ((commands, "client"), (states, "gripper")):
+        counts, topics = direction.counts, " and ".join(direction.inputs)
+        for count, what in (
+            (counts.undecodable, "undecodable messages"),
+            (counts.rejected, "NaN or infinity"),
+            (counts.short, "messages with too few motors"),
+        ):
+            if count:
+                yield f"{topics}: the {who} sends {what}; not forwarded (counted, said once)"
+    for side in states.silent(time.monotonic()):
+        yield f"the state of the {side} gripper has stopped"
+    if elapsed < _LONELY:
+        return
+    missing = states.missing()
+    if missing:
+        names = " and ".join(map(str, missing))
+        yield (
+            f"no state of the {names} gripper yet on {' and '.join(states.inputs)}, "
+            f"{bridge.gripper}"
+            + (
+                "; its place in the message is all 0, as where there is no gripper"
+                if states.counts.blank
+                else "; with one gripper only, say so: --side; 'dexkit doctor' looks around"
+            )
+        )
+    if not bridge.clients and not commands.counts.received:
+        yield f"no client yet on {bridge.client}"
+
+
+def _rates(bridge: Bridge) -> Iterator[str]:
+    """The status line, again and again."""
+    directions = {"cmd": bridge.commands, "state": bridge.states}
+    before: dict[tuple[str, Side], int] = {}
+    last = time.monotonic()
+    while True:
+        now = time.monotonic()
+        pieces = []
+        for side in bridge.sides:
+            texts = []
+            for name, direction in directions.items():
+                count = direction.parts[side]
+                rate = (count - before.get((name, side), 0)) / max(now - last, 1e-3)
+                before[name, side] = count
+                texts.append(f"{name} {rate:.0f}/s")
+            pieces.append(f"{side} {' '.join(texts)}")
+        last = now
+        yield f"{', '.join(pieces)}; clients {bridge.clients}, grippers {bridge.grippers}"

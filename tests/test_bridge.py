@@ -1,0 +1,447 @@
+"""The bridge's translation and rules: no DDS, a clock that is told the time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from dataclasses import astuple, replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexkit.bridge.core import PATIENCE, SILENT, Commands, Outgoing, States
+from dexkit.bridge.translate import Part, translator
+from dexkit.hand import MotorError, Side
+from dexkit.messages import message_type, unitree_go, unitree_hg
+from dexkit.models import DEX1_1, Dialect, dialect
+
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+BOTH = tuple(Side)
+GO, HG, ACTUATOR = (dialect(n) for n in ("unitree_go", "unitree_hg", "unitree_actuator"))
+PAIRS = list(itertools.permutations((GO, HG, ACTUATOR), 2))
+SCALE = 2 * math.pi / 5.4
+TIMEOUT = DEX1_1.command_timeout
+LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+
+float32 = st.floats(-1e4, 1e4, width=32)
+u32 = st.integers(0, 2**32 - 1)
+go_commands = st.builds(
+    unitree_go.MotorCmd_,
+    mode=st.integers(0, 255),
+    q=float32,
+    dq=float32,
+    tau=float32,
+    kp=st.floats(0, 1e4, width=32),
+    kd=st.floats(0, 1e4, width=32),
+    reserve=st.tuples(u32, u32, u32),
+)
+go_states = st.builds(
+    unitree_go.MotorState_,
+    mode=st.integers(0, 255),
+    q=float32,
+    dq=float32,
+    ddq=float32,
+    tau_est=float32,
+    q_raw=float32,
+    temperature=st.integers(0, 255),
+    lost=u32,
+    reserve=st.tuples(u32, u32),
+)
+
+
+def near(value: float) -> Any:
+    return pytest.approx(value, rel=2e-7, abs=1e-30)
+
+
+def on_wire(spoken: Dialect, kind: str, part: Any) -> Any:
+    """A part as it comes out of the message it was sent in."""
+    side = LEFT
+    codec = Part(spoken, kind)
+    message = codec.type.decode(codec.type.encode(codec.put({side: part})))
+    return codec.take(message, side)
+
+
+def there_and_back(via: Dialect, kind: str, part: Any) -> Any:
+    there = on_wire(via, kind, translator(GO, via, kind)(part))
+    return on_wire(GO, kind, translator(via, GO, kind)(there))
+
+
+class TestTranslation:
+    @given(go_commands, go_states)
+    def test_the_same_types_pass_as_they_are(
+        self, command: unitree_go.MotorCmd_, state: unitree_go.MotorState_
+    ) -> None:
+        assert there_and_back(ACTUATOR, "cmd", command) == command
+        assert there_and_back(ACTUATOR, "state", state) == state
+
+    @given(st.floats(0.0625, 5.125, width=32).filter(lambda q: 0.1001 < q * SCALE < 5.9999))
+    def test_a_position_is_the_same_after_there_and_back(self, q: float) -> None:
+        back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05))
+        assert back.q == near(q)
+        assert (back.kp, back.kd) == (near(5.0), near(0.05))
+
+    @given(st.floats(-10, 20, width=32))
+    def test_near_the_ends_the_specification_snaps(self, q: float) -> None:
+        back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q))
+        if q * SCALE < 0.0999:
+            assert back.q == 0.0
+        elif q * SCALE > 6.0001:
+            assert back.q == near(5.4)
+
+    @given(go_commands)
+    def test_a_command_presses_as_hard_on_either_scale(self, go: unitree_go.MotorCmd_) -> None:
+        """The same displacement of the jaws gives the same torque of the same joint."""
+        hg = translator(GO, HG, "cmd")(go).motor_cmd[0]
+        displacement = 0.3  # rad of 0 .. 5.4
+        assert hg.kp * displacement * SCALE == near(go.kp * displacement)
+        speed = -1.5
+        assert hg.kd * speed * SCALE == near(go.kd * speed)
+        assert (hg.tau, hg.mode) == (go.tau, 0)
+
+    @given(
+        st.builds(
+            unitree_hg.MotorCmd_,
+            mode=st.integers(0, 255),
+            q=float32,
+            dq=float32,
+            tau=float32,
+            kp=float32,
+            kd=float32,
+        )
+    )
+    def test_gains_of_the_specification_are_the_services_own(
+        self, motor: unitree_hg.MotorCmd_
+    ) -> None:
+        go = translator(HG, GO, "cmd")(unitree_hg.HandCmd_([motor]))
+        assert (go.dq, go.tau, go.kp, go.kd) == (0.0, 0.0, 5.0, 0.05)
+
+    @given(go_states)
+    def test_a_state_keeps_what_both_dialects_can_say(self, go: unitree_go.MotorState_) -> None:
+        back = there_and_back(HG, "state", go)
+        assert (back.q, back.dq, back.ddq) == (near(go.q), near(go.dq), near(go.ddq))
+        assert back.tau_est == -abs(go.tau_est)  # grip strength: what closes
+        assert back.temperature == (min(go.temperature, 127) or 25)
+        assert (back.lost, back.reserve[0]) == (go.lost, go.reserve[0])
+        assert back.reserve[1] == (go.reserve[1] == 1)
+        # once more is the same again
+        assert astuple(there_and_back(HG, "state", back)) == near_all(back)
+
+    def test_a_state_of_the_specification(self) -> None:
+        """Seed 000, "Gripper Publishes State"."""
+        motor = unitree_hg.MotorState_(
+            q=3.14, tau_est=0.5, temperature=(31, 40), vol=12.0, motorstate=0x20
+        )
+        message = unitree_hg.HandState_([motor], error=(0x20, 7))
+        go = translator(HG, GO, "state")(message)
+        assert go == unitree_go.MotorState_(
+            q=near(3.14 / SCALE), tau_est=-0.5, temperature=31, lost=7, reserve=(0x20, 0)
+        )
+        assert translator(GO, HG, "state")(go).motor_state[0].vol == 12.0
+
+    @given(st.floats(allow_nan=False, allow_infinity=False, width=32))
+    def test_what_is_finite_can_be_sent(self, value: float) -> None:
+        command = unitree_go.MotorCmd_(q=value, dq=value, tau=value, kp=value, kd=value)
+        state = unitree_go.MotorState_(q=value, dq=value, ddq=value, tau_est=value)
+        for kind, part in (("cmd", command), ("state", state)):
+            there = on_wire(HG, kind, translator(GO, HG, kind)(part))
+            assert Part(HG, kind).is_finite(there)
+
+
+def near_all(state: unitree_go.MotorState_) -> tuple[Any, ...]:
+    return tuple(near(v) if isinstance(v, float) else v for v in astuple(state))
+
+
+class Wire:
+    """Both directions of a bridge, and messages for them."""
+
+    def __init__(self, client: Dialect, gripper: Dialect, sides: tuple[Side, ...] = BOTH) -> None:
+        self.client, self.gripper = client, gripper
+        self.states = States(gripper, client, sides)
+        self.commands = Commands(client, gripper, sides, self.states)
+        self.now = 10.0
+
+    def command(self, *sides: Side, q: float = 1.0, **fields: Any) -> list[Outgoing]:
+        """Commands of q (of 0 .. 5.4; the right's is twice that) for sides, and what follows."""
+        out = []
+        for topic, payload in self._messages(self.client, "cmd", sides, q, fields):
+            out += self.commands.receive(topic, payload, self.now)
+        return out
+
+    def state(self, *sides: Side, q: float = 1.0, **fields: Any) -> list[Outgoing]:
+        out = []
+        for topic, payload in self._messages(self.gripper, "state", sides, q, fields):
+            out += self.states.receive(topic, payload, self.now)
+        return out
+
+    @staticmethod
+    def _messages(
+        spoken: Dialect, kind: str, sides: tuple[Side, ...], q: float, fields: dict[str, Any]
+    ) -> list[tuple[str, bytes]]:
+        codec = Part(spoken, kind)
+        motor = unitree_go.MotorCmd_ if kind == "cmd" else unitree_go.MotorState_
+        parts = {}
+        for side in sides:
+            go = motor(q=q if side is LEFT else 2 * q, **fields)
+            part = translator(GO, spoken, kind)(go)
+            parts[side] = part
+        which = 0 if kind == "cmd" else 1
+        if spoken.length > 1:
+            topic = spoken.topics(LEFT)[which]
+            return [(topic, codec.type.encode(codec.put(parts)))]
+        return [
+            (spoken.topics(s)[which], codec.type.encode(codec.put({s: p})))
+            for s, p in parts.items()
+        ]
+
+    def later(self, seconds: float) -> list[Outgoing]:
+        """Let time pass; what leaves meanwhile because it has waited long enough."""
+        self.now += seconds
+        return self.commands.flush(self.now) + self.states.flush(self.now)
+
+
+def q_of(spoken: Dialect, kind: str, out: list[Outgoing]) -> dict[Side, Any]:
+    """The q, of 0 .. 5.4, of each side in the newest messages."""
+    codec, found = Part(spoken, kind), {}
+    for message in out:
+        for side in Side:
+            if spoken.topics(side)[0 if kind == "cmd" else 1] == message.topic:
+                part = codec.take(codec.type.decode(message.payload), side)
+                scale = SCALE if spoken is HG else 1.0
+                found[side] = pytest.approx(codec.motor(part).q / scale, abs=1e-6)
+    return found
+
+
+def motors(out: list[Outgoing]) -> list[Any]:
+    """The motors, right first, of the one message for both sides."""
+    (message,) = out
+    kind = ACTUATOR.cmd_type if message.topic.endswith("cmd") else ACTUATOR.state_type
+    decoded = message_type(kind).decode(message.payload)
+    found: list[Any] = decoded.cmds if kind == ACTUATOR.cmd_type else decoded.states
+    assert len(found) == 2
+    return found
+
+
+@pytest.mark.parametrize(("client", "gripper"), PAIRS, ids=lambda d: d.name)
+class TestEveryPair:
+    def test_each_side_arrives_as_itself(self, client: Dialect, gripper: Dialect) -> None:
+        wire = Wire(client, gripper)
+        wire.state(*BOTH, q=0.5)
+        assert q_of(client, "state", wire.state(*BOTH, q=1.5)) == {LEFT: 1.5, RIGHT: 3.0}
+        wire.command(*BOTH)
+        wire.later(PATIENCE)
+        assert q_of(gripper, "cmd", wire.command(*BOTH, q=2.0)) == {LEFT: 2.0, RIGHT: 4.0}
+
+    def test_nothing_is_sent_unless_something_came(self, client: Dialect, gripper: Dialect) -> None:
+        wire = Wire(client, gripper)
+        for direction, speak in ((wire.commands, wire.command), (wire.states, wire.state)):
+            speak(*BOTH)
+            assert direction.due is None
+            assert wire.later(5.0) == []
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+    @pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
+    def test_what_is_not_finite_goes_nowhere(
+        self, client: Dialect, gripper: Dialect, field: str, bad: float
+    ) -> None:
+        wire = Wire(client, gripper)
+        codec = Part(client, "cmd")
+        for side in Side:
+            good = translator(GO, client, "cmd")(unitree_go.MotorCmd_(q=1.0))
+            setattr(codec.motor(good), field, bad)
+            payload = codec.type.encode(codec.put({side: good}))
+            if client.length == 1:
+                assert wire.commands.receive(client.topics(side)[0], payload, wire.now) == []
+                assert wire.commands.counts.rejected == 1
+                return
+            out = wire.commands.receive(client.topics(side)[0], payload, wire.now)
+            assert side not in q_of(gripper, "cmd", out)
+
+    def test_junk_is_counted(self, client: Dialect, gripper: Dialect) -> None:
+        wire = Wire(client, gripper)
+        topic = client.topics(LEFT)[0]
+        assert wire.commands.receive(topic, b"junk", wire.now) == []
+        empty = Part(client, "cmd").type
+        assert wire.commands.receive(topic, empty.encode(empty.cls()), wire.now) == []
+        counts = wire.commands.counts
+        assert (counts.received, counts.undecodable) == (2, 1)
+        assert counts.short >= 1
+
+
+class TestTwoTopicsIntoOneMessage:
+    """To unitree_actuator: what is put in the other side's place."""
+
+    def test_both_commands_leave_together(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        wire.command(*BOTH)
+        wire.later(PATIENCE)
+        wire.later(0.004)
+        assert wire.command(LEFT, q=2.0) == []  # the right's is to come
+        right, left = motors(wire.command(RIGHT, q=2.0))
+        assert (left.q, right.q) == (2.0, 4.0)
+
+    def test_one_waits_for_the_other_no_longer_than_the_patience(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        wire.command(*BOTH)
+        wire.later(0.005)
+        wire.command(LEFT, q=2.0)
+        assert wire.commands.due == pytest.approx(wire.now + PATIENCE)
+        assert wire.later(PATIENCE / 2) == []
+        right, left = motors(wire.later(PATIENCE))
+        assert (left.q, right.q) == (2.0, 2.0)  # the right's own newest: 2 x 1.0
+
+    def test_a_side_that_is_no_longer_commanded_stays_without_pulling(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        wire.state(*BOTH, q=1.25)
+        wire.command(*BOTH, kp=5.0, kd=0.05)
+        wire.later(PATIENCE)
+        wire.later(TIMEOUT)
+        wire.state(*BOTH, q=1.5)
+        right, left = motors(wire.command(LEFT, kp=5.0, kd=0.05))
+        assert right == unitree_go.MotorCmd_(mode=0, q=3.0, kd=near32(0.05))
+        assert left.kp == 5.0
+        wire.state(*BOTH, q=1.75)  # pushed away: it is not to follow
+        wire.later(0.005)
+        right, _ = motors(wire.command(LEFT))
+        assert right.q == 3.0
+        # and is commanded again
+        wire.later(0.005)
+        wire.command(LEFT)
+        right, _ = motors(wire.command(RIGHT, q=0.5, kp=5.0) or wire.later(PATIENCE))
+        assert (right.q, right.kp) == (1.0, 5.0)
+
+    def test_without_a_position_of_the_other_nothing_is_sent(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        assert wire.command(LEFT) == []
+        assert wire.commands.counts.held == 1
+        assert len(wire.command(RIGHT)) == 1  # both are commanded now: none needed
+
+    def test_nan_does_not_refresh(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        wire.state(*BOTH)
+        wire.command(*BOTH, kp=5.0)
+        for _ in range(20):
+            wire.later(TIMEOUT / 10)
+            wire.command(RIGHT, q=math.nan)
+            out = wire.command(LEFT) or wire.later(PATIENCE)
+        right, _ = motors(out)
+        assert (right.q, right.kp) == (2.0, 0.0)
+
+    def test_states_wait_for_both_grippers(self) -> None:
+        """Or the client would take the 0 of the one that is not there yet for its position."""
+        wire = Wire(ACTUATOR, GO)
+        assert wire.state(LEFT) == []
+        assert wire.states.missing() == [RIGHT]
+        right, left = motors(wire.state(RIGHT))
+        assert (left.q, right.q) == (1.0, 2.0)
+        assert wire.states.missing() == []
+
+    def test_of_one_gripper_the_other_place_is_blank(self) -> None:
+        wire = Wire(ACTUATOR, GO, (RIGHT,))
+        right, left = motors(wire.state(RIGHT))
+        assert (right.q, left) == (2.0, unitree_go.MotorState_())
+
+    def test_a_gripper_that_falls_silent_is_marked(self) -> None:
+        wire = Wire(ACTUATOR, GO)
+        wire.state(*BOTH, dq=0.25)
+        before = motors(wire.state(*BOTH, dq=0.25))[0]
+        assert before.lost == 0
+        lost = []
+        for _ in range(100):
+            wire.later(0.001)
+            out = wire.state(LEFT) or wire.later(PATIENCE)
+            right, left = motors(out)
+            lost.append(right.lost)
+            assert (left.lost, left.reserve) == (0, (0, 0))
+        assert right == replace(before, lost=lost[-1], reserve=(LINK, 0))
+        assert lost[0] == 0
+        assert lost[-5:] == list(range(lost[-5], lost[-5] + 5))
+        assert lost.count(0) == pytest.approx(SILENT / 0.002, abs=2)
+        assert wire.states.silent(wire.now) == [RIGHT]
+        wire.later(0.002)
+        out = wire.state(RIGHT, q=2.5) or wire.later(PATIENCE)
+        assert (motors(out)[0].q, motors(out)[0].lost) == (5.0, 0)  # it is back
+        assert wire.states.silent(wire.now) == []
+
+    def test_when_both_are_silent_so_is_the_bridge(self) -> None:
+        wire = Wire(ACTUATOR, GO)
+        wire.state(*BOTH)
+        wire.later(PATIENCE)
+        assert wire.later(1.0) == []
+        assert wire.states.due is None
+
+    @given(st.lists(st.tuples(st.sampled_from(BOTH), st.floats(0.0, 0.004)), max_size=60))
+    def test_the_newest_goes_out_once_and_in_time(self, arrivals: list[tuple[Side, float]]) -> None:
+        """Whatever order states come in: no message without cause, none later than the patience."""
+        wire = Wire(ACTUATOR, GO)
+        wire.state(*BOTH)
+        newest = {LEFT: 1.0, RIGHT: 2.0}
+        came = sent = 0
+        for i, (side, gap) in enumerate(arrivals):
+            due = wire.states.due
+            if due is not None and wire.now + gap >= due:
+                out = wire.states.flush(due + 1e-9)
+                sent += len(out)
+                assert [m.q for m in motors(out)] == [newest[RIGHT], newest[LEFT]]
+                assert wire.states.due is None
+            wire.later(gap)
+            q = float(i + 2)
+            newest[side] = q if side is LEFT else 2 * q
+            out = wire.state(side, q=q)
+            came += 1
+            sent += len(out)
+            if out:
+                assert [m.q for m in motors(out)] == [newest[RIGHT], newest[LEFT]]
+            else:
+                assert wire.states.due is not None
+        assert sent <= came
+
+
+class TestOneMessageIntoTwoTopics:
+    """From unitree_actuator."""
+
+    def test_a_gripper_that_is_not_there_is_not_invented(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        assert set(q_of(GO, "state", wire.state(LEFT))) == {LEFT}
+        assert wire.states.counts.blank == 1
+        # it may be commanded all the same: nobody is there to obey
+        assert len(wire.command(LEFT)) == 1
+
+    def test_a_gripper_at_0_that_was_elsewhere_is_there(self) -> None:
+        wire = Wire(GO, ACTUATOR)
+        wire.state(*BOTH)
+        assert q_of(GO, "state", wire.state(*BOTH, q=0.0)) == {LEFT: 0.0, RIGHT: 0.0}
+
+    def test_one_side_of_both(self) -> None:
+        wire = Wire(GO, ACTUATOR, (RIGHT,))
+        assert set(q_of(GO, "state", wire.state(*BOTH))) == {RIGHT}
+        right, left = motors(wire.command(RIGHT, q=1.5, kp=5.0))
+        assert (right.q, right.kp) == (3.0, 5.0)
+        assert (left.q, left.kp) == (1.0, 0.0)  # where it was seen
+        assert wire.commands.inputs == {"rt/dex1/right/cmd": (RIGHT,)}
+
+    def test_a_message_for_the_right_only(self) -> None:
+        wire = Wire(ACTUATOR, GO)
+        payload = message_type(ACTUATOR.cmd_type).encode(
+            unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=1.0)])
+        )
+        out = wire.commands.receive(ACTUATOR.cmd_topic, payload, wire.now)
+        assert q_of(GO, "cmd", out) == {RIGHT: 1.0}
+        assert wire.commands.counts.short == 1
+
+    def test_a_longer_message_is_cut(self) -> None:
+        wire = Wire(ACTUATOR, GO)
+        payload = message_type(ACTUATOR.cmd_type).encode(
+            unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q) for q in (1.0, 2.0, 3.0)])
+        )
+        out = wire.commands.receive(ACTUATOR.cmd_topic, payload, wire.now)
+        assert q_of(GO, "cmd", out) == {RIGHT: 1.0, LEFT: 2.0}
+        assert wire.commands.counts.overlong == 1
+
+
+def near32(value: float) -> float:
+    """``value`` as float32 holds it."""
+    found: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    return found
