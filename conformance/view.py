@@ -1,7 +1,8 @@
 """A recording as the checks see it: per side, columns of commands and states in seconds.
 
 Times are seconds from the beginning of the recording: ``t`` is reception, ``sent`` the source
-timestamp. Positions are in the dialect's radians; columns of joints have shape (n, n_joints).
+timestamp. Positions are in the dialect's radians, torques of states in N·m whatever the dialect's
+units; columns of joints have shape (n, n_joints).
 """
 
 from __future__ import annotations
@@ -52,8 +53,10 @@ class TraceLike(Protocol):
         """What discovery saw."""
         ...
 
-    def load(self, topics: Iterable[str] | None = None) -> dict[str, SampleArray]:
-        """Samples by topic."""
+    def load(
+        self, topics: Iterable[str] | None = None, *, decode: bool = False
+    ) -> dict[str, SampleArray]:
+        """Samples by topic; ``decode``: as columns, if it can."""
         ...
 
 
@@ -186,7 +189,7 @@ class Recording:
             )
         # the other side is decoded too: independence is judged with it
         topics = {t for s in Side for t in chosen.topics(s)} & present
-        samples = trace.load(sorted(topics)) if topics else {}
+        samples = trace.load(sorted(topics), decode=True) if topics else {}
         times = [s.log_time_ns for s in samples.values() if len(s)]
         marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
         usb = UsbRecording.of(trace)
@@ -316,7 +319,9 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
     if samples is None or samples.type_name != wire.dialect.state_type:
         t, none = np.empty(0), np.empty((0, wire.joints))
         return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)
-    columns = wire.state.columns(samples.payloads)
+    columns = samples.decoded
+    if columns is None:
+        columns = wire.state.columns(samples.payloads)
 
     def of(name: str) -> Floats:
         return _joints(columns, wire, side, wire.state_sequence, name)
@@ -331,7 +336,7 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
         q=of("q"),
         dq=of("dq"),
         ddq=of("ddq"),
-        tau=of("tau_est"),
+        tau=of("tau_est") * (wire.dialect.torque_units or 1.0),
         mode=of("mode"),
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
@@ -341,9 +346,8 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
 def _joints(columns: Columns, wire: Wire, side: Side, sequence: str, name: str) -> Floats:
     """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
     first = wire.dialect.index[side]
-    places = range(first, first + wire.joints)
     # a joint's values lie together, for checks go joint by joint
-    return np.stack([columns[f"{sequence}[{i}].{name}"] for i in places]).T
+    return columns.table([f"{sequence}[{first + i}].{name}" for i in range(wire.joints)])
 
 
 def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> Commands:
@@ -352,7 +356,9 @@ def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) 
         none = np.empty((0, wire.joints))
         count = np.empty(0, np.intp)
         return Commands(topic, np.empty(0), count, none, none, none, none, none, none)
-    columns = wire.command.columns(samples.payloads)
+    columns = samples.decoded
+    if columns is None:
+        columns = wire.command.columns(samples.payloads)
 
     def of(name: str) -> Floats:
         return _joints(columns, wire, side, wire.command_sequence, name)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import dexkit.messages.packed
 from dexkit.messages import message_type
-from dexkit.messages.columns import Columns, Packed
+from dexkit.messages.columns import Columns
+from dexkit.messages.packed import Packed, pieces, rows_at
 from tests.messages_helpers import messages
 
 PATHS = {
@@ -51,19 +54,12 @@ def test_payloads_are_given_as_they_were_put_in(payloads: list[bytes], data: st.
     order = data.draw(st.permutations(range(len(payloads))))
     wanted = [payloads[i] for i in order]
     given_ = packed(payloads, cuts, order)
-    groups = given_.alike()
-    tables = [(rows, given_.tables(rows)) for rows in groups]
-    found = {
-        int(row): table[at].tobytes()
-        for rows, pieces in tables
-        for table, begin in zip(pieces, np.cumsum([0, *map(len, pieces)]), strict=False)
-        for at, row in enumerate(rows[begin : begin + len(table)])
-    }
-    assert found == dict(enumerate(wanted))
-    for rows in groups:
-        found_kinds = {(len(w), w[:2] if len(w) > 1 else b"") for w in (wanted[i] for i in rows)}
-        assert len(found_kinds) == 1
-    assert [int(rows[0]) for rows in groups] == sorted(int(rows[0]) for rows in groups)
+    found = [
+        rows_at(data, np.array([start]), size)[0].tobytes()
+        for data, starts, sizes in pieces(given_)
+        for start, size in zip(starts.tolist(), sizes.tolist(), strict=True)
+    ]
+    assert found == wanted
     assert given_ == wanted
     assert given_[1:] == wanted[1:]
     assert [given_[i] for i in range(len(wanted))] == wanted
@@ -90,7 +86,14 @@ def test_columns_of_packed_payloads_are_those_of_single_ones(
         if data.draw(st.booleans())
         else data.draw(st.permutations(range(len(payloads))))
     )
-    bulk = mt.columns(packed(payloads, cuts, order))
+    if data.draw(st.booleans()):
+        bulk = mt.columns(packed(payloads, cuts, order))
+    else:  # as a reader gets them: piece by piece, and put in order afterwards
+        bulk = Columns(mt.layout)
+        for edge in pairwise(sorted({0, *(c for c in cuts if c < len(payloads)), len(payloads)})):
+            for piece in pieces(payloads[slice(*edge)]):
+                bulk.append(*piece)
+        bulk.reorder(np.array(order, dtype=np.intp))
     single = [mt.columns([payloads[i]]) for i in order]
     assert {i: str(e) for i, e in bulk.errors.items()} == {
         i: str(one.errors[0]) for i, one in enumerate(single) if one.errors
@@ -114,6 +117,11 @@ def _same(bulk: Columns, single: list[Columns], path: str) -> None:
         assert not bulk.errors
         assert constant.shape == (1, *column.shape[1:])
         assert (column == constant).all() or np.isnan(constant).any()
+    seen = column[bulk.ok]
+    low, high = (f(seen) if seen.size else np.nan for f in (np.min, np.max))
+    assert np.array_equal(bulk.extremes(path), (low, high), equal_nan=True)
+    if column.ndim == 1:
+        assert np.array_equal(bulk.table([path, path]), np.stack([column] * 2).T, equal_nan=True)
 
 
 def test_a_member_that_never_changes_is_known_to() -> None:
@@ -129,6 +137,28 @@ def test_a_member_that_never_changes_is_known_to() -> None:
     assert columns.constant("power_a") is None
     assert np.flatnonzero(columns["power_a"]).tolist() == [1400]
     assert columns["power_v"].tolist() == [24.0] * 1500
+
+
+def test_words_that_begin_to_change_in_any_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dexkit.messages.packed, "_SEGMENT", 100)
+    mt = message_type("unitree_hg::msg::dds_::HandState_")
+    payloads = []
+    for i in range(1030):
+        message = mt.cls()
+        message.power_v = float(i >= 99)
+        message.power_a = float(i >= 100)
+        message.system_v = float(i >= 1029)
+        message.device_v = float(i % 7)
+        message.imu_state.temperature = i // 700
+        payloads.append(mt.encode(message))
+    columns = mt.columns(payloads)
+    rows = np.arange(1030)
+    assert columns["power_v"].tolist() == (rows >= 99).tolist()
+    assert columns["power_a"].tolist() == (rows >= 100).tolist()
+    assert columns["system_v"].tolist() == (rows >= 1029).tolist()
+    assert columns["device_v"].tolist() == (rows % 7).tolist()
+    assert columns["imu_state.temperature"].tolist() == (rows // 700).tolist()
+    assert columns.extremes("system_v") == (0.0, 1.0)
 
 
 def test_one_odd_sample_leaves_the_small_members_of_the_others() -> None:

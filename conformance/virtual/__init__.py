@@ -205,8 +205,10 @@ class MemoryTrace:
             for (topic, kind), rows in self.rows.items()
         ]
 
-    def load(self, topics: Iterable[str] | None = None) -> dict[str, SampleArray]:
-        """Samples by topic."""
+    def load(
+        self, topics: Iterable[str] | None = None, *, decode: bool = False
+    ) -> dict[str, SampleArray]:
+        """Samples by topic; nothing is decoded here."""
         wanted = None if topics is None else set(topics)
         found: dict[str, SampleArray] = {}
         for (topic, kind), rows in self.rows.items():

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
-from copy import copy
-from typing import Any, NamedTuple, TypeAlias, overload
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,118 +17,15 @@ from numpy.typing import NDArray
 from dexkit.errors import UsageError, WireError
 from dexkit.messages.codec import check_count, check_end, is_big, truncated
 from dexkit.messages.layout import Field, Primitive, Struct, max_size
+from dexkit.messages.packed import Words, aligned, pieces, rows_at
 
-__all__ = ["Columns", "Packed"]
+__all__ = ["Columns"]
 
 _STEP = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\[(?P<index>\d*)\])?")
 _UINT32 = (struct.Struct("<I"), struct.Struct(">I"))
-_BLOCK = 512
-"""Samples that are turned into columns at once: few enough to stay in the processor's cache."""
-
 _Steps: TypeAlias = tuple[tuple[Field, "int | None"], ...]
-
-
-class Packed(Sequence[bytes]):
-    """Payloads one behind the other in a few buffers: many samples without an object for each.
-
-    :param blocks: the buffers, each of whole payloads.
-    :param starts: where each payload begins, counted through all of ``blocks``, shape (n,).
-    :param sizes: how long each is, shape (n,).
-    """
-
-    def __init__(
-        self,
-        blocks: Sequence[NDArray[np.uint8]],
-        starts: NDArray[np.int64],
-        sizes: NDArray[np.int64],
-    ) -> None:
-        self._blocks = blocks
-        self._joined: NDArray[np.uint8] | None = None
-        self._starts = starts
-        self._sizes = sizes
-
-    @property
-    def _bytes(self) -> NDArray[np.uint8]:
-        """All blocks as one, for those who do not go from front to back."""
-        if self._joined is None:
-            self._joined = np.concatenate([np.empty(0, np.uint8), *self._blocks])
-            self._blocks = [self._joined]  # so that they are not held twice
-        return self._joined
-
-    def __len__(self) -> int:
-        return len(self._starts)
-
-    @overload
-    def __getitem__(self, at: int) -> bytes: ...
-    @overload
-    def __getitem__(self, at: slice) -> Packed: ...
-    def __getitem__(self, at: int | slice) -> bytes | Packed:
-        if isinstance(at, slice):
-            return Packed([self._bytes], self._starts[at], self._sizes[at])
-        start, size = int(self._starts[at]), int(self._sizes[at])
-        first = self._blocks[0] if len(self._blocks) else self._bytes
-        if start + size <= len(first):
-            return first[start : start + size].tobytes()
-        return self._bytes[start : start + size].tobytes()
-
-    def __iter__(self) -> Iterator[bytes]:
-        buffer = self._bytes.data
-        for start, size in zip(self._starts.tolist(), self._sizes.tolist(), strict=True):
-            yield bytes(buffer[start : start + size])
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Sequence) or isinstance(other, (str, bytes)):
-            return NotImplemented
-        return len(self) == len(other) and all(a == b for a, b in zip(self, other, strict=True))
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def alike(self) -> list[NDArray[np.intp]]:
-        """Rows of equal length and equal first two bytes, those that come first first."""
-        if not len(self):
-            return []
-        every = np.arange(len(self))
-        tables = self._as_they_lie(every) if self._sizes[0] >= 2 else None
-        if tables is not None:
-            head = np.concatenate([t[:, 0] | t[:, 1].astype(np.int64) << 8 for t in tables])
-        else:
-            known = self._sizes >= 2
-            head = np.zeros(len(self), dtype=np.int64)
-            first = self._starts[known]
-            head[known] = self._bytes[first] | self._bytes[first + 1].astype(np.int64) << 8
-        keys = self._sizes << 16 | head
-        if (keys == keys[0]).all():
-            return [every]
-        keys, which = np.unique(keys, return_inverse=True)
-        groups = [np.flatnonzero(which == i) for i in range(len(keys))]
-        return sorted(groups, key=lambda rows: int(rows[0]))
-
-    def tables(self, rows: NDArray[np.intp]) -> list[NDArray[np.uint8]]:
-        """Payloads of one length in their order, in pieces of shape (some, length)."""
-        tables = self._as_they_lie(rows)
-        if tables is not None:
-            return tables
-        size = int(self._sizes[rows[0]])
-        if not size:
-            return [np.empty((len(rows), 0), dtype=np.uint8)]
-        every = np.lib.stride_tricks.sliding_window_view(self._bytes, size)
-        return [every[self._starts[rows]]]
-
-    def _as_they_lie(self, rows: NDArray[np.intp]) -> list[NDArray[np.uint8]] | None:
-        """The same without a copy, if they are of one length and lie one behind the other."""
-        size = int(self._sizes[rows[0]])
-        starts = self._starts[rows]
-        if not size or (self._sizes[rows] != size).any() or (np.diff(starts) != size).any():
-            return None
-        begin, end = int(starts[0]), int(starts[-1]) + size
-        found: list[NDArray[np.uint8]] = []
-        base = 0
-        for block in self._blocks:
-            piece = block[max(begin - base, 0) : max(end - base, 0)]
-            if len(piece):
-                found.append(piece.reshape(-1, size))
-            base += len(block)
-        return found
+_Shape: TypeAlias = tuple[bool, tuple[int, ...], int]
+"""Whether the numbers are big-endian, lengths of the sequences, bytes."""
 
 
 class Columns:
@@ -143,63 +39,84 @@ class Columns:
     (n, longest sequence).
     """
 
-    def __init__(self, kind: Struct, payloads: Sequence[bytes]) -> None:
+    def __init__(self, kind: Struct, payloads: Sequence[bytes] = ()) -> None:
         self._kind = kind
-        self._n = len(payloads)
+        self._n = 0
         self._limit = max_size(kind)
         self._sequences = [f.name for f in kind.fields if f.sequence]
         self.errors: dict[int, WireError] = {}
-        self._groups: list[_Group] = []
+        self._groups: dict[_Shape, _Group] = {}
+        self._usual: dict[int, _Group] = {}  # by length of the samples
         self._paths: dict[str, _Steps] = {}
-        # Samples of one length nearly always have one shape: parse one of them, compare the
-        # others' sequence lengths with it in bulk, and parse singly only those that differ.
-        odd: list[int] = []
-        for rows in _alike(payloads):
-            at, shape = self._first_good(rows, payloads)
-            if shape is None:
-                continue
-            rest = rows[at:]
-            words = _Words(_tables(payloads, rest), len(rest))
-            same = words.same(_count_words(kind, shape[1]))
-            if same is None:
-                self._add(shape, rest, words)
-            else:
-                self._add(shape, rest[same], words.only(same))
-                odd += rest[~same].tolist()
-        shapes: dict[tuple[bool, tuple[int, ...], int], list[int]] = {}
-        for row in odd:
-            shape = self._shape_of(row, payloads)
-            if shape is not None:
-                shapes.setdefault((*shape, len(payloads[row])), []).append(row)
-        for (big, counts, _), found in shapes.items():
-            rows = np.array(found, dtype=np.intp)
-            self._add((big, counts), rows, _Words(_tables(payloads, rows), len(rows)))
+        for piece in pieces(payloads):
+            self.append(*piece)
 
-    def _shape_of(self, row: int, payloads: Sequence[bytes]) -> tuple[bool, tuple[int, ...]] | None:
-        data = payloads[row]
+    def append(
+        self,
+        data: bytes | NDArray[np.uint8],
+        starts: NDArray[np.int64],
+        sizes: NDArray[np.int64],
+    ) -> None:
+        """Add the payloads that begin at ``starts`` in ``data``; their bytes are not kept."""
+        rows = np.arange(self._n, self._n + len(starts))
+        self._n += len(starts)
+        if len(sizes) and (sizes == sizes[0]).all():
+            self._append(aligned(rows_at(data, starts, int(sizes[0]))), rows, int(sizes[0]))
+            return
+        for size in np.unique(sizes).tolist():
+            some = sizes == size
+            self._append(aligned(rows_at(data, starts[some], size)), rows[some], size)
+
+    def reorder(self, order: NDArray[np.intp]) -> None:
+        """Put the samples into another order: the first is to be the one with number order[0]."""
+        place = np.empty(self._n, dtype=np.intp)
+        place[order] = np.arange(self._n)
+        self.errors = {int(place[row]): error for row, error in self.errors.items()}
+        for group in self._groups.values():
+            group.rows = [place[np.concatenate(group.rows)]]
+            group.moved = True
+
+    def _append(self, table: NDArray[np.uint32], rows: NDArray[np.intp], size: int) -> None:
+        # Samples of one length nearly always have one shape: parse one of them, compare the
+        # others' header and sequence lengths with it in bulk, parse singly those that differ.
+        while size not in self._usual and len(rows):
+            shape = self._shape_of(table[0], int(rows[0]), size)
+            if shape is None:
+                table, rows = table[1:], rows[1:]
+            else:
+                self._usual[size] = self._group(shape, table[0])
+        if not len(rows):
+            return
+        usual = self._usual[size]
+        changes = usual.words.changes(table)
+        same = usual.agrees(table, changes)
+        if same is None:
+            usual.put(table, rows, changes)
+            return
+        found: dict[_Shape, list[int]] = {}
+        for at in np.flatnonzero(~same).tolist():
+            shape = self._shape_of(table[at], int(rows[at]), size)
+            if shape is not None:
+                found.setdefault(shape, []).append(at)
+        for group, some in [
+            (usual, np.flatnonzero(same)),
+            *((self._group(s, table[at[0]]), np.array(at)) for s, at in found.items()),
+        ]:
+            group.put(table[some], rows[some], group.words.changes(table[some]))
+
+    def _shape_of(self, words: NDArray[np.uint32], row: int, size: int) -> _Shape | None:
+        data = words.view(np.uint8)[:size].tobytes()
         try:
             big = is_big(data, self._limit, self._kind.name)
-            return big, _counts(self._kind, data, big)
+            return big, _counts(self._kind, data, big), size
         except WireError as error:
-            self.errors[row] = error
+            self.errors[row] = error.with_traceback(None)  # which holds the samples
             return None
 
-    def _first_good(
-        self, rows: NDArray[np.intp], payloads: Sequence[bytes]
-    ) -> tuple[int, tuple[bool, tuple[int, ...]] | None]:
-        for at, row in enumerate(rows):
-            shape = self._shape_of(int(row), payloads)
-            if shape is not None:
-                return at, shape
-        return len(rows), None
-
-    def _add(
-        self, shape: tuple[bool, tuple[int, ...]], rows: NDArray[np.intp], words: _Words
-    ) -> None:
-        big, counts = shape
-        dtype = _dtype(self._kind, counts, ">" if big else "<", words.size)
-        where = slice(None) if len(rows) == self._n else rows
-        self._groups.append(_Group(where, counts, dtype, words))
+    def _group(self, shape: _Shape, first: NDArray[np.uint32]) -> _Group:
+        if shape not in self._groups:
+            self._groups[shape] = _Group(self._kind, shape, first.copy())
+        return self._groups[shape]
 
     def __len__(self) -> int:
         return self._n
@@ -220,8 +137,8 @@ class Columns:
             raise UsageError(f"{self._kind.name} has no sequence {sequence!r}")
         at = self._sequences.index(sequence)
         out = np.full(self._n, -1, dtype=np.intp)
-        for group in self._groups:
-            out[group.rows] = group.counts[at]
+        for group in self._groups.values():
+            out[group.where(self._n)] = group.counts[at]
         return out
 
     def __getitem__(self, path: str) -> NDArray[np.float64]:
@@ -229,14 +146,53 @@ class Columns:
 
         :raises UsageError: the type has no such member.
         """
+        shape = self._shape(self._steps(path))
+        return self._table([path], shape[0] if shape else 1).reshape(*shape, self._n).T
+
+    def table(self, paths: Sequence[str]) -> NDArray[np.float64]:
+        """Several columns of one number each side by side, shape (n, len(paths)).
+
+        :raises UsageError: the type has no such member.
+        """
+        return self._table(paths, 1).T
+
+    def _table(self, paths: Sequence[str], length: int) -> NDArray[np.float64]:
+        out = np.empty((len(paths) * length, self._n))
+        whole = sum(len(g.words) for g in self._groups.values()) == self._n
+        for i, path in enumerate(paths):
+            steps = self._steps(path)
+            columns = out[i * length : (i + 1) * length]
+            if not whole:
+                columns[:] = np.nan
+            for group in self._groups.values():
+                leaf, places = group.places(steps)
+                rows = group.where(self._n)
+                columns[len(places) :, rows] = np.nan
+                for column, at in zip(columns, places, strict=False):
+                    for part, values in group.words.parts(leaf, at):
+                        column[part if isinstance(rows, slice) else rows[part]] = values
+        return out
+
+    def extremes(self, path: str) -> tuple[float, float]:
+        """The lowest and highest number at ``path``, of all samples that can be decoded.
+
+        NaN if there are none, or if not all have it or if one is not a number.
+
+        :raises UsageError: the type has no such member.
+        """
         steps = self._steps(path)
         shape = self._shape(steps)
-        out = np.full((*shape, self._n), np.nan)
-        for group in self._groups:
+        low, high = [], []
+        for group in self._groups.values():
             leaf, places = group.places(steps)
-            for column, at in zip(out.reshape(-1, self._n), places, strict=False):
-                column[group.rows] = group.words.column(leaf, at)
-        return out.T
+            if len(places) != (shape[0] if shape else 1):
+                return np.nan, np.nan
+            for at in places:
+                for _, values in group.words.parts(leaf, at):
+                    low.append(float(np.min(values)))
+                    high.append(float(np.max(values)))
+        # numpy's, which pass NaN on
+        return (float(np.min(low)), float(np.max(high))) if low else (np.nan, np.nan)
 
     def constant(self, path: str) -> NDArray[np.float64] | None:
         """The row that every sample has at ``path``, shape (1,) or (1, length); None if they
@@ -245,9 +201,9 @@ class Columns:
         :raises UsageError: as for a column.
         """
         steps = self._steps(path)
-        if len(self._groups) != 1 or not isinstance(self._groups[0].rows, slice):
+        group = next(iter(self._groups.values()), None)
+        if group is None or len(group.words) != self._n:
             return None
-        group = self._groups[0]
         leaf, places = group.places(steps)
         shape = self._shape(steps)
         if len(places) != (shape[0] if shape else 1):
@@ -272,109 +228,53 @@ class Columns:
         return ()
 
 
-def _alike(payloads: Sequence[bytes]) -> list[NDArray[np.intp]]:
-    if isinstance(payloads, Packed):
-        return payloads.alike()
-    sizes: dict[tuple[bytes, int], list[int]] = {}
-    for row, data in enumerate(payloads):
-        sizes.setdefault((data[:2], len(data)), []).append(row)
-    return [np.array(rows, dtype=np.intp) for rows in sizes.values()]
-
-
-def _tables(payloads: Sequence[bytes], rows: NDArray[np.intp]) -> list[NDArray[np.uint8]]:
-    if isinstance(payloads, Packed):
-        return payloads.tables(rows)
-    joined = b"".join(payloads[i] for i in rows)
-    return [np.frombuffer(joined, dtype=np.uint8).reshape(len(rows), -1)]
-
-
-class _Words:
-    """Samples of one shape, word by word: the first of them, and columns of what changes.
-
-    Most of a state never changes, and what does is asked for member by member. So a sample is
-    read once, when it is in the cache, and only its changing words are kept.
-
-    :param tables: the samples, in pieces of shape (some, size).
-    :ivar size: bytes in a sample.
-    """
-
-    def __init__(self, tables: Sequence[NDArray[np.uint8]], n: int) -> None:
-        self.size = tables[0].shape[1]
-        self._row = _aligned(tables[0][:1])[0]
-        # changing words in the order in which they began to; memory not touched costs nothing
-        self._changing: list[int] = []
-        self._columns: NDArray[np.uint32] = np.empty((len(self._row), n), dtype=np.uint32)
-        begin = 0
-        for table in tables:
-            for at in range(0, len(table), _BLOCK):
-                piece = _aligned(table[at : at + _BLOCK])
-                self._put(begin, piece)
-                begin += len(piece)
-        self._place = {word: place for place, word in enumerate(self._changing)}
-
-    def _put(self, begin: int, piece: NDArray[np.uint32]) -> None:
-        changes = np.bitwise_or.reduce(piece ^ self._row, axis=0)
-        changes[self._changing] = 0
-        for word in np.flatnonzero(changes).tolist():
-            self._columns[len(self._changing), :begin] = self._row[word]
-            self._changing.append(word)
-        known = slice(len(self._changing)), slice(begin, begin + len(piece))
-        self._columns[known] = piece.take(self._changing, axis=1).T
-
-    def same(self, words: list[int]) -> NDArray[np.bool_] | None:
-        """Which samples have these words as the first has them; None for all."""
-        found = [self._columns[self._place[w]] == self._row[w] for w in words if w in self._place]
-        return np.logical_and.reduce(found) if found else None
-
-    def only(self, rows: NDArray[np.bool_]) -> _Words:
-        """Some of the samples, the first among them."""
-        out = copy(self)
-        # in order of columns, as they were: their bytes are looked at as other numbers
-        out._columns = np.ascontiguousarray(self._columns[: len(self._changing), rows])
-        return out
-
-    def varies(self, at: int) -> bool:
-        """Whether the word with the byte ``at`` ever changes."""
-        return at // 4 in self._place
-
-    def first(self, leaf: np.dtype[Any], at: int) -> Any:
-        """The number at byte ``at`` of the first sample."""
-        return self._row.view(np.uint8)[at : at + leaf.itemsize].view(leaf)[0]
-
-    def column(self, leaf: np.dtype[Any], at: int) -> Any:
-        """The number at byte ``at`` of each sample, shape (n,), or () if it never changes."""
-        place = self._place.get(at // 4)
-        if place is None:
-            return self.first(leaf, at)
-        return self._columns[place].view(leaf)[at % 4 // leaf.itemsize :: 4 // leaf.itemsize]
-
-
-def _aligned(table: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """Rows of bytes as rows of words, the last one filled up."""
-    n, size = table.shape
-    if size % 4:
-        padded = np.zeros((n, size + -size % 4), dtype=np.uint8)
-        padded[:, :size] = table
-        table = padded
-    return table.view(np.uint32)
-
-
-class _Group(NamedTuple):
+class _Group:
     """Samples of one shape.
 
-    :param rows: which these are.
-    :param counts: lengths of their sequences.
-    :param dtype: structured type of one.
+    :ivar counts: lengths of their sequences.
+    :ivar rows: which of all samples these are, piece by piece.
+    :ivar moved: whether these are no longer in the order of :attr:`words`.
     """
 
-    rows: NDArray[np.intp] | slice
-    counts: tuple[int, ...]
-    dtype: np.dtype[Any]
-    words: _Words
+    def __init__(self, kind: Struct, shape: _Shape, first: NDArray[np.uint32]) -> None:
+        big, self.counts, size = shape
+        self.rows: list[NDArray[np.intp]] = []
+        self.moved = False
+        self.words = Words(first)
+        self._dtype = _dtype(kind, self.counts, ">" if big else "<", size)
+        # the header's first two bytes tell the byte order, the others are free
+        self._fixed = np.array([0, *_count_words(kind, self.counts)])
+        self._mask = np.full(len(self._fixed), 0xFFFFFFFF, dtype=np.uint32)
+        self._mask[:1].view(np.uint8)[2:] = 0
+
+    def agrees(
+        self, table: NDArray[np.uint32], changes: NDArray[np.uint32]
+    ) -> NDArray[np.bool_] | None:
+        """Which samples are of this shape; None for all.
+
+        :param changes: the bits in which any of them differs from the first of this shape.
+        """
+        if not (changes[self._fixed] & self._mask).any():
+            return None
+        return self.words.same(table, self._fixed, self._mask)
+
+    def put(
+        self, table: NDArray[np.uint32], rows: NDArray[np.intp], changes: NDArray[np.uint32]
+    ) -> None:
+        """Add samples that agree."""
+        self.words.put(table, changes)
+        self.rows.append(rows)
+
+    def where(self, n: int) -> NDArray[np.intp] | slice:
+        """Which of all ``n`` samples these are."""
+        if len(self.words) == n and not self.moved:
+            return slice(None)
+        self.rows = [np.concatenate(self.rows)]
+        return self.rows[0]
 
     def places(self, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
         """Type, and first byte of each number, of what a path names; none that it lacks."""
-        return _places(self.dtype, 0, steps)
+        return _places(self._dtype, 0, steps)
 
 
 def _places(here: np.dtype[Any], start: int, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:

@@ -1,0 +1,192 @@
+"""Payloads in buffers, and what of many of them changes: the ground under columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeAlias, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Packed", "Piece", "Words", "aligned", "pieces", "rows_at"]
+
+_BLOCK = 512
+"""Payloads that are looked at at once: few enough to stay in the processor's cache."""
+_SEGMENT = 1 << 16
+"""Samples whose changing words are kept in one table."""
+
+Piece: TypeAlias = "tuple[bytes | NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]"
+"""A buffer, where some payloads begin in it, and how long each of them is."""
+
+
+def rows_at(
+    data: bytes | NDArray[np.uint8], starts: NDArray[np.int64], size: int
+) -> NDArray[np.uint8]:
+    """``size`` bytes from each start, shape (n, size)."""
+    if not size or not len(starts):
+        return np.empty((len(starts), size), dtype=np.uint8)
+    # one item for each place where it may begin, for whole items are copied quickly
+    every: NDArray[np.void] = np.ndarray((len(data) - size + 1,), f"V{size}", data, strides=(1,))
+    return every[starts].view(np.uint8).reshape(len(starts), size)
+
+
+class Packed(Sequence[bytes]):
+    """Payloads one behind the other in a few buffers: many samples without an object for each.
+
+    :param blocks: the buffers, each of whole payloads.
+    :param starts: where each payload begins, counted through all of ``blocks``, shape (n,).
+    :param sizes: how long each is, shape (n,).
+    """
+
+    def __init__(
+        self,
+        blocks: Sequence[NDArray[np.uint8]],
+        starts: NDArray[np.int64],
+        sizes: NDArray[np.int64],
+    ) -> None:
+        self._blocks = blocks
+        self._joined: NDArray[np.uint8] | None = None
+        self._starts = starts
+        self._sizes = sizes
+
+    @property
+    def _bytes(self) -> NDArray[np.uint8]:
+        """All blocks as one, for those who do not go from front to back."""
+        if self._joined is None:
+            self._joined = np.concatenate([np.empty(0, np.uint8), *self._blocks])
+            self._blocks = [self._joined]  # so that they are not held twice
+        return self._joined
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    @overload
+    def __getitem__(self, at: int) -> bytes: ...
+    @overload
+    def __getitem__(self, at: slice) -> Packed: ...
+    def __getitem__(self, at: int | slice) -> bytes | Packed:
+        if isinstance(at, slice):
+            return Packed([self._bytes], self._starts[at], self._sizes[at])
+        start, size = int(self._starts[at]), int(self._sizes[at])
+        first = self._blocks[0] if len(self._blocks) else self._bytes
+        if start + size <= len(first):
+            return first[start : start + size].tobytes()
+        return self._bytes[start : start + size].tobytes()
+
+    def __iter__(self) -> Iterator[bytes]:
+        buffer = self._bytes.data
+        for start, size in zip(self._starts.tolist(), self._sizes.tolist(), strict=True):
+            yield bytes(buffer[start : start + size])
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Sequence) or isinstance(other, (str, bytes)):
+            return NotImplemented
+        return len(self) == len(other) and all(a == b for a, b in zip(self, other, strict=True))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def pieces(self) -> Iterator[Piece]:
+        """All payloads in their order, in pieces that lie in one buffer."""
+        buffer = self._bytes
+        for at in range(0, len(self), _BLOCK):
+            some = slice(at, at + _BLOCK)
+            yield buffer, self._starts[some], self._sizes[some]
+
+
+def pieces(payloads: Sequence[bytes]) -> Iterator[Piece]:
+    """Payloads in pieces of a few hundred that lie in one buffer."""
+    if isinstance(payloads, Packed):
+        yield from payloads.pieces()
+        return
+    for at in range(0, len(payloads), _BLOCK):
+        some = payloads[at : at + _BLOCK]
+        sizes = np.array([len(p) for p in some], dtype=np.int64)
+        yield b"".join(some), np.cumsum(sizes) - sizes, sizes
+
+
+class Words:
+    """Samples of one length, word by word: the first of them, and columns of what changes.
+
+    Most of a state never changes, and what does is asked for member by member. So a sample is
+    read once, when it is in the cache, and only its changing words are kept.
+
+    :param first: the first sample, from :func:`aligned`.
+    """
+
+    def __init__(self, first: NDArray[np.uint32]) -> None:
+        self._row = first
+        self._n = 0
+        # changing words in the order in which they began to
+        self._changing: list[int] = []
+        self._place: dict[int, int] = {}
+        # a table of columns for each 65536 samples; memory that is not touched costs nothing
+        self._tables: list[NDArray[np.uint32]] = []
+        self._known: list[int] = []  # how many words changed when a table was full
+
+    def __len__(self) -> int:
+        return self._n
+
+    def changes(self, piece: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Which bits of each word differ from the first sample's, anywhere in ``piece``."""
+        return np.asarray(np.bitwise_or.reduce(piece ^ self._row, axis=0))
+
+    def same(
+        self, piece: NDArray[np.uint32], words: NDArray[np.intp], mask: NDArray[np.uint32]
+    ) -> NDArray[np.bool_]:
+        """Which samples in ``piece`` have these words, as far as masked, as the first has them."""
+        return np.asarray((((piece[:, words] ^ self._row[words]) & mask) == 0).all(axis=1))
+
+    def put(self, piece: NDArray[np.uint32], changes: NDArray[np.uint32]) -> None:
+        """Add samples, and what of them :meth:`changes`."""
+        changes[self._changing] = 0
+        new = np.flatnonzero(changes).tolist()
+        self._place |= {word: place for place, word in enumerate(new, len(self._changing))}
+        self._changing += new
+        if self._tables and new:
+            words = slice(len(self._changing) - len(new), len(self._changing))
+            self._tables[-1][words, : self._n % _SEGMENT or _SEGMENT] = self._row[new][:, None]
+        kept = piece.take(self._changing, axis=1).T
+        while kept.shape[1]:
+            at = self._n % _SEGMENT
+            if not at:
+                if self._tables:
+                    self._known.append(len(self._changing))
+                self._tables.append(np.empty((len(self._row), _SEGMENT), dtype=np.uint32))
+            some = min(kept.shape[1], _SEGMENT - at)
+            self._tables[-1][: len(self._changing), at : at + some] = kept[:, :some]
+            self._n += some
+            kept = kept[:, some:]
+
+    def varies(self, at: int) -> bool:
+        """Whether the word with the byte ``at`` ever changes."""
+        return at // 4 in self._place
+
+    def first(self, leaf: np.dtype[Any], at: int) -> Any:
+        """The number at byte ``at`` of the first sample."""
+        return self._row.view(np.uint8)[at : at + leaf.itemsize].view(leaf)[0]
+
+    def parts(self, leaf: np.dtype[Any], at: int) -> Iterator[tuple[slice, Any]]:
+        """The number at byte ``at`` of each sample: arrays, or one number that some all have."""
+        place = self._place.get(at // 4)
+        if place is None:
+            yield slice(0, self._n), self.first(leaf, at)
+            return
+        step = 4 // leaf.itemsize
+        for number, table in enumerate(self._tables):
+            begin = number * _SEGMENT
+            end = min(begin + _SEGMENT, self._n)
+            if number < len(self._known) and place >= self._known[number]:
+                yield slice(begin, end), self.first(leaf, at)  # it changed only later
+            else:
+                column = table[place, : end - begin].view(leaf)
+                yield slice(begin, end), column[at % 4 // leaf.itemsize :: step]
+
+
+def aligned(table: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Rows of bytes as rows of words, the last one filled up."""
+    n, size = table.shape
+    if size % 4:
+        padded = np.zeros((n, size + -size % 4), dtype=np.uint8)
+        padded[:, :size] = table
+        table = padded
+    return table.view(np.uint32)
