@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import ClassVar
 
@@ -38,6 +38,7 @@ class Tool:
 
     :param arguments: of ``dexkit``.
     :param on_line: is given each line that it prints, in a thread that must not be kept long.
+    :param environment: variables that it has beside those of this process.
 
     :cvar error: what is raised when it ends, or says nothing, before it is ready; its last words
         are the hint.
@@ -45,7 +46,12 @@ class Tool:
 
     error: ClassVar[type[DexkitError]] = DexkitError
 
-    def __init__(self, *arguments: str, on_line: Callable[[str], object] | None = None) -> None:
+    def __init__(
+        self,
+        *arguments: str,
+        on_line: Callable[[str], object] | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self.arguments = arguments
         self.ready = threading.Event()
         self.place = ""
@@ -59,7 +65,7 @@ class Tool:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
             # a Ctrl-C in the terminal is the caller's to act upon: it stops its tools in order
             start_new_session=True,
         )

@@ -85,6 +85,10 @@ class StatusLine:
         if self._lines:
             print(f"status: {text}", flush=True)
         elif self.on_terminal:
+            # a line that is broken in two could not be written over
+            room = os.get_terminal_size(sys.stderr.fileno()).columns - 1
+            if 0 < room < len(text):
+                text = f"{text[: room - 1]}…"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
     def clear(self) -> None:

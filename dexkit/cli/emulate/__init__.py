@@ -10,6 +10,11 @@ __all__ = ["command"]
 
 # name -> (module, attribute, one-line help); the help is here so that a listing imports nothing
 _DEVICES = {
+    "all": (
+        "dexkit.cli.emulate.all",
+        "emulate_all",
+        "Emulate a whole robot: a body and two hands.",
+    ),
     "dex1-motor": (
         "dexkit.cli.emulate.dex1_motor",
         "emulate_dex1_motor",

@@ -1,0 +1,236 @@
+"""``dexkit emulate all``: a whole robot, body and hands, for a teleoperation developer.
+
+Body and hands are processes of their own. In one process they would share an interpreter lock:
+with a G1 body beside two Dex3-1 the hands fell from 1000 to 960 states a second, and the body
+missed one state in forty, at half the load of a processor.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import TracebackType
+
+import click
+
+from dexkit.bodies import BODIES
+from dexkit.cli.common import STATUS_LINES, StatusLine, StopRequest, dds_options, stop_on_signals
+from dexkit.errors import DexkitError, EmulatorError
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1
+from dexkit.processes import READY_TIMEOUT, Tool
+
+__all__ = ["emulate_all"]
+
+_HANDS = {
+    "dex3": ("sim-dex3", DEX3_1),
+    "dex1": ("sim-dex1", DEX1_1),
+    "dex5": ("sim-dex5", DEX5_1),
+}
+_ARMS = {"g1": "G1_29", "h1": "H1"}  # names of the bodies in xr_teleoperate
+_POLL = 0.05  # seconds between looks whether all parts live
+
+
+@click.command("all", context_settings={"show_default": True})
+@click.option("--body", type=click.Choice(list(reversed(BODIES))), default="g1", help="Which body.")
+@click.option(
+    "--hands", type=click.Choice([*_HANDS, "none"]), default="dex3", help="Which hands, both sides."
+)
+@click.option(
+    "--dialect", help="Of the hands, as of 'dexkit serve'.  [default: the hand model's first]"
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="A setting of the hands, e.g. right.object=40; 'dexkit backends' lists them.",
+)
+@dds_options(default_domain=1)
+@click.option(
+    "--duration",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="End after so many seconds.  [default: at Ctrl-C]",
+)
+@click.option("--force", is_flag=True, help="Even if others publish the state topics.")
+@click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+def emulate_all(
+    body: str,
+    hands: str,
+    dialect: str | None,
+    settings: tuple[str, ...],
+    domain: int,
+    interface: str,
+    duration: float | None,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Emulate a whole robot: a body and two hands on Unitree's topics.
+
+    \b
+    Examples:
+      dexkit emulate all
+      dexkit emulate all --body h1 --hands dex1
+      dexkit emulate all --set right.object=40 --duration 60
+
+    Prints "ready: ..." when all topics are up, and what to start next. Ctrl-C or SIGTERM ends
+    it. When one part ends, all do, with its error and exit code.
+    """
+    if hands == "none" and (dialect or settings):
+        raise click.UsageError("--dialect and --set are for hands, and there are none")
+    common = ["--domain", str(domain), "--interface", interface]
+    common += ["--force"] * force + ["--quiet"] * quiet
+    parts = {body: ("emulate", body, *common)}
+    if hands != "none":
+        own = [option for text in settings for option in ("--set", text)]
+        own += ["--dialect", dialect] if dialect else []
+        parts["hands"] = ("serve", _HANDS[hands][0], "--side", "both", *own, *common)
+    with stop_on_signals() as stop, _Robot(parts, quiet) as robot:
+        robot.wait_ready(stop)
+        if not stop:
+            title = BODIES[body].title
+            if hands != "none":
+                title += f" and two {_HANDS[hands][1].title}s"
+            click.echo(f"ready: {title}, domain {domain}, {interface}")
+            click.echo("\n".join(_next(body, hands, domain, interface)))
+            sys.stdout.flush()
+            robot.watch(stop, duration)
+
+
+def _next(body: str, hands: str, domain: int, interface: str) -> list[str]:
+    """What to start now."""
+    end = "" if hands == "none" else f" --ee={hands}"
+    lines = []
+    if domain in (0, 1):
+        sim = " --sim" if domain == 1 else ""
+        lines += [
+            "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
+            f"  python teleop_hand_and_arm.py --arm={_ARMS[body]}{end}{sim}",
+        ]
+        if hands == "dex5":
+            lines.append("  (--ee=dex5 is not in a release: pull request 321)")
+    else:
+        lines.append("xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md")
+    where = "" if interface == "lo" else f" --interface {interface}"
+    return [
+        *lines,
+        f'with Unitree\'s SDK: ChannelFactoryInitialize({domain}, "{interface}")',
+        f"who is there: dexkit doctor --domain {domain}{where}",
+    ]
+
+
+class _Part:
+    """One process of the robot: what it said, and how it is doing."""
+
+    def __init__(self, name: str, arguments: tuple[str, ...], status: StatusLine) -> None:
+        self.name = name
+        self.status = ""
+        self._line = status
+        self._error: list[str] = []
+        self.tool = Tool(*arguments, on_line=self._hear, environment={STATUS_LINES: "1"})
+
+    def _hear(self, line: str) -> None:
+        first, _, rest = line.partition(": ")
+        if first == "status":
+            self.status = rest
+        elif self._error or first == "error":
+            self._error.append(rest if first == "error" else line.strip())
+        elif not line.startswith("INFO counters"):
+            self._line.clear()
+            out = first in ("ready", "stopped")
+            text = rest if first == "ready" else f"{self.name}: {line}"
+            click.echo(text, err=not out)
+
+    @property
+    def ready(self) -> bool:
+        return bool(self.tool.place)
+
+    def failure(self) -> DexkitError:
+        """Why it ended although it was not asked to."""
+        self.tool.stop()  # all that it said is heard
+        code = self.tool.exit_code or 0
+        if self._error:
+            message, *hint = self._error
+            error = DexkitError(f"{self.name}: {message}", hint=" ".join(hint))
+        elif code < 0:
+            error = DexkitError(f"{self.name}: killed by signal {-code}")
+        else:
+            error = DexkitError(
+                f"{self.name}: ended by itself, exit code {code}", hint=self.tool.last_words
+            )
+        error.exit_code = code if code > 0 else 1
+        return error
+
+
+class _Robot:
+    """All parts; a context manager. Leaving it ends them together."""
+
+    def __init__(self, parts: dict[str, tuple[str, ...]], quiet: bool) -> None:
+        self._commands = parts
+        self._status = StatusLine(quiet)
+        self.parts: list[_Part] = []
+
+    def __enter__(self) -> _Robot:
+        try:
+            for name, arguments in self._commands.items():
+                self.parts.append(_Part(name, arguments, self._status))
+        except BaseException:
+            self._stop()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._status.clear()
+        self._stop()
+
+    def _stop(self) -> None:
+        if not self.parts:
+            return
+        with ThreadPoolExecutor(len(self.parts)) as pool:
+            polite = list(pool.map(lambda part: part.tool.stop(), self.parts))
+        for part, was in zip(self.parts, polite, strict=True):
+            if not was:
+                click.echo(f"{part.name}: did not end when told to, and was killed", err=True)
+
+    def _check(self) -> None:
+        """Whether all live.
+
+        :raises DexkitError: one does not.
+        """
+        for part in self.parts:
+            if not part.tool.running:
+                raise part.failure()
+
+    def wait_ready(self, stop: StopRequest) -> None:
+        """Until all topics are up.
+
+        :raises DexkitError: a part ended instead, or took too long.
+        """
+        end = time.monotonic() + READY_TIMEOUT
+        while not all(part.ready for part in self.parts) and not stop.wait(_POLL):
+            self._check()
+            if time.monotonic() > end:
+                late = ", ".join(part.name for part in self.parts if not part.ready)
+                raise EmulatorError(f"{late}: not ready after {READY_TIMEOUT:g} s")
+
+    def watch(self, stop: StopRequest, duration: float | None) -> None:
+        """Until told to stop, or time is up: one status line for all.
+
+        :raises DexkitError: a part ended.
+        """
+        end = None if duration is None else time.monotonic() + duration
+        shown = ""
+        while not stop.wait(_POLL):
+            self._check()
+            if end is not None and time.monotonic() >= end:
+                return
+            line = " | ".join(part.status for part in self.parts if part.status)
+            if line != shown:
+                self._status.show(line)
+                shown = line
