@@ -36,6 +36,7 @@ __all__ = [
     "MotorCmds_",
     "MotorState_",
     "MotorStates_",
+    "WirelessController_",
 ]
 
 
@@ -190,6 +191,20 @@ class LowState_:
     fan_frequency: tuple[int, ...] = (0,) * 4
     reserve: int = 0
     crc: int = 0  # over the C struct (facts/unitree-dex A.7)
+
+
+@dataclass(slots=True)
+class WirelessController_:
+    """The wireless remote (unitree_sdk2 idl/go2/WirelessController_.hpp).
+
+    DDS type ``unitree_go::msg::dds_::WirelessController_``.
+    """
+
+    lx: float = 0.0  # sticks, -1 to 1
+    ly: float = 0.0
+    rx: float = 0.0
+    ry: float = 0.0
+    keys: int = 0  # R1 L1 start select R2 L2 F1 F2 A B X Y up right down left, from bit 0
 
 
 _MotorCmd_0 = (Struct("<B3x5f3I"), Struct(">B3x5f3I"))
@@ -498,3 +513,22 @@ def decode_LowState_(data: Buffer, big: bool) -> LowState_:
     if at != len(data):
         check_end("LowState_", data, at)
     return LowState_(head, level_flag, frame_reserve, sn, version, bandwidth, imu_state, motor_state, BmsState_(v[0], v[1], v[2], v[3], v[4], v[5], v[6:8], v[8:10], v[10:25]), v[25:29], v[29:33], v[33], v[34:74], v[74], v[75], v[76], v[77], v[78], v[79], v[80:84], v[84], v[85])
+
+
+_WirelessController_0 = (Struct("<4fH"), Struct(">4fH"))
+
+
+def encode_WirelessController_(m: WirelessController_) -> bytes:
+    """Encapsulation header and little-endian data of a WirelessController_."""
+    return HEADER + _WirelessController_0[0].pack(m.lx, m.ly, m.rx, m.ry, m.keys)
+
+
+def decode_WirelessController_(data: Buffer, big: bool) -> WirelessController_:
+    """The WirelessController_ after the encapsulation header of ``data``."""
+    if len(data) < 22:
+        raise truncated("WirelessController_", 22, len(data))
+    v = _WirelessController_0[big].unpack_from(data, 4)
+    at = 22
+    if at != len(data):
+        check_end("WirelessController_", data, at)
+    return WirelessController_(v[0], v[1], v[2], v[3], v[4])
