@@ -38,6 +38,7 @@ class BodyModel:
     :param state_rate: states a second.
     :param command_rate: commands a second of Unitree's low-level examples (F B.1: 2 ms).
     :param teleop_rate: commands a second of xr_teleoperate (F B.1).
+    :param remote_rate: messages of the wireless remote a second.
     :param command_timeout: seconds without a command after which the body damps.
     """
 
@@ -54,9 +55,12 @@ class BodyModel:
     cmd_topic: str = "rt/lowcmd"
     state_topic: str = "rt/lowstate"
     arm_topic: str = "rt/arm_sdk"
+    remote_topic: str = "rt/wirelesscontroller"
+    remote_type: str = "unitree_go::msg::dds_::WirelessController_"
     state_rate: float = 500.0  # F B.1: clients poll at 500 Hz, the examples' loops take 2 ms
     command_rate: float = 500.0
     teleop_rate: float = 250.0
+    remote_rate: float = 50.0  # invented: the sources give the topic and no rate
     # inferred: the sources are silent; the protection of the hands' motors trips after 1 s (F B.4)
     command_timeout: float = 1.0
 

@@ -24,6 +24,7 @@ from dexkit.emulators.body.supply import PERIOD, Supply
 from dexkit.emulators.mechanics import FixedSteps
 from dexkit.errors import WireError
 from dexkit.hand import MotorError
+from dexkit.messages.unitree_go import WirelessController_
 
 __all__ = ["Body", "Counters"]
 
@@ -343,6 +344,11 @@ class Body:
         message["wireless_remote"] = np.frombuffer(self._remote_bytes(), np.uint8)
         self.counters.states += 1
         return self._state.seal()
+
+    def remote_message(self) -> WirelessController_:
+        """What the wireless remote says on its own topic."""
+        sticks = {name: self.remote.sticks.get(name, 0.0) for name in Remote.STICKS}
+        return WirelessController_(**sticks, keys=self.remote.bits)
 
     def _shake(self, imu: Any) -> None:
         noise = self.settings.noise * self._random.standard_normal((2, 3))

@@ -68,7 +68,9 @@ class EmulatedBody:
         self._own_node: DdsNode | None = None
         self._publisher = publisher or Publisher(model.state_rate, self._clock)
         self._force = force
+        self._remote_every = round(model.state_rate / model.remote_rate)
         self._writer: Writer | None = None
+        self._remote: Writer | None = None
         self._commands: Reader | None = None
         self._arm_commands: Reader | None = None
 
@@ -100,6 +102,7 @@ class EmulatedBody:
             model = self.model
             self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
             self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
+            self._remote = node.writer(model.remote_topic, model.remote_type)
             self._writer = node.writer(model.state_topic, model.state_type)
         except BaseException:
             self._close()
@@ -124,10 +127,10 @@ class EmulatedBody:
         self.stop()
 
     def _close(self) -> None:
-        for handle in (self._commands, self._arm_commands, self._writer):
+        for handle in (self._commands, self._arm_commands, self._remote, self._writer):
             if handle is not None:
                 handle.close()
-        self._commands = self._arm_commands = self._writer = None
+        self._commands = self._arm_commands = self._remote = self._writer = None
         if self._own_node is not None:
             self._own_node.close()
             self._own_node = None
@@ -160,6 +163,7 @@ class EmulatedBody:
     def _live(self, missed: int) -> None:
         body, now = self.body, self._clock.now()
         assert self._writer is not None
+        assert self._remote is not None
         assert self._commands is not None
         assert self._arm_commands is not None
         self.missed += missed
@@ -169,6 +173,8 @@ class EmulatedBody:
             body.arm_command(sample.data, now)
         body.advance(now)
         self._writer.write_raw(body.state(now))
+        if body.counters.states % self._remote_every == 0:
+            self._remote.write(body.remote_message())
 
 
 def run_body(
