@@ -1,0 +1,198 @@
+"""The picture of the family: ``dexkit models``, docs/models.md and its drawings."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+from xml.etree import ElementTree
+
+import pytest
+from click.testing import CliRunner
+
+from dexkit.bodies import BODIES
+from dexkit.cli import cli
+from dexkit.cli.emulate import command as emulate
+from dexkit.errors import UsageError
+from dexkit.family import facts, layout
+from dexkit.family.drawing import draw_body, draw_hand
+from dexkit.family.facts import describe, indices, names
+from dexkit.family.page import DOCS, drawing, files
+from dexkit.family.svg import Box, Sheet
+from dexkit.hand import JointSpec, Side
+from dexkit.models import DEX3_1, MODELS
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(cli, ["models", *arguments], env={"COLUMNS": "80"})
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def joints(name: str) -> Iterator[tuple[int, JointSpec]]:
+    """Every joint of a model with its index, of both sides."""
+    if name in MODELS:
+        for side in Side:
+            yield from enumerate(MODELS[name].joints[side])
+    else:
+        yield from ((i, BODIES[name].joint(i)) for i in BODIES[name].used)
+
+
+def gap(a: Box, b: Box) -> float:
+    """Px between two texts."""
+    across = max(a.left - b.right, b.left - a.right, 0.0)
+    return math.hypot(across, max(a.top - b.bottom, b.top - a.bottom, 0.0))
+
+
+class TestCommandLine:
+    def test_overview_has_every_model_in_eighty_columns(self) -> None:
+        lines = run().splitlines()
+        assert max(map(len, lines)) <= 80
+        for name in names():
+            (line,) = (text for text in lines if text.startswith(f"{name} "))
+            title = MODELS[name].title if name in MODELS else BODIES[name].title
+            assert title in line
+        for model in MODELS.values():
+            assert f"{model.state_rate:g} Hz" in "\n".join(lines)
+
+    @pytest.mark.parametrize("name", names())
+    def test_a_model_in_eighty_columns(self, name: str) -> None:
+        output = run(name)
+        assert max(map(len, output.splitlines())) <= 80
+        for i, joint in joints(name):
+            row = rf"^ *{i} +{joint.name} .*{round(joint.q_max, 4):g} .* {joint.tau_max:g} "
+            assert re.search(row, output, re.MULTILINE), row
+        if name in MODELS:
+            for dialect in MODELS[name].dialects:
+                for text in (dialect.name, dialect.cmd_type, dialect.state_type):
+                    assert text in output
+
+    def test_several_at_once(self) -> None:
+        assert run("dex1-1", "h1") == f"{run('dex1-1')}\n{run('h1')}"
+
+    def test_an_unknown_model(self) -> None:
+        result = CliRunner().invoke(cli, ["models", "dex9"])
+        error = result.exception
+        assert isinstance(error, UsageError)
+        assert error.exit_code == 2
+        assert error.hint == "known: dex1-1, dex3-1, dex5-1, h1, g1"
+
+    def test_json_holds_everything_and_its_shape_is_documented(self) -> None:
+        models = {m["name"]: m for m in json.loads(run("--json"))["models"]}
+        assert list(models) == names()
+        for name in names():
+            assert models[name] == json.loads(json.dumps(describe(name)))
+            assert json.loads(run(name, "--json"))["models"] == [models[name]]
+        documented = set(re.findall(r'"(\w+)"', facts.__doc__ or ""))
+
+        def keys(value: object) -> Iterator[str]:
+            if isinstance(value, dict):
+                yield from value
+                for inner in value.values():
+                    yield from keys(inner)
+            elif isinstance(value, list):
+                for inner in value:
+                    yield from keys(inner)
+
+        assert {*keys(models)} - set(names()) <= documented
+
+    def test_figures_are_those_of_the_models(self) -> None:
+        data = describe("dex3-1")
+        for side in Side:
+            rows = data["sides"][str(side)]["joints"]
+            for row, joint in zip(rows, DEX3_1.joints[side], strict=True):
+                assert (row["q_min_rad"], row["q_max_rad"]) == (joint.q_min, joint.q_max)
+                assert row["q_max_deg"] == pytest.approx(math.degrees(joint.q_max), abs=0.01)
+                assert row["closing"] == joint.closing
+        assert {b["name"] for b in data["backends"]} >= {"sim-dex3", "dex3-usb"}
+        assert sum(len(s["slots"]) for s in data["pressure_sensors"]) == 33
+
+    def test_bodies_name_a_command_that_exists(self) -> None:
+        listed = CliRunner().invoke(emulate, ["--help"]).output
+        for name in BODIES:
+            assert describe(name)["emulator"] == f"dexkit emulate {name}"
+            assert f"  {name} " in listed
+
+    def test_indices_as_text(self) -> None:
+        assert indices([0, 1, 2, 5, 8, 9]) == "0 to 2, 5, 8, 9"
+        assert indices([]) == ""
+
+
+def test_the_page_and_its_drawings_are_up_to_date() -> None:
+    stale = [
+        path.name
+        for path, content in files().items()
+        if not path.exists() or path.read_text(encoding="utf-8") != content
+    ]
+    assert not stale, f"{stale}: python -m dexkit.family.page"
+
+
+def test_no_drawing_is_left_of_a_model_that_is_gone() -> None:
+    there = {path.name for path in (DOCS / "images").glob("model-*.svg")}
+    assert there == {f"model-{name}.svg" for name in names()}
+
+
+@pytest.mark.parametrize("name", names())
+class TestDrawings:
+    @pytest.fixture
+    def sheet(self, name: str) -> Sheet:
+        return draw_hand(MODELS[name]) if name in MODELS else draw_body(BODIES[name])
+
+    def test_every_joint_once_with_its_index(self, name: str, sheet: Sheet) -> None:
+        texts = Counter(box.text for box in sheet.texts)
+        expected = Counter(joint.name for _, joint in joints(name))
+        assert {text: texts[text] for text in expected} == expected
+        for i, joint in joints(name):
+            boxes = [b for b in sheet.texts if b.text == joint.name]
+            numbers = [b for b in sheet.texts if b.text == str(i)]
+            assert any(gap(number, box) < 24 for number in numbers for box in boxes), joint.name
+
+    def test_no_label_lies_on_another_or_beyond_the_sheet(self, name: str, sheet: Sheet) -> None:
+        for k, box in enumerate(sheet.texts):
+            assert box.left >= 0, box
+            assert box.right <= sheet.width, box
+            assert 0 <= box.top < box.bottom <= sheet.height, box
+            assert not [other.text for other in sheet.texts[k + 1 :] if box.overlaps(other)], box
+
+    def test_it_is_one_file_for_light_and_dark(self, name: str, sheet: Sheet) -> None:
+        root = ElementTree.fromstring(drawing(name))
+        assert root.tag == f"{SVG}svg"
+        assert root.findtext(f"{SVG}title")
+        assert "not to scale" in (root.findtext(f"{SVG}desc") or "")
+        assert not [e for e in root.iter() if any("href" in key for key in e.attrib)]
+        style = root.findtext(f"{SVG}style") or ""
+        light, dark = style.split("@media (prefers-color-scheme: dark)")
+        used = {e.get("class") for e in root.iter() if e.get("class")}
+        for kind in used:
+            assert f".{kind} {{" in light
+            assert f".{kind} {{" in dark
+        assert "schematic, not to scale" in {box.text for box in sheet.texts}
+
+
+def test_sensors_are_drawn_where_the_model_has_them() -> None:
+    root = ElementTree.fromstring(drawing("dex3-1"))
+    taxels = [e for e in root.iter() if e.get("class") == "taxel"]
+    badges = [e for e in root.iter(f"{SVG}text") if e.get("class") == "sensor"]
+    assert len(taxels) == 2 * 33 + 4  # both hands, and the legend
+    assert Counter(e.text for e in badges) == Counter([*map(str, range(9))] * 2 + ["0"])
+
+
+def test_fingers_hold_the_joints_that_bear_their_names() -> None:
+    for finger in layout.HANDS["dex3-1"].fingers:
+        for i in finger.joints:
+            assert DEX3_1.joints[Side.LEFT][i].name.startswith(f"{finger.name}_")
+    for name, hand in layout.HANDS.items():
+        covered = sorted(i for finger in hand.fingers for i in finger.joints)
+        assert covered == list(range(len(MODELS[name].joints[Side.LEFT])))
+
+
+def test_sides_are_mirror_images() -> None:
+    """What closes the left hand stands on the other side of the sheet on the right hand."""
+    sheet = draw_hand(DEX3_1)
+    for joint in DEX3_1.joints[Side.LEFT]:
+        left, right = sorted((b.left + b.right) / 2 for b in sheet.texts if b.text == joint.name)
+        assert left + right == pytest.approx(sheet.width, abs=1)
