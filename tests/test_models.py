@@ -149,7 +149,7 @@ class TestDrawings:
         for i, joint in joints(name):
             boxes = [b for b in sheet.texts if b.text == joint.name]
             numbers = [b for b in sheet.texts if b.text == str(i)]
-            assert any(gap(number, box) < 24 for number in numbers for box in boxes), joint.name
+            assert any(gap(number, box) < 30 for number in numbers for box in boxes), joint.name
 
     def test_no_label_lies_on_another_or_beyond_the_sheet(self, name: str, sheet: Sheet) -> None:
         for k, box in enumerate(sheet.texts):
