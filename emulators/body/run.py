@@ -136,20 +136,21 @@ class EmulatedBody:
             self._own_node = None
 
     def _refuse_conflict(self, node: DdsNode) -> None:
-        def others() -> list[str]:
-            return [
-                e.process or "somebody"
-                for e in node.endpoints()
-                if e.topic == self.model.state_topic and e.kind == "writer" and not e.own
-            ]
-
-        node.discovery.wait(lambda endpoints: others(), _DISCOVERY)
-        if found := sorted(set(others())):
-            raise TopicConflict(
-                f"{', '.join(found)} already publishes {self.model.state_topic} on domain "
-                f"{self.domain}",
-                hint="stop the other robot, choose another --domain, or add --force",
-            )
+        """States must arrive: some clients have a writer for them, which they never use."""
+        model = self.model
+        with node.reader(model.state_topic, model.state_type) as reader:
+            if not reader.wait(_DISCOVERY) or not reader.take():
+                return
+        who = {
+            e.process or "somebody"
+            for e in node.endpoints()
+            if e.topic == model.state_topic and e.kind == "writer" and not e.own
+        }
+        raise TopicConflict(
+            f"{', '.join(sorted(who)) or 'somebody'} already publishes {model.state_topic} on "
+            f"domain {self.domain}",
+            hint="stop the other robot, choose another --domain, or add --force",
+        )
 
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
