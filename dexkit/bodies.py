@@ -69,6 +69,11 @@ class BodyModel:
         """Motors in each message, used or not."""
         return len(self.joints)
 
+    @property
+    def min_state_rate(self) -> float:
+        """Hz below which clients suffer: each command is to be made from a new state."""
+        return self.teleop_rate
+
     @cached_property
     def used(self) -> tuple[int, ...]:
         """The slots that have a joint, in order."""
