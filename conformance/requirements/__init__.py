@@ -1,5 +1,11 @@
 """The requirements as data: TOML files in this folder, read into :class:`Requirement`.
 
+What one model has in common with another is written once: an entry with ``like = "DEX3-RATE-01"``
+takes everything from that requirement of another file but what it says itself. Its id is the same
+with this model's prefix, unless it gives another; ids and topics of the other model in the texts
+are turned into this model's; tolerances are taken one by one. Where it names no source of its
+own, it is an inference from the other's.
+
 Everything else takes them from here: checks (which look up their tolerances), pytest ids,
 selection, reports and the catalogue in docs/conformance.md.
 """
@@ -15,6 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dexkit.bodies import BodyModel, body
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS, HandModel, model
 
@@ -30,7 +37,6 @@ __all__ = [
     "Level",
     "Requirement",
     "catalogue",
-    "load",
     "models",
     "parse",
     "select",
@@ -56,8 +62,8 @@ CAPABILITIES: Mapping[str, str] = {
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
-LAYERS = ("dds", "usb")
-"""Where a requirement is judged: on the topics, or on the hand's own USB device."""
+LAYERS = ("dds", "usb", "body")
+"""Where a requirement is judged: on a hand's topics, on its own USB device, or on a body's topics."""
 _KEYS = {
     "id",
     "area",
@@ -77,8 +83,10 @@ _KEYS = {
     "cause",
     "expected",
     "repeat",
+    "like",
 }
 _OPTIONAL = {
+    "like",
     "after",
     "dialects",
     "tolerances",
@@ -125,6 +133,8 @@ class Requirement:
         where nothing shorter says it.
     :param capability: one of :data:`CAPABILITIES`, where it is about a unit that a hand may lack.
     :param repeat: how often its stimulus is applied.
+    :param like: the requirement of another model that it is taken from, and whose check judges
+        it; empty if it stands for itself.
     """
 
     id: str
@@ -147,6 +157,7 @@ class Requirement:
     expected: str = ""
     capability: str = ""
     repeat: int = 1
+    like: str = ""
 
     @property
     def phase(self) -> str | None:
@@ -164,7 +175,12 @@ class Requirement:
             raise ConformanceError(f"{self.id} has no tolerance {name!r}") from None
 
 
-def _resolve(value: Any, hand: HandModel, where: str) -> float:
+def _model_of(document: Mapping[str, Any]) -> HandModel | BodyModel:
+    name = str(document.get("model", ""))
+    return body(name) if document.get("layer") == "body" else model(name)
+
+
+def _resolve(value: Any, hand: HandModel | BodyModel, where: str) -> float:
     if isinstance(value, str) and value.startswith("model:"):
         fact = getattr(hand, value.removeprefix("model:"), None)
         if isinstance(fact, int | float):
@@ -175,24 +191,61 @@ def _resolve(value: Any, hand: HandModel, where: str) -> float:
     raise UsageError(f"{where}: a tolerance is a number or 'model:NAME', not {value!r}")
 
 
-def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
+def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str) -> list[Any]:
+    """The entries of a document, each with what it takes from another one's.
+
+    :param others: entries of other documents, by id.
+    """
+    prefix = str(document.get("prefix", ""))
+    found = []
+    for entry in document.get("requirement", []):
+        if "like" not in entry:
+            found.append(entry)
+            continue
+        if entry["like"] not in others:
+            raise UsageError(f"{origin}: no requirement {entry['like']!r} to be like")
+        origins = others[entry["like"]]
+        theirs = entry["like"].partition("-")[0]
+
+        def ours(value: Any, theirs: str = theirs) -> Any:
+            if isinstance(value, str):
+                return value.replace(f"{theirs}-", f"{prefix}-").replace(
+                    f"rt/{theirs.lower()}/", f"rt/{prefix.lower()}/"
+                )
+            return [ours(v) for v in value] if isinstance(value, list) else value
+
+        taken = {key: ours(value) for key, value in origins.items()}
+        taken["source"] = f"as {entry['like']}: {origins['source']}"
+        taken["confidence"] = "inferred"
+        tolerances = {**origins.get("tolerances", {}), **entry.get("tolerances", {})}
+        found.append({**taken, **entry, **({"tolerances": tolerances} if tolerances else {})})
+    return found
+
+
+def parse(
+    text: str, origin: str = "requirements", others: Mapping[str, Any] | None = None
+) -> tuple[Requirement, ...]:
     """Requirements of one TOML text.
 
+    :param others: entries of other texts, by id, for what is ``like`` them.
     :raises UsageError: a key is unknown or missing, a value is not one of those allowed, an id
-        occurs twice or is retired, or ``after`` names what does not come before.
+        occurs twice or is retired, ``after`` names what does not come before, or ``like`` what
+        there is not.
     """
     document = tomllib.loads(text)
-    unknown = set(document) - {"model", "layer", "retired", "requirement"}
+    unknown = set(document) - {"model", "prefix", "layer", "retired", "requirement"}
     if unknown:
         raise UsageError(f"{origin}: unknown keys {sorted(unknown)}")
     retired = set(document.get("retired", ()))
-    hand = model(str(document.get("model", "")))
+    hand = _model_of(document)
     layer = str(document.get("layer", "dds"))
     if layer not in LAYERS:
         raise UsageError(f"{origin}: layer is one of {', '.join(LAYERS)}")
-    dialect_names = tuple(d.name for d in hand.dialects)
+    dialect_names = (
+        (hand.name,) if isinstance(hand, BodyModel) else tuple(d.name for d in hand.dialects)
+    )
     found: dict[str, Requirement] = {}
-    for entry in document.get("requirement", []):
+    for entry in _entries(document, others or {}, origin):
         where = f"{origin}: {entry.get('id', 'a requirement without id')}"
         unknown = set(entry) - _KEYS
         missing = _KEYS - _OPTIONAL - set(entry)
@@ -243,23 +296,23 @@ def parse(text: str, origin: str = "requirements") -> tuple[Requirement, ...]:
             expected=entry.get("expected", entry["sentence"]).format(**tolerances),
             capability=entry.get("capability", ""),
             repeat=entry.get("repeat", 1),
+            like=entry.get("like", ""),
         )
     return tuple(found.values())
 
 
-def load(path: Path) -> tuple[Requirement, ...]:
-    """Requirements of one TOML file.
-
-    :raises UsageError: as :func:`parse`.
-    """
-    return parse(path.read_text(encoding="utf-8"), path.name)
-
-
 @cache
 def _shipped() -> tuple[Requirement, ...]:
+    texts = {p.name: p.read_text(encoding="utf-8") for p in Path(__file__).parent.glob("*.toml")}
+    entries = {
+        entry["id"]: entry
+        for text in texts.values()
+        for entry in tomllib.loads(text).get("requirement", [])
+        if "like" not in entry
+    }
     found: list[Requirement] = []
-    for path in sorted(Path(__file__).parent.glob("*.toml")):
-        found += load(path)
+    for name in sorted(texts):
+        found += parse(texts[name], name, entries)
     return tuple(found)
 
 
@@ -279,7 +332,7 @@ def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requ
 
 def models() -> tuple[str, ...]:
     """The hand models that have requirements."""
-    return tuple(dict.fromkeys(r.model for r in _shipped()))
+    return tuple(dict.fromkeys(r.model for r in _shipped() if r.layer != "body"))
 
 
 def select(
