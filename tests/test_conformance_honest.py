@@ -18,7 +18,9 @@ from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run, with_beats
 
-PHASES = frozenset({"step", "ends", "nan", "limp", "silence", "resume", "load", "burst"})
+PHASES = frozenset(
+    {"step", "ends", "nan", "out-of-range", "limp", "silence", "resume", "load", "burst"}
+)
 
 
 class JustFastEnough(ReferenceService):
@@ -57,6 +59,17 @@ class _Unhurried(ReferenceHand):
         return 0.0 if self.braking else torque
 
 
+class _Quick(ReferenceHand):
+    tau_max = 5.0
+    viscous = 0.11
+
+
+class Quick(ReferenceService):
+    """Goes from one end to the other in a sixth of a second."""
+
+    hand = _Quick
+
+
 class Unhurried(ReferenceService):
     """Takes four and a half seconds from one end to the other."""
 
@@ -78,6 +91,7 @@ def blamed(result: RunResult) -> set[str]:
     [
         (JustFastEnough, {"DEX1-RATE-02"}),
         (Plain, {"DEX1-QOS-02"}),
+        (Quick, set()),
         # slow, and so it is told; but it arrives, opens, closes and obeys
         (Unhurried, {"DEX1-MOVE-04", "DEX1-MOVE-07"}),
     ],
@@ -86,6 +100,12 @@ def test_an_honest_hand_is_warned_at_most(service: type[Service], warned: set[st
     result = judged(service)
     assert blamed(result) == warned
     assert result.overall is Overall.PASS
+
+
+def test_a_gripper_that_is_quick_for_its_size_is_not_taken_for_percent() -> None:
+    speed = of(judge(Recording.of(listened(Quick))), "DEX1-FIELD-14")
+    assert speed.verdict is Verdict.PASS
+    assert 30 < speed.values["speed_rad_s"] < 60
 
 
 def test_what_a_plain_hand_does_not_claim_is_not_held_against_it() -> None:

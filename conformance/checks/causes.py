@@ -10,7 +10,7 @@ import numpy as np
 from dexkit.hand import Floats, JointSpec
 from dexkit.models import DIALECTS, Dialect
 
-__all__ = ["of_positions", "of_scale", "of_type"]
+__all__ = ["of_positions", "of_range", "of_scale", "of_type"]
 
 
 def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec]) -> str:
@@ -48,6 +48,17 @@ def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSp
     return ""
 
 
+def of_range(q: float) -> str:
+    """Why a joint stands at ``q``, far off its range, or nothing."""
+    if abs(q - 100.0) < 5.0:
+        unit = "percent"
+    elif 120.0 < abs(q) <= 400.0:
+        unit = "degrees"
+    else:
+        return ""
+    return f"q looks like {unit}, in commands as in the state: of its range only a part was used."
+
+
 def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
     """Why steps of one joint end elsewhere, or nothing.
 
@@ -58,6 +69,12 @@ def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
         return ""
     if np.allclose(reached, stroke - targets, atol=0.06 * stroke):
         return "Travel is mirrored: what should open closes."
+    if reached.max() <= 0.06 * stroke and np.ptp(reached) >= 0.02 * stroke:
+        return "Commands look taken for percent or degrees: all that are radians close the hand."
+    if np.allclose(reached, stroke * np.clip(targets, 0.0, 1.0), atol=0.03 * stroke):
+        return "Commands look taken for 0 to 1: all that are above 1 rad open fully."
+    if np.allclose(reached, np.clip(targets, 0.0, 1.0), atol=0.03):
+        return "q looks like 0 to 1 instead of radians, in commands as in the state."
     for scale, what in ((1 / stroke, "0 to 1"), (100 / stroke, "0 to 100 (percent)")):
         if np.allclose(reached, scale * targets, atol=0.06 * scale * stroke):
             return f"q is published as {what} instead of radians."

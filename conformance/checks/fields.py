@@ -7,6 +7,8 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.view import joints_of
 
+_STAND_S = 0.1  # seconds without motion that are a stand
+
 
 @check("DEX1-FIELD-01", "DEX3-FIELD-01")
 def length(ctx: Context) -> Outcome:
@@ -52,7 +54,7 @@ def finite(ctx: Context) -> Outcome:
 def in_stroke(ctx: Context) -> Outcome:
     """Smallest and largest q of each joint."""
     states, margin = ctx.states, ctx.tolerance("margin_rad")
-    # what a wild command does to q is SAFE-02's finding
+    # what a wild command does to q is SAFE-02's finding, unless it shows another scale
     excused = np.zeros(len(states), dtype=np.bool_)
     for phase in ctx.phases("out-of-range"):
         begin, end = ctx.span(phase)
@@ -90,7 +92,74 @@ def in_stroke(ctx: Context) -> Outcome:
         if widest is None or beyond > widest[0]:
             within = ctx.passed(f"{low:.2f} .. {high:.2f} rad", text, q_min=low, q_max=high)
             widest = (beyond, within)
-    return widest[1] if widest else ctx.skipped("no state with a position")
+    if widest is None:
+        return ctx.skipped("no state with a position")
+    return _stands_far_off(ctx) or widest[1]
+
+
+def _stands_far_off(ctx: Context) -> Outcome | None:
+    """The finding, if a wild command brings a joint to a stand more than a stroke off its range.
+
+    No joint has its stop there: such a hand takes commands, and reports itself, in another unit,
+    of which the kit has used a small part only.
+    """
+    for phase in ctx.phases("out-of-range"):
+        begin, end = ctx.span(phase)
+        rows = ctx.states.between(begin, end)
+        t, positions = ctx.states.t[rows], ctx.states.q[rows]
+        for joint, spec in enumerate(ctx.joints):
+            q = positions[:, joint]
+            far = (q < spec.q_min - spec.stroke) | (q > spec.q_max + spec.stroke)
+            for i in np.flatnonzero(far):
+                stand = q[i : int(np.searchsorted(t, t[i] + _STAND_S))]
+                if len(stand) < 5 or t[-1] < t[i] + _STAND_S:
+                    break
+                if float(np.ptp(stand)) <= 0.1 * spec.stroke:
+                    return ctx.failed(
+                        f"{q[i]:.1f} rad",
+                        ctx.named(
+                            f"commanded far out of range it came to a stand at q = {q[i]:.1f} rad; "
+                            f"the stroke is {spec.q_min:g} to {spec.q_max:.3f} rad",
+                            joint,
+                        ),
+                        ctx.at(ctx.states.topic, float(t[i]), float(t[i]) + _STAND_S),
+                        q_stand=float(q[i]),
+                    ).because(causes.of_range(float(q[i])))
+    return None
+
+
+@check("DEX1-FIELD-14")
+def plausible_speed(ctx: Context) -> Outcome:
+    """The fastest motion of q, as a part of what the joint is good for."""
+    window = ctx.tolerance("window_s")
+    t = ctx.states.clock
+    ends = np.searchsorted(t, t + window)
+    starts = np.flatnonzero(ends < len(t))
+    ends = ends[starts]
+    near = t[ends] - t[starts] < 2 * window  # a gap in the state is RATE-03's finding
+    starts, ends = starts[near], ends[near]
+    worst: tuple[float, float, int, float] = (-1.0, 0.0, 0, 0.0)
+    for joint, spec in enumerate(ctx.joints):
+        q = ctx.states.q[:, joint]
+        speed = np.abs(q[ends] - q[starts]) / (t[ends] - t[starts])
+        if not np.isfinite(speed).any():
+            continue
+        i = int(np.nanargmax(speed))
+        worst = max(worst, (speed[i] / spec.dq_max, float(speed[i]), joint, float(t[starts[i]])))
+    part, speed_rad_s, joint, at = worst
+    if part < 0:
+        return ctx.skipped("no state with a position that lasts long enough")
+    if not speed_rad_s:
+        return ctx.skipped("the hand does not move in this recording")
+    text = ctx.named(f"q moves by up to {speed_rad_s:.1f} rad/s over {window:g} s", joint)
+    if part <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{speed_rad_s:.1f} rad/s", text, speed_rad_s=speed_rad_s)
+    return ctx.failed(
+        f"{speed_rad_s:.0f} rad/s",
+        f"{text}: {part:.1f} times what the joint is good for",
+        ctx.at(ctx.states.topic, at, at + window),
+        speed_rad_s=speed_rad_s,
+    )
 
 
 @check("DEX1-FIELD-04", "DEX3-FIELD-04")

@@ -141,12 +141,17 @@ def arrives(ctx: Context) -> Outcome:
 
 def _cause(found: Sequence[Step]) -> str:
     """Why steps end elsewhere, where they show it."""
-    if all(float(np.ptp(s.q)) < 0.02 * s.stroke for s in found):
-        return "Nothing moves at all: commands do not reach the motors, or these are not driven."
-    if len({s.joint for s in found}) > 1:
-        return ""
-    ends = np.array([(s.target, s.final) for s in found])
-    return causes.of_scale(ends[:, 0], ends[:, 1], found[0].stroke)
+    still = all(float(np.ptp(s.q)) < 0.02 * s.stroke for s in found)
+    scale = ""
+    if len({s.joint for s in found}) == 1:
+        ends = np.array([(s.target, s.final) for s in found])
+        scale = causes.of_scale(ends[:, 0], ends[:, 1], found[0].stroke)
+    if still and not scale:
+        return (
+            "Nothing moves at all: commands do not reach the motors, or these are not driven; or "
+            "commands are taken in another unit, in which all of them mean the same end."
+        )
+    return scale
 
 
 @check("DEX1-MOVE-03", "DEX3-MOVE-03")

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.checks.motion import Step, steps, steps_of
 from dexkit.conformance.checks.timing import gaps, slow, too_slow
 from dexkit.conformance.phases import Phase
@@ -133,7 +133,7 @@ def out_of_range(ctx: Context) -> Outcome:
                         joint,
                     ),
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                )
+                ).because(causes.of_range(float(np.nanmax(q))))
             reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} rad")
             values = {"q_min": float(q.min()), "q_max": float(q.max())}
     outcome = unharmed(ctx, "commands far out of range")

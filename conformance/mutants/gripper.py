@@ -35,11 +35,114 @@ class NanVelocity(_Fields):
         return fields if fields["dq"] else {**fields, "dq": math.nan}
 
 
-class Percent(_Fields):
-    """Publishes percent of the stroke instead of radians."""
+class _InUnit(_Fields):
+    """Takes or publishes another unit than radians, ``full`` where it is open."""
+
+    full = 100.0
+    takes = publishes = True
+
+    @property
+    def scale(self) -> float:
+        """Units in a radian."""
+        return self.full / self.dialect.q_open
+
+    def command(self, side: Side, motor: Motor) -> None:
+        if self.takes and math.isfinite(motor.q):
+            # its own controller is as stiff as the client asks for, in its own unit
+            stiff = max(self.scale, 1.0)
+            q, dq = motor.q / self.scale, motor.dq / self.scale
+            motor = replace(motor, q=q, dq=dq, kp=stiff * motor.kp, kd=stiff * motor.kd)
+        super().command(side, motor)
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "q": 100 * fields["q"] / self.dialect.q_open}
+        if not self.publishes:
+            return fields
+        return {**fields, **{name: self.scale * fields[name] for name in ("q", "dq", "ddq")}}
+
+
+class Percent(_InUnit):
+    """Publishes percent of the stroke instead of radians."""
+
+    takes = False
+
+
+class PercentCommands(_InUnit):
+    """Takes percent of the stroke instead of radians."""
+
+    publishes = False
+
+
+class Degrees(_InUnit):
+    """Publishes degrees instead of radians."""
+
+    full = math.degrees(5.4)
+    takes = False
+
+
+class _OtherScale(ReferenceHand):
+    """Counts in another unit, and is as quick in it as a good hand is in radians."""
+
+    full = 100.0
+    tau_max = 120.0
+    viscous = 0.06
+
+    def __init__(self, stroke: float, touch: float | None = None) -> None:
+        super().__init__(self.full, touch)
+        self.q = 3.0  # nearly closed: there it looks like radians
+
+    def fields(self) -> dict[str, float]:
+        return {**super().fields(), "tau_est": 0.1 * self.tau}
+
+
+class PercentBothWays(ReferenceService):
+    """Takes and publishes percent; begins nearly closed, where percent look like radians."""
+
+    hand = _OtherScale
+
+
+class PercentWithin(PercentBothWays):
+    """Takes and publishes percent, of commands that it has clamped to 5.4."""
+
+    def command(self, side: Side, motor: Motor) -> None:
+        if math.isfinite(motor.q):
+            motor = replace(motor, q=min(max(motor.q, 0.0), self.dialect.q_open))
+        super().command(side, motor)
+
+
+class _InDegrees(_OtherScale):
+    full = math.degrees(5.4)
+
+
+class DegreesBothWays(ReferenceService):
+    """Takes and publishes degrees; begins nearly closed, where degrees look like radians."""
+
+    hand = _InDegrees
+
+
+class Normalised(_InUnit):
+    """Publishes 0 to 1 instead of radians."""
+
+    full = 1.0
+    takes = False
+
+
+class NormalisedCommands(_InUnit):
+    """Takes 0 to 1 instead of radians."""
+
+    full = 1.0
+    publishes = False
+
+
+class NormalisedBothWays(_InUnit):
+    """Takes and publishes 0 to 1 instead of radians."""
+
+    full = 1.0
+
+
+class Metres(_InUnit):
+    """Takes and publishes the opening in metres instead of radians."""
+
+    full = 0.09
 
 
 class TurnedVelocity(_Fields):
@@ -361,7 +464,7 @@ DIALECTS = {
     "RestsAtZero": "unitree_actuator",
 }
 """The dialect of those that are wrong in one dialect only."""
-ALONE = ("RestsAtZero",)
+ALONE = ("RestsAtZero", "PercentBothWays", "PercentWithin", "DegreesBothWays")
 """Those that are seen in a left hand alone: an object would hold the right one away from 0."""
 ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
     (of(shared.OldTopic, ReferenceService), "DEX1-TOPIC-01", ()),
@@ -382,6 +485,10 @@ ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
     (of(shared.EmptyNowAndThen, ReferenceService), "DEX1-FIELD-01", ()),
     (NanVelocity, "DEX1-FIELD-02", ()),
     (Percent, "DEX1-FIELD-03", ()),
+    (PercentBothWays, "DEX1-FIELD-03", ()),
+    (Degrees, "DEX1-FIELD-03", ()),
+    (DegreesBothWays, "DEX1-FIELD-03", ()),
+    (PercentWithin, "DEX1-FIELD-14", ()),
     (TurnedVelocity, "DEX1-FIELD-04", ()),
     (OtherRobotsMode, "DEX1-FIELD-05", ()),
     (TurnedAcceleration, "DEX1-FIELD-06", ()),
@@ -394,6 +501,11 @@ ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
     (StatusInMotorstate, "DEX1-FIELD-12", ()),
     (NanAttitude, "DEX1-FIELD-13", ()),
     (Inverted, "DEX1-MOVE-01", ()),
+    (PercentCommands, "DEX1-MOVE-01", ()),
+    (Normalised, "DEX1-MOVE-01", ()),
+    (NormalisedBothWays, "DEX1-MOVE-01", ()),
+    (Metres, "DEX1-MOVE-01", ()),
+    (NormalisedCommands, "DEX1-MOVE-02", ("DEX1-MOVE-01",)),
     (of(shared.Frozen, ReferenceService), "DEX1-MOVE-01", ()),
     (OtherScale, "DEX1-MOVE-02", ()),
     (Hunts, "DEX1-MOVE-03", ()),
