@@ -14,7 +14,7 @@ import logging
 import threading
 from types import TracebackType
 
-from dexkit.bodies import BodyModel
+from dexkit.bodies import BODIES, BodyModel
 from dexkit.clock import Clock, RealClock
 from dexkit.dds import DdsNode, Reader, Writer
 from dexkit.emulators.body.body import Body
@@ -84,6 +84,23 @@ class EmulatedBody:
         """Writers of the two command topics."""
         readers = (self._commands, self._arm_commands)
         return sum(reader.matched for reader in readers if reader is not None)
+
+    def mismatches(self) -> list[str]:
+        """Sentences about clients with another type on the same topic; they get no error."""
+        node, model = self._node or self._own_node, self.model
+        if node is None:
+            return []
+        ours = dict.fromkeys((model.cmd_topic, model.arm_topic), model.cmd_type)
+        ours[model.state_topic] = model.state_type
+        found = []
+        for topic, kind in sorted({(e.topic, e.type_name) for e in node.endpoints() if not e.own}):
+            if topic in ours and kind != ours[topic]:
+                others = [b for b in BODIES.values() if kind in (b.cmd_type, b.state_type)]
+                found.append(
+                    f"{topic}: a peer uses {kind}, the {model.name} {ours[topic]}; they never match"
+                    + "".join(f". Try dexkit emulate {b.name}" for b in others)
+                )
+        return found
 
     def start(self) -> EmulatedBody:
         """Publish states and obey commands from now on.

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.bodies import G1, H1, BodyModel
-from dexkit.cli.common import StatusLine, StopRequest, dds_options, stop_on_signals
+from dexkit.cli.common import (
+    StatusLine,
+    StopRequest,
+    dds_options,
+    log_to_stderr,
+    stop_on_signals,
+)
 from dexkit.cli.emulate.stdin import read_faults
 from dexkit.errors import DdsError
 
@@ -21,6 +27,8 @@ if TYPE_CHECKING:
     from dexkit.emulators.body import EmulatedBody
 
 __all__ = ["emulate_g1", "emulate_h1"]
+
+log = logging.getLogger("dexkit.body")
 
 _STATUS_PERIOD = 0.5  # seconds
 _JSON_PERIOD = 1.0
@@ -52,8 +60,7 @@ def _command(model: BodyModel) -> click.Command:
         chosen = dataclasses.replace(model, mode_machine=mode_machine or model.mode_machine)
         settings = Settings(lenient=lenient, noise=noise, seed=seed)
         status = StatusLine(quiet)
-        clear = "\r\x1b[K" if status.on_terminal else ""  # the status line is written over
-        logging.basicConfig(level=logging.WARNING, format=f"{clear}%(levelname)s %(message)s")
+        log_to_stderr(quiet=True, status=status.on_terminal, always=log.name)
         robot = EmulatedBody(
             chosen, domain=domain, interface=interface, settings=settings, force=force
         )
@@ -94,7 +101,7 @@ def _command(model: BodyModel) -> click.Command:
     Examples:
       dexkit emulate {model.name}
       dexkit emulate {model.name} --remote A,R1,lx=0.5
-      dexkit emulate {model.name} --domain 0 --interface eth0 --json
+      dexkit emulate {model.name} --domain 0 --json    (programs that know no other domain)
 
     Prints "ready: ..." when the topics are up. Ctrl-C or SIGTERM ends it.
     """
@@ -164,12 +171,16 @@ def _watch(
     end = None if duration is None else time.monotonic() + duration
     counters = robot.body.counters
     then, states, orders = time.monotonic(), counters.states, counters.commands
-    while robot.failure is None:
+    said: set[str] = set()
+    over = False
+    while not over:
         left = period if end is None else min(period, end - time.monotonic())
-        if left <= 0 or stop.wait(left):
-            break
+        over = left <= 0 or stop.wait(left) or robot.failure is not None
+        for text in set(robot.mismatches()) - said:
+            said.add(text)
+            log.warning("%s", text)
         now = time.monotonic()
-        span = now - then
+        span = max(now - then, 1e-3)
         state_rate = (counters.states - states) / span
         command_rate = (counters.commands - orders) / span
         then, states, orders = now, counters.states, counters.commands

@@ -1,0 +1,140 @@
+"""``dexkit emulate h1`` and ``g1``, and bodies on topics of a test's own."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+
+import pytest
+from click.testing import CliRunner
+
+from dexkit.bodies import G1, H1
+from dexkit.cli.emulate import command
+from dexkit.dds import DdsNode
+from dexkit.emulators.body import EmulatedBody, run_body
+from dexkit.errors import EmulatorError, TopicConflict
+from dexkit.messages import encode
+from dexkit.wire.low_level import encode_with_crc, verify_payload
+from tests.body_helpers import low_cmd
+from tests.dds_helpers import free_domain, take_until, wait_until
+
+
+@pytest.fixture
+def node() -> Iterator[DdsNode]:
+    """On a domain that no other test has."""
+    with DdsNode(free_domain()) as node:
+        yield node
+
+
+def test_process(node: DdsNode) -> None:
+    """Ready, state, commands good and bad, the remote, JSON, a clean end."""
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "dexkit", "emulate", "g1", "--no-real-time"),
+            *("--domain", str(node.domain), "--remote-from-stdin", "--json"),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        ready = process.stdout.readline()
+        assert "ready: g1 on rt/lowcmd and rt/lowstate (unitree_hg, 29 joints in 35 slots)" in ready
+        assert f"500 Hz, domain {node.domain}, lo" in ready
+        states = node.reader(G1.state_topic, G1.state_type, depth=100)
+        commands = node.writer(G1.cmd_topic, G1.cmd_type)
+        first = take_until(states, bool)[0]
+        assert verify_payload(G1.state_type, first.data)
+        assert first.message.mode_machine == 5
+
+        elbow = G1.slot("left_elbow")
+        order = low_cmd(G1, {elbow: 1.0})
+        assert commands.wait_matched(10)
+        commands.write_raw(encode(order))  # no CRC
+        commands.write_raw(encode_with_crc(order))
+        take_until(states, lambda s: any(abs(x.message.motor_state[elbow].q - 1) < 0.01 for x in s))
+
+        process.stdin.write("X,lx=-1\nnonsense\n")
+        process.stdin.flush()
+        take_until(states, lambda s: any(x.message.wireless_remote[3] == 1 << 2 for x in s))
+        line = json.loads(process.stdout.readline())
+        assert line["body"] == "g1"
+        assert line["states"] > 0
+        process.stdin.write("release\n")
+        process.stdin.flush()
+        take_until(states, lambda s: any(not any(x.message.wireless_remote) for x in s))
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=15)
+        assert process.returncode == 0
+        lines = [json.loads(text) for text in rest.splitlines()]
+        assert (lines[-1]["bad_crc"], lines[-1]["commands"]) == (1, 1)
+        assert "the CRC is 0x00000000 and should be" in errors
+        assert "no key 'nonsense'" in errors
+        assert "Traceback" not in errors
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_two_robots_on_one_domain(node: DdsNode) -> None:
+    arguments = ["h1", "--domain", str(node.domain), "--duration", "0.2", "--no-real-time"]
+    stop, ready = threading.Event(), threading.Event()
+    thread = threading.Thread(
+        target=run_body, args=(H1,), kwargs={"domain": node.domain, "stop": stop, "ready": ready}
+    )
+    thread.start()
+    try:
+        assert ready.wait(10)
+        refused = CliRunner().invoke(command, arguments, standalone_mode=False)
+        assert isinstance(refused.exception, TopicConflict)
+        assert f"already publishes rt/lowstate on domain {node.domain}" in str(refused.exception)
+        assert "--force" in str(refused.exception.hint)
+        forced = CliRunner().invoke(command, [*arguments, "--force"], standalone_mode=False)
+        assert forced.exception is None
+        assert "stopped: states" in forced.output
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_clients_of_another_robot(node: DdsNode) -> None:
+    with EmulatedBody(G1, domain=node.domain) as robot, node.writer(H1.cmd_topic, H1.cmd_type):
+        wait_until(robot.mismatches)
+        (text,) = robot.mismatches()
+        assert "rt/lowcmd: a peer uses unitree_go::msg::dds_::LowCmd_, the g1 unitree_hg" in text
+        assert text.endswith("Try dexkit emulate h1")
+        with pytest.raises(EmulatorError, match="started already"):
+            robot.start()
+    assert robot.mismatches() == []
+
+
+def test_a_failure_is_told(node: DdsNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = EmulatedBody(H1, node=node)
+
+    def fail(now: float) -> bytes:
+        raise RuntimeError("out of joint")
+
+    monkeypatch.setattr(robot.body, "state", fail)
+    with robot:
+        wait_until(lambda: robot.failure)
+        assert str(robot.failure) == "out of joint"
+
+
+@pytest.mark.parametrize("name", ["h1", "g1"])
+def test_help(name: str) -> None:
+    result = CliRunner().invoke(command, [name, "--help"])
+    assert result.exit_code == 0
+    assert f"dexkit emulate {name} --remote A,R1,lx=0.5" in result.output
+    assert ("--mode-machine" in result.output) == (name == "g1")
+
+
+def test_bad_remote() -> None:
+    result = CliRunner().invoke(command, ["h1", "--remote", "Z"], standalone_mode=False)
+    assert "no key 'Z'" in str(result.exception)
