@@ -83,13 +83,23 @@ class TestTranslation:
         assert back.q == near(q)
         assert (back.kp, back.kd) == (near(5.0), near(0.05))
 
-    @given(st.floats(-10, 20, width=32))
-    def test_near_the_ends_the_specification_snaps(self, q: float) -> None:
-        back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q))
-        if q * SCALE < 0.0999:
-            assert back.q == 0.0
-        elif q * SCALE > 6.0001:
-            assert back.q == near(5.4)
+    @given(st.floats(-1, 7, width=32))
+    def test_near_the_ends_it_is_the_nearest_that_can_be_commanded(self, q: float) -> None:
+        """The specification's gripper takes 0.1 for closed and 6.0 for open."""
+        back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q)).q
+        low, high = 0.1 / SCALE, 6.0 / SCALE
+        wanted = min(max(q, 0.0), 5.4)
+        assert min(max(back, 0.0), 5.4) == pytest.approx(
+            min((0.0, 5.4, min(max(wanted, low), high)), key=lambda x: abs(x - wanted)), abs=2e-3
+        )
+
+    def test_the_teleoperation_client_gets_away_from_the_ends(self) -> None:
+        """It commands 0.18 rad from where the gripper is (facts/unitree-dex B.1)."""
+        for start, step in ((5.4, -0.18), (0.0, 0.18)):
+            q = start
+            for _ in range(10):
+                q = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q + step)).q
+            assert abs(q - start) > 1.5
 
     @given(go_commands)
     def test_a_command_presses_as_hard_on_either_scale(self, go: unitree_go.MotorCmd_) -> None:
@@ -165,6 +175,7 @@ class Wire:
 
     def command(self, *sides: Side, q: float = 1.0, **fields: Any) -> list[Outgoing]:
         """Commands of q (of 0 .. 5.4; the right's is twice that) for sides, and what follows."""
+        fields = {"kp": 5.0, **fields}
         out = []
         for topic, payload in self._messages(self.client, "cmd", sides, q, fields):
             out += self.commands.receive(topic, payload, self.now)
@@ -299,7 +310,7 @@ class TestTwoTopicsIntoOneMessage:
         wire.later(PATIENCE)
         wire.later(TIMEOUT)
         wire.state(*BOTH, q=1.5)
-        right, left = motors(wire.command(LEFT, kp=5.0, kd=0.05))
+        right, left = motors(wire.command(LEFT, kp=5.0, kd=0.05) or wire.later(PATIENCE))
         assert right == unitree_go.MotorCmd_(mode=0, q=3.0, kd=near32(0.05))
         assert left.kp == 5.0
         wire.state(*BOTH, q=1.75)  # pushed away: it is not to follow
@@ -314,7 +325,7 @@ class TestTwoTopicsIntoOneMessage:
 
     def test_without_a_position_of_the_other_nothing_is_sent(self) -> None:
         wire = Wire(GO, ACTUATOR)
-        assert wire.command(LEFT) == []
+        assert wire.command(LEFT) + wire.later(PATIENCE) == []
         assert wire.commands.counts.held == 1
         assert len(wire.command(RIGHT)) == 1  # both are commanded now: none needed
 
@@ -350,7 +361,7 @@ class TestTwoTopicsIntoOneMessage:
         assert before.lost == 0
         lost = []
         for _ in range(100):
-            wire.later(0.001)
+            wire.later(0.002)
             out = wire.state(LEFT) or wire.later(PATIENCE)
             right, left = motors(out)
             lost.append(right.lost)
@@ -399,6 +410,26 @@ class TestTwoTopicsIntoOneMessage:
         assert sent <= came
 
 
+class TestToTheSpecification:
+    """unitree_hg knows no gains."""
+
+    @pytest.mark.parametrize("kp", [0.0, -5.0])
+    def test_a_command_that_does_not_pull_leaves_the_gripper_where_it_is(self, kp: float) -> None:
+        wire = Wire(GO, HG)
+        assert wire.command(LEFT, q=0.0, kp=kp) == []  # where is it?
+        wire.state(LEFT, q=2.5)
+        assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=kp)) == {LEFT: 2.5}
+        wire.state(LEFT, q=2.0)  # pushed by hand
+        assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=kp, dq=1.0)) == {LEFT: 2.0}
+        assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=5.0)) == {LEFT: 0.0}
+
+    def test_its_own_clients_send_none(self) -> None:
+        for target in (GO, ACTUATOR):
+            wire = Wire(HG, target)
+            out = wire.command(*BOTH, q=1.0)
+            assert q_of(target, "cmd", out) == {LEFT: 1.0, RIGHT: 2.0}
+
+
 class TestOneMessageIntoTwoTopics:
     """From unitree_actuator."""
 
@@ -407,7 +438,7 @@ class TestOneMessageIntoTwoTopics:
         assert set(q_of(GO, "state", wire.state(LEFT))) == {LEFT}
         assert wire.states.counts.blank == 1
         # it may be commanded all the same: nobody is there to obey
-        assert len(wire.command(LEFT)) == 1
+        assert len(wire.command(LEFT) + wire.later(PATIENCE)) == 1
 
     def test_a_gripper_at_0_that_was_elsewhere_is_there(self) -> None:
         wire = Wire(GO, ACTUATOR)
@@ -417,7 +448,7 @@ class TestOneMessageIntoTwoTopics:
     def test_one_side_of_both(self) -> None:
         wire = Wire(GO, ACTUATOR, (RIGHT,))
         assert set(q_of(GO, "state", wire.state(*BOTH))) == {RIGHT}
-        right, left = motors(wire.command(RIGHT, q=1.5, kp=5.0))
+        (right, left) = motors(wire.command(RIGHT, q=1.5, kp=5.0))  # waits for nobody
         assert (right.q, right.kp) == (3.0, 5.0)
         assert (left.q, left.kp) == (1.0, 0.0)  # where it was seen
         assert wire.commands.inputs == {"rt/dex1/right/cmd": (RIGHT,)}

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import IO
+from contextlib import AbstractContextManager
 
 import pytest
 from click.testing import CliRunner
@@ -22,6 +17,7 @@ from dexkit.emulators.mx64 import emulated_ezgripper
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_go
 from dexkit.models import dialect
+from tests.cli_helpers import Process, running
 from tests.dds_helpers import dds_domain, dds_node, take_until
 
 __all__ = ["dds_domain", "dds_node"]
@@ -30,55 +26,8 @@ GO = dialect("unitree_go")
 LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
 
 
-class Process:
-    """A running ``dexkit serve``."""
-
-    def __init__(self, *arguments: object) -> None:
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", "dexkit", "serve", *map(str, arguments)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def ready(self) -> str:
-        stdout = self._popen.stdout
-        assert stdout is not None
-        line = stdout.readline()
-        assert line.startswith("ready: "), self.end(signal.SIGTERM)
-        return line.strip()
-
-    def line(self, pattern: str) -> str:
-        """The next line of its log that matches."""
-        stderr: IO[str] | None = self._popen.stderr
-        assert stderr is not None
-        for text in stderr:
-            if re.search(pattern, text):
-                return text.strip()
-        raise AssertionError(f"it ended without {pattern}")
-
-    def signal(self, number: int) -> None:
-        self._popen.send_signal(number)
-
-    def end(self, number: int) -> tuple[int, str, str]:
-        """Signal it and wait: exit code, rest of stdout, rest of stderr."""
-        if self._popen.poll() is None:
-            self._popen.send_signal(number)
-        try:
-            out, err = self._popen.communicate(timeout=15)
-        except subprocess.TimeoutExpired:
-            self._popen.kill()
-            raise
-        return self._popen.returncode, out, err
-
-
-@contextmanager
-def serving(*arguments: object) -> Iterator[Process]:
-    process = Process(*arguments)
-    try:
-        yield process
-    finally:
-        process.end(signal.SIGKILL)
+def serving(*arguments: object) -> AbstractContextManager[Process]:
+    return running("serve", *arguments)
 
 
 def counters(line: str) -> dict[str, object]:

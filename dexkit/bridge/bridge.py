@@ -19,7 +19,7 @@ from dexkit.clock import Clock, RealClock
 from dexkit.dds import DdsNode, Endpoint, Reader, Writer
 from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Side
-from dexkit.models import Dialect
+from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
 
 __all__ = ["Bridge", "End"]
@@ -65,6 +65,8 @@ class Bridge:
                 f"{client.dialect.name} is of a {client.dialect.model}, "
                 f"{gripper.dialect.name} of a {gripper.dialect.model}"
             )
+        if len(model(client.dialect.model).joints[Side.LEFT]) > 1:
+            raise UsageError(f"{client.dialect.name} is of a hand; grippers are bridged")
         if client.dialect == gripper.dialect and client.node.domain == gripper.node.domain:
             raise UsageError(
                 f"both ends are {client}: the bridge would answer itself",

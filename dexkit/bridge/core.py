@@ -7,7 +7,8 @@ sent. The rules, in both directions:
   whose watchdog acts, and a gripper that stops is silence for the client.
 * NaN or infinity in a number that a peer acts upon drops that gripper's part (counted).
 * Where two topics become one message, the newest parts of both sides go out together: at once
-  when the other side's has come too, otherwise ``PATIENCE`` later.
+  when the other side's has come too, otherwise ``PATIENCE`` later; a side that kept the other
+  waiting in vain is not waited for again until it comes.
 
 That one message has a place for a side of which nothing new is known. :class:`Commands` and
 :class:`States` say what is put there.
@@ -20,7 +21,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
-from dexkit.bridge.translate import Part, translator
+from dexkit.bridge.translate import Part, loses_gains, translator
 from dexkit.errors import WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.messages import unitree_go
@@ -58,7 +59,7 @@ class Counts:
     :ivar blank: parts of a gripper that is not there: all 0, and never anything else before.
     :ivar sent: messages sent.
     :ivar filled: of those, messages with a part that did not come from a fresh one.
-    :ivar held: messages not sent, since nothing is known for one of their places.
+    :ivar held: messages not sent, since a position that they need is not known (yet).
     """
 
     received: int = 0
@@ -105,8 +106,10 @@ class Direction(ABC):
         # both sides share what is written, whether or not both are bridged
         self._shared = target.length > 1
         self._newest: dict[Side, _Newest] = {}
-        # sides with a part that has not gone out, and since when the first of them waits
+        # sides with a part that has not gone out, and since when the first of them waits; sides
+        # that had none when something went out, and are not waited for until they come again
         self._pending: set[Side] = set()
+        self._absent: set[Side] = set()
         self._waits_since: float | None = None
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Outgoing]:
@@ -144,6 +147,10 @@ class Direction(ABC):
         """Whether a part is that of a gripper that is not there."""
         return False
 
+    def _translated(self, part: Any, side: Side) -> Any | None:
+        """A part in the target's dialect; None where that cannot be said."""
+        return self._translate(part)
+
     @abstractmethod
     def _live(self, side: Side, now: float) -> bool:
         """Whether a side's newest part still holds."""
@@ -165,7 +172,11 @@ class Direction(ABC):
         if side not in self._newest and self._is_blank(part, side):
             self.counts.blank += side in self.sides
             return False
-        self._newest[side] = _Newest(self._translate(part), now)
+        translated = self._translated(part, side)
+        if translated is None:
+            self.counts.held += 1
+            return False
+        self._newest[side] = _Newest(translated, now)
         return True
 
     def _forward(self, fresh: Sequence[Side], now: float) -> list[Outgoing]:
@@ -179,12 +190,14 @@ class Direction(ABC):
         if self._waits_since is None:
             self._waits_since = now
         self._pending.update(fresh)
-        if any(self._live(s, now) for s in self.sides if s not in self._pending):
+        self._absent.difference_update(fresh)
+        if not self._pending | self._absent >= set(self.sides):
             return self.flush(now)
         return self._send_shared(now)
 
     def _send_shared(self, now: float) -> list[Outgoing]:
         self._waits_since = None
+        self._absent = set(self.sides) - self._pending
         places, filled = {}, False
         for side in Side:
             if self._live(side, now):
@@ -279,6 +292,9 @@ class Commands(Direction):
     gains goes limp but for the damping, a simulated one that looks at q only stays where it is.
     Where no position is known, nothing is sent.
 
+    To a dialect without gains (``unitree_hg``), a command that does not pull towards its q goes
+    out with the q where the gripper is (:mod:`~dexkit.bridge.translate`).
+
     :param states: the other direction, which knows where the grippers are.
     """
 
@@ -291,6 +307,17 @@ class Commands(Direction):
         self._timeout = hand.command_timeout
         self._damping = hand.client_gains[1]
         self._resting: dict[Side, unitree_go.MotorCmd_] = {}
+        # what a position of the grippers is multiplied by to be one of the client's
+        self._scale = source.q_open / target.q_open
+        self._loses_gains = loses_gains(source, target)
+
+    def _translated(self, part: Any, side: Side) -> Any | None:
+        if self._loses_gains and part.kp <= 0:
+            q = self._states.position(side)
+            if q is None:
+                return None
+            part = replace(part, q=q * self._scale)
+        return super()._translated(part, side)
 
     def _accept(self, message: Any, side: Side, now: float) -> bool:
         accepted = super()._accept(message, side, now)

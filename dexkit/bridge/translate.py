@@ -8,8 +8,8 @@ as it is, every field. Between 0 .. 5.4 rad (``unitree_go``, ``unitree_actuator`
 =============  =====================================  =============================================
 what           to unitree_hg                          from unitree_hg
 =============  =====================================  =============================================
-q, dq, ddq     times s                                by s; a command at or below 0.1 closes, at
-                                                      or above 6.0 opens (seed 000)
+q, dq, ddq     times s; a command near an end to     by s; a command at or below 0.1 closes, at
+               the nearest that can be commanded      or above 6.0 opens (seed 000)
 tau            as it is                               of a command: 0, it is unused (seed 000)
 kp, kd         by s                                   5.0 and 0.05, whatever the command says, as
                                                       ``dexkit serve`` takes them
@@ -20,6 +20,17 @@ mode           0: it means "position" (seed 000)      of a command 1 (drive), of
 fault, lost    motorstate and error                   reserve[0] and lost
 predicted      reserve[0]                             reserve[1]
 =============  =====================================  =============================================
+
+**Near the ends.** A gripper of unitree_hg closes fully at q <= 0.1 and opens fully at q >= 6.0,
+so 0 .. 0.086 and 5.157 .. 5.4 rad of the other scale cannot be commanded there, but for the ends
+themselves. What lies between goes to the nearest of both. Passed on as it is, it would go to the
+end, and xr_teleoperate, which commands at most 0.18 rad from where the gripper is, would never
+get it away from fully open: 5.22 rad is 6.07 there, "open".
+
+**Without a gain.** unitree_hg knows no gains, so a command that does not pull towards its q
+(kp <= 0: limp, or driven by velocity or torque) cannot be said in it; obeyed as it is, q = 0 of
+a client that lets go would close the gripper. :class:`~dexkit.bridge.core.Commands` puts the
+gripper's own position there instead.
 
 **Why gains shrink and torques do not.** Torques of both dialects are those of the joint that
 runs from 0 to 5.4 rad (``dexkit serve`` publishes one tau_est in both). A radian of unitree_hg is
@@ -36,12 +47,12 @@ from typing import Any
 from dexkit.hand import HandState, Side
 from dexkit.messages import MessageType, layout, message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect, dialect, model
-from dexkit.service.dialects import StateView, dialect_map
+from dexkit.service.dialects import HG_CLOSED, HG_OPEN, StateView, dialect_map
 
-__all__ = ["Part", "Translator", "translator"]
+__all__ = ["Part", "Translator", "loses_gains", "translator"]
 
 _FLOAT_MAX = (2 - 2**-23) * 2.0**127
-_U32 = 0xFFFFFFFF
+_CLEAR = 1e-3  # rad from where a gripper of unitree_hg snaps to its end
 # of the numbers of a motor, those that are acted upon
 _NUMBERS = {
     "cmd": ("q", "dq", "tau", "kp", "kd"),
@@ -123,6 +134,11 @@ def translator(source: Dialect, target: Dialect, kind: str) -> Translator:
     return _command_from_hg if kind == "cmd" else _state_from_hg
 
 
+def loses_gains(source: Dialect, target: Dialect) -> bool:
+    """Whether a client of ``source`` sets gains that nobody in ``target`` obeys."""
+    return source.cmd_type != target.cmd_type == _HG.cmd_type
+
+
 _HG = dialect("unitree_hg")
 _DEX1 = model(_HG.model)
 _JOINT = _DEX1.joints[Side.LEFT][0]  # both sides' are alike
@@ -134,7 +150,7 @@ def _command_to_hg(motor: unitree_go.MotorCmd_) -> unitree_hg.HandCmd_:
     return unitree_hg.HandCmd_(
         [
             unitree_hg.MotorCmd_(
-                q=_fits(motor.q * _SCALE),
+                q=_nearest(_fits(motor.q * _SCALE)),
                 dq=_fits(motor.dq * _SCALE),
                 tau=motor.tau,
                 kp=motor.kp / _SCALE,
@@ -183,6 +199,15 @@ def _state_from_hg(message: unitree_hg.HandState_) -> unitree_go.MotorState_:
         lost=message.error[1],
         reserve=(motor.motorstate, 1 if motor.reserve[0] == 1 else 0),
     )
+
+
+def _nearest(q: float) -> float:
+    """The nearest to ``q`` that a gripper of unitree_hg does not take for another place."""
+    if 0.0 < q <= HG_CLOSED:
+        return HG_CLOSED + _CLEAR if q > HG_CLOSED / 2 else 0.0
+    if HG_OPEN <= q < (HG_OPEN + _HG.q_open) / 2:
+        return HG_OPEN - _CLEAR
+    return q
 
 
 def _fits(value: float) -> float:

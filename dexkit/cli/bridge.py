@@ -81,7 +81,7 @@ def command(
     real_time: bool,
     quiet: bool,
 ) -> int:
-    r"""Carry a client's commands to a Dex1-1 of another dialect, and its states back.
+    """Carry a client's commands to a Dex1-1 of another dialect, and its states back.
 
     \b
     xr_teleoperate v1.1 (--sim) drives a gripper of today:
@@ -91,7 +91,7 @@ def command(
 
     Prints "ready: ..." when the topics are up. Nothing is repeated: when the client stops, the
     gripper hears nothing and brakes (docs/bridge.md).
-    """
+    """  # noqa: D301 - click wants the character, not a backslash
     from dexkit.bridge import Bridge, End
     from dexkit.dds import DdsNode
 

@@ -69,11 +69,11 @@ from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect
 from dexkit.service.finger_state import FingerStateEncoder
 
-__all__ = ["DialectMap", "Fill", "Remark", "StateView", "dialect_map"]
+__all__ = ["HG_CLOSED", "HG_OPEN", "DialectMap", "Fill", "Remark", "StateView", "dialect_map"]
 
 # what xr_teleoperate sends to a Dex1 (facts/unitree-dex B.1)
 _KP, _KD = 5.0, 0.05
-_HG_CLOSED, _HG_OPEN = 0.1, 6.0  # seed 000, "Position Conversion"
+HG_CLOSED, HG_OPEN = 0.1, 6.0  # rad; seed 000, "Position Conversion"
 _HG_TEMPERATURE, _HG_VOL = 25, 12.0  # seed 000, "MotorState_"
 _ROUNDING = 1e-6  # rad; more than float32 loses of a limit
 _U32 = 0xFFFFFFFF
@@ -279,9 +279,9 @@ class _HgMap(DialectMap):
     def _q_in(self, q: float, joint: JointSpec) -> float:
         if not math.isfinite(q):
             return q  # for the gate to reject: minus infinity is not "closed"
-        if q <= _HG_CLOSED:
+        if q <= HG_CLOSED:
             return 0.0
-        if q >= _HG_OPEN:
+        if q >= HG_OPEN:
             return joint.q_max
         return q / self._scale(joint.q_max)
 
