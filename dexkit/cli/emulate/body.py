@@ -171,6 +171,7 @@ def _watch(
     end = None if duration is None else time.monotonic() + duration
     counters = robot.body.counters
     then, states, orders = time.monotonic(), counters.states, counters.commands
+    state_rate = command_rate = 0.0
     said: set[str] = set()
     over = False
     while not over:
@@ -180,10 +181,10 @@ def _watch(
             said.add(text)
             log.warning("%s", text)
         now = time.monotonic()
-        span = max(now - then, 1e-3)
-        state_rate = (counters.states - states) / span
-        command_rate = (counters.commands - orders) / span
-        then, states, orders = now, counters.states, counters.commands
+        if (span := now - then) > 0.5 * period:  # the last one may be too short
+            state_rate = (counters.states - states) / span
+            command_rate = (counters.commands - orders) / span
+            then, states, orders = now, counters.states, counters.commands
         if as_json:
             line = {
                 "body": robot.model.name,
