@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from random import Random
 from typing import Any
 
 import pytest
@@ -167,6 +168,31 @@ def test_nothing_is_told_of_motion_where_the_machine_was_overloaded(
     percent = copy_of(listened(gripper.Percent))
     found = of(judge(with_beats(percent, usual_us=int(usual_ms * 1e3))), "DEX1-FIELD-03")
     assert found.verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(
+    ("part", "late_ms"), [(0.02, 10.0), (0.05, 10.0), (0.05, 30.0), (0.2, 10.0)]
+)
+def test_late_stamps_do_not_bend_a_good_hands_acceleration(part: float, late_ms: float) -> None:
+    ratio = of(judge(Recording.of(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06")
+    assert ratio.verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE)
+    turned = stamped_late(gripper.TurnedAcceleration, part, late_ms)
+    found = of(judge(Recording.of(turned)), "DEX1-FIELD-06")
+    assert found.verdict is (Verdict.WARN if ratio.verdict is Verdict.PASS else ratio.verdict)
+
+
+def stamped_late(service: type[Service], part: float, late_ms: float) -> MemoryTrace:
+    """A trace of a hand whose publisher is now and then held up, and then sends what waited."""
+    trace, random, free = copy_of(listened(service)), Random(1), 0
+    key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+    rows = []
+    for at, sent, payload in trace.rows[key]:
+        if random.random() < part:
+            free = max(free, sent + round(random.expovariate(1 / late_ms) * 1e6))
+        free = max(free + 1000, sent)
+        rows.append((at + free - sent, free, payload))
+    trace.rows[key] = rows
+    return trace
 
 
 @cache
