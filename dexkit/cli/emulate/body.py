@@ -175,8 +175,8 @@ def _watch(
     said: set[str] = set()
     over = False
     while not over:
-        left = period if end is None else min(period, end - time.monotonic())
-        over = left <= 0 or stop.wait(left) or robot.failure is not None
+        left = float("inf") if end is None else end - time.monotonic()
+        over = stop.wait(max(0.0, min(period, left))) or left <= period or bool(robot.failure)
         for text in set(robot.mismatches()) - said:
             said.add(text)
             log.warning("%s", text)
