@@ -209,6 +209,10 @@ class Recording:
                 for s in sorted(Side, key=lambda s: s is not Side.LEFT)
                 if s in judged or any(topic in present for topic in chosen.topics(s))
             }
+        if not sides and (blank := [s for s in judged if _is_blank(views[s])]) != list(judged):
+            judged = tuple(s for s in judged if s not in blank)
+        else:
+            blank = []
         # the kit's own doing is no news: it sends another type to see that the hand ignores it
         phases = stimulus.phases if stimulus else []
         foreign = {s for p in phases if p.name == "foreign" for s in p.sides}
@@ -216,6 +220,11 @@ class Recording:
         notes = [text for text in trace.warnings if not text.startswith(own)]
         if trace.truncated:
             notes.append("the recording is unfinished; it is judged as far as it goes")
+        notes += [
+            f"{views[s].states.topic} says nothing of the {s} hand (all 0), and nobody drives it: "
+            f"taken for a service of one hand; --side {s} judges it all the same"
+            for s in blank
+        ]
         return cls(
             dialect=chosen,
             origin_ns=origin,
@@ -341,6 +350,14 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
     )
+
+
+def _is_blank(view: SideView) -> bool:
+    """Whether a side has a place in the messages, and nobody ever is in it."""
+    states, commands = view.states, view.commands
+    said = (states.q, states.dq, states.ddq, states.tau, states.mode)
+    drives = (commands.kp, commands.kd, commands.tau)
+    return len(states) > 0 and not any(np.nan_to_num(a).any() for a in (*said, *drives))
 
 
 def _joints(columns: Columns, wire: Wire, side: Side, sequence: str, name: str) -> Floats:
