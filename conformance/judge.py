@@ -12,7 +12,6 @@ from dexkit.conformance.checks import Check, Context, Outcome, all_checks
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
-from dexkit.conformance.usb.judge import judge_usb
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
@@ -50,6 +49,8 @@ def judge(
     order = {r.id: i for i, r in enumerate(every)}
     results.sort(key=lambda r: order[r.requirement.id])
     if recording.usb is not None:
+        from dexkit.conformance.usb.judge import judge_usb
+
         usb = claims.apply(catalogue(recording.model.name, "usb"))
         judged = {str(side) for side in recording.judged}
         results += [r for r in judge_usb(recording.usb, usb, claims) if r.side in judged]

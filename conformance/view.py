@@ -11,19 +11,23 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.figures import median
 from dexkit.conformance.phases import RECORD, Lost, Phase, Stimulus
-from dexkit.conformance.usb.view import UsbRecording
+from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.conformance.wire import Wire
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side
 from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
+
+if TYPE_CHECKING:
+    from dexkit.conformance.usb.view import UsbRecording
 
 __all__ = [
     "Commands",
@@ -95,7 +99,7 @@ class States:
         """
         if not len(self.sent) or not np.isfinite(self.sent).all():
             return self.t
-        return np.asarray(self.sent + np.median(self.t - self.sent))
+        return np.asarray(self.sent + median(self.t - self.sent))
 
     def between(self, begin: float, end: float) -> slice:
         """The samples received in [begin, end]."""
@@ -192,7 +196,7 @@ class Recording:
         samples = trace.load(sorted(topics), decode=True) if topics else {}
         times = [s.log_time_ns for s in samples.values() if len(s)]
         marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
-        usb = UsbRecording.of(trace)
+        usb = _usb(trace)
         if usb is not None:
             marks.append(usb.origin_ns)
         origin = min([int(t[0]) for t in times] + marks, default=0)
@@ -317,6 +321,14 @@ def joints_of(dialect: Dialect, side: Side) -> tuple[JointSpec, ...]:
     if math.isnan(dialect.q_open):
         return joints
     return tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
+
+
+def _usb(trace: TraceLike) -> UsbRecording | None:
+    if USB_RECORD not in trace.metadata:
+        return None
+    from dexkit.conformance.usb.view import UsbRecording  # few recordings have it
+
+    return UsbRecording.of(trace)
 
 
 def _seconds(times: NDArray[np.int64], origin: int) -> Floats:

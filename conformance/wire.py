@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from dexkit.hand import JointMode, Side
@@ -56,15 +57,18 @@ class Wire:
         self.joints = len(model(dialect.model).joints[Side.LEFT])
         self.command: MessageType = message_type(dialect.cmd_type)
         self.state: MessageType = message_type(dialect.state_type)
-        self.command_sequence, motor = _SEQUENCE[dialect.cmd_type]
+        self.command_sequence, self._command_motor = _SEQUENCE[dialect.cmd_type]
         self.state_sequence, self._state_motor = _SEQUENCE[dialect.state_type]
-        self._motor = message_type(motor).cls
         others = (DEX1_1.dialects[0].cmd_type, DEX3_1.dialects[0].cmd_type)
         self.foreign: MessageType = message_type(next(t for t in others if t != dialect.cmd_type))
         self._states: dict[int, Any] = {}
         self.command_topics = {s: dialect.topics(s)[0] for s in Side}
         self.state_topics = {s: dialect.topics(s)[1] for s in Side}
         self.shared = len(set(self.command_topics.values())) == 1
+
+    @cached_property
+    def _motor(self) -> type[Any]:
+        return message_type(self._command_motor).cls
 
     def encode(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
         """(topic, payload) of the commands to these sides, all in one message if they share it.

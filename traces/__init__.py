@@ -6,8 +6,10 @@ they were on the wire. See docs/traces.md.
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from dexkit.traces.names import dds_topic, dds_type
-from dexkit.traces.player import Player, PlayStats
 from dexkit.traces.reader import (
     ChannelInfo,
     SampleArray,
@@ -16,8 +18,11 @@ from dexkit.traces.reader import (
     TraceMessage,
     open_trace,
 )
-from dexkit.traces.recorder import Recorder
-from dexkit.traces.samples import SAMPLES, sample_labels, sample_path
+
+if TYPE_CHECKING:
+    from dexkit.traces.player import Player, PlayStats
+    from dexkit.traces.recorder import Recorder
+    from dexkit.traces.samples import SAMPLES, sample_labels, sample_path
 
 __all__ = [
     "SAMPLES",
@@ -35,3 +40,21 @@ __all__ = [
     "sample_labels",
     "sample_path",
 ]
+
+# loaded when they are asked for: whoever reads a recording needs neither
+_LATER = {
+    "Player": "player",
+    "PlayStats": "player",
+    "Recorder": "recorder",
+    "SAMPLES": "samples",
+    "sample_labels": "samples",
+    "sample_path": "samples",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
+    globals()[name] = found
+    return found

@@ -26,14 +26,13 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from dexkit.errors import TraceUnreadable, TraceUnsupported, UsageError
 from dexkit.messages import Columns, MessageType, message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
-from dexkit.traces import schemas
+from dexkit.messages.schemas import omgidl
 from dexkit.traces.names import USB, dds_topic, dds_type, select_topics
 
 __all__ = [
@@ -61,6 +60,7 @@ _KEPT = 8 * 2**20
 _MAX_PENDING = 1_000_000
 _MAX_WARNINGS = 50
 
+_MAGIC = b"\x89MCAP0\r\n"  # at the beginning and the end of a file (mcap.dev/spec)
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<QHIQQ")  # record length, channel, sequence, log time, publish time
@@ -420,8 +420,8 @@ class Trace:
             self._warn("it holds no messages")
 
     def _read_start(self, file: BinaryIO) -> None:
-        magic = file.read(len(MCAP0_MAGIC))
-        if magic != MCAP0_MAGIC:
+        magic = file.read(len(_MAGIC))
+        if magic != _MAGIC:
             raise TraceUnreadable(f"{self.path} is not an mcap file", hint=_guess(magic))
         head = file.read(_HEAD.size)
         if len(head) == _HEAD.size:
@@ -449,7 +449,7 @@ class Trace:
             body = at + _HEAD.size
             end = body + length
             if opcode == Opcode.FOOTER:
-                finished = size >= end + len(MCAP0_MAGIC)
+                finished = size >= end + len(_MAGIC)
                 break
             if opcode == 0:
                 # not an opcode: zeros are what a file system leaves after a power cut
@@ -873,10 +873,14 @@ def _times(pieces: list[NDArray[np.uint64]]) -> Times:
 
 def _check_layout(type_name: str, schema: Schema) -> tuple[str, list[str]]:
     """(why payloads of this schema cannot be decoded, or empty; remarks)."""
-    try:
-        ours = schemas.parse("omgidl", type_name, message_type(type_name).omgidl)
-    except UsageError:
+    if type_name not in STRUCTS:
         return f"dexkit does not know the type {type_name}", []
+    text = omgidl(STRUCTS[type_name])
+    if (schema.encoding, schema.name, schema.data) == ("omgidl", type_name, text.encode()):
+        return "", []  # as dexkit itself writes it
+    from dexkit.traces import schemas
+
+    ours = schemas.parse("omgidl", type_name, text)
     try:
         theirs = schemas.parse(schema.encoding, schema.name, schema.data.decode("utf-8", "replace"))
     except TraceUnsupported as error:

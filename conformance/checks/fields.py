@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.view import joints_of
+from dexkit.hand import Floats
+
+Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
 
 _STAND_S = 0.1  # seconds without motion that are a stand
 
@@ -165,12 +171,23 @@ def plausible_speed(ctx: Context) -> Outcome:
 @check("DEX1-FIELD-04", "DEX3-FIELD-04")
 def velocity(ctx: Context) -> Outcome:
     """Mean of dq over a window against the difference of q over it, in the worst joint."""
-    found = [_velocity(ctx, joint) for joint in range(len(ctx.joints))]
+    known: dict[bytes, Windows] = {}
+    found = [_velocity(ctx, joint, known) for joint in range(len(ctx.joints))]
     judged = [o for o in found if o.met is not None]
     return max(judged, key=lambda o: o.values["relative_rms"]) if judged else found[0]
 
 
-def _velocity(ctx: Context, joint: int) -> Outcome:
+def _windows(t: Floats, window: float) -> Windows:
+    """Rows at which windows begin and end, and their lengths in seconds."""
+    ends = np.searchsorted(t, t + window)
+    starts = np.flatnonzero(ends < len(t))
+    ends = ends[starts]
+    span = t[ends] - t[starts]
+    keep = (span > 0) & (span < 2 * window) & (ends - starts >= 4)
+    return starts[keep], ends[keep], span[keep]
+
+
+def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     states = ctx.states
     good = np.isfinite(states.q[:, joint]) & np.isfinite(states.dq[:, joint])
     t, q, dq = states.clock[good], states.q[good, joint], states.dq[good, joint]
@@ -179,12 +196,10 @@ def _velocity(ctx: Context, joint: int) -> Outcome:
     if not dq.any():
         return ctx.absent("dq is not filled (0 throughout)")
     window = ctx.tolerance("window_s")
-    ends = np.searchsorted(t, t + window)
-    starts = np.flatnonzero(ends < len(t))
-    ends = ends[starts]
-    span = t[ends] - t[starts]
-    keep = (span > 0) & (span < 2 * window) & (ends - starts >= 4)
-    starts, ends, span = starts[keep], ends[keep], span[keep]
+    which = good.tobytes()  # of all joints the same, unless states lack some
+    if which not in known:
+        known[which] = _windows(t, window)
+    starts, ends, span = known[which]
     if not len(starts):
         return ctx.skipped("the states are too far apart to derive a velocity")
     slope = (q[ends] - q[starts]) / span

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.figures import median
+from dexkit.hand import Floats
+
+Ranges: TypeAlias = NDArray[np.intp]
+"""Rows from the first to before the second, shape (n, 2)."""
 
 
 def squeezes(ctx: Context) -> tuple[float, float] | None:
@@ -42,18 +50,31 @@ def in_contact(ctx: Context) -> Outcome:
     return ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
 
 
-def _still(ctx: Context) -> list[float]:
+def _ranges(t: Floats, begins: Floats, ends: Floats, side: Literal["left", "right"]) -> Ranges:
+    """Rows of t in each stretch: the first, and the first behind it, shape (n, 2)."""
+    return np.column_stack([np.searchsorted(t, begins), np.searchsorted(t, ends, side)])
+
+
+def _bounds(values: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Lowest and highest value in each range, NaN if one of them is not a number.
+
+    Of an empty range, whatever stands at its beginning.
+    """
+    longer = np.append(values, np.nan)  # an end may lie behind the last row
+    if not len(ranges):
+        return np.empty(0), np.empty(0)
+    low, high = (f.reduceat(longer, ranges.ravel())[::2] for f in (np.minimum, np.maximum))
+    return low, high
+
+
+def _still(ctx: Context) -> Floats:
     """Begins of the windows, one after the other while commands come, in which q stands."""
     window, asked = ctx.tolerance("min_rest_s"), ctx.commands.t
-    begins = np.arange(float(asked[0]), float(asked[-1]) - window, window)
-    starts, ends = np.searchsorted(ctx.states.t, [begins, begins + window])
-    full = ends - starts >= 5
-    begins, edges = begins[full], np.column_stack([starts[full], ends[full]]).ravel()
-    if not len(begins):
-        return []
-    q = np.append(ctx.states.q[:, 0], np.nan)  # an end may lie behind the last row
-    high, low = (f.reduceat(q, edges)[::2] for f in (np.maximum, np.minimum))
-    return [float(b) for b in begins[high - low <= ctx.tolerance("max_ripple_stroke")]]
+    begins: Floats = np.asarray(np.arange(float(asked[0]), float(asked[-1]) - window, window))
+    ranges = _ranges(ctx.states.t, begins, begins + window, "left")
+    full = np.diff(ranges)[:, 0] >= 5
+    low, high = _bounds(ctx.states.q[:, 0], ranges[full])
+    return begins[full][high - low <= ctx.tolerance("max_ripple_stroke")]
 
 
 @check("DEX1-FORCE-02")
@@ -64,25 +85,24 @@ def at_rest(ctx: Context) -> Outcome:
         return ctx.skipped("no commands to this hand")
     window = ctx.tolerance("min_rest_s")
     known = ctx.recording.stimulus is not None
+    begins = _still(ctx)
+    rows = _ranges(states.t, begins, begins + window, "right")
+    asked = _ranges(commands.t, begins, begins + window, "left")
+    low, high = _bounds(states.q[:, 0], rows)
+    goal_low, goal_high = _bounds(commands.q[:, 0], asked)
+    rests = (np.diff(rows)[:, 0] >= 5) & (np.diff(asked)[:, 0] >= 3)
+    with np.errstate(invalid="ignore"):  # what is not finite has no ripple at most anything
+        rests &= high - low <= ctx.tolerance("max_ripple_stroke")
+        rests &= goal_high - goal_low <= ctx.tolerance("max_ripple_stroke")
+    rests &= _bounds(commands.kp[:, 0], asked)[0] > 0
+    if known and ctx.object_at is not None:
+        rests &= low > ctx.object_at + 0.1
     taus: list[tuple[float, float]] = []
-    for begin in _still(ctx):
-        end = begin + window
-        rows = states.between(begin, end)
-        asked = slice(*np.searchsorted(commands.t, [begin, end]))
-        q, tau, goal = states.q[rows, 0], states.tau[rows, 0], commands.q[asked, 0]
-        free = (
-            len(q) >= 5
-            and len(goal) >= 3
-            and np.isfinite(q).all()
-            and np.isfinite(goal).all()
-            and float(np.ptp(q)) <= ctx.tolerance("max_ripple_stroke")
-            and float(np.ptp(goal)) <= ctx.tolerance("max_ripple_stroke")
-            and float(np.abs(np.median(q) - np.median(goal))) <= ctx.tolerance("max_error_stroke")
-            and (commands.kp[asked, 0] > 0).all()
-            and not (known and ctx.object_at is not None and float(q.min()) <= ctx.object_at + 0.1)
-        )
-        if free:
-            taus.append((float(np.median(np.abs(tau))), begin))
+    for i in np.flatnonzero(rests):
+        here, there = slice(*rows[i]), slice(*asked[i])
+        error = median(states.q[here, 0]) - median(commands.q[there, 0])
+        if abs(error) <= ctx.tolerance("max_error_stroke"):
+            taus.append((median(np.abs(states.tau[here, 0])), float(begins[i])))
     if not taus:
         return ctx.skipped("the gripper never rests at its target in this recording")
     # the middle of all rests: one of them may be a touch that nobody announced

@@ -50,12 +50,40 @@ def measure(ctx: Context, search: float) -> list[Tracking] | str:
     span = _session(ctx)
     if isinstance(span, str):
         return span
-    found = [_measure(ctx, joint, span, search) for joint in range(len(ctx.joints))]
+    rows = _Rows(ctx.commands.t, ctx.states.t)
+    found = [_measure(ctx, joint, span, search, rows) for joint in range(len(ctx.joints))]
     figures = [f for f in found if isinstance(f, Tracking)]
     return figures or next(f for f in found if isinstance(f, str))
 
 
-def _measure(ctx: Context, joint: int, span: tuple[float, float], search: float) -> Tracking | str:
+class _Rows:
+    """The newest command and state at each of other times.
+
+    Joints nearly always have their times in common, so what was found is kept.
+    """
+
+    def __init__(self, commands: Floats, states: Floats) -> None:
+        self._commands, self._states = commands, states
+        self._known: dict[tuple[object, ...], NDArray[np.intp]] = {}
+
+    def of_states(self, times: Floats) -> NDArray[np.intp]:
+        """Row of the newest state; -1 before the first."""
+        return self._find(self._states, times, ())
+
+    def of_commands(self, times: Floats, good: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Row of the newest command among the good ones, or the first of them."""
+        return np.clip(self._find(self._commands[good], times, (good.tobytes(),)), 0, None)
+
+    def _find(self, t: Floats, times: Floats, which: tuple[object, ...]) -> NDArray[np.intp]:
+        key = (*which, len(times), *times[:1].tolist())  # times lie on a grid
+        if key not in self._known:
+            self._known[key] = np.searchsorted(t, times, "right") - 1
+        return self._known[key]
+
+
+def _measure(
+    ctx: Context, joint: int, span: tuple[float, float], search: float, rows: _Rows
+) -> Tracking | str:
     begin, end = span
     good = np.isfinite(ctx.commands.q[:, joint])
     ct, cq = ctx.commands.t[good], ctx.commands.q[good, joint]
@@ -64,10 +92,10 @@ def _measure(ctx: Context, joint: int, span: tuple[float, float], search: float)
     grid: Floats = np.asarray(np.arange(begin + search + 0.1, end, _GRID))
     if len(grid) * _GRID < ctx.tolerance("min_session_s") - search - 0.2:
         return f"the session is shorter than {ctx.tolerance('min_session_s'):g} s"
-    at = np.searchsorted(ctx.states.t, grid, "right") - 1
+    at = rows.of_states(grid)
     grid, at = grid[at >= 0], at[at >= 0]
     q = ctx.states.q[at, joint]
-    goal = cq[np.clip(np.searchsorted(ct, grid, "right") - 1, 0, None)]
+    goal = cq[rows.of_commands(grid, good)]
     if not len(grid) or float(np.ptp(goal)) < ctx.tolerance("min_travel_stroke", joint):
         return "the commands hardly move in this recording"
     free = _free(ctx, joint, at, goal) & np.isfinite(q)
@@ -76,7 +104,7 @@ def _measure(ctx: Context, joint: int, span: tuple[float, float], search: float)
     # Delays are steps of the grid: the commands are looked up once, on a grid that begins earlier.
     most = round(search / _GRID)
     longer = np.concatenate([grid[0] - _GRID * np.arange(most, 0, -1), grid])
-    asked = cq[np.clip(np.searchsorted(ct, longer, "right") - 1, 0, None)]
+    asked = cq[rows.of_commands(longer, good)]
     # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
     weight = free.astype(np.float64)
     middle = float(q[free].mean())

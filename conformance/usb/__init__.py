@@ -3,3 +3,10 @@
 The kit is a USB host: :func:`~dexkit.conformance.usb.run.run` plays a script at the hand and
 records every transfer; :func:`~dexkit.conformance.usb.judge.judge_usb` judges that recording.
 """
+
+from __future__ import annotations
+
+__all__ = ["RECORD"]
+
+RECORD = "dexkit.usb"
+"""Metadata record of a USB run."""

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from dexkit.conformance.phases import Beats, Stall
+from dexkit.conformance.usb import RECORD
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
 
@@ -31,8 +32,6 @@ __all__ = [
     "topic",
 ]
 
-RECORD = "dexkit.usb"
-"""Metadata record of a USB run."""
 VERSION = 1
 SCHEMA_NAME = "dexkit_usb/msg/Transfer"
 SCHEMA = """\

@@ -6,6 +6,7 @@ import importlib
 import struct
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property
+from types import ModuleType
 from typing import Any
 
 from dexkit.errors import EncodeError, UsageError
@@ -31,22 +32,38 @@ class MessageType:
 
     :ivar name: DDS name, ``unitree_go::msg::dds_::MotorCmds_``.
     :ivar ros_name: name of the ROS 2 type, ``unitree_go/msg/MotorCmds``.
-    :ivar cls: the dataclass.
     :ivar max_size: bytes of the longest sample that is accepted.
     """
 
     def __init__(self, kind: layout.Struct) -> None:
-        module = importlib.import_module(f"dexkit.messages.{kind.scope[0]}")
         self.layout = kind
         self.name = kind.dds_name
         self.ros_name = kind.ros_name
-        self.cls: type[Any] = getattr(module, kind.name)
         self.max_size = layout.max_size(kind)
-        self._encode: Callable[[Any], bytes] = getattr(module, f"encode_{kind.name}")
-        self._decode: Callable[[Buffer, bool], Any] = getattr(module, f"decode_{kind.name}")
 
     def __repr__(self) -> str:
         return f"<MessageType {self.name}>"
+
+    @cached_property
+    def _module(self) -> ModuleType:
+        # loaded when a single sample is wanted; columns need only the layout
+        return importlib.import_module(f"dexkit.messages.{self.layout.scope[0]}")
+
+    @cached_property
+    def cls(self) -> type[Any]:
+        """The dataclass."""
+        found: type[Any] = getattr(self._module, self.layout.name)
+        return found
+
+    @cached_property
+    def _encode(self) -> Callable[[Any], bytes]:
+        found: Callable[[Any], bytes] = getattr(self._module, f"encode_{self.layout.name}")
+        return found
+
+    @cached_property
+    def _decode(self) -> Callable[[Buffer, bool], Any]:
+        found: Callable[[Buffer, bool], Any] = getattr(self._module, f"decode_{self.layout.name}")
+        return found
 
     def encode(self, message: Any) -> bytes:
         """Encapsulation header and plain CDR, little endian.
