@@ -8,11 +8,11 @@ from functools import cache
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, model
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
 
 __all__ = ["QUICK", "length", "print_selection", "quick"]
 
-QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0}
+QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0}
 """Seconds of stimulus of a quick run; starting a pair of hands and judging take some more."""
 
 

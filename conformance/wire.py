@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dexkit.hand import JointMode, Side
 from dexkit.messages import MessageType, message_type
 from dexkit.models import DEX1_1, DEX3_1, Dialect, model
@@ -52,6 +55,9 @@ def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) ->
 class Wire:
     """Encodes commands and reads states of one dialect."""
 
+    machine = 0
+    """``mode_machine`` of the last state, where there is one."""
+
     def __init__(self, dialect: Dialect) -> None:
         self.dialect = dialect
         self.joints = len(model(dialect.model).joints[Side.LEFT])
@@ -62,9 +68,23 @@ class Wire:
         others = (DEX1_1.dialects[0].cmd_type, DEX3_1.dialects[0].cmd_type)
         self.foreign: MessageType = message_type(next(t for t in others if t != dialect.cmd_type))
         self._states: dict[int, Any] = {}
+        self._ids = dialect.name == "dex3"
+        self._modes = dialect.name in ("dex3", "dex5")
         self.command_topics = {s: dialect.topics(s)[0] for s in Side}
         self.state_topics = {s: dialect.topics(s)[1] for s in Side}
         self.shared = len(set(self.command_topics.values())) == 1
+
+    def mode(self, index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
+        """The mode byte of a motor: RIS_Mode for a Dex3-1; for a Dex5-1 just 1, position control
+        (facts/unitree-dex B.5); 0 where it has no meaning.
+        """
+        if self._ids:
+            return mode_byte(index, status, timeout)
+        return status if self._modes else 0
+
+    def status(self, modes: NDArray[np.intp]) -> NDArray[np.intp]:
+        """What mode bytes of states say about their motors: 1 driven, 0 not."""
+        return np.asarray(modes >> 4 & 7) if self._ids else modes
 
     @cached_property
     def _motor(self) -> type[Any]:

@@ -4,8 +4,8 @@ A check is a function of a :class:`Context` that returns an :class:`Outcome`. It
 missing evidence, and takes every figure from its requirement's tolerances, so that several hand
 models share it. Modules, by what they look at: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.motion`, :mod:`~.force`,
-:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.dex3` for what only that hand
-has.
+:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.fingers` for what only hands of
+several joints have.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 from dexkit.conformance.phases import Phase
-from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.view import Commands, Recording, SideView, States
 from dexkit.hand import JointSpec, Side
@@ -34,7 +34,7 @@ _MODULES = (
     "lifecycle",
     "tracking",
     "operator",
-    "dex3",
+    "fingers",
 )
 
 
@@ -196,7 +196,8 @@ def check(*requirement_ids: str) -> Callable[[Check], Check]:
 
 @cache
 def all_checks() -> Mapping[str, Check]:
-    """Every check, by requirement id."""
+    """Every check, by requirement id; what is like another requirement has the same."""
     for name in _MODULES:
         importlib.import_module(f"{__name__}.{name}")
-    return dict(_REGISTRY)
+    shared = {r.id: _REGISTRY[r.like] for r in catalogue() if r.like}
+    return {**shared, **_REGISTRY}

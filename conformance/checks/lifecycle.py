@@ -6,8 +6,8 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
+from dexkit.conformance.wire import Wire
 from dexkit.hand import JointMode
-from dexkit.models import DEX3_1
 
 
 @check("DEX1-START-01", "DEX3-START-01")
@@ -115,9 +115,8 @@ def last_word(ctx: Context) -> Outcome:
     """The mode of the last state before the service ended."""
     begin, end = ctx.span(ctx.phases()[-1])
     modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]
-    status = modes[np.isfinite(modes).all(axis=1)].astype(np.intp)
-    if ctx.recording.model.name == DEX3_1.name:
-        status = np.bitwise_and(np.right_shift(status, 4), 7)
+    modes = modes[np.isfinite(modes).all(axis=1)]
+    status = Wire(ctx.recording.dialect).status(modes.astype(np.intp))
     if len(status) < 2 or not (status[0] == JointMode.FOC).all():
         return ctx.absent("the mode of this hand does not tell whether it is driven")
     if not status[-1].any():

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import dex3, gripper, operator, shared
+from dexkit.conformance.mutants import fingers, gripper, operator, shared
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli import SCRIPTS, Plan, Session, phases_for
@@ -20,10 +20,10 @@ from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import Service, run_virtual
-from dexkit.conformance.virtual.dex3 import Dex3Service
+from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, dialect, model
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, dialect, model
 
 __all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
 
@@ -83,20 +83,25 @@ def _dex1(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
     return Mutant(name, DEX1_1.name, service, kills, also, sides, dialect=spoken)
 
 
-def _dex3(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
+def _fingers(hand: str, service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
     name = service.__name__
-    sides = tuple(Side) if name in dex3.BOTH else LEFT
-    brief = name in dex3.TOLD or (hasattr(shared, name) and name not in shared.DILUTED)
-    return Mutant(name, DEX3_1.name, service, kills, also, sides, brief)
+    sides = tuple(Side) if name in fingers.BOTH else LEFT
+    brief = name in fingers.TOLD or (hasattr(shared, name) and name not in shared.DILUTED)
+    return Mutant(name, hand, service, kills, also, sides, brief)
 
 
 MUTANTS: tuple[Mutant, ...] = (
     *(_dex1(*entry) for entry in (*gripper.ZOO, *operator.ZOO[DEX1_1.name])),
-    *(_dex3(*entry) for entry in (*dex3.ZOO, *operator.ZOO[DEX3_1.name])),
+    *(
+        _fingers(hand, *entry)
+        for hand, zoo in fingers.ZOOS.items()
+        for entry in (*zoo, *operator.ZOO[hand])
+    ),
 )
 REFERENCES: dict[str, type[Service]] = {
     DEX1_1.name: ReferenceService,
     DEX3_1.name: Dex3Service,
+    DEX5_1.name: Dex5Service,
 }
 """The good hand of each model."""
 

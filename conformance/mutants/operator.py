@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 from dexkit.conformance.mutants import shared
 from dexkit.conformance.virtual import Service
-from dexkit.conformance.virtual.dex3 import Dex3Service
+from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service, FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
 
 __all__ = ["ZOO"]
+
+_Entry: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
 
 
 class _PerJoint(Service):
@@ -44,7 +46,7 @@ class _PerJoint(Service):
         side, index = joint
         if self.dialect.model == DEX1_1.name:
             return self.dialect.q_open
-        return DEX3_1.joints[side][index].stroke
+        return model(self.dialect.model).joints[side][index].stroke
 
 
 class _DeadBand(_PerJoint):
@@ -63,7 +65,7 @@ class DeadBand(_DeadBand, ReferenceService):
     band = 0.14 / 5.4
 
 
-class FingerDeadBand(_DeadBand, Dex3Service):
+class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a target nearer than a fifteenth of a joint's range."""
 
     band = 1 / 15
@@ -84,7 +86,7 @@ class CoarseTargets(_Coarse, ReferenceService):
     grid = 1 / 18
 
 
-class CoarseFingers(_Coarse, Dex3Service):
+class CoarseFingers(_Coarse, FingerService):
     """Goes to the nearest of twenty-one places."""
 
     grid = 1 / 20
@@ -165,7 +167,7 @@ class _OpenEnd(_PerJoint):
 
     def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
         side, index = joint
-        spec = DEX3_1.joints[side][index]
+        spec = model(self.dialect.model).joints[side][index]
         if not spec.closing:
             return q
         closed = spec.q_max if spec.closing > 0 else spec.q_min
@@ -176,7 +178,7 @@ class _OpenEnd(_PerJoint):
         raise AssertionError  # overridden
 
 
-class SlowToLeave(_OpenEnd, Dex3Service):
+class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range a second."""
 
     speed = 0.1
@@ -190,7 +192,7 @@ class SlowToLeave(_OpenEnd, Dex3Service):
         return taken
 
 
-class Springs(_OpenEnd, Dex3Service):
+class Springs(_OpenEnd, FingerService):
     """Goes a quarter too far for half a second when it comes from the open end of a joint."""
 
     def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
@@ -200,11 +202,27 @@ class Springs(_OpenEnd, Dex3Service):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-class LateFingers(shared.Delayed, Dex3Service):
+class LateFingers(shared.Delayed, FingerService):
     """Carries out each command 0.15 s late."""
 
 
-ZOO: dict[str, tuple[tuple[type[Service], str, tuple[str, ...]], ...]] = {
+_FINGERS: tuple[_Entry, ...] = (
+    (SlowToLeave, "OPER-01", ("OPER-05",)),
+    (FingerDeadBand, "OPER-02", ()),
+    (Springs, "OPER-03", ()),
+    (CoarseFingers, "OPER-04", ("MOVE-04",)),
+    (LateFingers, "OPER-05", ("TRACK-02",)),
+)
+
+
+def _zoo(prefix: str, reference: type[FingerService]) -> tuple[_Entry, ...]:
+    return tuple(
+        (shared.of(mixin, reference), f"{prefix}-{kills}", tuple(f"{prefix}-{a}" for a in also))
+        for mixin, kills, also in _FINGERS
+    )
+
+
+ZOO: dict[str, tuple[_Entry, ...]] = {
     DEX1_1.name: (
         # where the client's filter sticks within the dead band, nothing moves any more
         (DeadBand, "DEX1-OPER-01", ("DEX1-OPER-04",)),
@@ -213,12 +231,7 @@ ZOO: dict[str, tuple[tuple[type[Service], str, tuple[str, ...]], ...]] = {
         (CoarseTargets, "DEX1-OPER-04", ()),
         (SlowToWake, "DEX1-OPER-05", ()),
     ),
-    DEX3_1.name: (
-        (SlowToLeave, "DEX3-OPER-01", ("DEX3-OPER-05",)),
-        (FingerDeadBand, "DEX3-OPER-02", ()),
-        (Springs, "DEX3-OPER-03", ()),
-        (CoarseFingers, "DEX3-OPER-04", ("DEX3-MOVE-04",)),
-        (LateFingers, "DEX3-OPER-05", ("DEX3-TRACK-02",)),
-    ),
+    DEX3_1.name: _zoo("DEX3", Dex3Service),
+    DEX5_1.name: _zoo("DEX5", Dex5Service),
 }
 """By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""

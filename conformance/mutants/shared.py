@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from dexkit.conformance.virtual import Sample, Service
-from dexkit.conformance.wire import Motor, mode_byte
+from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.messages import message_type
 
@@ -266,7 +266,7 @@ class EmptyIsZero(Service):
             return
         for side in self.sides:
             if self.wire.command_topics[side] == topic:
-                motors = (Motor(mode=mode_byte(i)) for i in range(self.wire.joints))
+                motors = (Motor(mode=self.wire.mode(i)) for i in range(self.wire.joints))
                 self.motors(side, tuple(motors))
 
 

@@ -4,7 +4,7 @@ A script's ``run`` is a generator. It yields an :data:`Action`, its runner carri
 sends back an :class:`Observation`. The live runner does so on DDS, the virtual one with a hand
 in memory on a virtual clock; the script cannot tell them apart. What was done when is noted in
 ``phases`` and travels with the recording. Each model has its own: :mod:`~.stimuli.gripper` and
-:mod:`~.stimuli.dex3`, on the common ground of :mod:`~.stimuli.script`.
+:mod:`~.stimuli.fingers`, on the common ground of :mod:`~.stimuli.script`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.stimuli.dex3 import Dex3Script
+from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.script import (
     Action,
@@ -28,7 +28,7 @@ from dexkit.conformance.stimuli.script import (
     StopService,
 )
 from dexkit.conformance.stimuli.session import Session
-from dexkit.models import DEX1_1, DEX3_1
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1
 
 __all__ = [
     "SCRIPTS",
@@ -48,7 +48,11 @@ __all__ = [
     "script_for",
 ]
 
-SCRIPTS: dict[str, type[Script]] = {DEX1_1.name: GripperScript, DEX3_1.name: Dex3Script}
+SCRIPTS: dict[str, type[Script]] = {
+    DEX1_1.name: GripperScript,
+    DEX3_1.name: FingerScript,
+    DEX5_1.name: FingerScript,
+}
 """The script of each model."""
 
 

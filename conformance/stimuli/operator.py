@@ -30,7 +30,7 @@ OPERATOR = "operator"
 """Name of the phase."""
 PROFILE = "feel"
 _CLEAR = 0.1  # of the stroke: room left to the object
-_DEX3_DEEPEST = 0.5  # how far the profile closes a Dex3-1
+_DEEPEST = 0.5  # how far the profile closes a hand of several joints
 _POLL = 0.001  # seconds between two looks for a state that is waited for
 
 
@@ -40,7 +40,7 @@ def _most(plan: Plan, side: Side) -> float:
     if touch is None:
         return 1.0
     if math.isnan(plan.dialect.q_open):  # percent of closing
-        return min(1.0, max(0.0, (touch / 100 - _CLEAR) / _DEX3_DEEPEST))
+        return min(1.0, max(0.0, (touch / 100 - _CLEAR) / _DEEPEST))
     return min(1.0, max(0.0, 1.0 - touch / plan.dialect.q_open - _CLEAR))
 
 

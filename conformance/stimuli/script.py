@@ -16,7 +16,7 @@ from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import joints_of
 from dexkit.conformance.wire import Motor, Motors, Wire
 from dexkit.hand import JointSpec, Side
-from dexkit.models import DEX1_1, DEX3_1, Dialect, HandModel, model
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, model
 
 __all__ = [
     "DEFAULT_OBJECTS",
@@ -38,7 +38,11 @@ __all__ = [
     "object_places",
 ]
 
-DEFAULT_OBJECTS = {DEX1_1.name: {Side.RIGHT: 37.0}, DEX3_1.name: {Side.RIGHT: 60.0}}
+DEFAULT_OBJECTS = {
+    DEX1_1.name: {Side.RIGHT: 37.0},
+    DEX3_1.name: {Side.RIGHT: 60.0},
+    DEX5_1.name: {Side.RIGHT: 60.0},
+}
 """Where the hands of a pair that the kit starts feel an object. Percent of opening for a gripper:
 2.0 rad, where the shipped session closes on one. Percent of closing for others: nearly as far as
 the shipped session closes."""

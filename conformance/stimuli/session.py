@@ -12,12 +12,16 @@ from dexkit.conformance.view import Commands, Recording
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, Dialect, model
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, model
 from dexkit.traces import open_trace, sample_path
 
 __all__ = ["DEFAULT_SECONDS", "DEFAULT_SESSIONS", "Session"]
 
-DEFAULT_SESSIONS = {DEX1_1.name: "dex1_pick_place", DEX3_1.name: "dex3_pinch"}
+DEFAULT_SESSIONS = {
+    DEX1_1.name: "dex1_pick_place",
+    DEX3_1.name: "dex3_pinch",
+    DEX5_1.name: "dex5_synthetic",
+}
 DEFAULT_SECONDS = 10.0
 
 

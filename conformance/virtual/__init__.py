@@ -2,8 +2,8 @@
 
 The same script drives it and the same checks judge it as in a live run; half a minute of hand
 takes a fraction of a second. It exists to prove the checks: the reference hands
-(:mod:`~dexkit.conformance.virtual.gripper`, :mod:`~dexkit.conformance.virtual.dex3`) do everything
-right, and each mutant in :mod:`dexkit.conformance.mutants` changes one thing.
+(:mod:`~dexkit.conformance.virtual.gripper`, :mod:`~dexkit.conformance.virtual.fingers`) do
+everything right, and each mutant in :mod:`dexkit.conformance.mutants` changes one thing.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ _MS = 1e3
     type=click.Choice(list(DIALECTS)),
     default="unitree_go",
     show_default=True,
-    help="How the hands speak; dex3 is the Dex3-1's.",
+    help="How the hands speak; dex3 is the Dex3-1's, dex5 the Dex5-1's.",
 )
 @dds_options(default_domain=1)
 @click.option(

@@ -11,6 +11,8 @@ from __future__ import annotations
 from dexkit.teleop.client import (
     Dex1Client,
     Dex3Client,
+    Dex5Client,
+    FingerClient,
     Inputs,
     JointCommand,
     Pose,
@@ -27,7 +29,9 @@ __all__ = [
     "PROFILES",
     "Dex1Client",
     "Dex3Client",
+    "Dex5Client",
     "Feel",
+    "FingerClient",
     "Inputs",
     "JointCommand",
     "Operator",

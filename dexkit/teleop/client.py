@@ -2,16 +2,17 @@
 
 What xr_teleoperate does to a hand between the hand tracking and the topics, with all of its
 quirks (facts/unitree-dex B.1 and B.7; read in its ``robot_hand_unitree.py`` and
-``weighted_moving_filter.py``, releases 1.1, 1.4 and the newest one of the fact sheet):
+``weighted_moving_filter.py``, releases 1.1, 1.4 and the newest one of the fact sheet; that of the
+Dex5-1 in a pull request that was open then):
 
 - States are received by one thread that reads left, then right, each time waiting for a sample
   that it has not had, and pauses for 2 ms: :class:`StateReceiver`. A side that falls silent stops
   the other one too.
-- No command before a state of both sides; for a Dex3-1 (and a Dex1-1 before 1.4) not before some
-  q is other than exactly 0.
+- No command before a state of both sides; for a Dex3-1 or Dex5-1 (and a Dex1-1 before 1.4) not
+  before some q is other than exactly 0.
 - The Dex1-1's target is clipped to 0.18 rad of the last state and smoothed over three values, but
   a pair of values equal to the one before is not counted: :class:`StickyFilter`.
-- Before any input the Dex1-1 goes to mid stroke, the Dex3-1 to 0.
+- Before any input the Dex1-1 goes to mid stroke, the others to 0.
 
 The caller steps a client :attr:`TeleopClient.rate` times a second. The genuine ones sleep the rest
 of each period, so they come out some 2 % below it.
@@ -28,7 +29,7 @@ from typing import NamedTuple, TypeAlias
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointMode, Side
-from dexkit.models import DEX1_1, DEX3_1, Dialect, dialect, model
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, dialect, model
 
 __all__ = [
     "LEAD",
@@ -37,6 +38,8 @@ __all__ = [
     "POLL_PAUSE",
     "Dex1Client",
     "Dex3Client",
+    "Dex5Client",
+    "FingerClient",
     "Inputs",
     "JointCommand",
     "Pose",
@@ -62,8 +65,8 @@ PINCH_MIN, PINCH_MAX = 5.0, 7.0
 Pose: TypeAlias = tuple[float, ...]
 """q of every joint of a hand, rad."""
 Inputs: TypeAlias = Mapping[Side, Pose | None]
-"""What hand tracking gives: the pinch value of a Dex1-1, the seven joint targets of a Dex3-1;
-None, or no entry, while it has nothing."""
+"""What hand tracking gives: the pinch value of a Dex1-1, the joint targets of other hands; None, or
+no entry, while it has nothing."""
 
 
 class JointCommand(NamedTuple):
@@ -255,6 +258,18 @@ class TeleopClient(ABC):
     def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
         return all(any(latest[s]) for s in self.sides)
 
+    def parting(self, pose: Pose) -> tuple[JointCommand, ...]:
+        """A command to stay there, with motors locked where the dialect can say so."""
+        gains = model(self.dialect.model).gains
+        return tuple(
+            JointCommand(self._mode(i, JointMode.BRAKE), q, 0.0, 0.0, kp, kd)
+            for i, (q, (kp, kd)) in enumerate(zip(pose, gains, strict=True))
+        )
+
+    def _mode(self, index: int, status: JointMode) -> int:
+        """The mode byte of a motor."""
+        return 0
+
     @abstractmethod
     def _control(
         self, latest: Mapping[Side, Pose], inputs: Inputs
@@ -339,19 +354,21 @@ class Dex1Client(TeleopClient):
         }
 
 
-class Dex3Client(TeleopClient):
-    """xr_teleoperate's ``Dex3_1_Controller``; its input are the joint targets.
+class FingerClient(TeleopClient):
+    """The client of a hand of several joints; its input are the joint targets.
 
-    The genuine one gets hand skeletons, and a retargeting library makes joint targets of them;
+    The genuine ones get hand skeletons, and a retargeting library makes joint targets of them;
     that library is not modelled. States are only waited for: nothing is clipped or smoothed, and
     the hand hears no more of where it is. One more quirk cannot be had without a process that
-    forks: the genuine client's commands reach only readers that were there before it (B.7).
+    forks: the genuine clients' commands reach only readers that were there before them (B.7).
     """
 
+    model: HandModel
+
     def __init__(self, spoken: Dialect | None = None, sides: Sequence[Side] = tuple(Side)) -> None:
-        spoken = spoken or DEX3_1.dialects[0]
-        if spoken.model != DEX3_1.name:
-            raise UsageError(f"the dialect {spoken.name} is not of a {DEX3_1.title}")
+        spoken = spoken or self.model.dialects[0]
+        if spoken.model != self.model.name:
+            raise UsageError(f"the dialect {spoken.name} is not of a {self.model.title}")
         super().__init__(spoken, sides)
         self._targets: dict[Side, Pose] = dict.fromkeys(self.sides, (0.0,) * spoken.length)
 
@@ -363,11 +380,31 @@ class Dex3Client(TeleopClient):
             self._targets = {s: value for s, value in given.items() if value is not None}
         return {
             s: tuple(
-                JointCommand(i | JointMode.FOC << 4, q, 0.0, 0.0, self._kp, self._kd)
-                for i, q in enumerate(self._targets[s])
+                JointCommand(self._mode(i, JointMode.FOC), q, 0.0, 0.0, kp, kd)
+                for i, (q, (kp, kd)) in enumerate(
+                    zip(self._targets[s], self.model.gains, strict=True)
+                )
             )
             for s in self.sides
         }
+
+
+class Dex3Client(FingerClient):
+    """xr_teleoperate's ``Dex3_1_Controller``: id and status in the mode byte."""
+
+    model = DEX3_1
+
+    def _mode(self, index: int, status: JointMode) -> int:
+        return index | status << 4
+
+
+class Dex5Client(FingerClient):
+    """xr_teleoperate's ``Dex5_1_Controller``: mode 1, other gains for the thumb (B.1, B.5)."""
+
+    model = DEX5_1
+
+    def _mode(self, index: int, status: JointMode) -> int:
+        return int(status)
 
 
 def client_for(
@@ -385,5 +422,6 @@ def client_for(
     if chosen.model == DEX1_1.name:
         return Dex1Client(chosen, sides, release=release, simulated=simulated)
     if release is not None or simulated:
-        raise UsageError(f"the client of a {DEX3_1.title} is the same in all releases")
-    return Dex3Client(chosen, sides)
+        title = model(chosen.model).title
+        raise UsageError(f"the client of a {title} is the same in all releases")
+    return (Dex3Client if chosen.model == DEX3_1.name else Dex5Client)(chosen, sides)

@@ -18,7 +18,7 @@ import numpy as np
 
 from dexkit.dds import DdsNode, Qos
 from dexkit.errors import TopicConflict, WireError
-from dexkit.hand import Floats, JointMode, Side
+from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.feel import Feel, feel
@@ -195,19 +195,10 @@ class LiveClient:
 
         The genuine one just stops sending. A Dex1-1's service then brakes within a second; a
         Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
-        to stay where it is, a Dex3-1 with its motors locked (status 0 of the mode byte).
+        to stay where it is, a Dex3-1 or Dex5-1 with its motors locked (status 0 of the mode byte).
         """
         poses = self._client.receiver.seen
-        locks = self._client.dialect.model != DEX1_1.name
-        kp, kd = model(self._client.dialect.model).client_gains
-        stay = {
-            s: tuple(
-                JointCommand(i | JointMode.BRAKE << 4 if locks else 0, q, 0.0, 0.0, kp, kd)
-                for i, q in enumerate(pose)
-            )
-            for s, pose in poses.items()
-            if s in self._client.sides
-        }
+        stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
         end = time.monotonic() + _LEAVING
         while stay and time.monotonic() < end:
             self._send(stay)

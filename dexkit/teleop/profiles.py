@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, Dialect, model
+from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, model
 from dexkit.teleop.client import PINCH_MAX, PINCH_MIN, Pose
 
 __all__ = [
@@ -159,20 +159,30 @@ def _sine(low: float, high: float, period: float) -> Closing:
     return lambda t: (middle + swing * math.sin(2 * math.pi * t / period),)
 
 
-def _fingers(closing: Closing, *, thumb: float, middle: float, index: float) -> Closing:
-    """The same motion to different depths for the three fingers of a Dex3-1."""
-    parts = (0.0, thumb, thumb, middle, middle, index, index)
+# whose joints they are, by index; ring and little finger do what the middle one does
+_FINGERS = {
+    DEX3_1.name: 3 * ("thumb",) + 2 * ("middle",) + 2 * ("index",),
+    DEX5_1.name: 4 * ("index",) + 12 * ("middle",) + 4 * ("thumb",),
+}
+
+
+def _fingers(hand: str, closing: Closing, **parts: float) -> Closing:
+    """The same motion to different depths for the fingers of a hand.
+
+    :param parts: of ``thumb``, ``middle`` and ``index``.
+    """
+    each = tuple(parts[finger] for finger in _FINGERS[hand])
 
     def all_joints(t: float) -> Pose | None:
         found = closing(t)
-        return None if found is None else tuple(p * found[0] for p in parts)
+        return None if found is None else tuple(p * found[0] for p in each)
 
     return all_joints
 
 
-def _clear(closing: Closing) -> Closing:
-    """A Dex3-1's fingers, and the thumb less far, clear of them."""
-    return _fingers(closing, thumb=0.4, middle=1.0, index=1.0)
+def _clear(hand: str, closing: Closing) -> Closing:
+    """A hand's fingers, and the thumb less far, clear of them."""
+    return _fingers(hand, closing, thumb=0.4, middle=1.0, index=1.0)
 
 
 _STEPS = _course((0.0, 0.2), (1.2, 0.4), (2.4, 0.6), (3.6, 0.8), (4.8, 0.5), move=0.0)
@@ -187,6 +197,59 @@ _FEEL = _joined(
     _course((0.0, 1.0), (1.6, 0.0), (3.2, 1.0), (4.6, 0.35), (5.4, 0.7), move=0.0),
     _sine(0.2, 0.8, 4.0),
 )
+
+
+def _of_fingers(hand: str) -> tuple[Profile, ...]:
+    """The profiles of a hand of several joints."""
+    return (
+        Profile(
+            "full-stroke",
+            hand,
+            "closed and open at once, two seconds each: how long a stroke takes",
+            0.5,
+            8.0,
+            _clear(hand, _STROKES),
+        ),
+        Profile(
+            "pinch",
+            hand,
+            "thumb against index finger and open again, twice",
+            1.0,
+            6.5,
+            _fingers(hand, _GRASP, thumb=0.6, middle=0.1, index=0.6),
+        ),
+        Profile(
+            "fist", hand, "the whole hand closes and opens, twice", 1.0, 6.5, _clear(hand, _GRASP)
+        ),
+        Profile(
+            "steps",
+            hand,
+            "all joints, a fifth of the stroke at a time",
+            0.5,
+            6.0,
+            _clear(hand, _STEPS),
+        ),
+        Profile(
+            "sine", hand, "all joints to and fro, 4 s", 0.5, 8.0, _clear(hand, _sine(0.1, 0.9, 4.0))
+        ),
+        Profile(
+            "startle",
+            hand,
+            "nothing for 3 s, then quick full strokes down to 0.25 s",
+            3.0,
+            4.0,
+            _clear(hand, _QUICK),
+        ),
+        Profile(
+            "feel",
+            hand,
+            "what the conformance suite does: all joints half closed, steps, sine",
+            0.6,
+            10.2,
+            _fingers(hand, _FEEL, thumb=0.5, middle=0.5, index=0.5),
+        ),
+    )
+
 
 PROFILES: tuple[Profile, ...] = (
     Profile(
@@ -220,52 +283,7 @@ PROFILES: tuple[Profile, ...] = (
         10.2,
         _FEEL,
     ),
-    Profile(
-        "full-stroke",
-        DEX3_1.name,
-        "closed and open at once, two seconds each: how long a stroke takes",
-        0.5,
-        8.0,
-        _clear(_STROKES),
-    ),
-    Profile(
-        "pinch",
-        DEX3_1.name,
-        "thumb against index finger and open again, twice",
-        1.0,
-        6.5,
-        _fingers(_GRASP, thumb=0.6, middle=0.1, index=0.6),
-    ),
-    Profile(
-        "fist", DEX3_1.name, "the whole hand closes and opens, twice", 1.0, 6.5, _clear(_GRASP)
-    ),
-    Profile(
-        "steps",
-        DEX3_1.name,
-        "all joints, a fifth of the stroke at a time",
-        0.5,
-        6.0,
-        _clear(_STEPS),
-    ),
-    Profile(
-        "sine", DEX3_1.name, "all joints to and fro, 4 s", 0.5, 8.0, _clear(_sine(0.1, 0.9, 4.0))
-    ),
-    Profile(
-        "startle",
-        DEX3_1.name,
-        "nothing for 3 s, then quick full strokes down to 0.25 s",
-        3.0,
-        4.0,
-        _clear(_QUICK),
-    ),
-    Profile(
-        "feel",
-        DEX3_1.name,
-        "what the conformance suite does: all joints half closed, steps, sine",
-        0.6,
-        10.2,
-        _fingers(_FEEL, thumb=0.5, middle=0.5, index=0.5),
-    ),
+    *(profile for hand in _FINGERS for profile in _of_fingers(hand)),
 )
 """The profiles that ship, by model."""
 

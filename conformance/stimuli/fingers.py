@@ -1,12 +1,14 @@
-"""The stimulus for the hand of seven joints, the Dex3-1.
+"""The stimulus for hands of several joints, the Dex3-1 and the Dex5-1.
 
 Both hands do the same at once, except where their independence is the subject. Poses are told by
-how far the flexing joints are closed, in percent, as the object is.
+how far the flexing joints are closed, in percent, as the object is. The phases of the mode byte's
+id and time-out bit are for the Dex3-1 alone.
 
 ============== =====================================================================================
 listen         no commands; state must flow
 approach       slowly to nearly open
-joint          one joint after the other closes and opens again
+joint          one joint after the other closes and opens again; where there are many, all of
+               them open together at the end. Joints that share a motor are one.
 step           one hand closes and opens again, the other holds
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
 range, empty,  limits, no motors, one too few, one and more too many, two mode bytes with each
@@ -17,7 +19,7 @@ foreign
 burst          hundreds of commands at once, of which the last one counts
 stiff, soft    the same step with the client's gains and with a fifth of its stiffness
 limp           zero gains, with a q far towards closed
-lock           the same with the client's gains and status 0 in the mode byte
+lock           the same with the client's gains and status 0 (Dex3-1), or mode 0 (Dex5-1)
 replay         a recorded session, as recorded
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
@@ -43,14 +45,38 @@ restart
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
-from dexkit.conformance.stimuli.script import Plan, Pose, Script, Steps
-from dexkit.conformance.wire import Motor, Motors, mode_byte
+from dexkit.conformance.stimuli.script import Pose, Script, Steps
+from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
+from dexkit.models import DEX3_1, DEX5_1
 
-__all__ = ["DRIVEN", "SLOW", "WRONG_IDS", "Dex3Script"]
+__all__ = ["PARTS", "FingerScript", "Parts"]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which joints are used for what, by index.
+
+    :param driven: when commands stop: those driven by a velocity.
+    :param slow: those then on a slow way to a position.
+    :param crossed: the joints that get each other's id; the first is told to move. Their limits
+        are equal, so that a hand that goes by the id can move the other one.
+    """
+
+    driven: tuple[int, int]
+    slow: tuple[int, int]
+    crossed: tuple[int, int] = (0, 0)
+
+
+PARTS = {
+    DEX3_1.name: Parts((3, 4), (5, 6), crossed=(4, 6)),
+    # first flexing joints of four fingers: none of them shares its motor
+    DEX5_1.name: Parts((1, 5), (9, 13)),
+}
+"""The parts of each model."""
 
 OPEN, CLOSED = 15.0, 50.0
 """Percent of closing between which the hand moves freely."""
@@ -58,11 +84,8 @@ BEYOND = 25.0
 """Percent of closing by which an object is squeezed."""
 SOFTER = 0.2
 """Stiffness of a soft step as a part of the client's."""
-WRONG_IDS = (4, 6)
-"""The joints that get each other's id; the first is told to move. Their limits are equal, so that
-a hand that goes by the id can move the other one."""
-DRIVEN, SLOW = (3, 4), (5, 6)
-"""When commands stop: joints driven by a velocity, and those on a slow way to a position."""
+_BOTH_WAYS = 8
+"""Motors of a hand up to which each of them closes and opens alone."""
 _SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of the former
 # of the latter, N m/rad and N m s/rad: still under way two seconds later
 _SLOW_GAINS = (0.2, 0.4)
@@ -70,22 +93,18 @@ _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
     "empty": "empty commands: nothing may move",
-    "short": "commands for six motors: nothing may move",
+    "short": "commands for a motor too few: nothing may move",
     "long": "commands for more motors than there are: nothing may move",
     "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
     "negative": "negative gains: no joint may run away",
 }
 
 
-class Dex3Script(Script):
-    """The script of a Dex3-1."""
+class FingerScript(Script):
+    """The script of a hand of several joints."""
 
     motion = "joint"
     _settling = 0.2
-
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(plan, say)
-        self._kp, self._kd = self._model.client_gains
 
     def _provoke(self) -> Steps:
         sides, phases = self.plan.sides, self.plan.phases
@@ -120,6 +139,10 @@ class Dex3Script(Script):
         if phases & {"squeeze", "silence", "resume"}:
             yield from self._squeeze_and_silence()
 
+    @property
+    def _parts(self) -> Parts:
+        return PARTS[self._model.name]
+
     # -- places -----------------------------------------------------------------------------
 
     def _pose(self, side: Side, percent: float) -> Pose:
@@ -149,7 +172,10 @@ class Dex3Script(Script):
         return side not in self.plan.objects
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
-        return [Motor(q=q, kp=self._kp, kd=self._kd, mode=mode_byte(i)) for i, q in enumerate(pose)]
+        return [
+            Motor(q=q, kp=kp, kd=kd, mode=self._wire.mode(i))
+            for i, (q, (kp, kd)) in enumerate(zip(pose, self._model.gains, strict=True))
+        ]
 
     def _all(self, percent: float, **change: float) -> dict[Side, Motors]:
         """Every hand so far closed, with something else in every motor."""
@@ -167,13 +193,19 @@ class Dex3Script(Script):
     def _one_by_one(self) -> Steps:
         self._say("one joint after the other: no other joint may move")
         sides = self.plan.sides
-        for joint in range(self._wire.joints):
-            for percent in (CLOSED, OPEN):
-                targets = {s: {joint: self._pose(s, percent)[joint]} for s in sides}
+        motors = self._model.motors
+        ways = (CLOSED, OPEN) if len(motors) <= _BOTH_WAYS else (CLOSED,)
+        for joints in motors:
+            for percent in ways:
+                targets = {
+                    s: {joint: self._pose(s, percent)[joint] for joint in joints} for s in sides
+                }
                 for s, moved in targets.items():
                     self._goal[s] = tuple(moved.get(i, q) for i, q in enumerate(self._goal[s]))
                 phase = self._begin("joint", sides, targets=targets)
                 yield from self._until_settled(phase, sides, least=0.6, most=1.5)
+        if OPEN not in ways:
+            yield from self._to("center", OPEN)
 
     def _alone(self, side: Side) -> Steps:
         self._say(f"the {side} hand alone; the other one must not move")
@@ -196,9 +228,9 @@ class Dex3Script(Script):
         elif name == "short":
             bursts = [{s: motors[:-1] for s, motors in good.items()}]
         elif name == "long":
-            far = Motor(q=1.0, kp=self._kp, kd=self._kd, mode=mode_byte(0))
             bursts = [
-                {s: [*motors, *[far] * more] for s, motors in good.items()} for more in (1, 13)
+                {s: [*motors, *[replace(motors[0], q=1.0)] * more] for s, motors in good.items()}
+                for more in (1, 13)
             ]
         elif name == "negative":
             near = {s: self._motors(s, self._aside(s)) for s in good}
@@ -234,11 +266,11 @@ class Dex3Script(Script):
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
         """Two motors with each other's id, the first of them told to go elsewhere."""
-        first, other = WRONG_IDS
+        first, other = self._parts.crossed
         target = self._other_place()[side][first]
         crossed = list(motors)
-        crossed[first] = replace(motors[first], q=target, mode=mode_byte(other))
-        crossed[other] = replace(motors[other], mode=mode_byte(first))
+        crossed[first] = replace(motors[first], q=target, mode=self._wire.mode(other))
+        crossed[other] = replace(motors[other], mode=self._wire.mode(first))
         return crossed
 
     def _stiff_and_soft(self) -> Steps:
@@ -248,7 +280,11 @@ class Dex3Script(Script):
             poses = {s: self._pose(s, percent) for s in self.plan.sides}
             targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
             phase = self._begin(name, self.plan.sides, targets=targets)
-            yield from self._hold(0.6, self._all(percent, kp=part * self._kp))
+            motors = {
+                s: [replace(m, kp=part * m.kp) for m in self._motors(s, pose)]
+                for s, pose in poses.items()
+            }
+            yield from self._hold(0.6, motors)
             self._end(phase)
             self._goal.update(poses)
         yield from self._to("center", OPEN)
@@ -257,7 +293,7 @@ class Dex3Script(Script):
         self._say(
             "commands without force (zero gains): the hand must not be pulled"
             if name == "limp"
-            else "locked motors (status 0): they must not follow their q"
+            else "locked motors: they must not follow their q"
         )
         sides = self.plan.sides
         yield from self._hold(0.1)
@@ -267,7 +303,10 @@ class Dex3Script(Script):
             motors = self._all(CLOSED, kp=0.0, kd=0.0)
         else:
             motors = {
-                s: [replace(m, mode=mode_byte(i, JointMode.BRAKE)) for i, m in enumerate(every)]
+                s: [
+                    replace(m, mode=self._wire.mode(i, JointMode.BRAKE))
+                    for i, m in enumerate(every)
+                ]
                 for s, every in self._all(CLOSED).items()
             }
         yield from self._hold(0.5, motors)
@@ -282,17 +321,17 @@ class Dex3Script(Script):
         targets: dict[Side, dict[int, float]] = {}
         for s in sides:
             motors = [
-                replace(m, mode=mode_byte(i, timeout=guard))
+                replace(m, mode=self._wire.mode(i, timeout=guard))
                 for i, m in enumerate(self._motors(s, self._goal[s]))
             ]
             far = self._pose(s, CLOSED)
-            for i in DRIVEN:
+            for i in self._parts.driven:
                 speed = math.copysign(_SPEED, self._joints[s][i].closing)
                 motors[i] = replace(motors[i], dq=speed, kp=0.0, kd=_DAMPING)
-            for i in SLOW:
+            for i in self._parts.slow:
                 motors[i] = replace(motors[i], q=far[i], kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
             hands[s] = motors
-            targets[s] = {i: far[i] for i in SLOW}
+            targets[s] = {i: far[i] for i in self._parts.slow}
         phase = self._begin(name, sides, targets=targets)
         yield from self._hold(0.3, hands)
         self._end(phase)
@@ -309,7 +348,7 @@ class Dex3Script(Script):
         targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
         phase = self._begin("guard-latch", sides, targets=targets)
         guarded = {
-            s: [replace(m, mode=mode_byte(i, timeout=True)) for i, m in enumerate(motors)]
+            s: [replace(m, mode=self._wire.mode(i, timeout=True)) for i, m in enumerate(motors)]
             for s, motors in self._all(CLOSED - 5.0).items()
         }
         yield from self._hold(0.4, guarded)
@@ -326,7 +365,10 @@ class Dex3Script(Script):
         }
         if pressing:
             self._say("squeezing the object")
-            targets = {s: {i: m.q for i, m in enumerate(squeeze[s]) if i} for s in pressing}
+            targets = {
+                s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
+                for s in pressing
+            }
             phase = self._begin("squeeze", pressing, targets=targets)
             yield from self._hold(1.0, squeeze)
             self._end(phase)

@@ -1,4 +1,8 @@
-"""Wrong Dex3-1 hands."""
+"""Wrong hands of several joints.
+
+Each is mixed into the reference service of a model by :func:`zoo`, and its ``wrong``, if it has
+one, into the reference hand.
+"""
 
 # ruff: noqa: D102  (each class says what it does wrong; its methods only override)
 
@@ -7,17 +11,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from dexkit.conformance.mutants import shared
 from dexkit.conformance.mutants.shared import of
-from dexkit.conformance.virtual import Sample
-from dexkit.conformance.virtual.dex3 import Dex3Hand, Dex3Service, Ints
-from dexkit.conformance.wire import Motor, mode_byte
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.virtual.fingers import (
+    Dex3Service,
+    Dex5Service,
+    FingerHand,
+    FingerService,
+    Flags,
+    Ints,
+)
+from dexkit.conformance.wire import Motor
 from dexkit.hand import Floats, Side
-from dexkit.models import DEX3_1
+from dexkit.models import DEX3_1, DEX5_1
 
 # --------------------------------------------------------------------- discovery and start-up
 
@@ -35,66 +47,75 @@ class LowRateIsFull(Dex3Service):
     low_period = Dex3Service.period
 
 
-class _Zero(Dex3Hand):
+class _Zero(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
         self.q = [0.0] * len(self.q)
 
 
-class RestsAtZero(Dex3Service):
+class RestsAtZero(FingerService):
     """Rests with every joint at exactly 0."""
 
-    hand = _Zero
+    wrong = _Zero
 
 
 # ------------------------------------------------------------------------------------ fields
 
 
-class NanVelocity(Dex3Service):
+class NanVelocity(FingerService):
     """Divides by a time step of zero at rest, in one joint."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         if len(motors) and not hand.dq[5]:
             motors["dq"][5] = math.nan
 
 
-class Unmirrored(Dex3Service):
+class Unmirrored(FingerService):
     """Has the left hand's signs on the right one, in both directions."""
 
+    def signs(self, side: Side) -> Floats:
+        """-1 for the joints of the right hand that are mirrored."""
+        joints = self.hand.model.joints
+        mirrored = [
+            side is Side.RIGHT and mine.closing * other.closing < 0
+            for mine, other in zip(joints[Side.RIGHT], joints[Side.LEFT], strict=True)
+        ]
+        return np.where(mirrored, -1.0, 1.0)
+
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if side is Side.RIGHT:
-            motors = tuple(replace(m, q=-m.q, dq=-m.dq, tau=-m.tau) for m in motors)
+        motors = tuple(
+            replace(m, q=sign * m.q, dq=sign * m.dq, tau=sign * m.tau)
+            for m, sign in zip(motors, self.signs(side).tolist(), strict=True)
+        )
         super().motors(side, motors)
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        if hand.side is Side.RIGHT:
-            for name in ("q", "dq", "tau_est"):
-                motors[name] = -motors[name]
+        for name in ("q", "dq", "tau_est"):
+            motors[name] *= self.signs(hand.side)[: len(motors)]
 
     def positions(self, side: Side) -> tuple[float, ...]:
-        sign = -1.0 if side is Side.RIGHT else 1.0
-        return tuple(sign * q for q in super().positions(side))
+        return tuple((self.signs(side) * super().positions(side)).tolist())
 
 
-class TurnedVelocity(Dex3Service):
+class TurnedVelocity(FingerService):
     """Publishes dq with the wrong sign."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["dq"] = -motors["dq"]
 
 
-class TurnedAcceleration(Dex3Service):
+class TurnedAcceleration(FingerService):
     """Publishes ddq with the wrong sign."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["ddq"] = -motors["ddq"]
 
 
-class _Filled(Dex3Service):
+class _Filled(FingerService):
     """Motors that say something else of themselves, or a hand that does."""
 
     motor: tuple[str, Any] | None = None
@@ -132,10 +153,10 @@ class FaultForAStatus(_Filled):
     whole = ("error", (7, 0))
 
 
-class CountsInReserve(Dex3Service):
+class CountsInReserve(FingerService):
     """Counts its states in a reserved word of the first motor."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["reserve"][0] = hand.version
 
@@ -152,7 +173,7 @@ class UnsetLost(_Filled):
     packet = ("lost", 0xCCCCCCCC)
 
 
-class NanGyroscope(Dex3Service):
+class NanGyroscope(FingerService):
     """Publishes NaN for an angular velocity that it does not know."""
 
     def message(self, count: int) -> Any:
@@ -161,55 +182,55 @@ class NanGyroscope(Dex3Service):
         return message
 
 
-class IdsFromOne(Dex3Service):
+class IdsFromOne(FingerService):
     """Counts its motors from 1."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["mode"] += 1
 
 
-class OddPackets(Dex3Service):
+class OddPackets(FingerService):
     """Publishes ten sensor packets."""
 
     sensors = 10
 
-    def pressures(self, hand: Dex3Hand) -> Floats:
+    def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
         return np.concatenate((felt, felt[:1]))
 
 
-class NanPressure(Dex3Service):
+class NanPressure(FingerService):
     """Publishes NaN where there is no sensor."""
 
-    def pressures(self, hand: Dex3Hand) -> Floats:
+    def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
         return np.where(felt == 30000.0, math.nan, felt)
 
 
-class ZeroForNoValue(Dex3Service):
+class ZeroForNoValue(FingerService):
     """Publishes 0 where there is no sensor."""
 
-    def pressures(self, hand: Dex3Hand) -> Floats:
+    def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
         return np.where(felt == 30000.0, 0.0, felt)
 
 
-class SevenPackets(Dex3Service):
+class SevenPackets(FingerService):
     """Publishes the SDK's default of seven packets."""
 
     sensors = 7
 
 
-class Numb(Dex3Service):
+class Numb(FingerService):
     """Never feels a touch."""
 
-    def pressures(self, hand: Dex3Hand) -> Floats:
+    def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
         return np.where(felt == 30000.0, felt, 0.0)
 
 
-class LongQuaternion(Dex3Service):
+class LongQuaternion(FingerService):
     """Publishes the raw counts of its attitude."""
 
     def quaternion(self) -> list[float]:
@@ -226,7 +247,7 @@ def _reordered(order: tuple[int, ...]) -> Callable[[tuple[Motor, ...]], tuple[Mo
     return reorder
 
 
-class IndexFirst(Dex3Service):
+class IndexFirst(FingerService):
     """Takes the commands of the right hand index finger first, as xr_teleoperate's enum says."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
@@ -235,7 +256,14 @@ class IndexFirst(Dex3Service):
         super().motors(side, motors)
 
 
-class CoupledFinger(Dex3Service):
+class ThumbFirst(FingerService):
+    """Takes the commands thumb first, as the URDF numbers the fingers."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(side, _reordered((*range(4, 20), *range(4)))(motors))
+
+
+class CoupledFinger(FingerService):
     """Has the second joint of a finger follow the first a little."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
@@ -244,7 +272,7 @@ class CoupledFinger(Dex3Service):
         super().motors(side, tuple(coupled))
 
 
-class _Backwards(Dex3Hand):
+class _Backwards(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         middle = 0.5 * (self.low + self.high)
         turned = rows.copy()
@@ -253,25 +281,25 @@ class _Backwards(Dex3Hand):
         super().take(turned, mode)
 
 
-class OneJointBackwards(Dex3Service):
+class OneJointBackwards(FingerService):
     """Turns the sign of the thumb's tip."""
 
-    hand = _Backwards
+    wrong = _Backwards
 
 
-class OtherScale(Dex3Service):
+class OtherScale(FingerService):
     """Goes only part of the way from its rest."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        rest = DEX3_1.rest_q[side]
+        rest = self.hand.model.rest_q[side]
         scaled = (replace(m, q=r + 0.75 * (m.q - r)) for m, r in zip(motors, rest, strict=True))
         super().motors(side, tuple(scaled))
 
 
-class _Hunts(Dex3Hand):
+class _Hunts(FingerHand):
     def move(self, dt: float, pull: list[float]) -> None:
-        if self.law_kp[2] > 1.0:
-            pull[2] += 0.25 * math.sin(2 * math.pi * 8.0 * self.now)
+        if self.law_kp[2] > 0.67 * self.client_kp[2]:
+            pull[2] += self.law_kp[2] / 6 * math.sin(2 * math.pi * 8.0 * self.now)
         super().move(dt, pull)
 
     def step(self, dt: float) -> None:
@@ -279,36 +307,42 @@ class _Hunts(Dex3Hand):
         super().step(dt)
 
 
-class Hunts(Dex3Service):
-    """Shakes the thumb about its target."""
+class Hunts(FingerService):
+    """Shakes a joint about its target."""
 
-    hand = _Hunts
-
-
-class _Weak(Dex3Hand):
-    viscous = 0.1
+    wrong = _Hunts
 
 
-class Slow(Dex3Service):
+class _Weak(FingerHand):
+    def __init__(self, side: Side, touch: float | None = None) -> None:
+        super().__init__(side, touch)
+        self.viscous = max(self.client_kp.min() / 15, 4 * self.viscous)
+
+
+class Slow(FingerService):
     """Has stiff grease in its gears."""
 
-    hand = _Weak
+    wrong = _Weak
 
 
-class _Springy(Dex3Hand):
+class _Springy(FingerHand):
+    def __init__(self, side: Side, touch: float | None = None) -> None:
+        super().__init__(side, touch)
+        self.viscous = 0.1 * self.viscous
+
     def take(self, rows: Floats, mode: Ints) -> None:
         undamped = rows.copy()
         undamped[4] = np.where(rows[3] > 0, 0.15 * rows[4], rows[4])
         super().take(undamped, mode)
 
 
-class Undamped(Dex3Service):
+class Undamped(FingerService):
     """Applies little of kd where there is a kp."""
 
-    hand = _Springy
+    wrong = _Springy
 
 
-class Coupled(Dex3Service):
+class Coupled(FingerService):
     """The left hand's first finger leaks into the right one."""
 
     left = 0.0
@@ -323,7 +357,7 @@ class Coupled(Dex3Service):
         super().motors(side, motors)
 
 
-class _Creeps(Dex3Hand):
+class _Creeps(FingerHand):
     since = 0.0
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -332,11 +366,13 @@ class _Creeps(Dex3Hand):
         super().take(rows, mode)
 
     def move(self, dt: float, pull: list[float]) -> None:
-        if self.now - self.since > 0.2 and self.law_on[6] and self.law_kp[6] > 1.0:
+        driven = self.law_on[6] and self.law_kp[6] > 0.67 * self.client_kp[6]
+        if self.now - self.since > 0.2 and driven:
             left = self.law_q[6] - self.q[6]
             if 0.02 < abs(left) < 0.1:
                 wanted = math.copysign(0.045, left)
-                pull[6] = self.law_kd[6] * wanted + math.copysign(self.coulomb, left)
+                resists = self.law_kd[6] + dt * self.law_kp[6] + self.viscous
+                pull[6] = resists * wanted + math.copysign(self.coulomb, left)
         super().move(dt, pull)
 
     def step(self, dt: float) -> None:
@@ -344,65 +380,76 @@ class _Creeps(Dex3Hand):
         super().step(dt)
 
 
-class Creeps(Dex3Service):
+class Creeps(FingerService):
     """Creeps the last part of the way with one finger."""
 
-    hand = _Creeps
+    wrong = _Creeps
 
 
-class _IgnoresZeroGains(Dex3Hand):
+class _IgnoresZeroGains(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         own = rows.copy()
         unset = (rows[3] == 0) & (rows[4] == 0)
-        own[3], own[4] = np.where(unset, 1.5, rows[3]), np.where(unset, 0.2, rows[4])
+        own[3] = np.where(unset, self.client_kp, rows[3])
+        own[4] = np.where(unset, self.client_kd, rows[4])
         super().take(own, mode)
 
 
-class DefaultsForZeroGains(Dex3Service):
+class DefaultsForZeroGains(FingerService):
     """Takes zero gains for gains that were not set, and uses its own."""
 
-    hand = _IgnoresZeroGains
+    wrong = _IgnoresZeroGains
 
 
-class _OwnStiffness(Dex3Hand):
+class _OwnStiffness(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         own = rows.copy()
-        own[3], own[4] = np.where(rows[3] > 0, 1.5, 0.0), np.where(rows[3] > 0, 0.2, rows[4])
+        own[3] = np.where(rows[3] > 0, self.client_kp, 0.0)
+        own[4] = np.where(rows[3] > 0, self.client_kd, rows[4])
         super().take(own, mode)
 
 
-class OwnStiffness(Dex3Service):
+class OwnStiffness(FingerService):
     """Uses its own stiffness whenever there is any."""
 
-    hand = _OwnStiffness
+    wrong = _OwnStiffness
 
 
 # --------------------------------------------------------------------------------- mode byte
 
 
-class AlwaysDriven(Dex3Service):
-    """Reports status 1 whatever it does."""
+class AlwaysDriven(FingerService):
+    """Says that its motors are driven whatever it does."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        motors["mode"] |= 1 << 4
+        motors["mode"] |= self.wire.mode(0)
 
 
-class _IgnoresStatus(Dex3Hand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode & 0x8F | 1 << 4)
-
-    def changed(self) -> None:
-        super().changed()
+class _IgnoresStatus(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        status, guarded = super().understood(mode)
+        return np.ones_like(status), guarded
 
 
-class IgnoresStatus(Dex3Service):
-    """Drives with status 0 as with 1."""
+class IgnoresStatus(FingerService):
+    """Drives whatever the mode byte says."""
 
-    hand = _IgnoresStatus
+    wrong = _IgnoresStatus
 
 
-class GoesById(Dex3Service):
+class _Ris(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        return (mode >> 4) & 7, mode >= 0x80
+
+
+class DecodesRis(FingerService):
+    """Takes the mode byte for a Dex3-1's: 1 is id 1 with status 0, which locks."""
+
+    wrong = _Ris
+
+
+class GoesById(FingerService):
     """Sorts a command's motors by the id in their mode byte."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
@@ -414,18 +461,26 @@ class GoesById(Dex3Service):
 # ------------------------------------------------------------------------------------- force
 
 
-class TurnedForce(Dex3Service):
+class TurnedForce(FingerService):
     """Publishes tau_est with the wrong sign."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] = -motors["tau_est"]
 
 
-class MilliNewtonMetres(Dex3Service):
+class FingersInNewtonMetres(FingerService):
+    """Publishes all torques in N m, the fingers' too."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= self.torque_units[: len(motors)]
+
+
+class MilliNewtonMetres(FingerService):
     """Publishes tau_est in mN m."""
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] *= 1e3
 
@@ -433,19 +488,19 @@ class MilliNewtonMetres(Dex3Service):
 # ------------------------------------------------------------------------------------ safety
 
 
-class _NegativeGains(Dex3Hand):
+class _NegativeGains(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         super().take(rows, mode)
         self.kp, self.kd = rows[3].copy(), np.abs(rows[4])
 
 
-class NegativeGains(Dex3Service):
+class NegativeGains(FingerService):
     """Takes a negative stiffness as it comes."""
 
-    hand = _NegativeGains
+    wrong = _NegativeGains
 
 
-class _NanPerJoint(Dex3Hand):
+class _NanPerJoint(FingerHand):
     def command(self, motors: tuple[Motor, ...]) -> None:
         now = zip(self.goal.tolist(), self.kp.tolist(), self.kd.tolist(), motors, strict=True)
         super().command(
@@ -458,26 +513,26 @@ class _NanPerJoint(Dex3Hand):
         )
 
 
-class RejectsOnlyTheBadJoint(Dex3Service):
+class RejectsOnlyTheBadJoint(FingerService):
     """Leaves out the joint with a NaN and moves the others."""
 
-    hand = _NanPerJoint
+    wrong = _NanPerJoint
 
 
-class _NoLimits(Dex3Hand):
+class _NoLimits(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
         self.low, self.high = self.low - 0.5, self.high + 0.5
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
-class NoLimits(Dex3Service):
+class NoLimits(FingerService):
     """Goes half a radian beyond the limits."""
 
-    hand = _NoLimits
+    wrong = _NoLimits
 
 
-class FillsUpWithZeros(Dex3Service):
+class FillsUpWithZeros(FingerService):
     """Fills up a short command with zeros."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
@@ -488,21 +543,21 @@ class FillsUpWithZeros(Dex3Service):
             if mine and 0 < len(sequence) < self.wire.joints:
                 given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence]
                 missing = range(len(given), self.wire.joints)
-                self.motors(side, (*given, *(Motor(mode=mode_byte(i)) for i in missing)))
+                self.motors(side, (*given, *(Motor(mode=self.wire.mode(i)) for i in missing)))
 
 
-class _KeepsSpeed(Dex3Hand):
+class _KeepsSpeed(FingerHand):
     def expire(self) -> None:
         self.tripped = self.tripped | self.guarded
 
 
-class KeepsDriving(Dex3Service):
+class KeepsDriving(FingerService):
     """Keeps the last velocity for ever, unless protected."""
 
-    hand = _KeepsSpeed
+    wrong = _KeepsSpeed
 
 
-class _AlwaysBrakes(Dex3Hand):
+class _AlwaysBrakes(FingerHand):
     brakes = False
 
     def expire(self) -> None:
@@ -522,13 +577,13 @@ class _AlwaysBrakes(Dex3Hand):
             self.law_kd = [self.brake] * n
 
 
-class LetsGo(Dex3Service):
+class LetsGo(FingerService):
     """Brakes in every silence, protected or not."""
 
-    hand = _AlwaysBrakes
+    wrong = _AlwaysBrakes
 
 
-class _LatchesWithoutGuard(Dex3Hand):
+class _LatchesWithoutGuard(FingerHand):
     stuck = False
 
     def expire(self) -> None:
@@ -540,16 +595,16 @@ class _LatchesWithoutGuard(Dex3Hand):
             super().take(rows, mode)
 
 
-class StuckAfterSilence(Dex3Service):
+class StuckAfterSilence(FingerService):
     """Takes no command any more after a silence without protection."""
 
-    hand = _LatchesWithoutGuard
+    wrong = _LatchesWithoutGuard
 
 
 # ---------------------------------------------------------------------- time-out protection
 
 
-class _HoldsOnly(Dex3Hand):
+class _HoldsOnly(FingerHand):
     def expire(self) -> None:
         self.speed = np.zeros_like(self.speed)
         self.push = np.zeros_like(self.push)
@@ -564,37 +619,37 @@ class _HoldsOnly(Dex3Hand):
             self.late = None
 
 
-class HoldsWhenGuarded(Dex3Service):
+class HoldsWhenGuarded(FingerService):
     """Takes the time-out bit for news about the next command: keeps going to the position."""
 
-    hand = _HoldsOnly
+    wrong = _HoldsOnly
 
 
-class _Silent(Dex3Hand):
+class _Silent(FingerHand):
     def changed(self) -> None:
         super().changed()
         self.mode = self.mode & 0x7F
 
 
-class TripsInSecret(Dex3Service):
+class TripsInSecret(FingerService):
     """Does not say that the protection has tripped."""
 
-    hand = _Silent
+    wrong = _Silent
 
 
-class _Unlatched(Dex3Hand):
+class _Unlatched(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         super().take(rows, mode)
         self.tripped = np.zeros_like(self.tripped)
 
 
-class ClearsByItself(Dex3Service):
+class ClearsByItself(FingerService):
     """Goes on with the next command, bit 7 or not."""
 
-    hand = _Unlatched
+    wrong = _Unlatched
 
 
-class _ForEver(Dex3Hand):
+class _ForEver(FingerHand):
     was = False
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -613,13 +668,13 @@ class _ForEver(Dex3Hand):
             self.tripped_at = self.now
 
 
-class SlowToClear(Dex3Service):
+class SlowToClear(FingerService):
     """Stays tripped for two seconds after it was cleared."""
 
-    hand = _ForEver
+    wrong = _ForEver
 
 
-class QuietWhenTripped(Dex3Service):
+class QuietWhenTripped(FingerService):
     """Publishes no state while its protection has tripped."""
 
     def publish(self) -> list[Sample]:
@@ -627,7 +682,9 @@ class QuietWhenTripped(Dex3Service):
         return [] if tripped else super().publish()
 
 
-_SHARED = {
+_Entry: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
+
+_SHARED: dict[str, tuple[type[Service], ...]] = {
     "TOPIC-01": (shared.OldTopic, shared.OtherStateType),
     "TOPIC-02": (shared.OtherCommandType,),
     "QOS-01": (shared.DemandsHistory,),
@@ -662,11 +719,9 @@ _SHARED = {
 }
 
 # a velocity cannot be derived twice from states that come in bursts
-_SHARED_ALSO: dict[type, tuple[str, ...]] = {shared.Bursts: ("DEX3-FIELD-05",)}
+_SHARED_ALSO: dict[type, tuple[str, ...]] = {shared.Bursts: ("FIELD-05",)}
 
-_OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
-    (NoLowRate, "TOPIC-03", ()),
-    (LowRateIsFull, "TOPIC-03", ()),
+_OWN: tuple[_Entry, ...] = (
     (RestsAtZero, "START-02", ()),
     (NanVelocity, "FIELD-02", ()),
     (Unmirrored, "FIELD-03", ()),
@@ -676,13 +731,10 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (RawSupply, "FIELD-07", ()),
     (FaultForAStatus, "FIELD-08", ()),
     (CountsInReserve, "FIELD-09", ()),
-    (HotSensors, "SENS-05", ()),
-    (UnsetLost, "SENS-06", ()),
     (NanGyroscope, "IMU-02", ()),
     (MilliNewtonMetres, "FORCE-02", ()),
     (Creeps, "MOVE-07", ("MOVE-04",)),
     (NegativeGains, "SAFE-06", ()),
-    (IndexFirst, "JOINT-01", ()),
     (CoupledFinger, "JOINT-01", ()),
     (OneJointBackwards, "MOVE-01", ()),
     (OtherScale, "MOVE-02", ()),
@@ -691,26 +743,34 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (Undamped, "MOVE-05", ()),
     (Coupled, "SIDE-01", ("MOVE-07",)),
     # a hand that answers to the other side's topic does not answer to its own
-    (of(shared.Swapped, Dex3Service), "SIDE-01", ("JOINT-01",)),
+    (shared.Swapped, "SIDE-01", ("JOINT-01",)),
     (DefaultsForZeroGains, "GAIN-01", ()),
     (OwnStiffness, "GAIN-02", ()),
-    (IdsFromOne, "MODE-01", ()),
     (AlwaysDriven, "MODE-02", ("LIFE-05",)),
     (IgnoresStatus, "MODE-03", ("MODE-02",)),
-    (GoesById, "MODE-04", ()),
-    (OddPackets, "SENS-01", ()),
-    (NanPressure, "SENS-02", ()),
-    (ZeroForNoValue, "SENS-03", ()),
-    (SevenPackets, "SENS-03", ()),
     (LongQuaternion, "IMU-01", ()),
-    (Numb, "SENS-04", ()),
     (TurnedForce, "FORCE-01", ()),
     (RejectsOnlyTheBadJoint, "SAFE-01", ()),
     (NoLimits, "SAFE-02", ()),
     (FillsUpWithZeros, "SAFE-04", ()),
     (KeepsDriving, "WDOG-01", ()),
-    (QuietWhenTripped, "WDOG-02", ()),
     (StuckAfterSilence, "WDOG-03", ()),
+)
+
+_DEX3: tuple[_Entry, ...] = (
+    (NoLowRate, "TOPIC-03", ()),
+    (LowRateIsFull, "TOPIC-03", ()),
+    (HotSensors, "SENS-05", ()),
+    (UnsetLost, "SENS-06", ()),
+    (IndexFirst, "JOINT-01", ()),
+    (IdsFromOne, "MODE-01", ()),
+    (GoesById, "MODE-04", ()),
+    (OddPackets, "SENS-01", ()),
+    (NanPressure, "SENS-02", ()),
+    (ZeroForNoValue, "SENS-03", ()),
+    (SevenPackets, "SENS-03", ()),
+    (Numb, "SENS-04", ()),
+    (QuietWhenTripped, "WDOG-02", ()),
     (LetsGo, "HOLD-01", ()),
     (HoldsWhenGuarded, "GUARD-01", ()),
     (TripsInSecret, "GUARD-02", ()),
@@ -718,18 +778,54 @@ _OWN: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
     (SlowToClear, "GUARD-04", ()),
 )
 
-ZOO: tuple[tuple[type[Dex3Service], str, tuple[str, ...]], ...] = (
-    *(
-        (of(mixin, Dex3Service), f"DEX3-{kills}", _SHARED_ALSO.get(mixin, ()))
+_DEX5: tuple[_Entry, ...] = (
+    (DecodesRis, "MODE-01", ()),
+    (ThumbFirst, "JOINT-01", ()),
+    (FingersInNewtonMetres, "FORCE-03", ()),
+)
+
+
+def _on(mixin: type[Service], reference: type[FingerService]) -> type[FingerService]:
+    """The wrong hand that the reference becomes with ``mixin``, and with its ``wrong`` hand."""
+    if issubclass(mixin, reference):
+        return mixin
+    made = of(mixin, reference)
+    wrong: type[FingerHand] | None = getattr(mixin, "wrong", None)
+    if wrong is not None:
+        made.hand = type(wrong.__name__, (wrong, reference.hand), {})
+    return made
+
+
+def zoo(
+    prefix: str, reference: type[FingerService], own: tuple[_Entry, ...]
+) -> tuple[tuple[type[FingerService], str, tuple[str, ...]], ...]:
+    """The wrong hands of a model, for what its catalogue has.
+
+    :param prefix: of its requirements' ids.
+    :param own: those that only this model has.
+    """
+    ids = {r.id for r in catalogue(reference.hand.model.name)}
+    shares = [
+        (mixin, kills, _SHARED_ALSO.get(mixin, ()))
         for kills, mixins in _SHARED.items()
         for mixin in mixins
-    ),
-    *(
-        (service, f"DEX3-{kills}", tuple(f"DEX3-{name}" for name in also))
-        for service, kills, also in _OWN
-    ),
-)
-"""(mutant, requirement that must catch it, requirements that cannot but fail with it)."""
+    ]
+    return tuple(
+        (
+            _on(mixin, reference),
+            f"{prefix}-{kills}",
+            tuple(f"{prefix}-{name}" for name in also if f"{prefix}-{name}" in ids),
+        )
+        for mixin, kills, also in (*shares, *_OWN, *own)
+        if f"{prefix}-{kills}" in ids
+    )
+
+
+ZOOS = {
+    DEX3_1.name: zoo("DEX3", Dex3Service, _DEX3),
+    DEX5_1.name: zoo("DEX5", Dex5Service, _DEX5),
+}
+"""By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
 BOTH = (
     *("Unmirrored", "IndexFirst", "Coupled", "Swapped", "Numb", "TurnedForce"),
     *("NanPressure", "ZeroForNoValue"),

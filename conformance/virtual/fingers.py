@@ -1,9 +1,9 @@
-"""A Dex3-1 that does everything right."""
+"""Hands of several joints that do everything right: a Dex3-1 and a Dex5-1."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,9 +14,9 @@ from dexkit.conformance.virtual import Sample, Service
 from dexkit.conformance.wire import Motor
 from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import message_type
-from dexkit.models import DEX3_1, Dialect
+from dexkit.models import DEX3_1, DEX5_1, Dialect, HandModel
 
-__all__ = ["Dex3Hand", "Dex3Service"]
+__all__ = ["Dex3Service", "Dex5Service", "FingerHand", "FingerService"]
 
 Flags: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]
@@ -38,24 +38,25 @@ _PACKET = np.dtype(
 )
 
 
-class Dex3Hand:
-    """Seven joints that obey tau = kp (q - q_now) + kd (dq - dq_now) + tau, and RIS_Mode.
+class FingerHand:
+    """Joints that obey tau = kp (q - q_now) + kd (dq - dq_now) + tau.
 
     Each is one inertia with friction between two stops, and an object if there is one.
 
     :param touch: percent of closing at which the flexing joints touch an object, or None.
     """
 
-    inertia = 0.001  # kg m²
-    viscous = 0.002  # N m s/rad
-    coulomb = 0.005  # N m
-    brake = 0.2  # N m s/rad of shorted windings
-    stiffness = 60.0  # N m/rad of stops and object
-    timeout = DEX3_1.command_timeout
+    model: HandModel
+    inertia: float  # kg m²
+    viscous: float  # N m s/rad
+    coulomb: float  # N m
+    brake: float  # N m s/rad of shorted windings
+    stiffness: float  # N m/rad of stops and object
 
     def __init__(self, side: Side, touch: float | None = None) -> None:
         self.side = side
-        specs = DEX3_1.joints[side]
+        specs = self.model.joints[side]
+        self.timeout = self.model.command_timeout
         self.low: Floats = np.array([j.q_min for j in specs])
         self.high: Floats = np.array([j.q_max for j in specs])
         self.most: Floats = np.array([j.tau_max for j in specs])
@@ -70,11 +71,12 @@ class Dex3Hand:
         self.touches = touch is not None
         n = len(specs)
         self.index = np.arange(n)
-        self.q = list(DEX3_1.rest_q[side])
+        self.q = list(self.model.rest_q[side])
         self.dq = [0.0] * n
         self.tau = [0.0] * n
         self.contact = [0.0] * n
         self.goal, self.speed, self.push, self.kp, self.kd = np.zeros((5, n))
+        self.client_kp, self.client_kd = np.array(self.model.gains).T
         self.status: Ints = np.zeros(n, dtype=np.intp)
         self.guarded: Flags = np.zeros(n, dtype=np.bool_)
         self.tripped: Flags = np.zeros(n, dtype=np.bool_)
@@ -104,13 +106,19 @@ class Dex3Hand:
         self.goal = np.minimum(np.maximum(rows[0], self.low), self.high)
         self.speed, self.push = rows[1:3]
         self.kp, self.kd = np.maximum(rows[3:], 0.0)
-        self.status = (mode >> 4) & 7
-        self.guarded = mode >= 0x80
+        self.status, self.guarded = self.understood(mode)
         self.tripped = self.tripped & self.guarded
 
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        """What mode bytes say: what each motor is to do, and whether it is protected."""
+        raise AssertionError  # overridden
+
+    def told(self) -> Ints:
+        """The mode bytes of a state."""
+        raise AssertionError  # overridden
+
     def expire(self) -> None:
-        """No command for longer than the time-out: nothing is left driven but a held position."""
-        self.tripped = self.tripped | self.guarded
+        """No command for longer than the time-out: nothing is left driven by a velocity."""
         self.speed = np.zeros_like(self.speed)
         self.push = np.zeros_like(self.push)
 
@@ -122,7 +130,7 @@ class Dex3Hand:
     def changed(self) -> None:
         """Work out what follows from the command in force."""
         self.driven: Flags = (self.status == JointMode.FOC) & ~self.tripped
-        self.mode: Ints = self.index | self.driven << 4 | self.tripped << 7
+        self.mode = self.told()
         self.law_on = self.driven.tolist()
         self.law_q = self.goal.tolist()
         self.law_kp = np.where(self.driven, self.kp, 0.0).tolist()
@@ -155,7 +163,7 @@ class Dex3Hand:
         """Let torques work, and the law's damping.
 
         Implicit in damping and stiffness, so that a stiff law is stable at this step. Plain
-        numbers: seven are too few for numpy to be quick.
+        numbers: there are too few joints for numpy to be quick.
         """
         part = dt / self.inertia
         slip = part * self.coulomb
@@ -185,6 +193,34 @@ class Dex3Hand:
         self.tau = [t if on else 0.0 for t, on in zip(tau_, self.law_on, strict=True)]
 
     def pressures(self) -> Floats:
+        """Shape (n_sensors, 12): what the sensor packets hold."""
+        return np.zeros((0, 12))
+
+
+class Dex3Hand(FingerHand):
+    """Seven joints and RIS_Mode (facts/unitree-dex B.4)."""
+
+    model = DEX3_1
+    inertia = 0.001
+    viscous = 0.002
+    coulomb = 0.005
+    brake = 0.2
+    stiffness = 60.0
+
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        """Status in bits 4 to 6, protection in bit 7."""
+        return (mode >> 4) & 7, mode >= 0x80
+
+    def told(self) -> Ints:
+        """The same, and the motor's index."""
+        return np.asarray(self.index | self.driven << 4 | self.tripped << 7)
+
+    def expire(self) -> None:
+        """Protected motors trip; the others keep their position."""
+        self.tripped = self.tripped | self.guarded
+        super().expire()
+
+    def pressures(self) -> Floats:
         """Shape (9, 12): what the sensor packets hold."""
         if not self.touches:
             return _UNTOUCHED
@@ -198,6 +234,31 @@ class Dex3Hand:
         return felt
 
 
+class Dex5Hand(FingerHand):
+    """Twenty joints; mode 1 drives them (facts/unitree-dex B.5)."""
+
+    model = DEX5_1
+    # light enough for the fingers' gains
+    inertia = 3e-4
+    viscous = 0.012
+    coulomb = 0.0005
+    brake = 0.05
+    stiffness = 20.0
+
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        """Only 1 drives; nothing is protected in another way than all are."""
+        return np.where(mode == JointMode.FOC, mode, 0), np.zeros_like(self.tripped)
+
+    def told(self) -> Ints:
+        """1 where a joint is driven."""
+        return np.asarray(self.driven, dtype=np.intp)
+
+    def expire(self) -> None:
+        """All joints brake."""
+        super().expire()
+        self.status = np.zeros_like(self.status)
+
+
 def _untouched() -> Floats:
     felt = np.full((len(DEX3_1.sensors), 12), NO_VALUE)
     for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
@@ -208,14 +269,16 @@ def _untouched() -> Floats:
 _UNTOUCHED = _untouched()
 
 
-class Dex3Service(Service):
-    """Dex3-1 hands on their topics, at half of the real one's rate."""
+class FingerService(Service):
+    """Such hands on their topics."""
 
     tick = 0.002
     period = 0.002
-    low_period = 1.0 / DEX3_1.low_rate
-    sensors = len(DEX3_1.sensors)
-    hand: type[Dex3Hand] = Dex3Hand
+    hand: type[FingerHand]
+    sensors = 0
+    """Sensor packets in a state."""
+    attitude: Sequence[float] = (0.0, 0.0, 0.0, 0.0)
+    """The quaternion: there is no IMU."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -224,7 +287,8 @@ class Dex3Service(Service):
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
         self._blank: dict[int, tuple[bytearray, Any, Any]] = {}
         self._sent: dict[Side, tuple[object, bytes]] = {}
-        self._low_due = 0.0
+        units = dialect.torque_units or (1.0,) * dialect.length
+        self.torque_units: Floats = np.array(units)
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         """One side's part of a command message."""
@@ -244,26 +308,6 @@ class Dex3Service(Service):
         for hand in self.hands.values():
             hand.step(dt)
 
-    def publish(self) -> list[Sample]:
-        """One state of everybody, now and then on the low-rate topic as well."""
-        samples = super().publish()
-        if self.now + 1e-9 < self._low_due:
-            return samples
-        self._low_due = self.now + self.low_period
-        return samples + self.low_rate(samples)
-
-    def low_rate(self, samples: list[Sample]) -> list[Sample]:
-        """Copies of the states on the low-rate topics."""
-        topics = {
-            self.wire.state_topics[s]: self.dialect.low_rate_topic.format(side=s)
-            for s in self.sides
-        }
-        return [
-            Sample(topics[x.topic], x.type_name, x.payload, x.sent)
-            for x in samples
-            if x.topic in topics
-        ]
-
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of a hand on the wire."""
         (side,) = sides
@@ -281,32 +325,31 @@ class Dex3Service(Service):
         self._sent[side] = (key, bytes(data))
         return self._sent[side][1]
 
-    def fill(self, motors: Any, hand: Dex3Hand) -> None:
+    def fill(self, motors: Any, hand: FingerHand) -> None:
         """What the motors say of themselves."""
         n = len(motors)
         motors["mode"] = hand.mode[:n]
         before, dt = hand.gained
         ddq = [(a - b) / dt for a, b in zip(hand.dq, before, strict=True)]
-        motors["values"] = np.array((hand.q, hand.dq, ddq, hand.tau)).T[:n]
+        tau = np.array(hand.tau) / self.torque_units
+        motors["values"] = np.array((hand.q, hand.dq, ddq, tau)).T[:n]
 
-    def pressures(self, hand: Dex3Hand) -> Floats:
+    def pressures(self, hand: FingerHand) -> Floats:
         """What its sensor packets hold."""
         return hand.pressures()
 
-    def quaternion(self) -> list[float]:
-        """The hand's attitude: upright."""
-        return [1.0, 0.0, 0.0, 0.0]
+    def quaternion(self) -> Sequence[float]:
+        """The hand's attitude."""
+        return self.attitude
 
     def message(self, count: int) -> Any:
-        """What does not change: so many motors, sensor packets, attitude, supply."""
+        """What does not change: so many motors, sensor packets, attitude."""
         motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
         packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
         message = self.wire.state.cls()
         message.motor_state = [motor(temperature=(30, 40), vol=24.0) for _ in range(count)]
         message.press_sensor_state = [packet(temperature=(25.0,) * 12) for _ in range(self.sensors)]
-        message.imu_state.quaternion = self.quaternion()
-        message.power_v, message.power_a = 24.0, 0.3
-        message.system_v, message.device_v = 12.0, 12.0
+        message.imu_state.quaternion = list(self.quaternion())
         return message
 
     def _message(self, count: int) -> tuple[bytearray, Any, Any]:
@@ -319,3 +362,46 @@ class Dex3Service(Service):
             packets = np.frombuffer(data, _PACKET, self.sensors, at)
             self._blank[count] = (data, motors, packets)
         return self._blank[count]
+
+
+class Dex3Service(FingerService):
+    """Dex3-1 hands on their topics, at half of the real one's rate."""
+
+    hand = Dex3Hand
+    sensors = len(DEX3_1.sensors)
+    attitude = (1.0, 0.0, 0.0, 0.0)
+    low_period = 1.0 / DEX3_1.low_rate
+    low_due = 0.0
+
+    def publish(self) -> list[Sample]:
+        """One state of everybody, now and then on the low-rate topic as well."""
+        samples = super().publish()
+        if self.now + 1e-9 < self.low_due:
+            return samples
+        self.low_due = self.now + self.low_period
+        return samples + self.low_rate(samples)
+
+    def low_rate(self, samples: list[Sample]) -> list[Sample]:
+        """Copies of the states on the low-rate topics."""
+        topics = {
+            self.wire.state_topics[s]: self.dialect.low_rate_topic.format(side=s)
+            for s in self.sides
+        }
+        return [
+            Sample(topics[x.topic], x.type_name, x.payload, x.sent)
+            for x in samples
+            if x.topic in topics
+        ]
+
+    def message(self, count: int) -> Any:
+        """The same with a supply."""
+        message = super().message(count)
+        message.power_v, message.power_a = 24.0, 0.3
+        message.system_v, message.device_v = 12.0, 12.0
+        return message
+
+
+class Dex5Service(FingerService):
+    """Dex5-1 hands on their topics."""
+
+    hand = Dex5Hand

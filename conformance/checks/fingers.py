@@ -1,4 +1,6 @@
-"""What only a Dex3-1 has: joints in an order, a mode byte, sensors, time-out protection."""
+"""What only hands of several joints have: an order, a mode byte, and of a Dex3-1 sensors and
+time-out protection.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,10 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
-from dexkit.conformance.stimuli.dex3 import DRIVEN, SLOW, WRONG_IDS
+from dexkit.conformance.stimuli.fingers import PARTS, Parts
+from dexkit.conformance.wire import Wire
 from dexkit.hand import Floats, JointMode
+from dexkit.models import model
 
 _SLOTS = 12  # of a PressSensorState_
 
@@ -186,6 +190,11 @@ def attitude(ctx: Context) -> Outcome:
 # ---------------------------------------------------------------------------------- mode byte
 
 
+def _parts(ctx: Context) -> Parts:
+    """Which joints the stimulus uses for what."""
+    return PARTS[ctx.recording.model.name]
+
+
 def _modes(ctx: Context, rows: slice = slice(None)) -> NDArray[np.intp]:
     """Mode bytes of whole states, shape (n, 7)."""
     mode = ctx.states.mode[rows]
@@ -228,7 +237,7 @@ def status(ctx: Context) -> Outcome:
             mode = _modes(ctx, ctx.states.between(a, b))
             if not len(mode):
                 return ctx.skipped(f"no state while {when}")
-            found = np.median(mode >> 4 & 7, axis=0)
+            found = np.median(Wire(ctx.recording.dialect).status(mode), axis=0)
             if (found != wanted).any():
                 joint = int(np.argmax(found != wanted))
                 return ctx.failed(
@@ -237,6 +246,28 @@ def status(ctx: Context) -> Outcome:
                     ctx.at(ctx.states.topic, a, b),
                 )
     return ctx.passed("1, then 0", "1 while driven, 0 while locked")
+
+
+@check("DEX5-MODE-01")
+def plain_mode(ctx: Context) -> Outcome:
+    """The joints that move at all with mode 1."""
+    moves: dict[int, bool] = {}
+    for step in steps(ctx):
+        if abs(step.size) >= 0.05 * step.stroke:
+            enough = ctx.tolerance("min_progress") * abs(step.size)
+            moved = float(np.abs(step.q - step.start).max()) >= enough
+            moves[step.joint] = moves.get(step.joint, False) or moved
+    if not moves:
+        return ctx.failed("no step", "there is no state while the joints were moved")
+    obeying = [joint for joint, moved in moves.items() if moved]
+    text = f"{len(obeying)} of {len(moves)} joints move with mode 1"
+    if len(obeying) > 1:  # which of them do is DEX5-JOINT-01's question
+        return ctx.passed(f"{len(obeying)} of {len(moves)}", text)
+    return ctx.failed(
+        f"{len(obeying)} of {len(moves)}",
+        f"{text}: {ctx.joints[obeying[0]].name}, of which 1 would be the id" if obeying else text,
+        *(ctx.at(ctx.states.topic, *ctx.span(phase)) for phase in ctx.phases()[:1]),
+    )
 
 
 @check("DEX3-MODE-03")
@@ -248,8 +279,8 @@ def locked(ctx: Context) -> Outcome:
 @check("DEX3-MODE-04")
 def wrong_id(ctx: Context) -> Outcome:
     """A motor whose place in the sequence says to hold, while another one bears its id."""
-    first, other = WRONG_IDS
-    names = [ctx.joints[i].name for i in WRONG_IDS]
+    first, other = _parts(ctx).crossed
+    names = [ctx.joints[i].name for i in (first, other)]
     quiet = [j for j in range(len(ctx.joints)) if j != first]
     return stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
 
@@ -263,6 +294,7 @@ def order(ctx: Context) -> Outcome:
     found = 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
+        told = phase.targets.get(ctx.side, {})
         for step in steps_of(ctx, phase):
             rows = ctx.states.between(begin, end)
             before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
@@ -270,7 +302,7 @@ def order(ctx: Context) -> Outcome:
                 continue
             moved = np.abs(ctx.states.q[rows] - np.median(before, axis=0)).max(axis=0)
             strokes = np.array([j.stroke for j in ctx.joints])
-            others = [j for j in range(len(ctx.joints)) if j != step.joint]
+            others = [j for j in range(len(ctx.joints)) if j not in told]
             limit = ctx.tolerance("max_others_stroke", 0) / ctx.joints[0].stroke
             wrong = [j for j in others if not moved[j] <= limit * strokes[j]]
             own = float(moved[step.joint])
@@ -363,6 +395,41 @@ def contact(ctx: Context) -> Outcome:
     return outcome
 
 
+@check("DEX5-FORCE-03")
+def units(ctx: Context) -> Outcome:
+    """tau_est compared with what the command's stiffness makes of the distance."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    span = squeezes(ctx)
+    if span is None:
+        return ctx.skipped("no state while it squeezed")
+    rows, given = ctx.states.between(*span), ctx.commands
+    told = (given.t >= span[0]) & (given.t <= span[1]) & np.isfinite(given.q).all(axis=1)
+    if not told.any():
+        return ctx.skipped("no command while it squeezed")
+    here, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
+    due = np.median(given.kp[told], axis=0) * (np.median(given.q[told], axis=0) - here)
+    joints = model(ctx.recording.dialect.model).joint_gains
+    ratios = {}
+    for name, mine in (("thumb", True), ("fingers", False)):
+        pressing = [
+            float(tau[i] / due[i])
+            for i, j in enumerate(ctx.joints)
+            if j.closing and (i in joints) is mine and abs(due[i]) > 1e-3
+        ]
+        if not pressing:
+            return ctx.skipped(f"no joint of the {name} pressed on the object")
+        ratios[name] = float(np.median(pressing))
+    text = ", ".join(f"{name} {ratio:.3g} times kp (q - q_now)" for name, ratio in ratios.items())
+    low, high = ctx.tolerance("min_ratio"), ctx.tolerance("max_ratio")
+    if all(low <= ratio <= high for ratio in ratios.values()):
+        return ctx.passed("N m, mN m", text)
+    outcome = ctx.failed("other units", text, ctx.at(ctx.states.topic, *span))
+    if low <= ratios["thumb"] <= high and low <= 1e3 * ratios["fingers"] <= high:
+        return outcome.because("The fingers' torques are in N m, as the thumb's.")
+    return outcome
+
+
 # ---------------------------------------------------------------------------- when commands end
 
 
@@ -417,13 +484,13 @@ def nothing_left_moving(ctx: Context) -> Outcome:
     """Joints that were driven by a velocity, without protection."""
     if ctx.object_at is not None:
         return ctx.skipped("this hand held an object when the commands stopped")
-    return _stops(ctx, DRIVEN)
+    return _stops(ctx, _parts(ctx).driven)
 
 
 @check("DEX3-GUARD-01")
 def brakes(ctx: Context) -> Outcome:
     """Joints on their way, by velocity or to a position, with protection."""
-    return _stops(ctx, (*DRIVEN, *SLOW))
+    return _stops(ctx, (*_parts(ctx).driven, *_parts(ctx).slow))
 
 
 @check("DEX3-GUARD-02")
@@ -484,9 +551,10 @@ def holds(ctx: Context) -> Outcome:
     if not len(ctx.states.q[rows]):
         return ctx.skipped("no state in the silence")
     here = np.median(ctx.states.q[rows], axis=0)
-    moved = _moved(ctx, SLOW, late, end)
+    slow = _parts(ctx).slow
+    moved = _moved(ctx, slow, late, end)
     least = ctx.requirement.tolerance("min_travel_stroke")
-    for i, joint in enumerate(SLOW):
+    for i, joint in enumerate(slow):
         left = abs(target[joint] - float(here[joint])) / ctx.joints[joint].stroke
         if left < 2 * least:
             return ctx.skipped("the hand had arrived before the time-out")
@@ -505,7 +573,7 @@ def holds(ctx: Context) -> Outcome:
 @check("DEX3-SAFE-04")
 def short(ctx: Context) -> Outcome:
     """A command with a motor too few."""
-    return stays(ctx, "commands for six motors")
+    return stays(ctx, "commands for a motor too few")
 
 
 @check("DEX3-SAFE-05")
