@@ -232,7 +232,12 @@ def parse(
         occurs twice or is retired, ``after`` names what does not come before, or ``like`` what
         there is not.
     """
-    document = tomllib.loads(text)
+    return _parse(tomllib.loads(text), origin, others or {})
+
+
+def _parse(
+    document: Mapping[str, Any], origin: str, others: Mapping[str, Any]
+) -> tuple[Requirement, ...]:
     unknown = set(document) - {"model", "prefix", "layer", "retired", "requirement"}
     if unknown:
         raise UsageError(f"{origin}: unknown keys {sorted(unknown)}")
@@ -245,7 +250,7 @@ def parse(
         (hand.name,) if isinstance(hand, BodyModel) else tuple(d.name for d in hand.dialects)
     )
     found: dict[str, Requirement] = {}
-    for entry in _entries(document, others or {}, origin):
+    for entry in _entries(document, others, origin):
         where = f"{origin}: {entry.get('id', 'a requirement without id')}"
         unknown = set(entry) - _KEYS
         missing = _KEYS - _OPTIONAL - set(entry)
@@ -302,18 +307,33 @@ def parse(
 
 
 @cache
-def _shipped() -> tuple[Requirement, ...]:
-    texts = {p.name: p.read_text(encoding="utf-8") for p in Path(__file__).parent.glob("*.toml")}
-    entries = {
-        entry["id"]: entry
-        for text in texts.values()
-        for entry in tomllib.loads(text).get("requirement", [])
-        if "like" not in entry
-    }
-    found: list[Requirement] = []
-    for name in sorted(texts):
-        found += parse(texts[name], name, entries)
-    return tuple(found)
+def _files() -> dict[str, tuple[str, str]]:
+    """Model and layer of each file that ships, by its name."""
+    found = {}
+    for path in sorted(Path(__file__).parent.glob("*.toml")):
+        head = tomllib.loads(path.read_text(encoding="utf-8").partition("[[")[0])
+        found[path.name] = _model_of(head).name, str(head.get("layer", "dds"))
+    return found
+
+
+@cache
+def _document(name: str) -> Mapping[str, Any]:
+    return tomllib.loads((Path(__file__).parent / name).read_text(encoding="utf-8"))
+
+
+@cache
+def _requirements(name: str) -> tuple[Requirement, ...]:
+    """Those of one file; the others are read only if it takes something from them."""
+    document = _document(name)
+    others = {}
+    if any("like" in entry for entry in document["requirement"]):
+        others = {
+            entry["id"]: entry
+            for other in _files()
+            for entry in _document(other)["requirement"]
+            if "like" not in entry
+        }
+    return _parse(document, name, others)
 
 
 @cache
@@ -324,15 +344,16 @@ def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requ
     :param layer: only those judged there; None for all.
     """
     return tuple(
-        r
-        for r in _shipped()
-        if (model is None or r.model == model) and (layer is None or r.layer == layer)
+        requirement
+        for name, about in _files().items()
+        if model in (None, about[0]) and layer in (None, about[1])
+        for requirement in _requirements(name)
     )
 
 
 def models() -> tuple[str, ...]:
     """The hand models that have requirements."""
-    return tuple(dict.fromkeys(r.model for r in _shipped() if r.layer != "body"))
+    return tuple(dict.fromkeys(name for name, layer in _files().values() if layer != "body"))
 
 
 def select(
