@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 from dexkit.conformance.checks import Check, Context, Outcome, all_checks
+from dexkit.conformance.checks.body import body_checks
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
@@ -36,9 +37,9 @@ def judge(
     :param subject: what to say of what was judged.
     """
     claims = claims or Claims()
-    every = claims.apply(catalogue(recording.model.name))
+    every = claims.apply(catalogue(recording.model.name, recording.layer))
     wanted = None if requirements is None else {r.id for r in requirements}
-    checks = all_checks()
+    checks = body_checks() if recording.layer == "body" else all_checks()
     results: list[Result] = []
     for side in recording.judged:
         found: dict[str, Result] = {}

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.clock import RealClock
+from dexkit.conformance.body import wire_for
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
@@ -235,7 +236,7 @@ class _Driver:
     _stopped: dict[str, float | None] = field(default_factory=dict)
 
     def __enter__(self) -> _Driver:
-        self._wire = Wire(self.plan.dialect)
+        self._wire = wire_for(self.plan.dialect)
         self._clock = RealClock()
         # wall clock, as recordings have it, on a monotonic footing
         self._offset = time.time_ns() - round(self._clock.now() * 1e9)
@@ -348,7 +349,8 @@ class _Driver:
                     joined = other.first_states()
                 else:
                     other.look()
-        return Observation(self.now_ns, q, dq, joined, self._stopped)
+        machine = self._wire.machine
+        return Observation(self.now_ns, q, dq, joined, self._stopped, machine)
 
 
 class _Client:

@@ -9,17 +9,19 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Floats, Side
 
-__all__ = ["IDLE", "RECORD", "Beats", "Lost", "Phase", "Stall", "Stimulus"]
+__all__ = ["BODY", "IDLE", "RECORD", "Beats", "Lost", "Phase", "Stall", "Stimulus"]
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
+BODY = cast(Side, "body")
+"""What a whole body has where a hand has its side."""
 IDLE = 1e-3
 """Seconds by which timers are late on a machine that has nothing else to do."""
 
@@ -164,21 +166,25 @@ class Stimulus:
                 phases=[
                     Phase(
                         name=p["name"],
-                        sides=tuple(Side(s) for s in p["sides"]),
+                        sides=tuple(_side(s) for s in p["sides"]),
                         begin_ns=int(p["begin_ns"]),
                         end_ns=int(p["end_ns"]),
-                        targets={Side(s): _joints(q) for s, q in p["targets"].items()},
+                        targets={_side(s): _joints(q) for s, q in p["targets"].items()},
                         params=dict(p["params"]),
                         observed=dict(p["observed"]),
                     )
                     for p in phases
                 ],
-                objects={Side(s): q for s, q in json.loads(record["objects"]).items()},
+                objects={_side(s): q for s, q in json.loads(record["objects"]).items()},
                 stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])],
                 beats=Beats(**json.loads(record.get("beats", "{}"))),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
+
+
+def _side(name: str) -> Side:
+    return BODY if name == BODY else Side(name)
 
 
 def _joints(value: Any) -> dict[int, float]:

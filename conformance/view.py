@@ -161,6 +161,9 @@ class Recording:
     notes: Sequence[str] = ()
     usb: UsbRecording | None = None
 
+    layer = "dds"
+    """Which layer's requirements it is judged by."""
+
     @classmethod
     def of(
         cls,

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from dexkit.bodies import G1, H1
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.stimuli.body import BodyScript
 from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.script import (
@@ -52,6 +54,8 @@ SCRIPTS: dict[str, type[Script]] = {
     DEX1_1.name: GripperScript,
     DEX3_1.name: FingerScript,
     DEX5_1.name: FingerScript,
+    H1.name: BodyScript,
+    G1.name: BodyScript,
 }
 """The script of each model."""
 
@@ -63,7 +67,7 @@ def script_for(plan: Plan, say: Callable[[str], None] = lambda text: None) -> Sc
 
 def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:
     """The phases that ``requirements`` and what they depend on need."""
-    by_id = {r.id: r for r in catalogue()}
+    by_id = {r.id: r for r in catalogue(None, None)}
     todo = list(requirements)
     names: set[str] = set()
     seen: set[str] = set()

@@ -80,6 +80,7 @@ class Observation:
     :param stopped: after :class:`StopService`: ``exit_s``, the seconds until the services had
         ended, and ``gone_s``, until their publishers had vanished from the domain after that;
         None is never. Nothing at all where the kit has not started the services.
+    :param machine: ``mode_machine`` of a body's newest state.
     """
 
     now_ns: int
@@ -87,6 +88,7 @@ class Observation:
     dq: Mapping[Side, Pose] = field(default_factory=dict)
     joined: Mapping[Side, float] = field(default_factory=dict)
     stopped: Mapping[str, float | None] = field(default_factory=dict)
+    machine: int = 0
 
 
 @dataclass(frozen=True)

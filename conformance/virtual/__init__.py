@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexkit.conformance.body import wire_for
 from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.stimuli import (
     Join,
@@ -78,7 +79,7 @@ class Service:
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
     ) -> None:
         self.dialect = dialect
-        self.wire = Wire(dialect)
+        self.wire = wire_for(dialect)
         self.sides = tuple(sides)
         self.command_type = dialect.cmd_type
         self.state_type = dialect.state_type
@@ -253,7 +254,7 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
     service = service_class(plan.dialect, plan.sides, plan.objects)
     trace = MemoryTrace(endpoints=service.endpoints())
     script = script_for(plan)
-    wire = Wire(plan.dialect)
+    wire = wire_for(plan.dialect)
     topics = {s: wire.state_topics[s] for s in plan.sides}
     states = set(topics.values())
     newest: dict[str, bytes] = {}
@@ -285,7 +286,9 @@ def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
     def observe() -> Observation:
         given = {s: newest[t] for s, t in topics.items() if t in newest}
         q, dq = _Poses(wire, given, 0), _Poses(wire, given, 1)
-        return Observation(EPOCH_NS + round(now * 1e9), q, dq, dict(joined), dict(stopped))
+        return Observation(
+            EPOCH_NS + round(now * 1e9), q, dq, dict(joined), dict(stopped), wire.machine
+        )
 
     def send(action: Send) -> None:
         sent = EPOCH_NS + round((now - action.age_s) * 1e9)

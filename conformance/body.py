@@ -1,0 +1,299 @@
+"""A robot's body as the kit sees it: its dialect, its messages, and a recording of it.
+
+A body is judged like a hand that has no sides: where a hand has a side, it has
+:data:`~dexkit.conformance.phases.BODY`. Its joints are those of the used motor slots, in their
+order. What is its own: a CRC in each message, and slots that are not used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.bodies import BODIES, H1, BodyModel, body
+from dexkit.conformance.phases import BODY, RECORD, Stimulus
+from dexkit.conformance.view import Commands, Recording, SideView, States, TraceLike
+from dexkit.conformance.wire import Motor, Motors, Wire
+from dexkit.errors import ConformanceError, WireError
+from dexkit.hand import Floats, Side
+from dexkit.messages import Columns, message_type
+from dexkit.models import Dialect
+from dexkit.traces import SampleArray
+from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.low_level import encode_with_crc, verify_payload
+
+__all__ = [
+    "SPOILS",
+    "BodyRecording",
+    "BodyWire",
+    "body_dialect",
+    "body_in",
+    "body_recording",
+    "wire_for",
+]
+
+Flags = NDArray[np.bool_]
+
+
+@cache
+def body_dialect(name: str) -> Dialect:
+    """How a body speaks, in the form that hands have.
+
+    :raises UsageError: there is no such body.
+    """
+    model = body(name)
+    return Dialect(
+        name=model.name,
+        model=model.name,
+        cmd_topic=model.cmd_topic,
+        state_topic=model.state_topic,
+        cmd_type=model.cmd_type,
+        state_type=model.state_type,
+        index={BODY: 0},
+        length=model.slots,
+        q_open=math.nan,
+        summary=f"{model.title} on Unitree's low-level topics",
+    )
+
+
+SPOILS = {
+    "bit": "a CRC that is off by a bit",
+    "zero": "a CRC of 0",
+    "cdr": "a CRC over the CDR bytes",
+}
+"""Wrong CRCs of commands."""
+
+
+class BodyWire(Wire):
+    """Encodes commands and reads states of a body.
+
+    :ivar machine: ``mode_machine`` of the last state that was read; commands repeat it.
+    """
+
+    def __init__(self, dialect: Dialect) -> None:
+        self.dialect = dialect
+        self.body: BodyModel = body(dialect.model)
+        self.joints = len(self.body.used)
+        self.command = message_type(dialect.cmd_type)
+        self.state = message_type(dialect.state_type)
+        other = next(b for b in BODIES.values() if b.family != self.body.family)
+        self.foreign = message_type(other.cmd_type)
+        self.command_topics = {BODY: dialect.cmd_topic}
+        self.state_topics = {BODY: dialect.state_topic}
+        self.shared = False
+        self.machine = 0
+
+    def read_state(
+        self, data: bytes, side: Side
+    ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """(q, dq) of the used slots.
+
+        :raises WireError: the payload is not of the body's state type.
+        """
+        message = self.state.decode(data)
+        self.machine = getattr(message, "mode_machine", 0)
+        motors = [message.motor_state[slot] for slot in self.body.used]
+        return tuple(m.q for m in motors), tuple(m.dq for m in motors)
+
+    def low_command(self, motors: Motors, machine: int, spoil: str = "") -> bytes:
+        """A command for all slots.
+
+        :param spoil: one of :data:`SPOILS`, for a CRC that is wrong in that way.
+        """
+        message = self._message(self.command.name, motors)
+        if hasattr(message, "mode_machine"):
+            message.mode_machine = machine
+        sealed = encode_with_crc(message)
+        if not spoil:
+            return sealed
+        right = int.from_bytes(sealed[-4:], "little")
+        crc = {"bit": right ^ 0x10, "zero": 0, "cdr": crc32_words(sealed[4:-4])}[spoil]
+        return sealed[:-4] + crc.to_bytes(4, "little")
+
+    def foreign_command(self, motors: Motors) -> bytes:
+        """The same in the other family's type."""
+        return encode_with_crc(self._message(self.foreign.name, motors))
+
+    def _message(self, type_name: str, motors: Sequence[Motor]) -> Any:
+        message = message_type(type_name).cls()
+        for place, m in zip(message.motor_cmd, motors, strict=False):
+            place.mode, place.q, place.dq = m.mode, m.q, m.dq
+            place.tau, place.kp, place.kd = m.tau, m.kp, m.kd
+        if hasattr(message, "head"):
+            message.head, message.level_flag = (0xFE, 0xEF), 0xFF  # facts/unitree-dex A.8
+        return message
+
+
+def wire_for(dialect: Dialect) -> Wire:
+    """The messages of a hand's or a body's dialect."""
+    return BodyWire(dialect) if dialect.model in BODIES else Wire(dialect)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyRecording(Recording):
+    """A recording of a body, decoded.
+
+    :param low: its states, all members; None without any.
+    :param payloads: of the states, likewise of the commands.
+    """
+
+    body: BodyModel = H1
+    low: Columns | None = None
+    payloads: Sequence[bytes] = field(default=(), repr=False)
+    command_payloads: Sequence[bytes] = field(default=(), repr=False)
+
+    layer = "body"
+
+    @property
+    def model(self) -> Any:
+        """The body: it has a model's name, title and rates."""
+        return self.body
+
+    @cached_property
+    def intact(self) -> Flags:
+        """Which states decode and carry the right CRC."""
+        return _intact(self.body.state_type, self.payloads)
+
+    @cached_property
+    def commands_intact(self) -> Flags:
+        """Which commands do."""
+        return _intact(self.body.cmd_type, self.command_payloads)
+
+
+def _intact(type_name: str, payloads: Sequence[bytes]) -> Flags:
+    def good(payload: bytes) -> bool:
+        try:
+            return verify_payload(type_name, payload)
+        except WireError:
+            return False
+
+    return np.fromiter(map(good, payloads), dtype=np.bool_, count=len(payloads))
+
+
+def body_in(trace: TraceLike) -> BodyModel | None:
+    """The body whose topics, of its types, are in a recording; None without any."""
+    seen = {(c.topic, c.type_name) for c in trace.channels}
+    seen |= {(e.topic, e.type_name) for e in trace.endpoints}
+    for model in BODIES.values():
+        if {(model.state_topic, model.state_type), (model.cmd_topic, model.cmd_type)} & seen:
+            return model
+    return None
+
+
+def body_recording(trace: TraceLike, name: str) -> BodyRecording:
+    """Decode the part of ``trace`` that is about a body.
+
+    :raises ConformanceError: it has none of the body's topics.
+    :raises TraceUnsupported: its stimulus record cannot be read.
+    """
+    model, dialect = body(name), body_dialect(name)
+    stimulus = Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
+    present = {c.topic for c in trace.channels if c.message_count}
+    topics = {model.cmd_topic, model.state_topic}
+    if not topics & (present | {e.topic for e in trace.endpoints}):
+        raise ConformanceError(
+            f"no topic of the {model.title} in this recording",
+            hint=f"it has: {', '.join(sorted(present)) or 'no messages'}",
+        )
+    samples = trace.load(sorted(topics & present)) if topics & present else {}
+    times = [s.log_time_ns for s in samples.values() if len(s)]
+    marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
+    origin = min([int(t[0]) for t in times] + marks, default=0)
+    end = max([int(t[-1]) for t in times] + marks, default=0)
+    states = _right(samples.get(model.state_topic), model.state_type)
+    commands = _right(samples.get(model.cmd_topic), model.cmd_type)
+    low = states.columns() if states is not None else None
+    with np.errstate(invalid="ignore"):
+        hand = SideView(
+            BODY,
+            _states(model, states, low, origin),
+            _commands(model, commands, origin),
+            tuple(model.joint(slot) for slot in model.used),
+        )
+    notes = [text for text in trace.warnings if not text.startswith(f"{model.cmd_topic} carries ")]
+    if trace.truncated:
+        notes.append("the recording is unfinished; it is judged as far as it goes")
+    return BodyRecording(
+        dialect=dialect,
+        origin_ns=origin,
+        duration=(end - origin) / 1e9,
+        sides={BODY: hand},
+        channels=trace.channels,
+        endpoints=trace.endpoints,
+        stimulus=stimulus,
+        judged=(BODY,),
+        notes=notes,
+        body=model,
+        low=low,
+        payloads=states.payloads if states is not None else (),
+        command_payloads=commands.payloads if commands is not None else (),
+    )
+
+
+def _right(samples: SampleArray | None, type_name: str) -> SampleArray | None:
+    if samples is None or samples.type_name != type_name or samples.problem:
+        return None
+    return samples
+
+
+def _times(samples: SampleArray, origin: int) -> tuple[Floats, Floats]:
+    sent = (samples.publish_time_ns - origin) / 1e9
+    sent[samples.publish_time_ns == 0] = np.nan
+    return (samples.log_time_ns - origin) / 1e9, sent
+
+
+def _used(columns: Columns, model: BodyModel, member: str) -> Floats:
+    return np.ascontiguousarray(columns[member].T[list(model.used)]).T
+
+
+def _states(
+    model: BodyModel, samples: SampleArray | None, columns: Columns | None, origin: int
+) -> States:
+    if samples is None or columns is None:
+        never, none = np.empty(0), np.empty((0, len(model.used)))
+        count = np.empty(0, np.intp)
+        return States(model.state_topic, never, never, count, none, none, none, none, none)
+    t, sent = _times(samples, origin)
+    return States(
+        topic=model.state_topic,
+        t=t,
+        sent=sent,
+        length=np.where(columns.ok, model.slots, -1).astype(np.intp),
+        q=_used(columns, model, "motor_state[].q"),
+        dq=_used(columns, model, "motor_state[].dq"),
+        ddq=_used(columns, model, "motor_state[].ddq"),
+        tau=_used(columns, model, "motor_state[].tau_est"),
+        mode=_used(columns, model, "motor_state[].mode"),
+        errors={i: str(e) for i, e in columns.errors.items()},
+        columns=columns,
+    )
+
+
+def _commands(model: BodyModel, samples: SampleArray | None, origin: int) -> Commands:
+    if samples is None:
+        none = np.empty((0, len(model.used)))
+        return Commands(
+            model.cmd_topic, np.empty(0), np.empty(0, np.intp), none, none, none, none, none, none
+        )
+    columns = samples.columns()
+
+    def of(name: str) -> Floats:
+        return _used(columns, model, f"motor_cmd[].{name}")
+
+    return Commands(
+        topic=model.cmd_topic,
+        t=_times(samples, origin)[0],
+        length=np.where(columns.ok, model.slots, -1).astype(np.intp),
+        q=of("q"),
+        dq=of("dq"),
+        tau=of("tau"),
+        kp=of("kp"),
+        kd=of("kd"),
+        mode=of("mode"),
+    )

@@ -1,0 +1,643 @@
+"""The checks of a robot's body; what it has in common with a hand is judged by the hands'."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from functools import cache
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dexkit.conformance.body import BodyRecording
+from dexkit.conformance.checks import (
+    STROKE_S,
+    Check,
+    Context,
+    Outcome,
+    discovery,
+    fields,
+    lifecycle,
+    timing,
+)
+from dexkit.conformance.phases import Phase
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.stimuli.body import STEP
+from dexkit.hand import Floats
+from dexkit.messages import Columns
+
+__all__ = ["body_checks"]
+
+_END = 0.06  # s at the end of a phase over which is averaged
+_STICKS = struct.Struct("<4x5f")  # in wireless_remote: behind head and keys
+
+
+def _recording(ctx: Context) -> BodyRecording:
+    return cast(BodyRecording, ctx.recording)
+
+
+def _low(ctx: Context) -> Columns:
+    """All members of the states."""
+    found = _recording(ctx).low
+    assert found is not None, "states are there: H1-TOPIC-01 has not failed"
+    return found
+
+
+def _at(ctx: Context, row: int) -> float:
+    return float(ctx.states.t[row])
+
+
+def _wrong_rows(ctx: Context, bad: ArrayLike, figure: str, what: str) -> Outcome:
+    """A failure in the samples where ``bad`` is true."""
+    rows = np.flatnonzero(bad)
+    places = [ctx.at(ctx.states.topic, _at(ctx, int(i))) for i in rows[:5]]
+    text = f"{what}, in {len(rows)} of {len(ctx.states)} states"
+    return ctx.failed(figure, text, *places, wrong=len(rows))
+
+
+# ------------------------------------------------------------------------------------ discovery
+
+
+def one_publisher(ctx: Context) -> Outcome:
+    """Writers of the state topic."""
+    writers = [
+        e for e in ctx.recording.endpoints if (e.topic, e.kind) == (ctx.states.topic, "writer")
+    ]
+    if not writers:
+        return ctx.skipped("the recording names no writer of the state topic")
+    if len(writers) == 1:
+        return ctx.passed("1", "one writer")
+    return ctx.failed(str(len(writers)), f"{len(writers)} writers publish {ctx.states.topic}")
+
+
+# ------------------------------------------------------------------------------------ integrity
+
+
+def state_crc(ctx: Context) -> Outcome:
+    """The CRC of every state."""
+    intact = _recording(ctx).intact
+    if intact.all():
+        return ctx.passed("right", f"{len(intact)} states")
+    crc = _low(ctx)["crc"]
+    outcome = _wrong_rows(ctx, ~intact, f"{int((~intact).sum())} wrong", "the CRC is wrong")
+    return outcome.because("The field is never set.") if not np.any(crc > 0) else outcome
+
+
+def client_crc(ctx: Context) -> Outcome:
+    """The CRC of the commands that the kit has not spoilt."""
+    intact, t = _recording(ctx).commands_intact, ctx.commands.t
+    counts = np.ones(len(t), dtype=np.bool_)
+    for phase in ctx.phases("wrong-crc"):
+        begin, end = ctx.span(phase)
+        counts &= (t < begin - 0.02) | (t > end + 0.02)
+    wrong = np.flatnonzero(counts & ~intact)
+    if not len(wrong):
+        return ctx.passed("right", f"{int(counts.sum())} commands")
+    return ctx.failed(
+        f"{len(wrong)} wrong",
+        f"{len(wrong)} of {int(counts.sum())} commands carry a wrong CRC",
+        *(ctx.at(ctx.commands.topic, float(t[i])) for i in wrong[:5]),
+    )
+
+
+def client_rate(ctx: Context) -> Outcome:
+    """The mean rate of commands."""
+    steps = np.diff(ctx.commands.t)
+    steady = steps[steps <= 0.1]
+    if float(steady.sum()) < ctx.tolerance("min_observed_s"):
+        return ctx.skipped("less than a second of steady commands in the recording")
+    rate = len(steady) / float(steady.sum())
+    text = f"{len(ctx.commands)} commands, {rate:.0f} Hz while they flow"
+    if rate >= ctx.tolerance("min_rate_hz"):
+        return ctx.passed(f"{rate:.0f} Hz", text)
+    return ctx.failed(f"{rate:.0f} Hz", text)
+
+
+def tick_goes_on(ctx: Context) -> Outcome:
+    """Steps of tick, and for how long it stands still."""
+    tick, clock = _low(ctx)["tick"], ctx.states.clock
+    if len(tick) < 2:
+        return ctx.skipped("fewer than two states")
+    steps = np.diff(tick)
+    back = np.concatenate(([False], (steps < 0) & (steps > -(2.0**31))))  # it may wrap round
+    if back.any():
+        return _wrong_rows(ctx, back, "goes back", "tick goes back")
+    changes = np.concatenate(([0], np.flatnonzero(steps) + 1, [len(tick) - 1]))
+    held = np.diff(clock[changes])
+    longest, i = float(held.max()), int(np.argmax(held))
+    if longest <= ctx.tolerance("max_hold_s"):
+        return ctx.passed(f"{longest * 1e3:.0f} ms", f"stood still for {longest:.3f} s at most")
+    begin = float(ctx.states.t[changes[i]])
+    return ctx.failed(
+        f"{longest:.2f} s",
+        f"tick stays {tick[changes[i]]:.0f} for {longest:.2f} s, in "
+        f"{int(changes[i + 1] - changes[i])} states",
+        ctx.at(ctx.states.topic, begin, begin + longest),
+    ).if_late(longest - ctx.tolerance("max_hold_s"))
+
+
+def tick_rate(ctx: Context) -> Outcome:
+    """How fast tick counts."""
+    tick, clock = _low(ctx)["tick"], ctx.states.clock
+    seconds = float(clock[-1] - clock[0]) if len(clock) else 0.0
+    if seconds < ctx.tolerance("min_observed_s"):
+        return ctx.skipped("less than a second of state in the recording")
+    rate = float((tick[-1] - tick[0]) % 2.0**32) / seconds
+    part = abs(rate / ctx.tolerance("rate_hz") - 1.0)
+    text = f"tick counts {rate:.0f} a second"
+    if part <= ctx.tolerance("tolerance_part"):
+        return ctx.passed(f"{rate:.0f} Hz", text)
+    return ctx.failed(f"{rate:.0f} Hz", text).if_late(part * seconds)
+
+
+# --------------------------------------------------------------------------------------- fields
+
+
+def within_limits(ctx: Context) -> Outcome:
+    """Positions against each joint's limits."""
+    low = np.array([j.q_min for j in ctx.joints]) - ctx.tolerance("margin_rad")
+    high = np.array([j.q_max for j in ctx.joints]) + ctx.tolerance("margin_rad")
+    beyond = np.nan_to_num(np.maximum(low - ctx.states.q, ctx.states.q - high), nan=-1.0)
+    if not (beyond > 0).any():
+        return ctx.passed("within", f"all {len(ctx.joints)} joints are within their limits")
+    row, joint = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
+    spec = ctx.joints[int(joint)]
+    q = float(ctx.states.q[row, joint])
+    return _wrong_rows(
+        ctx,
+        (beyond > 0).any(axis=1),
+        f"{q:.2f} rad",
+        f"{spec.name}: q = {q:.3f} rad; its limits are {spec.q_min:g} and {spec.q_max:g}",
+    )
+
+
+def speed_of_q(ctx: Context) -> Outcome:
+    """Speeds against the change of q, of each joint while it is moved."""
+    window, worst, name = ctx.tolerance("window_s"), 0.0, ""
+    for phase in ctx.phases():
+        joint = _index(ctx, phase)
+        rows = ctx.states.between(*ctx.span(phase))
+        t, q, dq = ctx.states.clock[rows], ctx.states.q[rows, joint], ctx.states.dq[rows, joint]
+        later = np.searchsorted(t, t + window)
+        first = np.flatnonzero(later < len(t))
+        if len(first) < 10:
+            return ctx.skipped("too few states while joints move")
+        later = later[first]
+        change = (q[later] - q[first]) / np.maximum(t[later] - t[first], 1e-6)
+        sums = np.concatenate(([0.0], np.cumsum(dq)))
+        told = (sums[later] - sums[first]) / (later - first)
+        off = float(np.abs(change - told).mean())
+        if not off <= worst:
+            worst, name = off, ctx.joints[joint].name
+    text = f"{name}: dq is off the change of q by {worst:.2f} rad/s in the mean"
+    if worst <= ctx.tolerance("tolerance_rad_s"):
+        return ctx.passed(f"{worst:.2f} rad/s", text)
+    return ctx.failed(f"{worst:.2f} rad/s", text)
+
+
+def unused_still(ctx: Context) -> Outcome:
+    """q, dq and tau_est of the slots without a motor."""
+    low, body = _low(ctx), _recording(ctx).body
+    unused = [slot for slot in range(body.slots) if slot not in body.used]
+    for member in ("q", "dq", "tau_est"):
+        values = low[f"motor_state[].{member}"][:, unused]
+        bad = (np.nan_to_num(values) != 0).any(axis=1)
+        if bad.any():
+            slot = unused[int(np.argmax(np.abs(values[np.argmax(bad)])))]
+            what = f"motor_state[{slot}].{member} is {values[np.argmax(bad)].max():.3g}"
+            return _wrong_rows(ctx, bad, f"slot {slot}", what)
+    return ctx.passed("0", f"slots {', '.join(map(str, unused))}")
+
+
+_BYTES = (
+    *("motor_state[].temperature", "imu_state.temperature", "temperature_ntc1"),
+    *("temperature_ntc2", "bms_state.bq_ntc", "bms_state.mcu_ntc"),
+)
+
+
+def byte_temperatures(ctx: Context) -> Outcome:
+    """The largest of the temperatures that are one byte."""
+    low, top = _low(ctx), 0.0
+    for member in _BYTES:
+        values = np.nan_to_num(low[member]).reshape(len(low), -1).max(axis=1)
+        bad = values > ctx.tolerance("max_c")
+        if bad.any():
+            return _wrong_rows(ctx, bad, f"{values.max():.0f}", f"{member} is {values.max():.0f}")
+        top = max(top, float(values.max(initial=0.0)))
+    return ctx.passed(f"{top:.0f}", f"at most {top:.0f} degrees")
+
+
+def motor_temperatures(ctx: Context) -> Outcome:
+    """Temperatures of the used motors."""
+    body = _recording(ctx).body
+    path = "temperature" if body.family == "unitree_go" else "temperature[0]"
+    values = _low(ctx)[f"motor_state[].{path}"][:, list(body.used)]
+    bad = ~((values >= ctx.tolerance("min_c")) & (values <= ctx.tolerance("max_c")))
+    if not bad.any():
+        return ctx.passed(f"{values.min():.0f} to {values.max():.0f}")
+    row = int(np.argmax(bad.any(axis=1)))
+    joint = int(np.argmax(bad[row]))
+    what = f"{ctx.joints[joint].name}: {values[row, joint]:.0f} degrees"
+    return _wrong_rows(ctx, bad.any(axis=1), f"{values[row, joint]:.0f}", what)
+
+
+def unit_quaternion(ctx: Context) -> Outcome:
+    """Length of the quaternion."""
+    length = np.linalg.norm(_low(ctx)["imu_state.quaternion"], axis=1)
+    bad = ~(np.abs(length - 1.0) <= ctx.tolerance("tolerance"))
+    if not bad.any():
+        return ctx.passed(f"{length.mean():.3f}")
+    first = float(length[np.argmax(bad)])
+    return _wrong_rows(ctx, bad, f"{first:.3f}", f"its length is {first:.3f}")
+
+
+def same_attitude(ctx: Context) -> Outcome:
+    """Angles against the quaternion."""
+    low = _low(ctx)
+    w, x, y, z = low["imu_state.quaternion"].T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    off = low["imu_state.rpy"] - np.stack([roll, pitch, yaw]).T
+    off = np.abs((off + math.pi) % (2 * math.pi) - math.pi).max(axis=1)
+    bad = ~(off <= ctx.tolerance("tolerance_rad"))
+    if not bad.any():
+        return ctx.passed(f"{off.max(initial=0.0):.3f} rad")
+    first = float(off[np.argmax(bad)])
+    what = f"rpy and quaternion (read as w, x, y, z) differ by {first:.2f} rad"
+    return _wrong_rows(ctx, bad, f"{first:.2f} rad", what)
+
+
+def feels_gravity(ctx: Context) -> Outcome:
+    """Accelerometer and gyroscope before anything is commanded."""
+    begin, end = ctx.span(ctx.phases()[0])
+    rows = ctx.states.between(begin, end)
+    low = _low(ctx)
+    force = np.linalg.norm(low["imu_state.accelerometer"][rows], axis=1)
+    turning = np.linalg.norm(low["imu_state.gyroscope"][rows], axis=1)
+    if not len(force):
+        return ctx.skipped("no state before the first command")
+    g, rate = float(force.mean()), float(turning.mean())
+    text = f"{g:.2f} m/s^2 and {rate:.3f} rad/s in the mean"
+    good = ctx.tolerance("low") <= g <= ctx.tolerance("high")
+    if good and rate <= ctx.tolerance("max_rad_s"):
+        return ctx.passed(f"{g:.2f} m/s^2", text)
+    return ctx.failed(f"{g:.2f} m/s^2", text, ctx.at(ctx.states.topic, begin, end))
+
+
+def frame_head(ctx: Context) -> Outcome:
+    """The frame's first bytes."""
+    low = _low(ctx)
+    bad = (low["head"] != (0xFE, 0xEF)).any(axis=1) | (low["level_flag"] != 0xFF)
+    if not bad.any():
+        return ctx.passed("FE EF FF")
+    row = int(np.argmax(bad))
+    told = " ".join(f"{int(v):02X}" for v in (*low["head"][row], low["level_flag"][row]))
+    return _wrong_rows(ctx, bad, told, f"head and level_flag are {told}")
+
+
+def battery(ctx: Context) -> Outcome:
+    """Charge and voltages."""
+    low = _low(ctx)
+    soc, volts = low["bms_state.soc"], low["power_v"]
+    cells = low["bms_state.cell_vol"].sum(axis=1) / 1e3
+    bad = ~((soc >= 1) & (soc <= 100))
+    bad |= ~((volts >= ctx.tolerance("min_v")) & (volts <= ctx.tolerance("max_v")))
+    bad |= (cells > 0) & ~(np.abs(cells - volts) <= ctx.tolerance("max_part") * volts)
+    row = int(np.argmax(bad))
+    told = f"{soc[row]:.0f} %, {volts[row]:.1f} V"
+    if not bad.any():
+        return ctx.passed(told)
+    return _wrong_rows(ctx, bad, told, f"{told}, cells of {cells[row]:.1f} V together")
+
+
+def foot_forces(ctx: Context) -> Outcome:
+    """The smallest foot force."""
+    force = _low(ctx)["foot_force"].min(axis=1)
+    bad = force < ctx.tolerance("min_force")
+    if not bad.any():
+        return ctx.passed(f"{force.min(initial=0.0):.0f}")
+    return _wrong_rows(ctx, bad, f"{force.min():.0f}", f"a foot force of {force.min():.0f}")
+
+
+def remote(ctx: Context) -> Outcome:
+    """The remote's sticks."""
+    values = np.nan_to_num(_low(ctx)["wireless_remote"]).astype(np.uint8)
+    kinds, which = np.unique(values, axis=0, return_inverse=True)
+    sticks = np.array([_STICKS.unpack(row.tobytes()[: _STICKS.size]) for row in kinds])
+    bad = ~(np.abs(sticks) <= ctx.tolerance("max_stick")).all(axis=1)
+    if not bad.any():
+        return ctx.passed(f"{np.abs(sticks).max(initial=0.0):.2f}")
+    worst = sticks[int(np.argmax(bad))]
+    told = ", ".join(f"{v:.3g}" for v in worst)
+    return _wrong_rows(ctx, bad[which.reshape(-1)], "rubbish", f"sticks at {told}")
+
+
+def machine_told(ctx: Context) -> Outcome:
+    """The machine's kind."""
+    kinds = np.unique(_low(ctx)["mode_machine"][_low(ctx).ok])
+    told = ", ".join(f"{k:.0f}" for k in kinds)
+    if len(kinds) == 1 and kinds[0] > 0:
+        return ctx.passed(told)
+    return ctx.failed(told, f"mode_machine is {told}")
+
+
+def mode_told(ctx: Context) -> Outcome:
+    """The mode bytes while motors are held, and of the one that was turned off."""
+    body = _recording(ctx).body
+    for phase in (*ctx.phases("hold"), *ctx.phases()):
+        begin, end = ctx.span(phase)
+        modes = ctx.states.mode[ctx.states.between(begin + (end - begin) / 2, end)]
+        if not len(modes):
+            return ctx.skipped(f"no state during '{phase.name}'")
+        wanted = np.array([body.enable[slot] for slot in body.used])
+        if phase.name == "off":
+            wanted[_index(ctx, phase)] = 0
+        wrong = np.flatnonzero((modes != wanted).any(axis=0))
+        if len(wrong):
+            joint = int(wrong[0])
+            name, told = ctx.joints[joint].name, modes[-1, joint]
+            return ctx.failed(
+                f"{told:.0f}",
+                f"{name}: mode {told:.0f} in the state, {wanted[joint]} in the command"
+                + (f"; {len(wrong)} motors are so" if len(wrong) > 1 else ""),
+                ctx.at(ctx.states.topic, begin, end),
+            )
+    return ctx.passed("told")
+
+
+# --------------------------------------------------------------------------------------- motion
+
+
+def _index(ctx: Context, phase: Phase) -> int:
+    """The joint that a phase is about."""
+    return _recording(ctx).body.used.index(int(phase.params["slot"]))
+
+
+def _silent(ctx: Context, phase: Phase) -> Outcome:
+    begin, end = ctx.span(phase)
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed("no state", f"no state during '{phase.name}'", place)
+
+
+def _q(ctx: Context, begin: float, end: float) -> Floats:
+    """Positions in [begin, end], shape (n, joints)."""
+    return ctx.states.q[ctx.states.between(begin, end)]
+
+
+def follows(ctx: Context) -> Outcome:
+    """Where each step of a joint ends."""
+    worst, where, name = -1.0, None, ""
+    for phase in ctx.phases():
+        if not phase.targets:
+            continue
+        begin, end = ctx.span(phase)
+        q = _q(ctx, end - _END, end)
+        if not len(q):
+            return _silent(ctx, phase)
+        ((joint, goal),) = phase.targets[ctx.side].items()
+        error = abs(float(q[:, joint].mean()) - goal)
+        error = error if math.isfinite(error) else math.inf
+        if error > worst:
+            worst, where, name = error, (begin, end), ctx.joints[joint].name
+    if where is None:
+        return ctx.skipped("no step was made")
+    text = f"{name} ends {worst:.3f} rad from where it was told to go"
+    if worst <= ctx.tolerance("max_error_rad"):
+        return ctx.passed(f"{worst:.3f} rad", text, error_rad=worst)
+    outcome = ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
+    return outcome.if_late(STROKE_S * worst / STEP)
+
+
+def independent(ctx: Context) -> Outcome:
+    """How far other joints move along."""
+    worst, text, where = -1.0, "", (0.0, 0.0)
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        q = _q(ctx, begin, end)
+        if not len(q):
+            return _silent(ctx, phase)
+        moved = np.abs(q - q[0]).max(axis=0)
+        mine = _index(ctx, phase)
+        moved[mine] = 0.0
+        joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
+        if moved[joint] > worst:
+            worst, where = float(moved[joint]), (begin, end)
+            text = f"{ctx.joints[joint].name} moves by {worst:.3f} rad with {ctx.joints[mine].name}"
+    if worst <= ctx.tolerance("max_motion_rad"):
+        return ctx.passed(f"{worst:.3f} rad", text)
+    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
+
+
+def stays(ctx: Context) -> Outcome:
+    """How far joints move during commands that are to have no effect."""
+    worst, text, where = -1.0, "", (0.0, 0.0)
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        before, q = _q(ctx, begin - 0.1, begin), _q(ctx, begin, end + 0.08)
+        if not len(before) or not len(q):
+            return _silent(ctx, phase)
+        moved = np.abs(q - before.mean(axis=0)).max(axis=0)
+        joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
+        kind = f" ({phase.params['kind']})" if "kind" in phase.params else ""
+        if not moved[joint] <= worst:
+            worst, where = float(moved[joint]), (begin, end)
+            text = f"{ctx.joints[joint].name} moves by {worst:.3f} rad{kind}"
+        if math.isnan(worst):
+            break
+    if worst <= ctx.tolerance("max_motion_rad"):
+        return ctx.passed(f"{worst:.3f} rad", text)
+    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
+
+
+def stiffness(ctx: Context) -> Outcome:
+    """How far a soft joint gives way."""
+    (phase,) = ctx.phases()
+    begin, end = ctx.span(phase)
+    joint, wanted = _index(ctx, phase), float(phase.params["way"])
+    before, after = _q(ctx, begin - _END, begin)[:, joint], _q(ctx, end - _END, end)[:, joint]
+    if not len(before) or not len(after):
+        return _silent(ctx, phase)
+    way = float(after.mean() - before.mean())
+    text = f"it gives way by {way:.3f} rad; tau / kp is {wanted:.3f} rad"
+    if abs(way / wanted - 1.0) <= ctx.tolerance("tolerance_part"):
+        return ctx.passed(f"{way:.3f} rad", text)
+    return ctx.failed(f"{way:.3f} rad", text, ctx.at(ctx.states.topic, begin, end))
+
+
+def _speed(ctx: Context, phase: Phase, begin: float, end: float) -> float | None:
+    """The mean speed of the phase's joint in [begin, end], rad/s."""
+    rows = ctx.states.between(begin, end)
+    t, q = ctx.states.clock[rows], ctx.states.q[rows, _index(ctx, phase)]
+    return float((q[-1] - q[0]) / (t[-1] - t[0])) if len(t) > 1 and t[-1] > t[0] else None
+
+
+def velocity(ctx: Context) -> Outcome:
+    """The speed of a joint that is commanded one."""
+    (phase,) = ctx.phases()
+    begin, end = ctx.span(phase)
+    wanted = float(phase.params["speed"])
+    speed = _speed(ctx, phase, (begin + end) / 2, end)
+    if speed is None:
+        return _silent(ctx, phase)
+    text = f"{speed:.2f} rad/s, commanded {wanted:.2f} rad/s"
+    if ctx.tolerance("low_part") <= speed / wanted <= ctx.tolerance("high_part"):
+        return ctx.passed(f"{speed:.2f} rad/s", text)
+    return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, begin, end))
+
+
+def torque(ctx: Context) -> Outcome:
+    """How far a torque turns a joint."""
+    (phase,) = ctx.phases()
+    begin, end = ctx.span(phase)
+    q = _q(ctx, begin, end + 0.05)[:, _index(ctx, phase)]
+    if not len(q):
+        return _silent(ctx, phase)
+    wanted = float(phase.params["torque"])
+    way = math.copysign(1.0, wanted) * (q - q[0])
+    far = float(way[np.argmax(np.abs(way))])
+    text = f"{wanted:.2f} N m turn it by {far * math.copysign(1.0, wanted):.3f} rad"
+    if far >= ctx.tolerance("min_motion_rad"):
+        return ctx.passed(f"{far:.2f} rad", text)
+    return ctx.failed(f"{far:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
+
+
+def torque_told(ctx: Context) -> Outcome:
+    """tau_est while only tau is commanded."""
+    (phase,) = ctx.phases()
+    begin, end = ctx.span(phase)
+    rows = ctx.states.between(begin + 0.01, end)
+    tau = ctx.states.tau[rows, _index(ctx, phase)]
+    if len(tau) < 3:
+        return ctx.skipped("the joint was turned for too short a time")
+    wanted, told = float(phase.params["torque"]), float(np.median(tau))
+    text = f"tau_est is {told:.2f} N m, tau was {wanted:.2f} N m"
+    if ctx.tolerance("low_part") <= told / wanted <= ctx.tolerance("high_part"):
+        return ctx.passed(f"{told:.2f} N m", text)
+    return ctx.failed(f"{told:.2f} N m", text, ctx.at(ctx.states.topic, begin, end))
+
+
+# ------------------------------------------------------------------------------------- watchdog
+
+
+def damps(ctx: Context) -> Outcome:
+    """When a driven joint stands still after the last command."""
+    (phase,) = ctx.phases()
+    begin, end = ctx.span(phase)
+    after = begin + ctx.tolerance("max_s")
+    speed = _speed(ctx, phase, after, end)
+    if speed is None:
+        return _silent(ctx, phase)
+    text = f"{after - begin:.1f} s after the last command it turns at {speed:.2f} rad/s"
+    if abs(speed) <= ctx.tolerance("max_speed_rad_s"):
+        return ctx.passed(f"{abs(speed):.3f} rad/s", text)
+    return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, after, end))
+
+
+def state_in_silence(ctx: Context) -> Outcome:
+    """Gaps of the state while nothing is commanded."""
+    limit, longest = ctx.tolerance("max_gap_s"), 0.0
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        found = timing.gaps(ctx, limit, begin, end)
+        if found:
+            a, b = found[0]
+            text = f"no state from {a:.3f} s to {b:.3f} s, {a - begin:.2f} s after the last command"
+            outcome = ctx.failed(f"{b - a:.2f} s", text, ctx.at(ctx.states.topic, a, b))
+            return outcome.if_late(b - a - limit)
+        clock = ctx.states.clock[(ctx.states.clock >= begin) & (ctx.states.clock <= end)]
+        longest = max(longest, float(np.diff(clock).max(initial=0.0)))
+    return ctx.passed(f"{longest * 1e3:.0f} ms", f"the longest gap is {longest * 1e3:.1f} ms")
+
+
+def resumes(ctx: Context) -> Outcome:
+    """The jump when commands come again, and the step after that."""
+    hold = next(p for p in ctx.phases() if not p.targets)
+    begin, end = ctx.span(hold)
+    q = _q(ctx, begin - 0.02, end)
+    if not len(q):
+        return _silent(ctx, hold)
+    moved = np.abs(q - q[0]).max(axis=0)
+    joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
+    if not moved[joint] <= ctx.tolerance("max_jump_rad"):
+        text = f"{ctx.joints[joint].name} moves by {moved[joint]:.3f} rad when commands come again"
+        return ctx.failed(f"{moved[joint]:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
+    return follows(ctx)
+
+
+def bridges(ctx: Context) -> Outcome:
+    """The speed of a driven joint in a short pause."""
+    (phase,) = ctx.phases()
+    begin, end = ctx.span(phase)
+    wanted = float(phase.params["speed"])
+    speed = _speed(ctx, phase, begin, end)
+    if speed is None:
+        return _silent(ctx, phase)
+    text = f"{speed:.2f} rad/s in a pause of {end - begin:.2f} s, commanded {wanted:.2f} rad/s"
+    if speed / wanted >= ctx.tolerance("low_part"):
+        return ctx.passed(f"{speed:.2f} rad/s", text)
+    return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, begin, end))
+
+
+_CHECKS: Mapping[str, Check] = {
+    "TOPIC-01": discovery.state_topic,
+    "TOPIC-02": discovery.command_topic,
+    "TOPIC-03": one_publisher,
+    "QOS-01": discovery.command_qos,
+    "QOS-02": discovery.state_qos,
+    "START-01": lifecycle.state_first,
+    "FIELD-01": fields.length,
+    "FIELD-02": fields.finite,
+    "FIELD-03": within_limits,
+    "FIELD-04": speed_of_q,
+    "FIELD-05": unused_still,
+    "CRC-01": state_crc,
+    "CRC-02": stays,
+    "RATE-01": timing.mean_rate,
+    "RATE-02": timing.vendor_rate,
+    "RATE-03": timing.no_gap,
+    "ORDER-01": timing.order,
+    "TICK-01": tick_goes_on,
+    "TICK-02": tick_rate,
+    "TEMP-01": byte_temperatures,
+    "TEMP-02": motor_temperatures,
+    "IMU-01": unit_quaternion,
+    "IMU-02": same_attitude,
+    "IMU-03": feels_gravity,
+    "HEAD-01": frame_head,
+    "BMS-01": battery,
+    "FOOT-01": foot_forces,
+    "REMOTE-01": remote,
+    "MACH-01": machine_told,
+    "MODE-01": mode_told,
+    "MODE-02": stays,
+    "MOVE-01": follows,
+    "MOVE-02": independent,
+    "GAIN-01": stiffness,
+    "GAIN-02": velocity,
+    "GAIN-03": torque,
+    "GAIN-04": stays,
+    "FORCE-01": torque_told,
+    "SAFE-01": stays,
+    "SAFE-02": stays,
+    "SAFE-03": stays,
+    "SAFE-04": follows,
+    "SAFE-05": stays,
+    "WDOG-01": damps,
+    "WDOG-02": state_in_silence,
+    "WDOG-03": resumes,
+    "WDOG-04": bridges,
+    "LIFE-01": lifecycle.late_joiner,
+    "LIFE-02": follows,
+    "CLIENT-01": client_crc,
+    "CLIENT-02": client_rate,
+}
+"""By what follows the body's name in a requirement's id."""
+
+
+@cache
+def body_checks() -> Mapping[str, Check]:
+    """Every check of bodies, by requirement id."""
+    return {r.id: _CHECKS[r.id.partition("-")[2]] for r in catalogue(None, "body")}
