@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from dexkit.bodies import G1, H1
 from dexkit.cli.emulate import command
-from dexkit.dds import DdsNode
+from dexkit.dds import DdsNode, Sample
 from dexkit.emulators.body import EmulatedBody, run_body
 from dexkit.errors import EmulatorError, TopicConflict
 from dexkit.messages import encode
@@ -57,9 +57,14 @@ def test_process(node: DdsNode) -> None:
         elbow = G1.slot("left_elbow")
         order = low_cmd(G1, {elbow: 1.0})
         assert commands.wait_matched(10)
-        commands.write_raw(encode(order))  # no CRC
-        commands.write_raw(encode_with_crc(order))
-        take_until(states, lambda s: any(abs(x.message.motor_state[elbow].q - 1) < 0.01 for x in s))
+
+        def there(samples: list[Sample]) -> bool:
+            # again and again: the other side may not know this writer yet
+            commands.write_raw(encode(order))  # no CRC
+            commands.write_raw(encode_with_crc(order))
+            return any(abs(s.message.motor_state[elbow].q - 1) < 0.01 for s in samples)
+
+        take_until(states, there)
 
         process.stdin.write("X,lx=-1\nnonsense\n")
         process.stdin.flush()
@@ -74,7 +79,8 @@ def test_process(node: DdsNode) -> None:
         assert process.wait(15) == 0  # with its input open: the end of that would stop it, too
         rest, errors = process.communicate()
         lines = [json.loads(text) for text in rest.splitlines()]
-        assert (lines[-1]["bad_crc"], lines[-1]["commands"]) == (1, 1)
+        assert lines[-1]["bad_crc"] > 0
+        assert lines[-1]["commands"] > 0
         assert "the CRC is 0x00000000 and should be" in errors
         assert "no key 'nonsense'" in errors
         assert "Traceback" not in errors
