@@ -26,6 +26,7 @@ from typing import Any
 
 from dexkit import __version__
 from dexkit.conformance.requirements import Level, Requirement
+from dexkit.conformance.requirements.sources import told
 from dexkit.errors import UsageError
 
 __all__ = [
@@ -179,7 +180,7 @@ class Result:
             if self.cause:
                 lines.append(f"  cause:    {self.cause}")
             lines.append(f"  try:      {self.requirement.advice}")
-            lines.append(f"  source:   {self.requirement.source}")
+            lines.append(f"  source:   {told(self.requirement.source)}")
         return "\n".join(lines)
 
 

@@ -27,6 +27,7 @@ from dexkit.conformance.report.wording import (
     quantity,
 )
 from dexkit.conformance.requirements import CAPABILITIES, Requirement
+from dexkit.conformance.requirements.sources import Section, linked, told
 from dexkit.conformance.results import (
     Evidence,
     Overall,
@@ -304,7 +305,7 @@ def _card(need: Requirement, group: list[Result], plots: _Plots, link: str) -> s
         name = "likely cause" if len(found) == 1 else f"likely cause, {escape(who)}"
         rows.append((name, escape(cause)))
     rows.append(("what to try", escape(need.advice)))
-    rows.append(("source", f"{escape(need.source)} (confidence: {escape(need.confidence)})"))
+    rows.append(("source", _source(need)))
     facts = "".join(f"<dt>{k}</dt><dd>{v}</dd>" for k, v in rows)
     figures = "".join(plots.of(entry) for entry in group)
     if figures and all(r.verdict is Verdict.BLOCKED for r in group):
@@ -415,9 +416,19 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         f"{cells}</summary>"
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
         f"<p>{escape(need.rationale)}</p>"
-        f'<p class="dim">Source: {escape(need.source)} (confidence: {escape(need.confidence)})</p>'
+        f'<p class="dim">Source: {_source(need)}</p>'
         "</div></details>"
     )
+
+
+def _source(need: Requirement) -> str:
+    """Who says so; the codes of its sections explain themselves."""
+
+    def explained(code: str, section: Section) -> str:
+        return f'<abbr title="{escape(section.title)}: {escape(section.names)}">{code}</abbr>'
+
+    text = linked(escape(told(need.source), quote=False), explained)
+    return f"{text} (confidence: {escape(need.confidence)})"
 
 
 def _cell(result: Result) -> str:
@@ -470,6 +481,7 @@ def _glossary(result: RunResult) -> str:
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
         ("tau_est, N m", "torque that the motor feels: what the hand knows of touch."),
         ("not applicable", "this recording or hand gave no occasion for it; the row says why."),
+        ("docs/sources.md", "dexkit's list of documents and measurements, by section (A.1)."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]
     if result.claims is not None:

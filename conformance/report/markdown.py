@@ -19,6 +19,7 @@ from dexkit.conformance.report.wording import (
     nature,
 )
 from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 
 __all__ = ["plain", "render_markdown", "table"]
@@ -130,7 +131,7 @@ def _card(need: Requirement, group: Sequence[Result]) -> list[str]:
     lines += [f"- likely cause: {plain(cause)}" for _, cause in causes(list(group))]
     lines += [
         f"- try: {plain(need.advice)}",
-        f"- source: {plain(need.source)} ({plain(need.confidence)})",
+        f"- source: {plain(told(need.source))} ({plain(need.confidence)})",
         "",
     ]
     return lines

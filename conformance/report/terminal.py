@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dexkit.conformance.report.wording import about_harness, causes
+from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 
 __all__ = ["MARKS", "print_result"]
@@ -61,9 +62,9 @@ def print_result(
     console.print(table)
     if hidden:
         console.print(
-            f"[dim]{hidden} requirement(s) could not be judged here, or are not claimed, and are "
-            "not shown"
-            f"{f' ({more})' if more else ''}.[/dim]"
+            f"[dim]{hidden} {'requirement' if hidden == 1 else 'requirements'} could not be judged "
+            f"here, or {'is' if hidden == 1 else 'are'} not claimed, and "
+            f"{'is' if hidden == 1 else 'are'} not shown{f' ({more})' if more else ''}.[/dim]"
         )
     for wanted in ((Verdict.FAIL, Verdict.ERROR), (Verdict.WARN,)):
         for _, group in result.by_requirement():
@@ -128,7 +129,7 @@ def _lines(group: Sequence[Result]) -> Iterator[tuple[str, str]]:
         yield "cause", f"{sides}: {cause}" if len(found) > 1 else cause
     if group[0].verdict is not Verdict.ERROR:
         yield "try", need.advice
-        yield "source", f"{need.source} ({need.confidence})"
+        yield "source", f"{told(need.source)} ({need.confidence})"
 
 
 def _hung(console: Console, head: str, text: str) -> str:

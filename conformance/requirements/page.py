@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.requirements.sources import PAGE, anchor, linked, told
 
 __all__ = ["BEGIN", "END", "catalogue_page", "entry"]
 
@@ -49,10 +50,16 @@ def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[
             f"*Likely cause of a failure:* {requirement.cause} *Try:* {requirement.advice}  "
         )
     lines.append(
-        f"*Source:* {requirement.source} ({requirement.confidence}). *Judged from:* {where}. "
+        f"*Source:* {_source(requirement)} ({requirement.confidence}). *Judged from:* {where}. "
         f"*Proven by:* {proof}."
     )
     return [*lines, ""]
+
+
+def _source(requirement: Requirement) -> str:
+    """Who says so, with links to the list of sources."""
+    text = told(requirement.source).replace(f"{PAGE} ", "")
+    return linked(text, lambda code, _: f"[{code}](sources.md#{anchor(code)})")
 
 
 def _needs(requirement: Requirement) -> str:
