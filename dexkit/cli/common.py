@@ -80,10 +80,13 @@ class StatusLine:
     def __bool__(self) -> bool:
         return self._lines or self.on_terminal
 
-    def show(self, text: str) -> None:
-        """Say this now."""
+    def show(self, text: str, brief: str = "") -> None:
+        """Say this now.
+
+        :param brief: what a command that shows several of these has room for.
+        """
         if self._lines:
-            print(f"status: {text}", flush=True)
+            print(f"status: {brief or text}", flush=True)
         elif self.on_terminal:
             # a line that is broken in two could not be written over
             room = os.get_terminal_size(sys.stderr.fileno()).columns - 1

@@ -293,11 +293,8 @@ def _watch(services: Sequence[HandService], stop: StopRequest, status: StatusLin
             topics = ", ".join(service.state_topic for service in services)
             log.info("no client reads %s yet; is it on the same domain and interface?", topics)
         if status:
-            status.show(
-                " | ".join(
-                    _line(service, rate()) for service, rate in zip(services, rates, strict=True)
-                )
-            )
+            lines = [_line(service, rate()) for service, rate in zip(services, rates, strict=True)]
+            status.show(*(" | ".join(texts) for texts in zip(*lines, strict=True)))
     status.clear()
 
 
@@ -320,8 +317,10 @@ class _Rate:
         return (now[1] - n0) / (now[0] - t0) if now[0] > t0 else 0.0
 
 
-def _line(service: HandService, rate: float) -> str:
+def _line(service: HandService, rate: float) -> tuple[str, str]:
+    """How a service is doing, and the same in brief."""
     hands = []
+    brief = []
     for side, core in service.cores.items():
         q = ""
         if core.spec.n_joints == 1:  # seven would not fit
@@ -335,5 +334,9 @@ def _line(service: HandService, rate: float) -> str:
         if core.connected and core.predicting:
             what += ", predicted"
         hands.append(f"{side} {q}{what} {core.measured_rate:.0f}/s")
+        brief.append(f"{side} {q}{what}")
     clients = f"{service.clients} client{'' if service.clients == 1 else 's'}"
-    return f"{', '.join(hands)}; state {rate:.0f} Hz, {clients}"
+    return (
+        f"{', '.join(hands)}; state {rate:.0f} Hz, {clients}",
+        f"{', '.join(brief)} {rate:.0f} Hz",
+    )

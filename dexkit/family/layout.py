@@ -81,14 +81,14 @@ HANDS: dict[str, HandLayout] = {
     "dex5-1": HandLayout(
         centres=(240.0, 640.0),
         top=466.0,
-        palm=(288.0, 130.0),
+        palm=(280.0, 130.0),
         width=62.0,
         fingers=(
             Finger("index", range(0, 4), (-108.0, -90.0), (0.0, -66.0), tip=0.15),
             Finger("middle", range(4, 8), (-36.0, -106.0), (0.0, -66.0), tip=0.15, root=0.7),
             Finger("ring", range(8, 12), (36.0, -90.0), (0.0, -66.0), tip=0.15),
             Finger("little", range(12, 16), (108.0, -66.0), (0.0, -66.0), tip=0.15),
-            Finger("thumb", range(16, 20), (-164.0, 26.0), (-9.0, -66.0), tip=0.15, root=0.1),
+            Finger("thumb", range(16, 20), (-167.0, 26.0), (-9.0, -66.0), tip=0.15, root=0.1),
         ),
     ),
 }
@@ -141,7 +141,7 @@ BODIES: dict[str, BodyLayout] = {
                 *((-40.0, 292.0), (-5.0, 46.0), 0.5),
             ),
         ),
-        trunk=(("waist_yaw", (-34.0, 222.0)),),
+        trunk=(("waist_yaw", (-46.0, 222.0)),),
         torso=(4.0, 270.0, 66.0),
         bottom=510.0,
     ),
@@ -160,9 +160,9 @@ BODIES: dict[str, BodyLayout] = {
             ),
         ),
         trunk=(
-            ("waist_yaw", (-34.0, 240.0)),
-            ("waist_roll", (-34.0, 202.0)),
-            ("waist_pitch", (-34.0, 164.0)),
+            ("waist_yaw", (-46.0, 240.0)),
+            ("waist_roll", (-46.0, 202.0)),
+            ("waist_pitch", (-46.0, 164.0)),
         ),
         torso=(4.0, 286.0, 66.0),
         bottom=530.0,

@@ -76,7 +76,7 @@ def emulate_all(
 
     Prints "ready: ..." when all topics are up, and what to start next. Ctrl-C or SIGTERM ends
     it. When one part ends, all do, with its error and exit code.
-    """
+    """  # noqa: D301  # click wants the backspace itself
     if hands == "none" and (dialect or settings):
         raise click.UsageError("--dialect and --set are for hands, and there are none")
     common = ["--domain", str(domain), "--interface", interface]

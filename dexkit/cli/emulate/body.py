@@ -205,7 +205,8 @@ def _watch(
                 f"{robot.model.name} {what}; state {state_rate:.0f} Hz, {robot.clients} readers; "
                 f"commands {command_rate:.0f} Hz of {robot.commanders}, {ignored} ignored"
             )
-            status.show(text)
+            orders_in = f", {command_rate:.0f} commands/s" if robot.commanders else ""
+            status.show(text, f"{robot.model.name} {what} {state_rate:.0f} Hz{orders_in}")
     status.clear()
 
 
