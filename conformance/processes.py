@@ -57,7 +57,7 @@ EMULATED: dict[str, Emulation] = {
 
 ON_USB = ("dex3-usb",)
 """Backends whose device is judged on USB as well."""
-SIMULATED = ("sim-dex1", "sim-dex3")
+SIMULATED = ("sim-dex1", "sim-dex3", "sim-dex5")
 """Backends without a device, which are told of an object by the setting ``object``."""
 
 
