@@ -102,6 +102,8 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
         assert isinstance(refused.exception, TopicConflict)
         assert f"already publishes rt/lowstate on domain {node.domain}" in str(refused.exception)
         assert "--force" in str(refused.exception.hint)
+        with pytest.raises(TopicConflict):
+            EmulatedBody(G1, node=node).start()  # another robot, on the same topics
         forced = CliRunner().invoke(command, [*arguments, "--force"], standalone_mode=False)
         assert forced.exception is None
         assert "stopped: states" in forced.output

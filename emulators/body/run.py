@@ -153,21 +153,26 @@ class EmulatedBody:
             self._own_node = None
 
     def _refuse_conflict(self, node: DdsNode) -> None:
-        """States must arrive: some clients have a writer for them, which they never use."""
+        """States must arrive: some clients have a writer for them, which they never use.
+
+        A writer of another type is another robot's; its states cannot arrive.
+        """
         model = self.model
         with node.reader(model.state_topic, model.state_type) as reader:
-            if not reader.wait(_DISCOVERY) or not reader.take():
-                return
-        who = {
-            e.process or "somebody"
+            arrived = reader.wait(_DISCOVERY) and bool(reader.take())
+        writers = [
+            e
             for e in node.endpoints()
             if e.topic == model.state_topic and e.kind == "writer" and not e.own
-        }
-        raise TopicConflict(
-            f"{', '.join(sorted(who)) or 'somebody'} already publishes {model.state_topic} on "
-            f"domain {self.domain}",
-            hint="stop the other robot, choose another --domain, or add --force",
-        )
+        ]
+        if not arrived:
+            writers = [e for e in writers if e.type_name != model.state_type]
+        if arrived or writers:
+            who = sorted({e.process or "somebody" for e in writers}) or ["somebody"]
+            raise TopicConflict(
+                f"{', '.join(who)} already publishes {model.state_topic} on domain {self.domain}",
+                hint="stop the other robot, choose another --domain, or add --force",
+            )
 
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
