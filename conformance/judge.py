@@ -9,7 +9,6 @@ from datetime import datetime, timezone
 import numpy as np
 
 from dexkit.conformance.checks import Check, Context, Outcome, all_checks
-from dexkit.conformance.checks.body import body_checks
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
@@ -39,7 +38,11 @@ def judge(
     claims = claims or Claims()
     every = claims.apply(catalogue(recording.model.name, recording.layer))
     wanted = None if requirements is None else {r.id for r in requirements}
-    checks = body_checks() if recording.layer == "body" else all_checks()
+    checks = all_checks()
+    if recording.layer == "body":
+        from dexkit.conformance.checks.body import body_checks
+
+        checks = body_checks()
     results: list[Result] = []
     for side in recording.judged:
         found: dict[str, Result] = {}
@@ -111,17 +114,31 @@ def _in_silence(context: Context, outcome: Outcome) -> Outcome:
     )
 
 
+_NOT_OURS = (
+    "the kit ends and starts only a service that it has started itself (not --backend external)"
+)
+_REMEDY = {
+    "squeeze": "put something between the fingers, and say where it is felt (--object {side}=PCT)",
+    "shutdown": _NOT_OURS,
+    "service-restart": _NOT_OURS,
+}
+"""What to do, or why not, where a stimulus was not applied."""
+
+
 def _missing(context: Context) -> str:
     """What the recording lacks for this requirement, or nothing."""
     requirement, recording = context.requirement, context.recording
     if requirement.phase:
         if recording.stimulus is None:
             return f"needs the stimulus '{requirement.phase}', which only a live run applies"
+        why = _REMEDY.get(requirement.phase, "")
+        why = f": {why.format(side=context.side)}" if why else ""
         if not recording.phases(requirement.phase):
-            return f"the stimulus '{requirement.phase}' was not applied in this run"
+            return f"the stimulus '{requirement.phase}' was not applied in this run{why}"
         other = requirement.needs.startswith("other-")
         if not other and not context.phases():
-            return f"the stimulus '{requirement.phase}' was not applied to the {context.side} hand"
+            to = f"the {context.side} hand"
+            return f"the stimulus '{requirement.phase}' was not applied to {to}{why}"
     if requirement.needs == "endpoints" and not recording.endpoints:
         return "the recording does not say who published and subscribed (record dds_endpoints)"
     if requirement.needs in ("commands", "session") and not len(context.commands):

@@ -11,7 +11,7 @@ several joints have.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -33,8 +33,8 @@ _MODULES = (
     "safety",
     "lifecycle",
     "tracking",
-    "operator",
     "fingers",
+    "operator",
 )
 
 
@@ -194,10 +194,32 @@ def check(*requirement_ids: str) -> Callable[[Check], Check]:
     return register
 
 
+class _Checks(Mapping[str, Check]):
+    """Every check, by requirement id; their modules are loaded as far as one is looked for."""
+
+    def __init__(self) -> None:
+        self._modules = iter(_MODULES)
+
+    def __getitem__(self, name: str) -> Check:
+        for module in self._modules if name not in _REGISTRY else ():
+            importlib.import_module(f"{__name__}.{module}")
+            if name in _REGISTRY:
+                break
+        return _REGISTRY[name] if name in _REGISTRY else self._every()[name]
+
+    def _every(self) -> Mapping[str, Check]:
+        for module in self._modules:
+            importlib.import_module(f"{__name__}.{module}")
+        return {r.id: _REGISTRY[r.like] for r in catalogue() if r.like} | _REGISTRY
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._every())
+
+    def __len__(self) -> int:
+        return len(self._every())
+
+
 @cache
 def all_checks() -> Mapping[str, Check]:
     """Every check, by requirement id; what is like another requirement has the same."""
-    for name in _MODULES:
-        importlib.import_module(f"{__name__}.{name}")
-    shared = {r.id: _REGISTRY[r.like] for r in catalogue() if r.like}
-    return {**shared, **_REGISTRY}
+    return _Checks()

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.figures import median
 from dexkit.hand import Floats
 
 __all__: list[str] = []
@@ -128,7 +129,7 @@ def _bend(t: Floats, x: Floats, window: float) -> Floats:
     behind = np.searchsorted(t, t[middle] + window)
     a, b = t[middle] - t[before], t[behind] - t[middle]
     even = (np.abs(a - window) < 0.2 * window) & (np.abs(b - window) < 0.2 * window)
-    steps, usual = np.diff(t), float(np.median(np.diff(t)))
+    steps, usual = np.diff(t), median(np.diff(t))
     uneven = (steps > usual + 0.1 * window) | (steps < 0.3 * usual)
     count = np.concatenate(([0], np.cumsum(uneven)))
     even &= count[behind] == count[before]

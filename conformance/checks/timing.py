@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.figures import median
 from dexkit.hand import Floats
 
 # stimuli whose own requirements judge the state's flow
@@ -255,11 +256,11 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
         if travel < least:
             return ctx.skipped("the hand does not move in this recording")
         # changes too small to be called steps: fresher than the rule asks for
-        fastest = float(np.median(np.diff(t[changes])))
+        fastest = median(np.diff(t[changes]))
         return ctx.passed(
             f"{fastest * 1e3:.1f} ms", "changes from sample to sample", hold_s=fastest
         )
-    hold = float(np.median(holds))
+    hold = median(holds)
     text = f"a new value every {hold * 1e3:.1f} ms while moving (median of {len(holds)})"
     if hold <= ctx.tolerance("max_hold_s"):
         return ctx.passed(f"{hold * 1e3:.1f} ms", ctx.named(text, joint), hold_s=hold)
