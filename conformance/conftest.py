@@ -14,6 +14,14 @@ from dexkit.errors import DexkitError
 from dexkit.stopping import stop_on_signals
 
 
+class Ended(pytest.exit.Exception):
+    """Ends the pytest run with a message and an exit code."""
+
+
+# pytest prints the exception's own name before the message: "conformance", not its module's path
+Ended.__module__, Ended.__qualname__ = "builtins", "conformance"
+
+
 @pytest.fixture(scope="session")
 def conformance_run(request: pytest.FixtureRequest) -> RunResult:
     """The one run that every requirement is judged by."""
@@ -27,7 +35,7 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
 
     def end(why: str, returncode: int, more: str = "") -> NoReturn:
         request.config.stash[WHY_KEY] = why
-        pytest.exit(f"{why}{more}", returncode=returncode)
+        raise Ended(f"{why}{more}", returncode)
 
     # Whoever ends the run early must not leave a hand driven: services are ended in order.
     with stop_on_signals() as stop:

@@ -24,6 +24,7 @@ from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.report.wording import VERDICTS
+from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
 from dexkit.conformance.view import Recording
@@ -44,7 +45,7 @@ def test_markdown_tells_every_verdict_and_each_failure_wholly() -> None:
         assert VERDICTS[verdict].mark in text
     failed = next(r for r in result.results if r.verdict is Verdict.FAIL)
     need = failed.requirement
-    for part in (need.sentence, failed.observed, failed.cause, need.advice, need.source):
+    for part in (need.sentence, failed.observed, failed.cause, need.advice, told(need.source)):
         assert plain(part) in text
     assert "rt/plain words` at 1.250 s to 1.500 s, log time `1700000001250000000`" in text
     assert "left hand reached: **moving**" in text
@@ -284,7 +285,7 @@ def test_without_a_recording_the_page_has_words_only(judged: Path, tmp_path: Pat
     page = (tmp_path / "r.html").read_text()
     assert "<svg" not in page
     assert "Plots of the evidence need the recording" in page
-    assert "gap(s); the first from 9.49" in page
+    assert "a gap from 9.49" in page
 
 
 def test_another_recording_is_refused(judged: Path, tmp_path: Path) -> None:
@@ -340,7 +341,7 @@ def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) 
     run_named("G", "2026-01-02", TOPIC_01=Verdict.FAIL).write_json(b)
     done = run("compare", a, b, "--html", tmp_path / "c.html")
     assert done.exit_code == 1
-    assert "1 regression(s): DEX1-TOPIC-01" in done.output
+    assert "1 regression: DEX1-TOPIC-01" in done.output
     assert "Regressions (1)" in (tmp_path / "c.html").read_text()
     same = run("compare", a, a)
     assert same.exit_code == 0

@@ -267,3 +267,12 @@ def test_lateness_lies_between_the_least_and_the_most(gaps: list[int], late: int
 def test_a_beat_that_was_due_in_a_stretch_counts_for_it() -> None:
     beats = Beats(0, [100_000], [90_000])  # due at 10 ms, fired at 100 ms
     assert beats.lateness(20_000_000, 80_000_000) == (0.09, 0.09)
+
+
+def test_a_stimulus_that_was_not_applied_says_what_to_do() -> None:
+    touch = of(judge(Recording.of(short_run())), "DEX1-FORCE-01")
+    assert touch.verdict is Verdict.NOT_APPLICABLE
+    assert touch.reason == (
+        "the stimulus 'squeeze' was not applied in this run: put something between the fingers, "
+        "and say where it is felt (--object left=PCT)"
+    )

@@ -70,7 +70,7 @@ def test_the_whole_story(tmp_path: Path) -> None:
     assert demo.returncode == 0, out
     assert time.monotonic() - begin < 60
     assert "PASS: every MUST that could be judged is met (35 requirements: 35 pass)" in out
-    result = json.loads((tmp_path / "results.json").read_text())
+    result = json.loads((tmp_path / "result.json").read_text())
     assert result["overall"] == "pass"
     assert (tmp_path / "report.html").stat().st_size > 50_000
     assert (tmp_path / "recording.mcap").exists()

@@ -210,7 +210,7 @@ def reserved(ctx: Context) -> Outcome:
         for place in range(values.shape[1]):
             most = max(most, (len(np.unique(values[:, place])), f"{path}[{place}]"))
     count, path = most
-    text = f"{path} takes {count} different value(s)"
+    text = f"{path} takes {count} different {'value' if count == 1 else 'values'}"
     if count <= ctx.tolerance("max_values"):
         return ctx.passed(f"{count}", text)
     return ctx.failed(f"{count} values", text)

@@ -126,9 +126,10 @@ def no_gap(ctx: Context) -> Outcome:
     if found:
         longest = max(b - a for a, b in found)
         first = found[0]
+        many = "a gap" if len(found) == 1 else f"{len(found)} gaps; the first"
         return ctx.failed(
             f"{longest:.3f} s",
-            f"{len(found)} gap(s); the first from {first[0]:.3f} s to {first[1]:.3f} s",
+            f"{many} from {first[0]:.3f} s to {first[1]:.3f} s",
             *(ctx.at(ctx.states.topic, a, b) for a, b in found),
             max_gap_s=longest,
             gaps=len(found),

@@ -263,7 +263,7 @@ def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
     if view is None and full:
         parts.append(
             '<p class="dim">Plots of the evidence need the recording: '
-            "<code>dexkit report RESULT.json --recording RUN.mcap --html REPORT.html</code></p>"
+            "<code>dexkit report RESULT.json --recording RUN.mcap --report REPORT.html</code></p>"
         )
     return "".join(parts)
 

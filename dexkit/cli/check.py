@@ -53,7 +53,9 @@ from dexkit.models import DIALECTS
 )
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the result file.")
 @click.option("--junit", "junit_path", type=click.Path(path_type=Path), help="Write JUnit XML.")
-@click.option("--html", "html_path", type=click.Path(path_type=Path), help="Write a report page.")
+@click.option(
+    "--report", "--html", "html_path", type=click.Path(path_type=Path), help="Write a report page."
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also say what could not be judged, and why.")
 def command(
     recording: Path | None,

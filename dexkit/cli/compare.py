@@ -18,6 +18,7 @@ from dexkit.cli.report import write_text
     metavar="A.json B.json ...",
 )
 @click.option(
+    "--report",
     "--html",
     "html_path",
     type=click.Path(path_type=Path),
@@ -55,5 +56,6 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     regressions = comparison.regressions
     if regressions:
         names = ", ".join(dict.fromkeys(c.requirement.id for c in regressions))
-        click.echo(f"{len(regressions)} regression(s): {names}", err=True)
+        what = "regression" if len(regressions) == 1 else "regressions"
+        click.echo(f"{len(regressions)} {what}: {names}", err=True)
         raise click.exceptions.Exit(1)

@@ -32,7 +32,7 @@ _INTRO = (
     default=Path("demo-out"),
     show_default=True,
     metavar="DIR",
-    help="Where to write report.html, recording.mcap and results.json.",
+    help="Where to write report.html, recording.mcap and result.json.",
 )
 @click.option(
     "--backend",
@@ -55,7 +55,7 @@ def command(out: Path, backend: str, domain: int | None) -> None:
     options = SuiteOptions.make(
         backend=backend,
         domain=domain,
-        json=out / "results.json",
+        json=out / "result.json",
         report=out / "report.html",
         recording=out / "recording.mcap",
     )

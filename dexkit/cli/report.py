@@ -35,7 +35,9 @@ def write_text(path: Path, text: str) -> None:
     help="The recording that was judged: the page then shows plots. Default: the one that the "
     "result names, if it lies beside it.",
 )
-@click.option("--html", "html_path", type=_FILE, metavar="FILE", help="Write the report page.")
+@click.option(
+    "--report", "--html", "html_path", type=_FILE, metavar="FILE", help="Write the report page."
+)
 @click.option(
     "--markdown", "markdown_path", type=_FILE, metavar="FILE", help="Write a summary; - prints it."
 )
