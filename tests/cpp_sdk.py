@@ -13,22 +13,18 @@ In tests::
         sdk.command(q=[...], kp=[...], kd=[...])     # repeated at 500 Hz until the next one
         sdk.remote()["lx"]
 
-The process speaks JSON lines: one request a line, one answer a line.
+What the SDK prints goes to stderr.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from types import TracebackType
 from typing import Any
+
+from tests.json_child import JsonChild, answer_requests
 
 __all__ = ["CppSdk", "dds_config"]
 
@@ -49,52 +45,22 @@ def dds_config(domain: int, interface: str = "lo") -> str:
     )
 
 
-class CppSdk:
+class CppSdk(JsonChild):
     """A process in which the SDK is the client of a robot.
 
     :param robot: ``"h1"`` or ``"g1"``.
-
-    :ivar output: after :meth:`close`: what the SDK printed.
     """
 
     def __init__(self, robot: str, domain: int) -> None:
-        self.output = ""
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.cpp_sdk", robot, str(domain)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=Path(__file__).parent.parent,
-        )
-        self._receive()
-
-    def _receive(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        watchdog = threading.Timer(60, self._process.kill)  # never hang a test run
-        watchdog.start()
-        line = self._process.stdout.readline()
-        watchdog.cancel()
-        if not line:
-            _, said = self._process.communicate()
-            raise AssertionError(f"the C++ SDK's process has gone: {said}")
-        answer: dict[str, Any] = json.loads(line)
-        assert "error" not in answer, answer["error"]
-        return answer
-
-    def _call(self, **request: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        return self._receive()
+        super().__init__("tests.cpp_sdk", robot, str(domain))
 
     def state(self) -> dict[str, Any]:
         """The newest state that the SDK has accepted; all zero before the first."""
-        return self._call(op="state")
+        return self.call("state")
 
     def remote(self) -> dict[str, Any]:
         """The newest message of the wireless remote."""
-        return self._call(op="remote")
+        return self.call("remote")
 
     def wait(
         self,
@@ -117,28 +83,7 @@ class CppSdk:
 
         The gains are the SDK's own unless given.
         """
-        self._call(op="command", **members)
-
-    def close(self) -> None:
-        """End the process."""
-        if self._process.returncode is not None:
-            return
-        try:
-            _, self.output = self._process.communicate(timeout=10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
-
-    def __enter__(self) -> CppSdk:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+        self.call("command", **members)
 
 
 class _Server:
@@ -181,27 +126,7 @@ def main() -> None:
     parser.add_argument("robot", choices=["h1", "g1"])
     parser.add_argument("domain", type=int)
     options = parser.parse_args()
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # the SDK prints to stdout
-
-    def answer(value: dict[str, Any]) -> None:
-        answers.write(json.dumps(value) + "\n")
-        answers.flush()
-
-    try:
-        server = _Server(options.robot, options.domain)
-    except Exception as error:
-        answer({"error": f"the SDK does not start: {error}"})
-        return
-    answer({"ready": True})
-    for line in sys.stdin:
-        request = json.loads(line)
-        try:
-            answer(getattr(server, request.pop("op"))(**request))
-        except Exception as error:
-            answer({"error": f"{type(error).__name__}: {error}"})
-    sys.stdout.flush()
-    os._exit(0)  # the SDK's threads do not end by themselves
+    answer_requests(lambda: _Server(options.robot, options.domain))
 
 
 if __name__ == "__main__":

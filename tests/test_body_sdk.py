@@ -14,7 +14,7 @@ from dexkit.bodies import G1, H1, BodyModel
 from dexkit.dds import DdsNode
 from dexkit.emulators.body import EmulatedBody, Remote, Settings
 from tests.cpp_sdk import CppSdk
-from tests.dds_helpers import dds_domain
+from tests.dds_helpers import dds_domain, wait_until
 
 __all__ = ["dds_domain"]
 
@@ -34,7 +34,7 @@ def positions(model: BodyModel, motors: int, by: float) -> list[float]:
     return q
 
 
-def test_h1(dds_domain: int) -> None:
+def test_h1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
     with DdsNode(dds_domain) as node, CppSdk("h1", dds_domain) as sdk:
         with EmulatedBody(H1, node=node) as robot:
             robot.body.remote = Remote.parse("A,L2,lx=0.5,ry=-0.25")
@@ -77,10 +77,17 @@ def test_h1(dds_domain: int) -> None:
             sdk.command(q=goal, **gains)
             sdk.wait(lambda s: all(abs(s["q"][i] - goal[i]) < 0.02 for i in used))
             assert robot.body.counters.wrong_mode == 0
-    assert "CRC" not in sdk.output
+        # what it would have said of a wrong CRC
+        assert "CRC Error" not in "".join(capfd.readouterr())
+        good = robot.body.state(0.0)
+        spoiled = good[:-1] + bytes([good[-1] ^ 1])
+        with node.writer(H1.state_topic, H1.state_type) as writer:
+            wait_until(
+                lambda: writer.write_raw(spoiled) and "CRC Error" in "".join(capfd.readouterr())
+            )
 
 
-def test_g1(dds_domain: int) -> None:
+def test_g1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
     with (
         DdsNode(dds_domain) as node,
         CppSdk("g1", dds_domain) as sdk,
@@ -112,4 +119,4 @@ def test_g1(dds_domain: int) -> None:
         counters = robot.body.counters
         assert counters.commands > 100
         assert counters.bad_crc == counters.bad_machine == counters.wrong_mode == 0
-    assert "CRC" not in sdk.output
+    assert "CRC Error" not in "".join(capfd.readouterr())

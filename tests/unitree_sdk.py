@@ -26,26 +26,24 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
 import os
-import subprocess
 import sys
 import threading
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Any
 
 from dexkit.messages import message_type
+from tests.json_child import JsonChild, answer_requests
 
-__all__ = ["SdkClient", "SdkError", "SdkSample", "load", "sdk_class"]
+__all__ = ["SdkClient", "SdkSample", "load", "sdk_class"]
 
 
 def load() -> Any:
     """The SDK's ``core.channel`` module (``ChannelFactoryInitialize``, ``ChannelPublisher``...)."""
     sys.modules.setdefault("unitree_sdk2py.b2", ModuleType("unitree_sdk2py.b2"))
-    channel = importlib.import_module("unitree_sdk2py.core.channel")
+    channel: Any = importlib.import_module("unitree_sdk2py.core.channel")
     channel.ChannelConfigHasInterface = channel.ChannelConfigHasInterface.replace(
         "/tmp/cdds.LOG", os.devnull
     )
@@ -59,10 +57,6 @@ def sdk_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"unitree_sdk2py.idl.{package}.msg.dds_"), name)
 
 
-class SdkError(AssertionError):
-    """The client process says that something went wrong, or has gone."""
-
-
 @dataclass(frozen=True)
 class SdkSample:
     """A sample that the SDK received: its bytes as the SDK serialises them again."""
@@ -71,100 +65,41 @@ class SdkSample:
     message: Any
 
 
-class SdkClient:
+class SdkClient(JsonChild):
     """A process that runs the SDK on ``domain`` and ``interface``."""
 
     def __init__(self, domain: int, interface: str = "lo") -> None:
-        self._process = subprocess.Popen(
-            [
-                sys.executable,
-                *("-m", "tests.unitree_sdk"),
-                *("--domain", str(domain), "--interface", interface),
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=Path(__file__).parent.parent,
-        )
         self._types: dict[str, str] = {}
-        self._receive()  # its first line says that the SDK is up
-
-    @property
-    def pid(self) -> int:
-        """Process id of the client."""
-        return self._process.pid
-
-    def _receive(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        watchdog = threading.Timer(90, self._process.kill)  # never hang a test run
-        watchdog.start()
-        line = self._process.stdout.readline()
-        watchdog.cancel()
-        if not line:
-            raise SdkError(f"the SDK process has gone (exit code {self._process.wait(10)})")
-        answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            raise SdkError(answer["error"])
-        return answer
-
-    def _call(self, **request: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        return self._receive()
+        super().__init__("tests.unitree_sdk", "--domain", str(domain), "--interface", interface)
 
     def subscribe(self, topic: str, type_name: str) -> None:
         """Receive a topic with the SDK's ``ChannelSubscriber`` and a handler."""
         self._types[topic] = type_name
-        self._call(op="subscribe", topic=topic, type=type_name)
+        self.call("subscribe", topic=topic, type=type_name)
 
     def publish(self, topic: str, type_name: str, message: Any) -> None:
         """Write one message with the SDK's ``ChannelPublisher``."""
         data = message_type(type_name).encode(message).hex()
-        self._call(op="publish", topic=topic, type=type_name, data=data)
+        self.call("publish", topic=topic, type=type_name, data=data)
 
     def stream(self, topic: str, type_name: str, message: Any, hz: float) -> None:
         """Write a message over and over until :meth:`stop` or the next call for this topic."""
         data = message_type(type_name).encode(message).hex()
-        self._call(op="stream", topic=topic, type=type_name, data=data, hz=hz)
+        self.call("stream", topic=topic, type=type_name, data=data, hz=hz)
 
     def stop(self, topic: str) -> int:
         """End a stream; returns how many messages it has written."""
-        return int(self._call(op="stop", topic=topic)["written"])
+        return int(self.call("stop", topic=topic)["written"])
 
     def wait(self, topic: str, count: int = 1, timeout: float = 10.0) -> list[SdkSample]:
         """Samples received since the last call, at least ``count`` of them.
 
-        :raises SdkError: fewer arrived within ``timeout`` seconds.
+        :raises ChildError: fewer arrived within ``timeout`` seconds.
         """
-        answer = self._call(op="wait", topic=topic, count=count, timeout=timeout)
+        answer = self.call("wait", topic=topic, count=count, timeout=timeout)
         kind = message_type(self._types[topic])
         samples = [bytes.fromhex(text) for text in answer["samples"]]
         return [SdkSample(data, kind.decode(data)) for data in samples]
-
-    def close(self) -> None:
-        """End the process."""
-        if self._process.poll() is None:
-            assert self._process.stdin is not None
-            self._process.stdin.close()
-            try:
-                self._process.wait(10)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-
-    def __enter__(self) -> SdkClient:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class _Server:
@@ -244,28 +179,13 @@ def main() -> None:
     parser.add_argument("--domain", type=int, required=True)
     parser.add_argument("--interface", default="lo")
     options = parser.parse_args()
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # the SDK prints to stdout
 
-    def answer(value: dict[str, Any]) -> None:
-        answers.write(json.dumps(value) + "\n")
-        answers.flush()
-
-    channel = load()
-    try:
+    def make() -> _Server:
+        channel = load()
         channel.ChannelFactoryInitialize(options.domain, options.interface)
-    except Exception as error:
-        answer({"error": f"the SDK does not start: {error}"})
-        return
-    server = _Server(channel)
-    answer({"ready": True})
-    for line in sys.stdin:
-        request = json.loads(line)
-        try:
-            answer(getattr(server, request.pop("op"))(**request))
-        except Exception as error:
-            answer({"error": f"{type(error).__name__}: {error}"})
-    os._exit(0)  # the SDK's reader threads and listeners do not end by themselves
+        return _Server(channel)
+
+    answer_requests(make)
 
 
 if __name__ == "__main__":
