@@ -13,10 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.bridge.core import PATIENCE, SILENT, Commands, Outgoing, States
-from dexkit.bridge.translate import Part, translator
+from dexkit.bridge.translate import Part, Reachable, translator
 from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import DEX1_1, Dialect, dialect
+from dexkit.teleop.client import LEAD, StickyFilter
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 BOTH = tuple(Side)
@@ -82,24 +83,6 @@ class TestTranslation:
         back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05))
         assert back.q == near(q)
         assert (back.kp, back.kd) == (near(5.0), near(0.05))
-
-    @given(st.floats(-1, 7, width=32))
-    def test_near_the_ends_it_is_the_nearest_that_can_be_commanded(self, q: float) -> None:
-        """The specification's gripper takes 0.1 for closed and 6.0 for open."""
-        back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q)).q
-        low, high = 0.1 / SCALE, 6.0 / SCALE
-        wanted = min(max(q, 0.0), 5.4)
-        assert min(max(back, 0.0), 5.4) == pytest.approx(
-            min((0.0, 5.4, min(max(wanted, low), high)), key=lambda x: abs(x - wanted)), abs=2e-3
-        )
-
-    def test_the_teleoperation_client_gets_away_from_the_ends(self) -> None:
-        """It commands 0.18 rad from where the gripper is (facts/unitree-dex B.1)."""
-        for start, step in ((5.4, -0.18), (0.0, 0.18)):
-            q = start
-            for _ in range(10):
-                q = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q + step)).q
-            assert abs(q - start) > 1.5
 
     @given(go_commands)
     def test_a_command_presses_as_hard_on_either_scale(self, go: unitree_go.MotorCmd_) -> None:
@@ -408,6 +391,52 @@ class TestTwoTopicsIntoOneMessage:
             else:
                 assert wire.states.due is not None
         assert sent <= came
+
+
+class TestReachable:
+    """All in rad of unitree_hg."""
+
+    @staticmethod
+    def goes_to(q: float) -> float:
+        """Where a gripper of the specification goes (seed 000)."""
+        return 0.0 if q <= 0.1 else 2 * math.pi if q >= 6.0 else q
+
+    @given(st.floats(0.0, 2 * math.pi), st.none() | st.floats(0.0, 2 * math.pi))
+    def test_it_goes_to_the_nearest_that_there_is(self, q: float, position: float | None) -> None:
+        sent = Reachable()(q, position, 0.0)
+        assert self.goes_to(sent) == pytest.approx(sent)
+        reach = (0.0, 2 * math.pi, min(max(q, 0.101), 5.999))
+        assert abs(sent - q) == pytest.approx(min(abs(r - q) for r in reach))
+
+    @pytest.mark.parametrize("speed", [1.5, 6.5, 24.0])
+    @pytest.mark.parametrize(
+        ("start", "goal"), [(0.0, 5.4), (5.4, 0.0), (5.412, 0.0), (2.7, 5.4), (5.4, 3.0)]
+    )
+    def test_the_teleoperation_client_gets_through(
+        self, start: float, goal: float, speed: float
+    ) -> None:
+        reach, smooth, position = Reachable(), StickyFilter(), start * SCALE
+        smooth((start,))
+        places = []
+        for step in range(1200):
+            lead = min(max(goal - position / SCALE, -LEAD), LEAD)
+            (q,) = smooth((position / SCALE + lead,))
+            target = self.goes_to(reach(q * SCALE, position, 0.005 * step))
+            far = 0.005 * speed * SCALE
+            position += min(max(target - position, -far), far)
+            places.append(position / SCALE)
+        # 0.06: its filter stops there, with any gripper
+        assert places[-1] == pytest.approx(goal, abs=0.07 if goal == 3.0 else 0.001)
+        assert max(places[1000:]) - min(places[1000:]) < 1e-6  # it rests there
+
+    @given(st.floats(0.0, 2 * math.pi), st.floats(0.0, 2 * math.pi))
+    def test_a_standing_command_leaves_the_gripper_at_rest(self, q: float, position: float) -> None:
+        reach, places = Reachable(), set()
+        for step in range(400):
+            position = self.goes_to(reach(q, position, 0.005 * step))
+            if step > 200:
+                places.add(position)
+        assert len(places) == 1
 
 
 class TestToTheSpecification:

@@ -21,7 +21,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
-from dexkit.bridge.translate import Part, loses_gains, translator
+from dexkit.bridge.translate import Part, Reachable, loses_gains, translator
 from dexkit.errors import WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.messages import unitree_go
@@ -147,7 +147,7 @@ class Direction(ABC):
         """Whether a part is that of a gripper that is not there."""
         return False
 
-    def _translated(self, part: Any, side: Side) -> Any | None:
+    def _translated(self, part: Any, side: Side, now: float) -> Any | None:
         """A part in the target's dialect; None where that cannot be said."""
         return self._translate(part)
 
@@ -172,7 +172,7 @@ class Direction(ABC):
         if side not in self._newest and self._is_blank(part, side):
             self.counts.blank += side in self.sides
             return False
-        translated = self._translated(part, side)
+        translated = self._translated(part, side, now)
         if translated is None:
             self.counts.held += 1
             return False
@@ -293,7 +293,8 @@ class Commands(Direction):
     Where no position is known, nothing is sent.
 
     To a dialect without gains (``unitree_hg``), a command that does not pull towards its q goes
-    out with the q where the gripper is (:mod:`~dexkit.bridge.translate`).
+    out with the q where the gripper is, and one that is out of reach with one that is not
+    (:mod:`~dexkit.bridge.translate`).
 
     :param states: the other direction, which knows where the grippers are.
     """
@@ -310,14 +311,20 @@ class Commands(Direction):
         # what a position of the grippers is multiplied by to be one of the client's
         self._scale = source.q_open / target.q_open
         self._loses_gains = loses_gains(source, target)
+        self._reachable = {side: Reachable() for side in self.sides}
 
-    def _translated(self, part: Any, side: Side) -> Any | None:
-        if self._loses_gains and part.kp <= 0:
-            q = self._states.position(side)
-            if q is None:
+    def _translated(self, part: Any, side: Side, now: float) -> Any | None:
+        if not self._loses_gains:
+            return super()._translated(part, side, now)
+        position = self._states.position(side)
+        if part.kp <= 0:
+            if position is None:
                 return None
-            part = replace(part, q=q * self._scale)
-        return super()._translated(part, side)
+            part = replace(part, q=position * self._scale)
+        message = super()._translated(part, side, now)
+        motor = self._out.motor(message)
+        motor.q = self._reachable[side](motor.q, position, now)
+        return message
 
     def _accept(self, message: Any, side: Side, now: float) -> bool:
         accepted = super()._accept(message, side, now)

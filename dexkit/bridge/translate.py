@@ -8,8 +8,8 @@ as it is, every field. Between 0 .. 5.4 rad (``unitree_go``, ``unitree_actuator`
 =============  =====================================  =============================================
 what           to unitree_hg                          from unitree_hg
 =============  =====================================  =============================================
-q, dq, ddq     times s; a command near an end to     by s; a command at or below 0.1 closes, at
-               the nearest that can be commanded      or above 6.0 opens (seed 000)
+q, dq, ddq     times s; see "near the ends"           by s; a command at or below 0.1 closes, at
+                                                      or above 6.0 opens (seed 000)
 tau            as it is                               of a command: 0, it is unused (seed 000)
 kp, kd         by s                                   5.0 and 0.05, whatever the command says, as
                                                       ``dexkit serve`` takes them
@@ -23,9 +23,7 @@ predicted      reserve[0]                             reserve[1]
 
 **Near the ends.** A gripper of unitree_hg closes fully at q <= 0.1 and opens fully at q >= 6.0,
 so 0 .. 0.086 and 5.157 .. 5.4 rad of the other scale cannot be commanded there, but for the ends
-themselves. What lies between goes to the nearest of both. Passed on as it is, it would go to the
-end, and xr_teleoperate, which commands at most 0.18 rad from where the gripper is, would never
-get it away from fully open: 5.22 rad is 6.07 there, "open".
+themselves. :class:`Reachable` chooses between both.
 
 **Without a gain.** unitree_hg knows no gains, so a command that does not pull towards its q
 (kp <= 0: limp, or driven by velocity or torque) cannot be said in it; obeyed as it is, q = 0 of
@@ -49,10 +47,9 @@ from dexkit.messages import MessageType, layout, message_type, unitree_go, unitr
 from dexkit.models import Dialect, dialect, model
 from dexkit.service.dialects import HG_CLOSED, HG_OPEN, StateView, dialect_map
 
-__all__ = ["Part", "Translator", "loses_gains", "translator"]
+__all__ = ["Part", "Reachable", "Translator", "loses_gains", "translator"]
 
 _FLOAT_MAX = (2 - 2**-23) * 2.0**127
-_CLEAR = 1e-3  # rad from where a gripper of unitree_hg snaps to its end
 # of the numbers of a motor, those that are acted upon
 _NUMBERS = {
     "cmd": ("q", "dq", "tau", "kp", "kd"),
@@ -134,6 +131,58 @@ def translator(source: Dialect, target: Dialect, kind: str) -> Translator:
     return _command_from_hg if kind == "cmd" else _state_from_hg
 
 
+class Reachable:
+    """Where a gripper of unitree_hg is sent for a position that it cannot be sent to.
+
+    To the nearer end of the gap. But if it rests there, and for ``DWELL`` the command has been
+    ``ELSEWHERE`` and not there, to the other end, until the command changes. xr_teleoperate needs
+    that: it commands no more than 0.18 rad from where the gripper is, and its filter stops half
+    way while nothing moves (traces/samples/README.md). So at 5.4 it says "close" as 5.31, which
+    is nearest to 5.4, and would say so for ever.
+    """
+
+    GAPS = ((0.0, HG_CLOSED + 1e-3), (HG_OPEN - 1e-3, 2 * math.pi))
+    """Gaps in what can be commanded, rad of unitree_hg; their ends can be."""
+    ELSEWHERE = 0.07
+    """Rad of unitree_hg. Of xr_teleoperate's lead the filter lets half pass at least, 0.10 here;
+    when it wants the end itself, it stops within 0.05."""
+    DWELL = 0.2
+    """Seconds; while the gripper moves the filter lags by 0.015."""
+
+    def __init__(self) -> None:
+        self._rests_since: float | None = None
+        self._sent_across: tuple[float, float] | None = None  # the command, and where to
+
+    def __call__(self, q: float, position: float | None, now: float) -> float:
+        """A command that the gripper obeys as it is meant; all in rad of unitree_hg.
+
+        :param position: where the gripper is, if known.
+        :param now: seconds.
+        """
+        for low, high in self.GAPS:
+            if low < q < high:
+                near, far = (low, high) if q - low < high - q else (high, low)
+                return self._in_gap(q, near, far, position, now)
+        self._sent_across = self._rests_since = None
+        return q
+
+    def _in_gap(
+        self, q: float, near: float, far: float, position: float | None, now: float
+    ) -> float:
+        if self._sent_across is not None and abs(q - self._sent_across[0]) <= self.ELSEWHERE:
+            return self._sent_across[1]
+        self._sent_across = None
+        is_there = position is not None and abs(position - near) <= self.ELSEWHERE
+        if not is_there or abs(q - near) <= self.ELSEWHERE:
+            self._rests_since = None
+        elif self._rests_since is None:
+            self._rests_since = now
+        elif now - self._rests_since >= self.DWELL:
+            self._sent_across, self._rests_since = (q, far), None
+            return far
+        return near
+
+
 def loses_gains(source: Dialect, target: Dialect) -> bool:
     """Whether a client of ``source`` sets gains that nobody in ``target`` obeys."""
     return source.cmd_type != target.cmd_type == _HG.cmd_type
@@ -150,7 +199,7 @@ def _command_to_hg(motor: unitree_go.MotorCmd_) -> unitree_hg.HandCmd_:
     return unitree_hg.HandCmd_(
         [
             unitree_hg.MotorCmd_(
-                q=_nearest(_fits(motor.q * _SCALE)),
+                q=_fits(motor.q * _SCALE),
                 dq=_fits(motor.dq * _SCALE),
                 tau=motor.tau,
                 kp=motor.kp / _SCALE,
@@ -199,15 +248,6 @@ def _state_from_hg(message: unitree_hg.HandState_) -> unitree_go.MotorState_:
         lost=message.error[1],
         reserve=(motor.motorstate, 1 if motor.reserve[0] == 1 else 0),
     )
-
-
-def _nearest(q: float) -> float:
-    """The nearest to ``q`` that a gripper of unitree_hg does not take for another place."""
-    if 0.0 < q <= HG_CLOSED:
-        return HG_CLOSED + _CLEAR if q > HG_CLOSED / 2 else 0.0
-    if HG_OPEN <= q < (HG_OPEN + _HG.q_open) / 2:
-        return HG_OPEN - _CLEAR
-    return q
 
 
 def _fits(value: float) -> float:
