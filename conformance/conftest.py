@@ -6,6 +6,7 @@ import traceback
 from typing import NoReturn
 
 import pytest
+from _pytest.outcomes import Exit
 
 from dexkit.conformance.plugin import OPTIONS_KEY, RESULT_KEY, WHY_KEY
 from dexkit.conformance.results import RunResult
@@ -14,7 +15,7 @@ from dexkit.errors import DexkitError
 from dexkit.stopping import stop_on_signals
 
 
-class Ended(pytest.exit.Exception):
+class Ended(Exit):
     """Ends the pytest run with a message and an exit code."""
 
 
