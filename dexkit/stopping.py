@@ -5,6 +5,7 @@ A program that dies at once leaves a hand driven by whatever it was told last.
 
 from __future__ import annotations
 
+import _thread
 import signal
 import threading
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ class StopRequest:
         self.signum = 0
 
     def __bool__(self) -> bool:
-        return self.event.is_set()
+        return self.signum != 0 or self.event.is_set()
 
     def set(self) -> None:
         """Ask for a stop from the program itself."""
@@ -46,10 +47,11 @@ def stop_on_signals() -> Iterator[StopRequest]:
     request = StopRequest()
 
     def handle(signum: int, frame: FrameType | None) -> None:
-        if request.event.is_set() and signum == signal.SIGINT:
+        if request and signum == signal.SIGINT:
             raise KeyboardInterrupt
         request.signum = request.signum or signum
-        request.event.set()
+        # not here: this may have interrupted event.wait() while that holds the event's lock
+        _thread.start_new_thread(request.event.set, ())
 
     ending = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

@@ -1,0 +1,36 @@
+"""Signals that ask for a stop, at bad moments."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from dexkit.stopping import stop_on_signals
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_in_the_middle_of_a_wait_does_not_hang(number: int) -> None:
+    with stop_on_signals() as request:
+        with request.event._cond:  # as wait() holds it for moments
+            signal.raise_signal(number)
+            assert request
+        assert request.wait(10)
+        assert request.signum == number
+
+
+def test_a_second_interrupt_interrupts_at_once() -> None:
+    with stop_on_signals() as request:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert request.signum == signal.SIGTERM
+
+
+def test_a_stop_from_the_program_itself() -> None:
+    with stop_on_signals() as request:
+        assert not request
+        request.set()
+        assert request.wait(0)
+        assert request.signum == 0
