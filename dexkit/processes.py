@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -16,21 +17,20 @@ from typing import ClassVar
 
 from dexkit.errors import DexkitError
 
-__all__ = ["READY_TIMEOUT", "STOP_TIMEOUT", "Tool"]
+__all__ = ["END_WITH_PARENT", "READY_TIMEOUT", "STOP_TIMEOUT", "Tool", "end_with_parent"]
 
 READY_TIMEOUT = 30.0
 STOP_TIMEOUT = 5.0
+_PR_SET_PDEATHSIG = 1
 
-# whoever starts it and is killed takes it along: SIGTERM when the parent dies (Linux)
-_ENTRY = """
-import ctypes, signal
-try:
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
-except (OSError, AttributeError):
-    pass
-from dexkit.cli import main
-main()
-"""
+END_WITH_PARENT = "DEXKIT_END_WITH_PARENT"
+"""Environment variable: set for a command that is to end when whoever started it is killed."""
+
+
+def end_with_parent() -> None:
+    """Have SIGTERM sent to this process when its parent dies, where the system can (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Tool:
@@ -59,13 +59,18 @@ class Tool:
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=40)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _ENTRY, *arguments],
+            [sys.executable, "-m", "dexkit", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
+            env={
+                **os.environ,
+                "PYTHONUNBUFFERED": "1",
+                END_WITH_PARENT: "1",
+                **(environment or {}),
+            },
             # a Ctrl-C in the terminal is the caller's to act upon: it stops its tools in order
             start_new_session=True,
         )
