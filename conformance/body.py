@@ -24,6 +24,7 @@ from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import Dialect
+from dexkit.topics import HAND_TOPICS
 from dexkit.traces import SampleArray
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import encode_with_crc, verify_payload
@@ -35,6 +36,7 @@ __all__ = [
     "body_dialect",
     "body_in",
     "body_recording",
+    "recording_of",
     "wire_for",
 ]
 
@@ -234,6 +236,23 @@ def body_recording(trace: TraceLike, name: str) -> BodyRecording:
         payloads=states.payloads if states is not None else (),
         command_payloads=commands.payloads if commands is not None else (),
     )
+
+
+def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
+    """Decode a recording of hands or of a body.
+
+    :param dialect_name: None to take what the topics show: hands, if there are any.
+    :raises ConformanceError: it has none of their topics.
+    :raises TraceUnsupported: its stimulus record cannot be read.
+    """
+    name = dialect_name
+    if name is None:
+        topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
+        found = None if topics & HAND_TOPICS else body_in(trace)
+        name = found.name if found else None
+    if name in BODIES:
+        return body_recording(trace, name)
+    return Recording.of(trace, dialect_name=name, sides=sides)
 
 
 def _right(samples: SampleArray | None, type_name: str) -> SampleArray | None:

@@ -44,6 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     Each also has a long name, ``--dexkit-NAME``. Should another plug-in of the environment own
     the short one, that is the only one: this plug-in must not break anybody's pytest.
     """
+    from dexkit.bodies import BODIES
     from dexkit.models import DIALECTS
 
     group = parser.getgroup("dexkit conformance", "judge a hand on Unitree's topics")
@@ -77,7 +78,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     add(
         "dialect",
-        choices=list(DIALECTS),
+        choices=[*DIALECTS, *BODIES],
         help="how the hand speaks (default: as its model does; unitree_go with external)",
     )
     add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")

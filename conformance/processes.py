@@ -15,11 +15,22 @@ from pathlib import Path
 from types import TracebackType
 
 from dexkit import processes
+from dexkit.bodies import BODIES
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
 
-__all__ = ["EMULATED", "EXTERNAL", "ON_USB", "SIMULATED", "Emulation", "Rig", "RigOptions", "Tool"]
+__all__ = [
+    "BODY_EMULATORS",
+    "EMULATED",
+    "EXTERNAL",
+    "ON_USB",
+    "SIMULATED",
+    "Emulation",
+    "Rig",
+    "RigOptions",
+    "Tool",
+]
 
 EXTERNAL = "external"
 """The backend's name for a service that somebody else runs."""
@@ -59,6 +70,10 @@ ON_USB = ("dex3-usb",)
 """Backends whose device is judged on USB as well."""
 SIMULATED = ("sim-dex1", "sim-dex3", "sim-dex5")
 """Backends without a device, which are told of an object by the setting ``object``."""
+
+
+BODY_EMULATORS = {f"sim-{name}": name for name in BODIES}
+"""Backends that are emulated bodies: the names of their emulators."""
 
 
 class Tool(processes.Tool):
@@ -212,6 +227,9 @@ class Rig:
 
     def _serve(self, sides: Sequence[Side], settings: Sequence[str]) -> Tool:
         options = self.options
+        place_on_dds = ("--domain", str(options.domain), "--interface", options.interface)
+        if options.backend in BODY_EMULATORS:
+            return self._tool("emulate", BODY_EMULATORS[options.backend], "--quiet", *place_on_dds)
         arguments = ["serve", options.backend, "--side"]
         arguments.append(str(sides[0]) if len(sides) == 1 else "both")
         for side in sides:
@@ -229,8 +247,7 @@ class Rig:
         return self._tool(
             *arguments,
             *("--dialect", options.dialect.name),
-            *("--domain", str(options.domain)),
-            *("--interface", options.interface),
+            *place_on_dds,
         )
 
     def _tool(self, *arguments: str) -> Tool:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 
+from dexkit.bodies import BODIES, G1, H1
+from dexkit.conformance.body import body_dialect
+from dexkit.conformance.phases import BODY
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.hand import Side
@@ -12,13 +15,15 @@ from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
 
 __all__ = ["QUICK", "length", "print_selection", "quick"]
 
-QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0}
+QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0, H1.name: 6.0, G1.name: 6.0}
 """Seconds of stimulus of a quick run; starting a pair of hands and judging take some more."""
 
 
 @cache
 def length(model_name: str, phases: frozenset[str]) -> float:
     """Seconds that a pair of hands which obey at once takes for these phases."""
+    if model_name in BODIES:
+        return SCRIPTS[model_name](Plan(body_dialect(model_name), (BODY,), phases=phases)).length()
     dialect = model(model_name).dialects[0]
     return SCRIPTS[model_name](Plan(dialect, tuple(Side), phases=phases)).length()
 
@@ -33,7 +38,7 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
     for name in dict.fromkeys(r.model for r in requirements):
         needs: dict[frozenset[str], list[str]] = {}
         for r in requirements:
-            if (r.model, r.layer, r.level) == (name, "dds", Level.MUST):
+            if (r.model, r.level) == (name, Level.MUST) and r.layer != "usb":
                 own = phases_for([r])
                 if "replay" not in own:
                     needs.setdefault(own, []).append(r.id)

@@ -10,9 +10,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from dexkit.bodies import BODIES
+from dexkit.conformance.body import body_dialect, recording_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.processes import EMULATED, EXTERNAL, ON_USB, SIMULATED, RigOptions
+from dexkit.conformance.phases import BODY
+from dexkit.conformance.processes import (
+    BODY_EMULATORS,
+    EMULATED,
+    EXTERNAL,
+    ON_USB,
+    SIMULATED,
+    RigOptions,
+)
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.selection import quick as quick_ones
@@ -119,6 +129,9 @@ class SuiteOptions:
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
         """
+        of_body = _body_of(backend, dialect_name)
+        if of_body:
+            _refuse_for_bodies(side=side, device=devices, object=objects, set=settings, trace=trace)
         one_device = len(devices) == 1 and "=" not in devices[0]
         sides = sides_of(side or ("left" if one_device else "both"))
         if one_device and len(sides) > 1:
@@ -126,7 +139,10 @@ class SuiteOptions:
                 "one --device for two hands", hint="--device left=PATH --device right=PATH"
             )
         named = _by_side(devices, sides, str, "--device")
-        chosen = _dialect(backend, dialect_name, sides[0], named, settings)
+        if of_body:
+            sides, chosen = (BODY,), body_dialect(of_body)
+        else:
+            chosen = _dialect(backend, dialect_name, sides[0], named, settings)
         touch = [o for o in objects if o != "none"]
         by_side = _by_side(touch, sides, float, "--object")
         low, high, of_what = (5, 60, "opening") if chosen.q_open > 0 else (55, 75, "closing")
@@ -152,7 +168,7 @@ class SuiteOptions:
                 raise UsageError(f"cannot write {file}: it is a directory")
             if file is not None and not os.access(file.absolute().parent, os.W_OK):
                 raise UsageError(f"cannot write {file}: its directory is read-only")
-        every = catalogue(chosen.model)
+        every = catalogue(chosen.model, "body" if of_body else "dds")
         if backend in ON_USB:
             every += catalogue(chosen.model, "usb")
         claims = Claims.load(capabilities, chosen.model)
@@ -216,7 +232,7 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
     if config.getoption("dexkit_backend"):
         return SuiteOptions.from_pytest(config).requirements
     name = config.getoption("dexkit_dialect")
-    model_name = dialect(name).model if name else None
+    model_name = name if name in BODIES else dialect(name).model if name else None
     path = config.getoption("dexkit_capabilities")
     claims = Claims.load(Path(path) if path else None, model_name)
     found = select(
@@ -225,6 +241,30 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
         level=config.getoption("dexkit_level"),
     )
     return quick_ones(found) if config.getoption("dexkit_quick") else found
+
+
+def _body_of(backend: str, dialect_name: str | None) -> str:
+    """The body that is to be judged; empty for a hand.
+
+    :raises UsageError: a backend and a dialect of two of them.
+    """
+    started = BODY_EMULATORS.get(backend, "")
+    wanted = dialect_name if dialect_name in BODIES else ""
+    if (started and dialect_name and wanted != started) or (
+        wanted and not started and backend != EXTERNAL
+    ):
+        raise UsageError(
+            f"{backend} does not speak {dialect_name}",
+            hint=f"bodies: --backend {' or '.join(BODY_EMULATORS)}, or external with --dialect "
+            f"{' or '.join(BODIES)}",
+        )
+    return started or wanted or ""
+
+
+def _refuse_for_bodies(**given: Any) -> None:
+    wrong = [f"--{name}" for name, value in given.items() if value]
+    if wrong:
+        raise UsageError(f"{', '.join(wrong)} is about hands, and a body is to be judged")
 
 
 def _dialect(
@@ -283,7 +323,7 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
     """
     from dexkit.conformance.live import LiveOptions
 
-    phases = phases_for(r for r in options.requirements if r.layer == "dds")
+    phases = phases_for(r for r in options.requirements if r.layer != "usb")
     session = None
     if "replay" in phases:
         session = (
@@ -323,9 +363,7 @@ def run_suite(
             if not record_run(live_options(options, domain), path, say=say, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")
             say("judging the recording")
-            view = Recording.of(
-                open_trace(path), dialect_name=options.dialect.name, sides=options.sides
-            )
+            view = recording_of(open_trace(path), options.dialect.name, options.sides)
             result = judge_recording(options, view)
     return result
 

@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dexkit.conformance import mutants as dds
-from dexkit.conformance.mutants import shared
+from dexkit.conformance.mutants import body, shared
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.conformance.usb import mutants as usb
 from dexkit.models import DEX1_1, DEX3_1
@@ -67,7 +67,7 @@ class Outcome:
 
 
 def trials() -> tuple[Trial, ...]:
-    """Every wrong hand: on the topics and on USB."""
+    """Every wrong hand, on the topics and on USB, and every wrong body."""
     found = [
         Trial(
             "dds",
@@ -83,6 +83,7 @@ def trials() -> tuple[Trial, ...]:
     return (
         *found,
         *(Trial("usb", DEX3_1.name, m.name, m.kills, m.also, m.summary, 0.5) for m in usb.MUTANTS),
+        *(Trial("body", m.model, m.name, m.kills, m.also, m.summary, 4.0) for m in body.MUTANTS),
     )
 
 
@@ -116,12 +117,19 @@ def try_one(trial: Trial, *, short: bool = False) -> Outcome:
     if trial.layer == "usb":
         wrong = next(m for m in usb.MUTANTS if (m.name, m.kills) == (trial.name, trial.kills))
         _, blamed = usb.try_mutant(wrong.device, catalogue(trial.model, "usb"))
-        due = {trial.kills, *trial.also}
-        return Outcome(trial, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
+        return _outcome(trial, blamed)
+    if trial.layer == "body":
+        bad = next(m for m in body.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
+        return _outcome(trial, bad.blamed(short=short))
     mutant = next(m for m in dds.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
     plan = mutant.short_plan if short and mutant.name not in shared.DILUTED else mutant.plan
     found = dds.trial(mutant, dds.run_mutant(mutant.service, plan))
     return Outcome(trial, tuple(sorted(found["missed"])), tuple(sorted(found["wrongly"])))
+
+
+def _outcome(trial: Trial, blamed: set[str]) -> Outcome:
+    due = {trial.kills, *trial.also}
+    return Outcome(trial, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
 
 
 def _ignore_interrupts() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
+from dexkit.bodies import BODIES
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.models import MODELS
 
@@ -103,7 +104,8 @@ def tally(result: RunResult) -> Tally:
 
 def model_title(result: RunResult) -> str:
     """``Dex1-1``, or ``hand`` where the model is not known."""
-    known = MODELS.get(result.subject.get("model", ""))
+    name = result.subject.get("model", "")
+    known = MODELS.get(name) or BODIES.get(name)
     return known.title if known else "hand"
 
 
@@ -118,12 +120,12 @@ def hand_name(result: RunResult) -> str:
 
 def nature(result: RunResult) -> str:
     """``emulated``, ``simulated``, ``recorded``, or empty: how real the hand was."""
-    from dexkit.conformance.processes import SIMULATED
+    from dexkit.conformance.processes import BODY_EMULATORS, SIMULATED
 
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":
         return "emulated"
-    if name in SIMULATED or name.startswith("virtual "):
+    if name in (*SIMULATED, *BODY_EMULATORS) or name.startswith("virtual "):
         return "simulated"
     return "" if name else "recorded"
 

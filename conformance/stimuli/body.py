@@ -91,6 +91,8 @@ class BodyScript(Script):
         self._next_ns = self._obs.now_ns
         yield from self._listen()
         if BODY not in self._obs.q:
+            yield from self._wake()
+        if BODY not in self._obs.q:
             self._say("no state: nothing more can be asked of this body")
             return
         self._start = dict(zip(self._body.used, self._obs.q[BODY], strict=True))
@@ -102,6 +104,13 @@ class BodyScript(Script):
         self._end(phase)
         yield from self._provoke()
         yield from self._keep(0.2)
+
+    def _wake(self) -> Steps:
+        """Commands that only damp: does it wait for some before it tells its state?"""
+        for slot in self._body.used:
+            _, kd = self._body.client_gains[slot]
+            self._order[slot] = Motor(kp=0.0, kd=kd, mode=self._body.enable[slot])
+        yield from self._keep(0.3)
 
     def _provoke(self) -> Steps:
         parts: list[tuple[str, Callable[[], Steps]]] = [
@@ -299,7 +308,10 @@ class BodyScript(Script):
 
     def _foreign(self) -> Steps:
         yield Join(Role.STRANGER)
-        payload = self._coder.foreign_command(self._wish())
+        wish = list(self._order)  # of every joint: the families' slots are not the same
+        for slot in self._body.used:
+            wish[slot] = replace(wish[slot], q=wish[slot].q + self._inward(slot, STEP))
+        payload = self._coder.foreign_command(wish)
 
         def send() -> Steps:
             self._next_ns += self._period_ns

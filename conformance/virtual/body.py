@@ -16,7 +16,7 @@ import numpy as np
 
 from dexkit.bodies import BodyModel
 from dexkit.conformance.body import BodyWire
-from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.virtual import MemoryTrace, Sample, Service
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import decode, message_type
@@ -71,6 +71,10 @@ class ReferenceBody(Service):
         self._law: Any = (None,)
         self._last: tuple[bytes, Orders | None] = (b"", None)
         self._state: Any = message_type(dialect.state_type).cls()
+
+    @classmethod
+    def recorded(cls, trace: MemoryTrace) -> None:
+        """Change the recording: a client that is wrong is not a body, but is found in the same."""
 
     # -- commands ---------------------------------------------------------------------------
 

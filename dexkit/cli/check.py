@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from dexkit.bodies import BODIES
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS
 
@@ -26,10 +27,10 @@ from dexkit.models import DIALECTS
 )
 @click.option(
     "--dialect",
-    type=click.Choice(["auto", *DIALECTS]),
+    type=click.Choice(["auto", *DIALECTS, *BODIES]),
     default="auto",
     show_default=True,
-    help="How the hand speaks; auto takes it from topics and types.",
+    help="How the hand speaks, or which body it is; auto takes it from topics and types.",
 )
 @click.option(
     "--require",
@@ -78,26 +79,31 @@ def command(
     Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
     usable or nothing in it could be judged.
     """
+    from dexkit.conformance.body import recording_of
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import catalogue, select
-    from dexkit.conformance.view import Recording, sides_of
+    from dexkit.conformance.view import sides_of
     from dexkit.traces import open_trace
 
-    view, model_name = None, None if dialect == "auto" else DIALECTS[dialect].model
+    view, model_name = None, None
+    if dialect != "auto":
+        model_name = dialect if dialect in BODIES else DIALECTS[dialect].model
     if recording is not None:
-        view = Recording.of(
+        view = recording_of(
             open_trace(recording),
-            dialect_name=None if dialect == "auto" else dialect,
-            sides=sides_of(side) if side else (),
+            None if dialect == "auto" else dialect,
+            sides_of(side) if side else (),
         )
         model_name = view.model.name
     claims = Claims.load(capabilities, model_name)
     model_name = model_name or claims.hand.get("model")
-    every = catalogue(model_name)
-    if view is None or view.usb is not None:
-        every += catalogue(model_name, "usb")
+    if view is None:
+        every = catalogue(model_name, None)
+    else:
+        every = catalogue(model_name, view.layer)
+        every += catalogue(model_name, "usb") if view.usb is not None else ()
     requirements = select(claims.apply(every), prefixes=require, level=level)
     if not requirements:
         raise ConformanceError("no requirement is left by --require and --level together")

@@ -9,12 +9,17 @@ import click
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from dexkit.bodies import BODIES
 from dexkit.cli.common import stop_on_signals
 from dexkit.models import MODELS
 
 
 @click.command("mutants")
-@click.option("--model", type=click.Choice(list(MODELS)), help="Only wrong hands of this model.")
+@click.option(
+    "--model",
+    type=click.Choice([*MODELS, *BODIES]),
+    help="Only wrong hands, or bodies, of this model.",
+)
 @click.option(
     "--require",
     multiple=True,
