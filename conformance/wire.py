@@ -80,7 +80,7 @@ class Wire:
         """
         if self._ids:
             return mode_byte(index, status, timeout)
-        return status if self._modes else 0
+        return int(status) if self._modes else 0
 
     def status(self, modes: NDArray[np.intp]) -> NDArray[np.intp]:
         """What mode bytes of states say about their motors: 1 driven, 0 not."""

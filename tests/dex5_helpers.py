@@ -20,29 +20,27 @@ from dexkit.teleop.wire import ClientWire
 from dexkit.traces import Recorder, sample_path
 
 EPOCH_NS = 1_795_000_000_000_000_000
-OBJECT = 60.0  # percent of closing, right
+PROFILE = "sine"
+MOST = {Side.RIGHT: 0.6}  # of the profile: clear of where the conformance kit puts an object
 STATE_NS = 2_000_000
 CLIENT_STEPS = 5  # of the state's period
 CLIENT_STARTS = 0.5  # seconds after the hands
 
 
-def write(path: Path, seconds: float = 8.5) -> None:
+def write(path: Path, seconds: float = 6.0) -> None:
     """The session, or the beginning of it."""
     dialect = DEX5_1.dialects[0]
     clock = ManualClock()
-    hands = {
-        Side.LEFT: SimDex5(Side.LEFT, clock=clock),
-        Side.RIGHT: SimDex5(Side.RIGHT, object_at=OBJECT, clock=clock),
-    }
+    hands = {s: SimDex5(s, clock=clock) for s in Side}
     maps = {s: dialect_map(dialect, {s: hand.spec}) for s, hand in hands.items()}
     client, wire = client_for(dialect), ClientWire(dialect)
-    operator = Operator(profile("fist", DEX5_1.name), dialect)
+    operator = Operator(profile(PROFILE, DEX5_1.name), dialect, most=MOST)
     decode = message_type(dialect.cmd_type).decode
     commands = {s: HandCommand.brake(hand.spec.n_joints) for s, hand in hands.items()}
     about = {
         "controller_commit": "none: dexkit's model of xr_teleoperate's Dex5_1_Controller",
-        "states": "dexkit's simulated hands (sim-dex5), an object in the right one",
-        "operator": "dexkit's profile 'fist'",
+        "states": "dexkit's simulated hands (sim-dex5)",
+        "operator": f"dexkit's profile {PROFILE!r}",
         "network": "none: one virtual clock",
     }
     with Recorder(path, overwrite=True) as recorder:

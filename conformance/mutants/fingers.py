@@ -9,7 +9,7 @@ one, into the reference hand.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -274,15 +274,15 @@ class CoupledFinger(FingerService):
 
 class _Backwards(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
-        middle = 0.5 * (self.low + self.high)
+        rest = np.array(self.model.rest_q[self.side])
         turned = rows.copy()
-        turned[0] = np.where(self.index == 2, 2 * middle - rows[0], rows[0])
+        turned[0] = np.where(self.index == 2, 2 * rest - rows[0], rows[0])
         turned[1] = np.where(self.index == 2, -rows[1], rows[1])
         super().take(turned, mode)
 
 
 class OneJointBackwards(FingerService):
-    """Turns the sign of the thumb's tip."""
+    """Turns the sign of one joint."""
 
     wrong = _Backwards
 
@@ -718,9 +718,6 @@ _SHARED: dict[str, tuple[type[Service], ...]] = {
     "TRACK-02": (shared.Delayed,),
 }
 
-# a velocity cannot be derived twice from states that come in bursts
-_SHARED_ALSO: dict[type, tuple[str, ...]] = {shared.Bursts: ("FIELD-05",)}
-
 _OWN: tuple[_Entry, ...] = (
     (RestsAtZero, "START-02", ()),
     (NanVelocity, "FIELD-02", ()),
@@ -779,10 +776,22 @@ _DEX3: tuple[_Entry, ...] = (
 )
 
 _DEX5: tuple[_Entry, ...] = (
+    # what sees that nothing moves comes first
+    (shared.Frozen, "MODE-01", ()),
     (DecodesRis, "MODE-01", ()),
     (ThumbFirst, "JOINT-01", ()),
     (FingersInNewtonMetres, "FORCE-03", ()),
 )
+
+
+_DEX5_ALSO: dict[str, tuple[str, ...]] = {
+    # softer gains swing less, and come to rest more slowly
+    "Hunts": (),
+    "Slow": ("MOVE-07",),
+    "Coupled": ("MOVE-02",),
+    "TurnedForce": ("FORCE-03",),
+}
+"""What else fails with a wrong hand where it is another than of a Dex3-1."""
 
 
 def _on(mixin: type[Service], reference: type[FingerService]) -> type[FingerService]:
@@ -797,16 +806,21 @@ def _on(mixin: type[Service], reference: type[FingerService]) -> type[FingerServ
 
 
 def zoo(
-    prefix: str, reference: type[FingerService], own: tuple[_Entry, ...]
+    prefix: str,
+    reference: type[FingerService],
+    own: tuple[_Entry, ...],
+    others: Mapping[str, tuple[str, ...]],
 ) -> tuple[tuple[type[FingerService], str, tuple[str, ...]], ...]:
     """The wrong hands of a model, for what its catalogue has.
 
     :param prefix: of its requirements' ids.
     :param own: those that only this model has.
+    :param others: what else fails with some of them, by name, if not the same as usual.
     """
+    named = {mixin.__name__ for mixin, _, _ in own}
     ids = {r.id for r in catalogue(reference.hand.model.name)}
     shares = [
-        (mixin, kills, _SHARED_ALSO.get(mixin, ()))
+        (mixin, kills, ())
         for kills, mixins in _SHARED.items()
         for mixin in mixins
     ]
@@ -814,21 +828,28 @@ def zoo(
         (
             _on(mixin, reference),
             f"{prefix}-{kills}",
-            tuple(f"{prefix}-{name}" for name in also if f"{prefix}-{name}" in ids),
+            tuple(
+                f"{prefix}-{name}"
+                for name in others.get(mixin.__name__, also)
+                if f"{prefix}-{name}" in ids
+            ),
         )
-        for mixin, kills, also in (*shares, *_OWN, *own)
+        for mixin, kills, also in (
+            *(entry for entry in (*shares, *_OWN) if entry[0].__name__ not in named),
+            *own,
+        )
         if f"{prefix}-{kills}" in ids
     )
 
 
 ZOOS = {
-    DEX3_1.name: zoo("DEX3", Dex3Service, _DEX3),
-    DEX5_1.name: zoo("DEX5", Dex5Service, _DEX5),
+    DEX3_1.name: zoo("DEX3", Dex3Service, _DEX3, {}),
+    DEX5_1.name: zoo("DEX5", Dex5Service, _DEX5, _DEX5_ALSO),
 }
 """By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
 BOTH = (
     *("Unmirrored", "IndexFirst", "Coupled", "Swapped", "Numb", "TurnedForce"),
-    *("NanPressure", "ZeroForNoValue"),
+    *("NanPressure", "ZeroForNoValue", "FingersInNewtonMetres"),
 )
 """What is wrong of the right hand, of both together, or in touch; the others show it in the left
 hand alone, in half the time."""

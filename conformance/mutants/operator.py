@@ -6,6 +6,7 @@ Each keeps every MUST; what is wrong shows where commands depend on states.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -210,14 +211,21 @@ _FINGERS: tuple[_Entry, ...] = (
     (SlowToLeave, "OPER-01", ("OPER-05",)),
     (FingerDeadBand, "OPER-02", ()),
     (Springs, "OPER-03", ()),
-    (CoarseFingers, "OPER-04", ("MOVE-04",)),
+    (CoarseFingers, "OPER-04", ()),
     (LateFingers, "OPER-05", ("TRACK-02",)),
 )
 
 
-def _zoo(prefix: str, reference: type[FingerService]) -> tuple[_Entry, ...]:
+def _zoo(
+    prefix: str, reference: type[FingerService], others: Mapping[type[Service], tuple[str, ...]]
+) -> tuple[_Entry, ...]:
+    """The wrong hands of a model; ``others`` says what else fails only with this one."""
     return tuple(
-        (shared.of(mixin, reference), f"{prefix}-{kills}", tuple(f"{prefix}-{a}" for a in also))
+        (
+            shared.of(mixin, reference),
+            f"{prefix}-{kills}",
+            tuple(f"{prefix}-{a}" for a in (*also, *others.get(mixin, ()))),
+        )
         for mixin, kills, also in _FINGERS
     )
 
@@ -231,7 +239,7 @@ ZOO: dict[str, tuple[_Entry, ...]] = {
         (CoarseTargets, "DEX1-OPER-04", ()),
         (SlowToWake, "DEX1-OPER-05", ()),
     ),
-    DEX3_1.name: _zoo("DEX3", Dex3Service),
-    DEX5_1.name: _zoo("DEX5", Dex5Service),
+    DEX3_1.name: _zoo("DEX3", Dex3Service, {CoarseFingers: ("MOVE-04",)}),
+    DEX5_1.name: _zoo("DEX5", Dex5Service, {}),
 }
 """By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
