@@ -178,6 +178,7 @@ def test_mode_of_another_kind_of_motor() -> None:
     lenient = Bench(H1, Settings(lenient=True))
     state = lenient.run(1.0, order)
     assert state.motor_state[hip].q == pytest.approx(0.4, abs=0.02)
+    assert state.motor_state[hip].mode == 1  # as commanded
     assert not lenient.reports
 
 
@@ -461,4 +462,3 @@ def test_structs_and_samples(name: str, noise: bytes) -> None:
 def test_body_without_settings() -> None:
     assert Body(H1).timeout == H1.command_timeout
     assert Body(H1, Settings(command_timeout=0.2)).timeout == 0.2
-    assert Body(G1).slots["left_elbow"] == 18

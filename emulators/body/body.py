@@ -75,9 +75,17 @@ class _Order:
     """A command in force."""
 
     law: Law
-    following: NDArray[np.bool_]  # motors that are on
+    mode: NDArray[np.uint8]  # as in the state; 0 for motors that are off
     since: float
     weight: float = 1.0
+
+
+def _law(numbers: Array, on: NDArray[np.bool_]) -> Law:
+    """The law of motors that are commanded q, dq, tau, kp, kd (shape (5, n)); none where off."""
+    q, dq, tau, kp, kd = numbers
+    kp = (on & (np.abs(q) < Q_STOP)) * np.maximum(kp, 0.0)
+    kd = (on & (np.abs(dq) < DQ_STOP)) * np.maximum(kd, 0.0)
+    return Law(on * tau + kp * q + kd * dq, kp, kd)
 
 
 class Body:
@@ -111,7 +119,8 @@ class Body:
         self._start = now
         self._lived = 0
         self._used = np.array(model.used)
-        self._enable = np.array([model.enable[slot] for slot in model.used])
+        self._enable = np.array([model.enable[slot] for slot in model.used], np.uint8)
+        self._all_off = np.zeros_like(self._enable)
         self._arm = np.isin(self._used, model.arm_slots)
         self._damping = Law.damping(np.array([model.client_gains[slot][1] for slot in model.used]))
         self._law = self._damping
@@ -134,11 +143,6 @@ class Body:
         """Whether commands are in force; otherwise it damps."""
         return self._order is not None or self._arm_order is not None
 
-    @property
-    def slots(self) -> dict[str, int]:
-        """Motor slots by joint name."""
-        return {self.model.joint(slot).name: slot for slot in self.model.used}
-
     def position(self, slot: int) -> float:
         """Where a joint is, rad."""
         return float(self.joints.q[self.model.used.index(slot)])
@@ -147,12 +151,16 @@ class Body:
 
     def command(self, data: bytes, now: float) -> bool:
         """Take a sample of the command topic; whether it is obeyed."""
-        order = self._read(data, now, self.model.cmd_topic)
-        if order is None:
+        topic = self.model.cmd_topic
+        if not self._read(data, topic):
             return False
-        self.counters.commands += 1
-        self._order = order
+        numbers = self._numbers(topic)
+        if numbers is None or not self._is_ours(topic):
+            return False
+        mode = self._known_modes(topic)
+        self._order = _Order(_law(numbers, mode != 0), mode, now)
         self._lost = False
+        self.counters.commands += 1
         self._settle()
         return True
 
@@ -162,87 +170,95 @@ class Body:
         Unitree's arm examples set neither CRC nor mode bytes (unitree_sdk2
         ``g1_arm7_sdk_dds_example.cpp``), so a CRC of 0 counts as none, and all modes as on.
         """
-        order = self._read(data, now, self.model.arm_topic)
-        if order is None:
+        topic = self.model.arm_topic
+        if not self._read(data, topic, crc_may_be_unset=True):
             return False
+        numbers = self._numbers(topic)
+        weight = float(self._orders[self.model.weight_slot, 0])
+        if numbers is None or not self._finite(weight, topic):
+            return False
+        weight = min(max(weight, 0.0), 1.0)
+        mode = self._enable * (self._arm & (weight > 0))
+        self._arm_order = _Order(_law(numbers, self._arm), mode, now, weight)
         self.counters.arm_commands += 1
-        self._arm_order = order
         self._settle()
         return True
 
-    def _read(self, data: bytes, now: float, topic: str) -> _Order | None:
-        arm = topic == self.model.arm_topic
-        image, counters = self._cmd, self.counters
+    def _read(self, data: bytes, topic: str, *, crc_may_be_unset: bool = False) -> bool:
+        """Take a sample into the image of a command, if it is one and has the right CRC."""
         try:
-            image.read(data)
+            self._cmd.read(data)
         except WireError as error:
-            counters.malformed += 1
+            self.counters.malformed += 1
             self._say("malformed", f"{topic}: no {self.model.cmd_type}: {error}; ignored")
-            return None
-        message = image.message
-        crc, right = int(message["crc"][0]), image.crc()
-        if crc != right and not (arm and crc == 0):
-            counters.bad_crc += 1
-            self._say(
-                "crc",
-                f"{topic}: the CRC is 0x{crc:08X} and should be 0x{right:08X}; such commands are "
-                "ignored" + (" (it was never set)" if crc == 0 else ""),
-            )
-            return None
-        machine = self.model.mode_machine
-        if machine is not None and not arm and not self.settings.lenient:
-            sent = int(message["mode_machine"][0])
-            if sent != machine:
-                counters.bad_machine += 1
-                self._say(
-                    "machine",
-                    f"{topic}: mode_machine is {sent} and should be {machine}, as in "
-                    f"{self.model.state_topic}; such commands are ignored",
-                )
-                return None
-        motors = message["motor_cmd"][0]
-        mode = motors["mode"][self._used]
-        numbers = self._orders[self._used].astype(np.float64)
-        weight = float(self._orders[self.model.weight_slot, 0]) if arm else 1.0
-        # a sum finds what is not finite: of some singles, in double precision, it cannot overflow
-        if not math.isfinite(numbers.sum() + weight):
-            counters.bad_number += 1
-            self._say("number", f"{topic}: NaN or infinity; such commands are ignored")
-            return None
-        following = self._following(mode, topic) if not arm else self._arm
-        q, dq, tau, kp, kd = numbers.T
-        kp = (following & (np.abs(q) < Q_STOP)) * np.maximum(kp, 0.0)
-        kd = (following & (np.abs(dq) < DQ_STOP)) * np.maximum(kd, 0.0)
-        bias = following * tau + kp * q + kd * dq
-        if machine is not None:
-            self._mode_pr = int(message["mode_pr"][0]) if not arm else self._mode_pr
-            if self._mode_pr:
-                self._say(
-                    "mode_pr",
-                    f"{topic}: mode_pr {self._mode_pr}: motors A and B are taken for pitch and "
-                    "roll",
-                )
-        elif not arm and (message["head"][0].tolist(), message["level_flag"][0]) != _LOW_LEVEL:
-            self._say("head", f"{topic}: head and level_flag are not FE EF FF; obeyed all the same")
-        return _Order(Law(bias, kp, kd), following, now, min(max(weight, 0.0), 1.0))
+            return False
+        crc, right = int(self._cmd.message["crc"][0]), self._cmd.crc()
+        if crc == right or (crc_may_be_unset and crc == 0):
+            return True
+        self.counters.bad_crc += 1
+        self._say(
+            "crc",
+            f"{topic}: the CRC is 0x{crc:08X} and should be 0x{right:08X}; such commands are "
+            "ignored" + (" (it was never set)" if crc == 0 else ""),
+        )
+        return False
 
-    def _following(self, mode: NDArray[np.uint8], topic: str) -> NDArray[np.bool_]:
-        """The motors that their mode bytes turn on."""
-        known: NDArray[np.bool_] = mode == self._enable
-        if self.settings.lenient:
-            known = mode != 0
-        unknown = ~known & (mode != 0)
-        if unknown.any():
-            self.counters.wrong_mode += 1
-            first = int(np.argmax(unknown))
-            slot = self.model.used[first]
+    def _is_ours(self, topic: str) -> bool:
+        """Look at what stands before the motors; whether the command is for this robot."""
+        message, machine = self._cmd.message, self.model.mode_machine
+        if machine is None:
+            if (message["head"][0].tolist(), message["level_flag"][0]) != _LOW_LEVEL:
+                self._say(
+                    "head", f"{topic}: head and level_flag are not FE EF FF; obeyed all the same"
+                )
+            return True
+        sent = int(message["mode_machine"][0])
+        if sent != machine and not self.settings.lenient:
+            self.counters.bad_machine += 1
             self._say(
-                "mode",
-                f"{topic}: mode 0x{int(mode[first]):02X} for motor {slot} "
-                f"({self.model.joint(slot).name}), which takes 0x{self.model.enable[slot]:02X}; "
-                "motors with a wrong mode stay off",
+                "machine",
+                f"{topic}: mode_machine is {sent} and should be {machine}, as in "
+                f"{self.model.state_topic}; such commands are ignored",
             )
-        return known
+            return False
+        self._mode_pr = int(message["mode_pr"][0])
+        if self._mode_pr:
+            self._say(
+                "mode_pr",
+                f"{topic}: mode_pr {self._mode_pr}: motors A and B are taken for pitch and roll",
+            )
+        return True
+
+    def _numbers(self, topic: str) -> Array | None:
+        """q, dq, tau, kp, kd of the used motors, shape (5, n); None if one is no number."""
+        numbers: Array = self._orders[self._used].astype(np.float64).T
+        # a sum shows what is not finite: of some singles, in double precision, it cannot overflow
+        return numbers if self._finite(float(numbers.sum()), topic) else None
+
+    def _finite(self, number: float, topic: str) -> bool:
+        if math.isfinite(number):
+            return True
+        self.counters.bad_number += 1
+        self._say("number", f"{topic}: NaN or infinity; such commands are ignored")
+        return False
+
+    def _known_modes(self, topic: str) -> NDArray[np.uint8]:
+        """The mode bytes of the used motors, 0 in the place of those that a motor does not know."""
+        mode: NDArray[np.uint8] = self._cmd.message["motor_cmd"][0]["mode"][self._used]
+        known: NDArray[np.bool_] = mode == self._enable
+        if self.settings.lenient or (known | (mode == 0)).all():
+            return mode
+        self.counters.wrong_mode += 1
+        first = int(np.argmax(~known & (mode != 0)))
+        slot = self.model.used[first]
+        self._say(
+            "mode",
+            f"{topic}: mode 0x{int(mode[first]):02X} for motor {slot} "
+            f"({self.model.joint(slot).name}), which takes 0x{self.model.enable[slot]:02X}; "
+            "motors with a wrong mode stay off",
+        )
+        mode = np.where(known, mode, self._all_off)
+        return mode
 
     def _settle(self) -> None:
         """Find the law of the motors from the commands in force."""
@@ -324,12 +340,10 @@ class Body:
         """The state as it is, as a sample with its CRC."""
         message, joints, used = self._state.message, self.joints, self._used
         motors = message["motor_state"][0]
-        following = np.zeros(len(used), bool)
-        if self._order is not None:
-            following |= self._order.following
-        if self._arm_order is not None and self._arm_order.weight > 0:
-            following |= self._arm
-        motors["mode"][used] = np.where(following, self._enable, 0)
+        mode = self._order.mode if self._order is not None else self._all_off
+        if self._arm_order is not None:
+            mode = np.where(self._arm_order.mode, self._arm_order.mode, mode)
+        motors["mode"][used] = mode
         motion = np.array((joints.q, joints.dq, joints.ddq, joints.tau)).T
         self._motion[used] = motion
         if self._raw is not None:
