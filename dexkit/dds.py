@@ -335,10 +335,11 @@ def type_hash(name: str) -> str:
     Peers whose hash differs have another version of the message (facts/unitree-dex A.3) and do
     not match.
     """
-    description = cyclone_type(name).__idl__
-    description.populate()
-    description.fill_type_data()
-    value: bytes = description.get_type_id().value
+    with _types_lock:
+        description = cyclone_type(name).__idl__
+        description.populate()
+        description.fill_type_data()
+        value: bytes = description.get_type_id().value
     return value.hex()
 
 
@@ -392,6 +393,8 @@ class _Domain:
 
 _domains: dict[int, _Domain] = {}
 _domains_lock = threading.Lock()
+# CycloneDDS describes a type when its first topic is made, and not for two threads at once
+_types_lock = threading.RLock()
 
 
 def _acquire_domain(number: int, interface: str) -> None:
@@ -896,9 +899,10 @@ class DdsNode:
     def _topic(self, name: str, kind: MessageType) -> Any:
         key = (name, kind.name)
         if key not in self._topics:
-            self._topics[key] = _cyclone().topic.Topic(
-                self._participant, name, cyclone_type(kind.name)
-            )
+            with _types_lock:
+                self._topics[key] = _cyclone().topic.Topic(
+                    self._participant, name, cyclone_type(kind.name)
+                )
         return self._topics[key]
 
     def _add(self, handle: _Handle, factory: Any, mask: int) -> None:

@@ -6,6 +6,8 @@ Unitree's SDK, which somebody else wrote.
 
 from __future__ import annotations
 
+import sys
+import threading
 from importlib.util import find_spec
 from typing import Any
 
@@ -13,10 +15,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import tests.dds_helpers  # noqa: F401  (skips this module where CycloneDDS is missing)
-from dexkit.dds import cyclone_type, type_hash
+from dexkit.dds import DdsNode, cyclone_type, type_hash
 from dexkit.messages import message_type
 from dexkit.messages.layout import STRUCTS, Struct
+from tests.dds_helpers import free_domain  # skips this module where CycloneDDS is missing
 from tests.messages_helpers import NAMES, messages
 from tests.unitree_sdk import sdk_class
 
@@ -72,6 +74,33 @@ def test_cyclonedds_big_endian_is_understood(name: str, data: st.DataObject) -> 
     serialised = theirs.__idl__.serialize(theirs, endianness=Endianness.Big)
     assert serialised[:2] == b"\x00\x00"
     assert message_type(name).decode(serialised) == message
+
+
+def test_two_threads_may_be_the_first_to_use_a_type() -> None:
+    """CycloneDDS itself describes a type with the first topic of it, and not in two threads."""
+    names = [name for name in NAMES if "Low" in name]
+    failed: list[BaseException] = []
+    cyclone_type.cache_clear()
+
+    def use(first: int) -> None:
+        try:
+            with DdsNode(domain=domain) as node:
+                for name in (*names[first:], *names[:first]):
+                    node.reader(f"rt/{name.replace(':', '')}", name)
+        except Exception as error:
+            failed.append(error)
+
+    domain, interval = free_domain(), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=use, args=(i,)) for i in range(len(names))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not failed
 
 
 @pytest.mark.skipif("sdk" not in REFERENCES, reason="needs the unitree-sdk2 package")
