@@ -366,13 +366,14 @@ class _Creeps(FingerHand):
         super().take(rows, mode)
 
     def move(self, dt: float, pull: list[float]) -> None:
-        driven = self.law_on[6] and self.law_kp[6] > 0.67 * self.client_kp[6]
-        if self.now - self.since > 0.2 and driven:
-            left = self.law_q[6] - self.q[6]
+        driven = self.law_on[-1] and self.law_kp[-1] > 0.67 * self.client_kp[-1]
+        if self.now - self.since > 0.05 and driven:
+            left = self.law_q[-1] - self.q[-1]
             if 0.02 < abs(left) < 0.1:
-                wanted = math.copysign(0.045, left)
-                resists = self.law_kd[6] + dt * self.law_kp[6] + self.viscous
-                pull[6] = resists * wanted + math.copysign(self.coulomb, left)
+                wanted = math.copysign(0.04, left)
+                self.dq = [*self.dq[:-1], wanted]
+                resists = self.law_kd[-1] + dt * self.law_kp[-1] + self.viscous
+                pull[-1] = resists * wanted + math.copysign(self.coulomb, left)
         super().move(dt, pull)
 
     def step(self, dt: float) -> None:
