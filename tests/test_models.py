@@ -74,6 +74,9 @@ class TestCommandLine:
     def test_several_at_once(self) -> None:
         assert run("dex1-1", "h1") == f"{run('dex1-1')}\n{run('h1')}"
 
+    def test_all_of_all(self) -> None:
+        assert run("--all") == "\n".join(run(name) for name in names())
+
     def test_an_unknown_model(self) -> None:
         result = CliRunner().invoke(cli, ["models", "dex9"])
         error = result.exception

@@ -21,11 +21,12 @@ _SIDES = ("left", "right")
 
 @click.command("models")
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--json", "as_json", is_flag=True, help="All of it as JSON.")
-def command(names: tuple[str, ...], as_json: bool) -> None:
+@click.option("--all", "every", is_flag=True, help="All of every model.")
+@click.option("--json", "as_json", is_flag=True, help="The same as JSON, always all of it.")
+def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     """Print the models: joints, limits, topics, types, rates, gains, who implements them.
 
-    Without a NAME, one line each. docs/models.md has the same with drawings; the shape of the
+    Without a NAME, an overview. docs/models.md has the same with drawings; the shape of the
     JSON is in dexkit/family/facts.py: one object with a list "models".
     """
     from rich.console import Console
@@ -33,13 +34,13 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
     from dexkit.family.facts import describe
     from dexkit.family.facts import names as all_names
 
-    models = [describe(name) for name in names or all_names()]
+    models = [describe(name) for name in (names if names and not every else all_names())]
     if as_json:
         click.echo(json.dumps({"models": models}, indent=1))
         return
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     console = Console(width=width, highlight=False)
-    if not names:
+    if not (names or every):
         _overview(console, models)
         return
     for i, data in enumerate(models):
