@@ -787,6 +787,7 @@ _DEX5: tuple[_Entry, ...] = (
 
 _DEX5_ALSO: dict[str, tuple[str, ...]] = {
     # softer gains swing less, and come to rest more slowly
+    "Creeps": (),
     "Hunts": (),
     "Slow": ("MOVE-07",),
     "Coupled": ("MOVE-02",),
@@ -820,11 +821,7 @@ def zoo(
     """
     named = {mixin.__name__ for mixin, _, _ in own}
     ids = {r.id for r in catalogue(reference.hand.model.name)}
-    shares = [
-        (mixin, kills, ())
-        for kills, mixins in _SHARED.items()
-        for mixin in mixins
-    ]
+    shares = [(mixin, kills, ()) for kills, mixins in _SHARED.items() for mixin in mixins]
     return tuple(
         (
             _on(mixin, reference),

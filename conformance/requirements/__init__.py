@@ -39,6 +39,7 @@ __all__ = [
     "catalogue",
     "models",
     "parse",
+    "renamed",
     "select",
 ]
 
@@ -63,7 +64,7 @@ _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
 LAYERS = ("dds", "usb", "body")
-"""Where a requirement is judged: on a hand's topics, on its own USB device, or on a body's topics."""
+"""Where a requirement is judged: on a hand's topics, on its USB device, or on a body's topics."""
 _KEYS = {
     "id",
     "area",
@@ -191,6 +192,13 @@ def _resolve(value: Any, hand: HandModel | BodyModel, where: str) -> float:
     raise UsageError(f"{where}: a tolerance is a number or 'model:NAME', not {value!r}")
 
 
+def renamed(text: str, theirs: str, ours: str) -> str:
+    """``text`` with one prefix' ids and topics in place of another's."""
+    return text.replace(f"{theirs}-", f"{ours}-").replace(
+        f"rt/{theirs.lower()}/", f"rt/{ours.lower()}/"
+    )
+
+
 def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str) -> list[Any]:
     """The entries of a document, each with what it takes from another one's.
 
@@ -209,9 +217,7 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
 
         def ours(value: Any, theirs: str = theirs) -> Any:
             if isinstance(value, str):
-                return value.replace(f"{theirs}-", f"{prefix}-").replace(
-                    f"rt/{theirs.lower()}/", f"rt/{prefix.lower()}/"
-                )
+                return renamed(value, theirs, prefix)
             return [ours(v) for v in value] if isinstance(value, list) else value
 
         taken = {key: ours(value) for key, value in origins.items()}

@@ -1,5 +1,5 @@
 """The catalogue as a page: ``python -m dexkit.conformance.requirements.page`` brings it up to date
-in docs/conformance.md.
+in docs/conformance.md. Of what is like another requirement only the differences are told.
 """
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.requirements import Requirement, catalogue, renamed
 from dexkit.conformance.requirements.sources import PAGE, anchor, linked, told
 
 __all__ = ["BEGIN", "END", "catalogue_page", "entry"]
@@ -39,13 +39,16 @@ def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[
     """
     unit = f", if `{requirement.capability}` is claimed" if requirement.capability else ""
     proof = ", ".join(f"`{name}`" for name in killers)
-    lines = [
-        f"**{requirement.id}** ({requirement.level}{unit}) {requirement.sentence}  ",
-        f"{requirement.rationale}  ",
-    ]
-    if requirement.expected != requirement.sentence:
+    lines = [f"**{requirement.id}** ({requirement.level}{unit}) {requirement.sentence}  "]
+    known: set[str] = set()
+    if requirement.like:
+        lines.append(f"Like {requirement.like}.  ")
+        known = _told_of(requirement)
+    if requirement.rationale not in known:
+        lines.append(f"{requirement.rationale}  ")
+    if requirement.expected not in {requirement.sentence} | known:
         lines.append(f"*Expected:* {requirement.expected}.  ")
-    if requirement.cause:
+    if requirement.cause and not {requirement.cause, requirement.advice} <= known:
         lines.append(
             f"*Likely cause of a failure:* {requirement.cause} *Try:* {requirement.advice}  "
         )
@@ -54,6 +57,14 @@ def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[
         f"*Proven by:* {proof}."
     )
     return [*lines, ""]
+
+
+def _told_of(requirement: Requirement) -> set[str]:
+    """What is told of the requirement that this one is like, in this one's names."""
+    theirs = next(r for r in catalogue(None, None) if r.id == requirement.like)
+    ours, others = (name.partition("-")[0] for name in (requirement.id, theirs.id))
+    texts = (theirs.rationale, theirs.expected, theirs.cause, theirs.advice)
+    return {renamed(text, others, ours) for text in texts}
 
 
 def _source(requirement: Requirement) -> str:
