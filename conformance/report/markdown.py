@@ -122,6 +122,8 @@ def _card(need: Requirement, group: Sequence[Result]) -> list[str]:
         lines.append(f"- expected: {plain(group[0].expected)}")
     for entry in group:
         lines.append(f"- observed, {plain(entry.side)}: {plain(entry.observed or entry.reason)}")
+        if entry.observed and entry.reason:
+            lines.append(f"- reason, {plain(entry.side)}: {plain(entry.reason)}")
         for place in entry.evidence[:1]:
             until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
             lines.append(
