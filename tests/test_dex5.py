@@ -1,0 +1,261 @@
+"""The Dex5-1: its joints, its dialect, its simulated hand, its client and its synthetic session."""
+
+from __future__ import annotations
+
+import math
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.backends import BackendOptions, backend
+from dexkit.clock import ManualClock
+from dexkit.conformance.judge import judge
+from dexkit.conformance.results import Overall, Verdict
+from dexkit.conformance.view import Recording
+from dexkit.emulators.sim_dex5 import SimDex5, sim_dex5
+from dexkit.errors import HandLost, UsageError
+from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
+from dexkit.messages import message_type, unitree_hg
+from dexkit.models import DEX5_1, dialect
+from dexkit.service.core import HandCore
+from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.teleop import Dex5Client
+from dexkit.topics import roles
+from dexkit.traces import open_trace, sample_path
+from tests.dex5_helpers import write
+
+DEX5 = dialect("dex5")
+STATES, COMMANDS = message_type(DEX5.state_type), message_type(DEX5.cmd_type)
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+N, THUMB = 20, slice(16, 20)
+KP, KD = np.array(DEX5_1.gains).T
+CLOSING = {s: np.array([j.closing for j in DEX5_1.joints[s]]) for s in Side}
+
+
+# --------------------------------------------------------------------------------------- the model
+
+
+def test_the_joints_are_the_urdfs_in_the_clients_order() -> None:
+    names = [j.name for j in DEX5_1.joints[LEFT]]
+    fingers = [f"{'Roll' if i == 1 else 'Pitch'}_{f}{i}" for f in (2, 3, 4, 5) for i in range(1, 5)]
+    assert names == [*fingers, "Yaw_11", "Roll_12", "Pitch_13", "Pitch_14"]
+    assert [j.name for j in DEX5_1.joints[RIGHT]] == names
+    assert [j.urdf for j in DEX5_1.joints[RIGHT]] == [f"{name}R" for name in names]
+    odd = {j.urdf for j in DEX5_1.joints[LEFT]} - {f"{name}L" for name in names}
+    assert odd == {"Link_41L"}
+
+
+def test_only_the_thumbs_roll_is_mirrored() -> None:
+    for left, right in zip(DEX5_1.joints[LEFT], DEX5_1.joints[RIGHT], strict=True):
+        if left.name == "Roll_12":
+            assert (left.q_min, left.q_max, left.closing) == (-1.8151, 0.0, -1)
+            assert (right.q_min, right.q_max, right.closing) == (0.0, 1.8151, 1)
+        else:
+            assert (left.q_min, left.q_max, left.closing) == (
+                right.q_min,
+                right.q_max,
+                right.closing,
+            )
+
+
+def test_the_thumb_has_gains_of_its_own_and_motors_are_shared() -> None:
+    assert KP.tolist() == [0.10] * 16 + [1.0] * 4
+    assert KD.tolist() == [0.001] * 16 + [0.02] * 4
+    assert len(DEX5_1.motors) == 16
+    assert sorted(i for group in DEX5_1.motors for i in group) == list(range(N))
+
+
+def test_no_rest_is_zero_or_at_a_stop() -> None:
+    for side in Side:
+        for q, joint in zip(DEX5_1.rest_q[side], DEX5_1.joints[side], strict=True):
+            assert joint.q_min < q < joint.q_max
+            assert q != 0.0
+
+
+def test_its_topics_are_known() -> None:
+    (state,) = roles("rt/dex5/left/state")
+    assert (state.kind, state.dialect.name, state.sides) == ("state", "dex5", (LEFT,))
+    assert [r.kind for r in roles("rt/dex5/right/cmd")] == ["cmd"]
+
+
+# --------------------------------------------------------------------------------- simulated hand
+
+
+def opened(side: Side = LEFT, **options: float) -> tuple[SimDex5, ManualClock]:
+    clock = ManualClock()
+    hand = SimDex5(side, clock=clock, **options)
+    hand.open()
+    return hand, clock
+
+
+def hold(hand: SimDex5, clock: ManualClock, command: HandCommand, seconds: float) -> HandState:
+    state = hand.exchange(command)
+    for _ in range(int(seconds * 100)):
+        clock.advance(0.01)
+        state = hand.exchange(command)
+    return state
+
+
+def test_is_a_hand() -> None:
+    hand = SimDex5(RIGHT)
+    assert isinstance(hand, Hand)
+    assert (hand.spec.model, hand.spec.n_joints, hand.spec.n_sensors) == ("dex5-1", N, 0)
+    assert hand.spec.simulated
+    assert backend("sim-dex5") is sim_dex5
+    with pytest.raises(HandLost):
+        hand.exchange(HandCommand.brake(N))
+
+
+@pytest.mark.parametrize("side", Side)
+def test_every_joint_goes_where_the_clients_gains_bring_it(side: Side) -> None:
+    hand, clock = opened(side)
+    low, high = hand.spec.q_min, hand.spec.q_max
+    state = hold(hand, clock, HandCommand.brake(N), 0.2)
+    assert state.q.tolist() == list(DEX5_1.rest_q[side])
+    assert not state.mode.any()
+    for part in (0.8, 0.2):
+        goal = low + part * (high - low)
+        state = hold(hand, clock, HandCommand.position(goal, kp=KP, kd=KD), 1.5)
+        assert np.abs(state.q - goal).max() < 0.01
+        assert state.mode.tolist() == [JointMode.FOC] * N
+    assert np.isnan(state.voltage).all()
+    assert state.pressure is None
+    assert state.supply is None
+
+
+def test_fingers_and_thumb_press_on_an_object_towards_closing() -> None:
+    hand, clock = opened(RIGHT, object_at=50.0)
+    closed = np.where(CLOSING[RIGHT] > 0, hand.spec.q_max, hand.spec.q_min)
+    goal = np.where(CLOSING[RIGHT] != 0, closed, 0.0)
+    state = hold(hand, clock, HandCommand.position(goal, kp=KP, kd=KD), 2.0)
+    felt = state.tau_est * CLOSING[RIGHT]
+    presses = CLOSING[RIGHT] != 0
+    assert (felt[presses] > 0.05).all()
+    assert felt[THUMB].max() > 5 * felt[:16].max()
+    assert np.abs(state.q[presses] - 0.5 * closed[presses]).max() < 0.02
+
+
+def test_settings_are_those_of_a_hand_of_several_joints() -> None:
+    hand = sim_dex5.make(BackendOptions(LEFT, settings={"start": "0", "object": "40"}))
+    assert isinstance(hand, SimDex5)
+    assert not hand.body.q[CLOSING[LEFT] != 0].any()
+    with pytest.raises(UsageError, match="start=half is not a number"):
+        sim_dex5.make(BackendOptions(LEFT, settings={"start": "half"}))
+    with pytest.raises(UsageError, match="inside the object"):
+        sim_dex5.make(BackendOptions(LEFT, settings={"start": "50", "object": "40"}))
+
+
+# --------------------------------------------------------------------------------------- dialect
+
+
+def mapping(fill: Fill = Fill.KNOWN, side: Side = LEFT) -> DialectMap:
+    return dialect_map(DEX5, {side: DEX5_1.spec(side, io_rate=500.0)}, fill)
+
+
+def message(modes: list[int], **fields: float) -> unitree_hg.HandCmd_:
+    return unitree_hg.HandCmd_([unitree_hg.MotorCmd_(mode=m, **fields) for m in modes])  # type: ignore[arg-type]
+
+
+@given(st.lists(st.integers(0, 255), min_size=N, max_size=N))
+@settings(max_examples=100, deadline=None)
+def test_only_mode_1_drives(modes: list[int]) -> None:
+    command = mapping().command(message(modes), LEFT)
+    assert command is not None
+    assert command.mode.tolist() == [int(m == 1) for m in modes]
+    assert command.timeout is None  # the service's own time-out holds for all
+    odd = [r.counter for r in mapping().remarks(message(modes), LEFT)]
+    assert odd == (["unknown_status"] if any(m > 1 for m in modes) else [])
+
+
+def test_who_sends_a_dex3s_mode_byte_is_told() -> None:
+    (remark,) = mapping().remarks(message([0x10 | i for i in range(16)] + [1] * 4), LEFT)
+    assert "no RIS_Mode with ids, as a Dex3-1 has; send 1 to drive it" in remark.text
+
+
+def test_seven_joints_of_a_default_message_hold_no_command() -> None:
+    assert mapping().command(message([1] * 7), LEFT) is None
+
+
+def test_torques_come_in_two_units() -> None:
+    command = mapping().command(message([1] * N, tau=500.0, kp=0.25), LEFT)
+    assert command is not None
+    assert command.tau.tolist() == pytest.approx([0.5] * 16 + [500.0] * 4)
+    assert command.kp.tolist() == [0.25] * N
+
+
+@given(st.lists(st.floats(-0.93, 0.93), min_size=N, max_size=N), st.sampled_from(Fill))
+@settings(max_examples=60, deadline=None)
+def test_a_state_is_twenty_joints_and_nothing_that_is_not_known(
+    tau: list[float], fill: Fill
+) -> None:
+    modes = [i % 2 for i in range(N)]
+    state = HandState.of(DEX5_1.rest_q[LEFT], tau_est=tau, mode=modes, stamp=0.0)
+    data = mapping(fill).encode({LEFT: StateView(state, (0,) * N)})
+    assert len(data) == 1220  # facts/unitree-dex A.4
+    sent = STATES.decode(data)
+    assert [m.mode for m in sent.motor_state] == modes
+    assert [m.q for m in sent.motor_state] == pytest.approx(DEX5_1.rest_q[LEFT])
+    units = [1e-3] * 16 + [1.0] * 4
+    found = [m.tau_est * unit for m, unit in zip(sent.motor_state, units, strict=True)]
+    assert found == pytest.approx(tau, abs=1e-6)
+    assert sent.press_sensor_state == []
+    assert math.hypot(*sent.imu_state.quaternion) == 0.0
+
+
+def test_it_brakes_a_second_after_the_last_command() -> None:
+    clock = ManualClock()
+    core = HandCore(DEX5_1.spec(LEFT, io_rate=500.0, simulated=True), DEX5_1, clock)
+    core.opened(core.spec)
+    command = mapping().command(message([1] * N, kp=0.1), LEFT)
+    assert command is not None
+    clock.advance(0.01)
+    assert core.submit(command)
+    clock.advance(0.98)
+    assert not core.next_command().is_brake
+    clock.advance(0.03)
+    assert core.next_command().is_brake
+    assert core.submit(command)
+    assert not core.next_command().is_brake
+
+
+# --------------------------------------------------------------------------- client and recording
+
+
+def test_the_client_sends_what_the_genuine_one_does() -> None:
+    client = Dex5Client()
+    rest = {s: DEX5_1.rest_q[s] for s in Side}
+    assert client.step(0.0, {LEFT: (0.0,) * N, RIGHT: rest[RIGHT]}, {}) == {}
+    assert client.missing == {LEFT: "every q is exactly 0"}
+    told = client.step(0.01, rest, dict.fromkeys(Side, (0.2,) * N))
+    for motors in told.values():
+        assert {m.mode for m in motors} == {1}
+        assert [(m.q, m.kp, m.kd) for m in motors] == [(0.2, kp, kd) for kp, kd in DEX5_1.gains]
+    assert {m.mode for m in client.parting(rest[LEFT])} == {0}
+    with pytest.raises(UsageError, match="not of a Dex5-1"):
+        Dex5Client(dialect("dex3"))
+
+
+def test_the_synthetic_session_is_what_its_helper_writes(tmp_path: Path) -> None:
+    path = tmp_path / "again.mcap"
+    write(path, 1.2)
+    again = [(m.topic, m.log_time_ns, m.data) for m in open_trace(path).messages()]
+    shipped = open_trace(sample_path("dex5_synthetic"))
+    assert len(again) > 1000
+    kept = islice(shipped.messages(), len(again))
+    assert again == [(m.topic, m.log_time_ns, m.data) for m in kept]
+    assert "none" in shipped.metadata["provenance"]["controller_commit"]
+
+
+def test_the_synthetic_session_is_judged_as_a_dex5() -> None:
+    recording = Recording.of(open_trace(sample_path("dex5_synthetic")))
+    assert recording.dialect is DEX5
+    result = judge(recording)
+    assert result.overall is Overall.PASS
+    passed = {r.requirement.id for r in result.results if r.verdict is Verdict.PASS}
+    assert {"DEX5-FIELD-01", "DEX5-FIELD-03", "DEX5-TRACK-01", "DEX5-FORCE-02"} <= passed
+    # the fingers' mN m are N m to the checks
+    assert np.nanmax(np.abs(recording.sides[LEFT].states.tau[:, :16])) < 0.5
