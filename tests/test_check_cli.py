@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -125,3 +127,26 @@ def test_a_result_file_that_cannot_be_written_is_told(capsys: pytest.CaptureFixt
     name = "/no/such/directory/r.json"
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--json", name) == 2
     assert f"error: {name}: No such file or directory" in capsys.readouterr().err
+
+
+_UNUSED = (
+    *("cyclonedds", "pytest", "numpy.ma", "mcap.writer", "dexkit.dds", "dexkit.service"),
+    *("dexkit.teleop", "dexkit.drivers", "dexkit.emulators", "dexkit.backends"),
+    *("dexkit.conformance.mutants", "dexkit.conformance.stimuli", "dexkit.conformance.live"),
+    *("dexkit.conformance.usb.view", "dexkit.conformance.report.html", "dexkit.traces.recorder"),
+    *("dexkit.messages.unitree_go", "dexkit.messages.unitree_hg"),
+)
+
+
+@pytest.mark.parametrize("name", ["dex1_pick_place", "dex3_pinch"])
+def test_a_check_loads_no_more_than_it_needs(name: str) -> None:
+    code = (
+        "import sys\nfrom dexkit.cli import main\ntry:\n    main()\nexcept SystemExit as end:\n"
+        f"    print('loaded', end.code, [m for m in {_UNUSED!r} if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "check", str(sample_path(name))],
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.splitlines()[-1] == "loaded 0 []", done.stdout + done.stderr

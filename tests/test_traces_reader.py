@@ -5,6 +5,7 @@ import re
 import struct
 import tracemalloc
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -543,3 +544,61 @@ def test_two_types_on_one_topic_are_told_and_not_mixed(tmp_path: Path) -> None:
     assert trace.samples(CMD).type_name == STATE_TYPE
     assert len(trace.samples(CMD)) == 3
     assert len(list(trace.messages())) == 5
+
+
+# -- the message index ----------------------------------------------------------------------------
+
+
+def with_offsets(data: bytes, change: Callable[[int, int], int]) -> bytes:
+    """``data`` with other offsets in its message indexes: ``change(number, offset)``."""
+    out = bytearray(data)
+    at, number = len(MCAP0_MAGIC), 0
+    while at + 9 <= len(out) - len(MCAP0_MAGIC):
+        opcode, length = struct.unpack_from("<BQ", out, at)
+        if opcode == 7:
+            for place in range(at + 9 + 6 + 8, at + 9 + length, 16):
+                (offset,) = struct.unpack_from("<Q", out, place)
+                struct.pack_into("<Q", out, place, change(number, offset))
+                number += 1
+        at += 9 + length
+    assert number
+    return bytes(out)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda number, offset: offset,
+        lambda number, offset: offset + 1,
+        lambda number, offset: 0,
+        lambda number, offset: 2**63 - 1,
+        lambda number, offset: 2**64 - 1 - offset,
+        lambda number, offset: offset if number % 9 else offset + 40,
+        lambda number, offset: offset if number % 20 else 2**40,
+    ],
+)
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
+def test_a_message_index_is_only_believed_where_it_fits(
+    tmp_path: Path, change: Callable[[int, int], int], compression: CompressionType
+) -> None:
+    data = mcap_bytes(rows(200), Shape(compression))
+    trace = open_trace(write(tmp_path / "a.mcap", with_offsets(data, change)))
+    wanted = open_trace(write(tmp_path / "b.mcap", data))
+    loaded, decoded = trace.load(), trace.load(decode=True)
+    for topic, path in ((STATE, "states[0].q"), (CMD, "cmds[0].q")):
+        payloads = [m.data for m in wanted.messages([topic])]
+        assert loaded[topic].payloads == payloads
+        assert not len(decoded[topic].payloads)
+        columns = decoded[topic].columns()
+        assert columns[path].tolist() == loaded[topic].columns()[path].tolist()
+        assert len(columns) == len(decoded[topic]) == len(payloads)
+    assert trace.warnings == []
+
+
+def test_samples_that_are_decoded_while_they_are_read_come_in_order(tmp_path: Path) -> None:
+    found = rows(120)
+    shuffled = [found[i] for i in np.random.default_rng(3).permutation(len(found))]
+    trace = open_trace(write(tmp_path / "a.mcap", mcap_bytes(shuffled, Shape())))
+    q = trace.load(decode=True)[STATE].columns()["states[0].q"]
+    assert q.tolist() == trace.load()[STATE].columns()["states[0].q"].tolist()
+    assert (np.diff(q) > 0).all()

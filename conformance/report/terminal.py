@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from dexkit.conformance.report.wording import about_harness, causes
 from dexkit.conformance.requirements.sources import told
@@ -53,11 +54,12 @@ def print_result(
         mark, style = MARKS[verdict]
         cells = {r.side: _cell(r) for r in group}
         table.add_row(
-            requirement.id,
-            str(requirement.level),
-            requirement.title,
-            f"[{style}]{mark}[/]",
-            *(cells.get(side, "") for side in sides),
+            # texts, for rich would read a string as markup each time that it measures it
+            Text(requirement.id),
+            Text(str(requirement.level)),
+            Text(requirement.title),
+            Text(mark, style),
+            *(cells.get(side, Text()) for side in sides),
         )
     console.print(table)
     if hidden:
@@ -157,6 +159,6 @@ def _print_blocked(result: RunResult, console: Console) -> None:
         console.print(f"[magenta]{text}[/]", highlight=False, soft_wrap=True)
 
 
-def _cell(result: Result) -> str:
+def _cell(result: Result) -> Text:
     mark, style = MARKS[result.verdict]
-    return f"[{style}]{escape(result.figure or mark)}[/]"
+    return Text(result.figure or mark, style)

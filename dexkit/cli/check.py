@@ -117,7 +117,7 @@ def command(
     result = judge(
         view, requirements=requirements, claims=claims, subject={"recording": recording.name}
     )
-    console = Console()
+    console = Console(highlight=False, emoji=False)
     print_result(result, console, verbose=verbose, more="-v says why")
     if json_path:
         result.write_json(json_path)
