@@ -316,7 +316,7 @@ class Hunts(FingerService):
 class _Weak(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
-        self.viscous = max(self.client_kp.min() / 15, 4 * self.viscous)
+        self.viscous = max(self.client_kp.min() / 15, 3 * self.viscous)
 
 
 class Slow(FingerService):
@@ -789,7 +789,7 @@ _DEX5_ALSO: dict[str, tuple[str, ...]] = {
     # softer gains swing less, and come to rest more slowly
     "Creeps": (),
     "Hunts": (),
-    "Slow": ("MOVE-07",),
+    "Slow": ("TRACK-01",),
     "Coupled": ("MOVE-02",),
     "TurnedForce": ("FORCE-03",),
 }
