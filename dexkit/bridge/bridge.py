@@ -51,6 +51,8 @@ class Bridge:
     :raises UsageError: the ends are the same, or their dialects are of different hands.
     """
 
+    COMPANY_HINT = "stop it, choose another domain for one end, or add --force"
+
     def __init__(
         self,
         client: End,
@@ -182,16 +184,17 @@ class Bridge:
         both = {e.process for e in clients} & {e.process for e in hands}
         for process in sorted(both):
             if process and own not in process:
-                return f"{process} bridges the other way; the two would answer each other"
+                return (
+                    f"{process} commands on {self.client} and answers on {self.gripper}: "
+                    "if it bridges the other way, the two will answer each other"
+                )
         return None
 
     def _refuse_company(self) -> None:
         for node in {self.client.node, self.gripper.node}:
             node.discovery.wait(lambda _: self.others() or self.reverse(), _DISCOVERY)
         if found := self.others() or self.reverse():
-            raise TopicConflict(
-                found, hint="stop it, choose another domain for one end, or add --force"
-            )
+            raise TopicConflict(found, hint=self.COMPANY_HINT)
 
 
 class _Way:

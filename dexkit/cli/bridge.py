@@ -122,16 +122,18 @@ def command(
                 f"{' and '.join(map(str, bridge.sides))}"
             )
             sys.stdout.flush()
-            trouble = _watch(bridge, stop, duration, status)
+            trouble = _watch(bridge, stop, duration, status, force)
         bridge.log_counters()
     if bridge.failure is not None:
         raise DexkitError(f"the bridge died: {bridge.failure}")
-    if trouble and not force:
-        raise TopicConflict(trouble, hint="stop it, or choose another domain for one end")
+    if trouble:
+        raise TopicConflict(trouble, hint=Bridge.COMPANY_HINT)
     return 0
 
 
-def _watch(bridge: Bridge, stop: StopRequest, duration: float | None, status: bool) -> str | None:
+def _watch(
+    bridge: Bridge, stop: StopRequest, duration: float | None, status: bool, force: bool
+) -> str | None:
     """Until told to stop, or time is up: a status line, and hints.
 
     :returns: who came and made the bridge a loop; then it ends, too.
@@ -147,7 +149,7 @@ def _watch(bridge: Bridge, stop: StopRequest, duration: float | None, status: bo
             break
         if bridge.failure is not None:
             break
-        if found := bridge.reverse():
+        if not force and (found := bridge.reverse()):
             return found
         for text in _hints(bridge, time.monotonic() - started):
             if text not in said:
