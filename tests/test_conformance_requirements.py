@@ -8,7 +8,7 @@ import pytest
 
 from dexkit.conformance.checks import all_checks
 from dexkit.conformance.mutants import MUTANTS
-from dexkit.conformance.requirements import Level, catalogue, models, parse, select
+from dexkit.conformance.requirements import LAYERS, Level, catalogue, models, parse, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.selection import quick
 from dexkit.conformance.session import SuiteOptions
@@ -64,6 +64,43 @@ def test_tolerances_come_from_the_model_and_fill_the_sentence() -> None:
 def test_what_is_wrong_in_a_requirement_is_said(old: str, new: str, says: str) -> None:
     with pytest.raises(UsageError, match=says.replace("[", r"\[").replace("]", r"\]")):
         parse(GOOD.replace(old, new))
+
+
+LIKE = """
+model = "dex5-1"
+prefix = "DEX5"
+[[requirement]]
+like = "DEX1-X-01"
+"""
+
+
+def test_what_is_like_another_takes_what_it_does_not_say() -> None:
+    theirs = {
+        "id": "DEX1-X-01",
+        "area": "A",
+        "level": "MUST",
+        "title": "t",
+        "sentence": "From {low:g} to {high:g} on rt/dex1/SIDE/state.",
+        "rationale": "see DEX1-Y-01",
+        "source": "s",
+        "confidence": "measured",
+        "needs": "state",
+        "advice": "a",
+        "tolerances": {"low": 1, "high": 2},
+    }
+    others = {"DEX1-X-01": theirs}
+    (alike,) = parse(LIKE, others=others)
+    assert (alike.id, alike.like, alike.model) == ("DEX5-X-01", "DEX1-X-01", "dex5-1")
+    assert alike.sentence == "From 1 to 2 on rt/dex5/SIDE/state."
+    assert alike.rationale == "see DEX5-Y-01"
+    # somebody else's evidence is none for this hand
+    assert (alike.source, alike.confidence) == ("as DEX1-X-01: s", "inferred")
+    own = LIKE + 'level = "INFO"\nconfidence = "measured"\ntolerances = { high = 3 }\n'
+    (other,) = parse(own, others=others)
+    assert (str(other.level), other.confidence) == ("INFO", "measured")
+    assert other.tolerances == {"low": 1, "high": 3}
+    with pytest.raises(UsageError, match="no requirement 'DEX1-X-01' to be like"):
+        parse(LIKE)
 
 
 def test_what_is_expected_is_the_sentence_unless_it_is_said_shorter() -> None:
@@ -129,8 +166,11 @@ def test_the_documented_catalogue_is_the_data() -> None:
 
 def test_what_is_quick_can_be_told_of_every_hand_at_once() -> None:
     everything = catalogue(layer=None)
-    assert {r.layer for r in everything} == {"dds", "usb"}
-    assert quick(everything) == (*quick(catalogue("dex1-1")), *quick(catalogue("dex3-1")))
+    assert {r.layer for r in everything} == set(LAYERS)
+    names = dict.fromkeys(r.model for r in everything)
+    each = [quick(catalogue(name, None)) for name in names]
+    assert all(each)
+    assert quick(everything) == tuple(r for found in each for r in found)
 
 
 def test_what_cannot_be_written_is_told_before_the_run(

@@ -28,6 +28,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         ("unitree_hg", BOTH),
         ("unitree_actuator", BOTH),
         ("dex3", BOTH),
+        ("dex5", BOTH),
     ],
 )
 def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
@@ -80,7 +81,7 @@ def test_every_mutant_says_what_it_does_wrong() -> None:
     assert len({(t.layer, t.model, t.name) for t in every}) == len(every)
 
 
-@pytest.mark.parametrize("model", ["dex1-1", "dex3-1"])
+@pytest.mark.parametrize("model", ["dex1-1", "dex3-1", "dex5-1"])
 def test_a_third_of_the_requirements_are_negative(model: str) -> None:
     """What a hand must not do, or must do with bad input or a bad peer."""
     every = catalogue(model)
