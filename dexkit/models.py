@@ -170,7 +170,7 @@ DIALECTS: dict[str, Dialect] = {
             index={Side.LEFT: 0, Side.RIGHT: 0},
             length=1,
             q_open=2 * math.pi,
-            summary="the DDS interface specification (seed 000): 0 closed .. 2 pi rad open",
+            summary="the gripper's DDS interface specification: 0 closed .. 2 pi rad open",
         ),
         Dialect(
             name="unitree_actuator",
