@@ -15,7 +15,8 @@ pytestmark = pytest.mark.conformance
 
 HOW = (
     "name the hand to judge: --backend ezgripper or dex3-usb (emulated unless --device is given), "
-    "--backend sim-dex1, sim-dex3 or sim-dex5, --backend package.module:Class, or --backend external"
+    "--backend sim-dex1, sim-dex3 or sim-dex5, --backend package.module:Class, or "
+    "--backend external"
 )
 
 
