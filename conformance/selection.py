@@ -15,7 +15,7 @@ from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
 
 __all__ = ["QUICK", "length", "print_selection", "quick"]
 
-QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0, H1.name: 6.0, G1.name: 6.0}
+QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0, H1.name: 13.0, G1.name: 17.0}
 """Seconds of stimulus of a quick run; starting a pair of hands and judging take some more."""
 
 

@@ -30,7 +30,7 @@ from dexkit.messages import Columns
 
 __all__ = ["body_checks"]
 
-_END = 0.06  # s at the end of a phase over which is averaged
+_END = 0.06  # s at the end of a phase, or before it, over which is averaged
 _STICKS = struct.Struct("<4x5f")  # in wireless_remote: behind head and keys
 
 
@@ -436,7 +436,7 @@ def stays(ctx: Context) -> Outcome:
     worst, text, where = -1.0, "", (0.0, 0.0)
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before, q = _q(ctx, begin - 0.1, begin), _q(ctx, begin, end + 0.08)
+        before, q = _q(ctx, begin - _END, begin), _q(ctx, begin, end + _END)
         if not len(before) or not len(q):
             return _silent(ctx, phase)
         moved = np.abs(q - before.mean(axis=0)).max(axis=0)

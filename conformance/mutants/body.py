@@ -319,7 +319,8 @@ class Coupled(ReferenceBody):
         elbow, hip = self.body.slot("right_elbow"), self.body.slot("right_hip_pitch")
         before = self.q[elbow]
         super().live(dt)
-        self.q[hip] += 6.0 * (self.q[elbow] - before)
+        if self.driven:
+            self.q[hip] += 3.0 * (self.q[elbow] - before)
 
 
 class OwnGains(ReferenceBody):
@@ -536,8 +537,13 @@ class BodyMutant:
         :param short: go through no more phases than show it.
         """
         every = catalogue(self.model, "body")
-        needed = select(every, prefixes=[self.kills, *self.also]) if short else every
-        return run_body_mutant(self.service, self.model, phases_for(needed))
+        if not short:
+            return run_body_mutant(self.service, self.model, phases_for(every))
+        needed = select(every, prefixes=[self.kills, *self.also])
+        phases = phases_for(needed)
+        if not any(r.phase == "joint" for r in needed):
+            phases -= {"joint"}  # by far the longest: all of them were moved for the others
+        return run_body_mutant(self.service, self.model, phases)
 
 
 def run_body_mutant(service: type[ReferenceBody], model: str, phases: frozenset[str]) -> set[str]:

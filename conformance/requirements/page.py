@@ -1,5 +1,6 @@
 """The catalogue as a page: ``python -m dexkit.conformance.requirements.page`` brings it up to date
-in docs/conformance.md. Of what is like another requirement only the differences are told.
+in docs/conformance.md, that of bodies in docs/conformance-body.md. Of what is like another
+requirement only the differences are told.
 """
 
 from __future__ import annotations
@@ -10,23 +11,31 @@ from pathlib import Path
 from dexkit.conformance.requirements import Requirement, catalogue, renamed
 from dexkit.conformance.requirements.sources import PAGE, anchor, linked, told
 
-__all__ = ["BEGIN", "END", "catalogue_page", "entry"]
+__all__ = ["BEGIN", "END", "PAGES", "catalogue_page", "entry"]
 
 BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
 END = "<!-- end of catalogue -->"
 
 
-def catalogue_page() -> str:
-    """Markdown of all requirements, by area."""
-    from dexkit.conformance.mutants import MUTANTS
+PAGES = {"dds": "conformance.md", "body": "conformance-body.md"}
+"""The page of each layer that is written here, in docs."""
+
+
+def catalogue_page(layer: str = "dds") -> str:
+    """Markdown of a layer's requirements, by area."""
+    from dexkit.conformance.mutants import MUTANTS, body
 
     lines: list[str] = []
     area = ""
-    for requirement in catalogue():
-        if requirement.area != area:
-            area = requirement.area
+    every = catalogue(layer=layer)
+    derived = {r.model for r in every if r.like}  # they come after what they are like
+    for requirement in sorted(every, key=lambda r: r.model in derived):
+        whose = f"{requirement.model.upper()}: " if layer == "body" else ""
+        if f"{whose}{requirement.area}" != area:
+            area = f"{whose}{requirement.area}"
             lines += ["", f"### {area}", ""]
-        killers = [m.name for m in MUTANTS if m.kills == requirement.id]
+        zoo = body.MUTANTS if layer == "body" else MUTANTS
+        killers = [m.name for m in zoo if m.kills == requirement.id]
         lines += entry(requirement, _needs(requirement), killers)
     return "\n".join(lines)
 
@@ -86,16 +95,18 @@ def _needs(requirement: Requirement) -> str:
         kind, _, name = requirement.needs.partition(":")
         other = " of the other hand" if kind.startswith("other") else ""
         where = f"stimulus `{name}`{other}"
-    only = "" if len(requirement.dialects) == 3 else f", in {' and '.join(requirement.dialects)}"
-    return where + only
+    if len(requirement.dialects) == 3 or requirement.layer == "body":
+        return where
+    return f"{where}, in {' and '.join(requirement.dialects)}"
 
 
 def main() -> None:
     """Write it into the documentation."""
-    path = Path(__file__).resolve().parents[2] / "docs" / "conformance.md"
-    text = path.read_text(encoding="utf-8")
-    head, tail = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-    path.write_text(f"{head}\n{catalogue_page()}\n{tail}", encoding="utf-8")
+    for layer, name in PAGES.items():
+        path = Path(__file__).resolve().parents[2] / "docs" / name
+        text = path.read_text(encoding="utf-8")
+        head, tail = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+        path.write_text(f"{head}\n{catalogue_page(layer)}\n{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -59,6 +59,7 @@ _RAMP, _STAND = 0.2, 0.2  # s in which it is moved, and then held
 _SPEED = 0.4  # rad/s
 _TORQUE_PART = 0.1  # of the joint's largest torque
 _MOVED = 0.1  # rad after which the torque is taken off
+_STILL = 0.02  # rad/s
 _JOINT = "right_elbow"
 _NOTHING = Motor(kp=0.0, kd=0.0)
 
@@ -84,6 +85,12 @@ class BodyScript(Script):
         self._start: dict[int, float] = {}
         self._order: list[Motor] = [_NOTHING] * self._body.slots
         self._sent: tuple[object, bytes] = (None, b"")
+        self._dry = False
+
+    def length(self) -> float:
+        """Seconds that :meth:`run` takes with a body that is where it should at once."""
+        self._dry = True
+        return super().length()
 
     def run(self) -> Steps:
         """The whole script."""
@@ -163,6 +170,9 @@ class BodyScript(Script):
         return by if self._here(slot) < (joint.q_min + joint.q_max) / 2 else -by
 
     def _put(self, order: Motors, spoil: str = "", machine: int | None = None) -> Steps:
+        if self._dry:
+            yield from self._send([])
+            return
         own = self._obs.machine or self._body.mode_machine or 0
         told = own if machine is None else machine
         key = (tuple(order), told, spoil)
@@ -203,7 +213,15 @@ class BodyScript(Script):
         away = {s: q for s, q in self._start.items() if self._order[s].q != q}
         if away:
             yield from self._ramp(away, _RAMP)
+        begin = self._obs.now_ns
         yield from self._keep(0.1)
+        while self._fastest() > _STILL and self._obs.now_ns - begin < 1e9:
+            yield from self._put(self._order)
+
+    def _fastest(self) -> float:
+        """The speed of the joint that moves most."""
+        speeds = [abs(v) for v in self._obs.dq.get(BODY, ()) if math.isfinite(v)]
+        return max(speeds, default=0.0)
 
     def _phase(self, name: str, **params: str) -> Phase:
         return self._begin(name, (BODY,), targets=None, slot=str(self._slot), **params)

@@ -1,0 +1,297 @@
+"""The conformance of bodies: a good one passes, wrong ones are caught, and a run on DDS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dexkit.bodies import BODIES, G1, H1, BodyModel
+from dexkit.cli.check import command
+from dexkit.conformance.body import (
+    SPOILS,
+    BodyWire,
+    body_dialect,
+    body_in,
+    body_recording,
+    recording_of,
+)
+from dexkit.conformance.checks.body import body_checks
+from dexkit.conformance.judge import judge
+from dexkit.conformance.live import LiveOptions, free_domain, record_run
+from dexkit.conformance.mutants.body import (
+    MUTANTS,
+    BodyMutant,
+    CdrCrc,
+    NoCrc,
+    WaitsForCommands,
+    run_body_mutant,
+)
+from dexkit.conformance.phases import BODY, Stimulus
+from dexkit.conformance.processes import RigOptions
+from dexkit.conformance.requirements import Level, catalogue, select
+from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
+from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
+from dexkit.conformance.session import SuiteOptions
+from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.virtual import MemoryTrace, run_virtual
+from dexkit.conformance.virtual.body import ReferenceBody
+from dexkit.conformance.wire import Motor
+from dexkit.errors import ConformanceError, UsageError
+from dexkit.messages import decode
+from dexkit.traces import Recorder, open_trace
+from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.low_level import crc_of, verify_payload
+
+NAMES = list(BODIES)
+DOCS = Path(__file__).parent.parent / "docs" / "conformance-body.md"
+
+
+def plan(name: str, phases: Iterable[str]) -> Plan:
+    return Plan(body_dialect(name), (BODY,), phases=frozenset(phases))
+
+
+def everything(name: str) -> frozenset[str]:
+    return phases_for(catalogue(name, "body"))
+
+
+@cache
+def listened(name: str, service: type[ReferenceBody] = ReferenceBody) -> MemoryTrace:
+    """A body that is listened to, and told to hold."""
+    return run_virtual(plan(name, ()), service)
+
+
+def judged(trace: MemoryTrace, name: str) -> RunResult:
+    return judge(body_recording(trace, name))
+
+
+# ----------------------------------------------------------------------------------- the wire
+
+
+@pytest.mark.parametrize("model", BODIES.values(), ids=NAMES)
+def test_commands_are_what_the_codec_reads(model: BodyModel) -> None:
+    wire = BodyWire(body_dialect(model.name))
+    motors = [Motor(0.1 * i, 0.2, 0.3, 4.0, 0.5, i % 3) for i in range(model.slots)]
+    payload = wire.low_command(motors, 7)
+    assert verify_payload(model.cmd_type, payload)
+    message = decode(model.cmd_type, payload)
+    read = [(m.mode, m.q, m.dq, m.tau, m.kp, m.kd) for m in message.motor_cmd]
+    told = [(m.mode, *np.float32((m.q, m.dq, m.tau, m.kp, m.kd)).tolist()) for m in motors]
+    assert read == told
+    if model is G1:
+        assert message.mode_machine == 7
+    else:
+        assert (*message.head, message.level_flag) == (0xFE, 0xEF, 0xFF)
+
+
+@pytest.mark.parametrize("kind", SPOILS)
+def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
+    wire = BodyWire(body_dialect("h1"))
+    motors = [Motor(q=0.5)] * 20
+    good, bad = wire.low_command(motors, 0), wire.low_command(motors, 0, kind)
+    assert good[:-4] == bad[:-4]
+    assert not verify_payload(H1.cmd_type, bad)
+    right = crc_of(decode(H1.cmd_type, good))
+    wrong = {"bit": right ^ 0x10, "zero": 0, "cdr": crc32_words(good[4:-4])}[kind]
+    assert int.from_bytes(bad[-4:], "little") == wrong
+
+
+# ---------------------------------------------------------------------------------- its teeth
+
+
+@pytest.mark.parametrize("name", ["h1", pytest.param("g1", marks=pytest.mark.soak)])
+def test_a_good_body_passes_everything(name: str) -> None:
+    result = judged(run_virtual(plan(name, everything(name)), ReferenceBody), name)
+    bad = [r.explain() for r in result.results if r.verdict is not Verdict.PASS]
+    assert not bad, "\n".join(bad)
+    assert result.overall is Overall.PASS
+    assert [r.requirement.id for r in result.results] == [r.id for r in catalogue(name, "body")]
+    assert result.stage == {"body": Stage.MOVING}
+
+
+def _one_of_each() -> list[BodyMutant]:
+    """A wrong body for each check of a MUST, and what only a G1 has."""
+    checks, level = body_checks(), {r.id: r.level for r in catalogue(None, "body")}
+    found: dict[object, BodyMutant] = {}
+    for mutant in MUTANTS:
+        if level[mutant.kills] is Level.MUST and mutant.model == "h1":
+            found.setdefault(checks[mutant.kills], mutant)
+    only_g1 = [m for m in MUTANTS if m.kills in ("G1-MACH-01", "G1-SAFE-05", "G1-SAFE-03")]
+    return [*found.values(), *only_g1]
+
+
+@pytest.mark.parametrize("mutant", _one_of_each(), ids=lambda m: f"{m.model}-{m.name}")
+def test_a_wrong_body_is_caught(mutant: BodyMutant) -> None:
+    assert mutant.blamed(short=True) == {mutant.kills, *mutant.also}, mutant.summary
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_requirement_has_a_check_and_a_body_that_breaks_it(name: str) -> None:
+    every = catalogue(name, "body")
+    assert {m.kills for m in MUTANTS if m.model == name} == {r.id for r in every}
+    assert {r.id for r in every} <= set(body_checks())
+    negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
+    negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
+    found = [r for r in every if r.id.partition("-")[2].startswith(negative)]
+    assert len(found) >= len(every) / 3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_stimulus_that_is_needed_exists(name: str) -> None:
+    script = SCRIPTS[name](plan(name, everything(name)))
+    assert 15 < script.length() < 40
+    assert everything(name) <= {p.name for p in script.phases}
+
+
+def test_the_documented_catalogue_is_the_current_one() -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    page = text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip()
+    assert page == catalogue_page("body").strip(), (
+        "docs/conformance-body.md is out of date: python -m dexkit.conformance.requirements.page"
+    )
+
+
+# ------------------------------------------------------------------------------ single findings
+
+
+def test_a_crc_that_was_never_set_is_told_from_a_wrong_one() -> None:
+    def cause(service: type[ReferenceBody]) -> str:
+        results = judged(listened("h1", service), "h1").results
+        return next(r.cause for r in results if r.requirement.id == "H1-CRC-01")
+
+    assert cause(NoCrc) == "The field is never set."
+    assert "CDR" in cause(CdrCrc)
+
+
+def test_a_body_that_waits_is_woken() -> None:
+    blamed = run_body_mutant(WaitsForCommands, "g1", frozenset())
+    assert blamed == {"G1-START-01"}
+
+
+def test_a_body_that_says_nothing_is_not_commanded_for_long() -> None:
+    class Mute(ReferenceBody):
+        """Nothing at all."""
+
+        def publish(self) -> list[object]:  # type: ignore[override]
+            return []
+
+    trace = run_virtual(plan("h1", everything("h1")), Mute)
+    assert Stimulus.from_metadata(trace.metadata["dexkit.stimulus"]).phases[-1].name == "listen"
+    result = judged(trace, "h1")
+    assert result.overall is Overall.FAIL
+    assert result.stage == {"body": Stage.TYPE_MATCHED}
+    failed = {r.requirement.id for r in result.results if r.verdict is Verdict.FAIL}
+    assert failed == {"H1-TOPIC-01"}
+
+
+def test_a_machine_that_was_busy_is_not_the_bodys_fault() -> None:
+    """The gap of a tenth of a second is blocked where the kit's own timer stood still as long."""
+    trace = listened("h1")
+    ((key, rows),) = ((k, r) for k, r in trace.rows.items() if k[0] == "rt/lowstate")
+    begin = rows[200][0]
+    kept = [row for row in rows if not begin < row[0] < begin + 150_000_000]
+    meta = {k: dict(v) for k, v in trace.metadata.items()}
+    holed = MemoryTrace(trace.endpoints, meta, rows={**trace.rows, key: kept})
+
+    def verdict() -> Verdict:
+        results = judged(holed, "h1").results
+        return next(r.verdict for r in results if r.requirement.id == "H1-RATE-03")
+
+    assert verdict() is Verdict.FAIL
+    stimulus = Stimulus.from_metadata(meta["dexkit.stimulus"])
+    stimulus.beats.begin_ns = begin
+    stimulus.beats.t_us, stimulus.beats.late_us = [150_000], [150_000]
+    holed.metadata["dexkit.stimulus"] = stimulus.to_metadata()
+    assert verdict() is Verdict.BLOCKED
+
+
+# --------------------------------------------------------------------------------- recordings
+
+
+def write(trace: MemoryTrace, path: Path, *, bare: bool = False) -> Path:
+    """As a file; ``bare`` without what only the kit writes."""
+    with Recorder(path) as recorder:
+        for (topic, kind), rows in trace.rows.items():
+            for log, sent, data in rows:
+                recorder.put(topic, kind, data, log, sent)
+        if not bare:
+            for name, record in trace.metadata.items():
+                recorder.add_metadata(name, record)
+    return path
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
+    path = write(listened(name), tmp_path / "run.mcap")
+    files = [f"{option}={tmp_path / file}" for option, file in FILES.items()]
+    result = CliRunner().invoke(command, [str(path), *files])
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "result.json").read_text())
+    assert found["subject"]["model"] == name
+    assert found["overall"] == "pass"
+    assert found["counts"]["pass"] >= 20
+    page = (tmp_path / "report.html").read_text()
+    assert f"{BODIES[name].title}" in page
+    assert f"{name.upper()}-CRC-01-body" in (tmp_path / "junit.xml").read_text()
+
+
+FILES = {"--json": "result.json", "--html": "report.html", "--junit": "junit.xml"}
+
+
+def test_somebody_elses_recording_shows_what_needs_no_stimulus(tmp_path: Path) -> None:
+    path = write(listened("g1", CdrCrc), tmp_path / "session.mcap", bare=True)
+    result = CliRunner().invoke(command, [str(path)])
+    assert result.exit_code == 1
+    assert "G1-CRC-01" in result.output
+    (failed,) = [line for line in result.output.splitlines() if " FAIL " in line]
+    assert failed.startswith("G1-CRC-01")
+    trace = open_trace(path)
+    assert body_in(trace) is G1
+    assert recording_of(trace, None, ()).dialect.name == "g1"
+    other = CliRunner().invoke(command, [str(path), "--dialect", "h1"])
+    assert other.exit_code == 1
+    assert "wrong type" in other.output
+    with pytest.raises(ConformanceError, match="no topic of the H1 body"):
+        body_recording(MemoryTrace(), "h1")
+
+
+def test_the_requirements_are_listed_without_a_recording() -> None:
+    result = CliRunner().invoke(command, ["--list", "--dialect", "h1", "--level", "must"])
+    assert result.exit_code == 0
+    musts = [r for r in catalogue("h1", "body") if r.level is Level.MUST]
+    assert f"{len(musts)} requirements" in result.output
+
+
+# ------------------------------------------------------------------------------------ live runs
+
+
+def test_what_is_about_hands_is_refused() -> None:
+    options = SuiteOptions.make(backend="sim-g1")
+    assert (options.sides, options.dialect.name) == ((BODY,), "g1")
+    assert {r.layer for r in options.requirements} == {"body"}
+    quick = SuiteOptions.make(backend="sim-h1", quick=True).requirements
+    assert {r.level for r in quick} == {Level.MUST}
+    assert 10 < len(quick) < len(options.requirements)
+    for wrong in ({"side": "left"}, {"devices": ["/dev/null"]}, {"settings": ["a=b"]}):
+        with pytest.raises(UsageError, match="is about hands"):
+            SuiteOptions.make(backend="sim-h1", **wrong)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="sim-h1 does not speak g1"):
+        SuiteOptions.make(backend="sim-h1", dialect_name="g1")
+    with pytest.raises(UsageError, match="sim-dex1 does not speak h1"):
+        SuiteOptions.make(backend="sim-dex1", dialect_name="h1")
+    assert SuiteOptions.make(backend="external", dialect_name="h1").domain == 0
+
+
+def test_an_emulated_body_passes_on_dds(tmp_path: Path) -> None:
+    wanted = select(catalogue("g1", "body"), prefixes=["G1-LIFE-01", "G1-CRC-01", "G1-TOPIC"])
+    rig = RigOptions("sim-g1", (BODY,), body_dialect("g1"), free_domain())
+    path = tmp_path / "run.mcap"
+    assert record_run(LiveOptions(rig, phases_for(wanted)), path)
+    result = judge(body_recording(open_trace(path), "g1"), requirements=wanted)
+    bad = [r.explain() for r in result.results if r.verdict not in (Verdict.PASS, Verdict.BLOCKED)]
+    assert not bad, "\n".join(bad)
