@@ -182,9 +182,11 @@ def body_in(trace: TraceLike) -> BodyModel | None:
     """The body whose topics, of its types, are in a recording; None without any."""
     seen = {(c.topic, c.type_name) for c in trace.channels}
     seen |= {(e.topic, e.type_name) for e in trace.endpoints}
-    for model in BODIES.values():
-        if {(model.state_topic, model.state_type), (model.cmd_topic, model.cmd_type)} & seen:
-            return model
+    # the state first: a client of the other robot, the kit among them, is no body
+    for topic in ("state", "cmd"):
+        for model in BODIES.values():
+            if (getattr(model, f"{topic}_topic"), getattr(model, f"{topic}_type")) in seen:
+                return model
     return None
 
 

@@ -44,7 +44,7 @@ from dexkit.conformance.virtual.body import ReferenceBody
 from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.messages import decode
-from dexkit.traces import Recorder, open_trace
+from dexkit.traces import Recorder, TraceEndpoint, open_trace
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import crc_of, verify_payload
 
@@ -252,6 +252,10 @@ def test_somebody_elses_recording_shows_what_needs_no_stimulus(tmp_path: Path) -
     assert failed.startswith("G1-CRC-01")
     trace = open_trace(path)
     assert body_in(trace) is G1
+    memory = MemoryTrace(rows={("rt/lowcmd", H1.cmd_type): [(0, 0, b"")]})
+    assert body_in(memory) is H1
+    memory.endpoints.append(TraceEndpoint("rt/lowstate", "writer", "", type_name=G1.state_type))
+    assert body_in(memory) is G1
     assert recording_of(trace, None, ()).dialect.name == "g1"
     other = CliRunner().invoke(command, [str(path), "--dialect", "h1"])
     assert other.exit_code == 1
