@@ -16,6 +16,7 @@ import numpy as np
 
 from dexkit.conformance.phases import Phase
 from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, histogram
+from dexkit.conformance.report.wording import whose
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence, Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
@@ -230,7 +231,7 @@ def operated(view: Recording, hand: SideView, joint: int, span: tuple[float, flo
     """What the operator wants, what the client commands of it, and what the hand does."""
     wanted = wish(view, hand, joint)
     return chart(
-        f"{hand.side} hand, {_called(hand, joint)}: driven by Unitree's teleoperation client",
+        f"{whose(hand.side)}, {_called(hand, joint)}: driven by Unitree's teleoperation client",
         [*([wanted] if wanted else []), *command_and_state(hand, joint)],
         y_unit="rad",
         span=span,
@@ -273,7 +274,7 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
     bands += [b for b in scene.alarms if b.end - b.begin < 0.85 * (span[1] - span[0])]
     return "".join(
         chart(
-            f"{hand.side} hand, {_called(hand, joint)}: command and state, "
+            f"{whose(hand.side)}, {_called(hand, joint)}: command and state, "
             f"{span[0]:.1f} to {span[1]:.1f} s",
             command_and_state(hand, joint),
             y_unit="rad",
@@ -308,10 +309,12 @@ def _both_sides(scene: _Scene) -> list[str]:
         mine = view.side is hand.side
         t, q = view.states.t, view.states.q
         if len(t):
-            lines.append(Line(f"{view.side} hand", "state" if mine else "other", t, q[:, joint]))
+            lines.append(Line(f"{whose(view.side)}", "state" if mine else "other", t, q[:, joint]))
         if not mine and len(view.commands):
             goal = _clipped(view.commands.q[:, joint], view.joints[joint])
-            lines.insert(0, Line(f"command to the {view.side} hand", "cmd", view.commands.t, goal))
+            lines.insert(
+                0, Line(f"command to the {whose(view.side)}", "cmd", view.commands.t, goal)
+            )
     return [
         chart(
             f"both hands, {_called(hand, joint)}, while only the other one is to move",
@@ -363,7 +366,7 @@ def _steps(scene: _Scene) -> str:
     if "max_overshoot_stroke" in limits:
         ranges.append(Range(-np.inf, 100 * limits["max_overshoot_stroke"], "overshoot allowed"))
     return chart(
-        f"{hand.side} hand, {count} laid over each other: distance to the target, "
+        f"{whose(hand.side)}, {count} laid over each other: distance to the target, "
         "in % of the stroke (above 0: beyond it), over seconds after the step",
         lines,
         y_unit="%",
@@ -417,7 +420,7 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
         return ""
     shown = span or (0.0, max(scene.view.duration, 0.1))
     return chart(
-        f"{scene.hand.side} hand: time from each state to the next",
+        f"{whose(scene.hand.side)}: time from each state to the next",
         [Line("each state", "state", t, steps, "stems" if span else "dots")],
         y_unit="ms",
         span=shown,
@@ -434,7 +437,7 @@ def _interval_histogram(scene: _Scene) -> str:
     if len(steps) < 10:
         return ""
     return histogram(
-        f"{scene.hand.side} hand: how often which interval between states",
+        f"{whose(scene.hand.side)}: how often which interval between states",
         steps,
         unit="ms",
         levels=_interval_levels(scene.need),
@@ -457,7 +460,7 @@ def _rates(scene: _Scene) -> str:
         if n in limits
     ]
     return chart(
-        f"{scene.hand.side} hand: rate of the state over time",
+        f"{whose(scene.hand.side)}: rate of the state over time",
         [line],
         y_unit="Hz",
         span=(0.0, max(scene.view.duration, 0.1)),
@@ -474,7 +477,7 @@ def _samples(scene: _Scene) -> list[str]:
     span = (max(0.0, middle[0] - 0.05), middle[1] + 0.25)
     return [
         chart(
-            f"{hand.side} hand, {_called(hand, joint)}: each sample of the state while it moves",
+            f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
             [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
             y_unit="rad",
             span=span,
@@ -502,7 +505,7 @@ def _torque(scene: _Scene) -> str:
         for sign in (1, -1)
     ]
     return chart(
-        f"{hand.side} hand: torque that it reports",
+        f"{whose(hand.side)}: torque that it reports",
         [
             Line("tau_est", "force", hand.states.t, hand.states.tau[:, j])
             for j in scene.joints(span)
@@ -530,7 +533,7 @@ def _torque_by_position(scene: _Scene) -> str:
     touch = scene.view.stimulus.objects.get(hand.side) if scene.view.stimulus else None
     held = touch is not None and len(hand.joints) == 1
     return chart(
-        f"{hand.side} hand, {_called(hand, joint)}: torque over position",
+        f"{whose(hand.side)}, {_called(hand, joint)}: torque over position",
         [
             Line("each state of the run", "force", q[good], tau[good], "dots"),
             Line("here", "bad", q[here], tau[here], "dots"),
@@ -552,7 +555,7 @@ def _field(scene: _Scene) -> str:
         return ""
     name, column = found
     return chart(
-        f"{hand.side} hand: {name}",
+        f"{whose(hand.side)}: {name}",
         [Line(name, "force", hand.states.t, column)],
         y_unit=_FIELDS.get(name, ""),
         span=span,
@@ -576,7 +579,7 @@ def _pressure(scene: _Scene) -> str:
     if not lines:
         return ""
     return chart(
-        f"{hand.side} hand: pressure, summed over each of {count} sensor packets",
+        f"{whose(hand.side)}: pressure, summed over each of {count} sensor packets",
         lines,
         y_unit="",
         span=span,
@@ -700,7 +703,7 @@ def _descriptors(hand: UsbSide) -> str:
         or "none",
     }
     return _table(
-        f"{hand.side} hand: what the device says of itself",
+        f"{whose(hand.side)}: what the device says of itself",
         ("", ""),
         [f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows.items()],
     )
@@ -750,7 +753,7 @@ def _joints(result: Result, hand: UsbSide, span: tuple[float, float]) -> str:
     bands = [Band(p.name, *hand.span(p)) for p in hand.record.phases if hand.span(p)[1] > span[0]]
     marks = [Band("here", e.time_s, e.end_s or e.time_s, "alarm") for e in result.evidence]
     return chart(
-        f"{hand.side} hand: joint positions in the answers",
+        f"{whose(hand.side)}: joint positions in the answers",
         [
             Line(names[i], css, t, q[:, i])
             for i, css in zip(shown[:3], ("state", "force", "cmd"), strict=False)
@@ -779,7 +782,7 @@ def _latency(result: Result, hand: UsbSide) -> str:
     if "min_rate_hz" in limits:
         levels.append(Level(1e3 / limits["min_rate_hz"], f"{limits['min_rate_hz']:g} Hz"))
     return histogram(
-        f"{hand.side} hand: from command to answer",
+        f"{whose(hand.side)}: from command to answer",
         np.array([ms for _, ms in found]),
         unit="ms",
         levels=levels,

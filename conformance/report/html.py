@@ -25,6 +25,8 @@ from dexkit.conformance.report.wording import (
     moment,
     nature,
     quantity,
+    subject,
+    whose,
 )
 from dexkit.conformance.requirements import CAPABILITIES, Requirement
 from dexkit.conformance.requirements.sources import Section, linked, told
@@ -111,13 +113,13 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
 
 def _verdict(result: RunResult) -> str:
     answer = ANSWERS[result.overall]
-    counts = result.counts()
+    counts, what = result.counts(), subject(result)
     sentence = {
-        Overall.PASS: "This hand did everything that it must and that could be tested here.",
-        Overall.FAIL: "This hand broke at least one rule that it must keep.",
+        Overall.PASS: f"This {what} did everything that it must and that could be tested here.",
+        Overall.FAIL: f"This {what} broke at least one rule that it must keep.",
         Overall.INCONCLUSIVE: "A rule that must be kept could not be tested: this is not a pass."
         if result.judged
-        else "Nothing could be tested, so nothing can be said of the hand: this is not a pass.",
+        else f"Nothing could be tested, so nothing can be said of the {what}: this is not a pass.",
     }[result.overall]
     if result.overall is Overall.PASS and counts[Verdict.WARN]:
         n = counts[Verdict.WARN]
@@ -156,7 +158,7 @@ def _stage(side: str, stage: Stage) -> str:
     )
     css = "ok" if stage is Stage.MOVING else "open" if reached >= 4 else "bad"
     return (
-        f'<p class="stage {css}"><span><b>{escape(side)} hand</b> reached: <b>{stage}</b> '
+        f'<p class="stage {css}"><span><b>{escape(whose(side))}</b> reached: <b>{stage}</b> '
         f'({reached} of {len(steps) - 1})</span><span class="steps" aria-hidden="true">{marks}'
         "</span></p>"
     )
@@ -462,7 +464,20 @@ def _what(result: RunResult) -> str:
         "<em>state</em> back (this is where I am) 500 to 1000 times a second. Another hand "
         "can take the original's place only if it speaks and behaves the same. "
     ]
-    if "backend" in result.subject:
+    if subject(result) == "body":
+        text = [
+            "<h2>What was done</h2><p>A program leads the body of a Unitree robot joint by joint: "
+            "it sends <em>commands</em> (positions, speeds, torques and gains of all motors) some "
+            "hundred times a second and gets <em>state</em> back 500 times a second. A simulator "
+            "can take the robot's place only if it speaks and behaves the same. "
+        ]
+    if "backend" in result.subject and subject(result) == "body":
+        text.append(
+            "Here a test program led it: it listened, moved each joint, sent broken commands, fell "
+            "silent and came back. Everything was recorded, and the verdicts were read off the "
+            "recording.</p>"
+        )
+    elif "backend" in result.subject:
         text.append(
             "Here a test program took the robot's role: it listened, moved each hand, sent "
             "broken commands, fell silent, came back, and replayed a recorded teleoperation "

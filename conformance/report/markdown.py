@@ -17,6 +17,7 @@ from dexkit.conformance.report.wording import (
     hand_name,
     model_title,
     nature,
+    whose,
 )
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.requirements.sources import told
@@ -65,7 +66,9 @@ def render_markdown(result: RunResult) -> str:
         + (" A recording was judged, not a live hand." if real == "recorded" else ""),
         "",
     ]
-    lines += [f"- {plain(side)} hand reached: **{stage}**" for side, stage in result.stage.items()]
+    lines += [
+        f"- {plain(whose(side))} reached: **{stage}**" for side, stage in result.stage.items()
+    ]
     if harness := about_harness(result):
         lines.append(f"- test machine: {harness}")
     lines += ["", *_areas(result), ""]

@@ -8,6 +8,7 @@ import numpy as np
 
 from dexkit.conformance.report.evidence import command_and_state, operated, phase_bands
 from dexkit.conformance.report.plots import Band, Level, Line, chart, histogram
+from dexkit.conformance.report.wording import subject, whose
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording, SideView
@@ -19,8 +20,8 @@ __all__ = ["overview"]
 def overview(result: RunResult, view: Recording) -> str:
     """Plots of every judged hand, as HTML."""
     parts = [
-        "<h2>What the hands did</h2>",
-        '<p class="key"><span><i class="cmd"></i>command: where the hand is told to go</span>'
+        f"<h2>What the {subject(result, many=True)} did</h2>",
+        '<p class="key"><span><i class="cmd"></i>command: where it is told to go</span>'
         '<span><i class="state"></i>state: where it says it is</span>'
         '<span><i class="force"></i>the force that it feels</span></p>',
     ]
@@ -30,9 +31,9 @@ def overview(result: RunResult, view: Recording) -> str:
 
 
 def _hand(result: RunResult, view: Recording, hand: SideView) -> str:
-    name = f"{str(hand.side).capitalize()} hand"
+    name = whose(hand.side).capitalize()
     if not len(hand.states):
-        return f"<h3>{name}</h3><p>No state of this hand was received.</p>"
+        return f"<h3>{name}</h3><p>No state of this {subject(result)} was received.</p>"
     gripper = len(hand.joints) == 1
     opening = f": opening (0 closed, {hand.joints[0].stroke:.2f} open)" if gripper else ""
     return "".join(
@@ -59,7 +60,7 @@ def _joint(result: RunResult, view: Recording, hand: SideView, index: int) -> st
     joint, gripper = hand.joints[index], len(hand.joints) == 1
     name = "position" if gripper else joint.name
     figure = chart(
-        f"{hand.side} hand, {name}: command and state over the whole run",
+        f"{whose(hand.side)}, {name}: command and state over the whole run",
         command_and_state(hand, index),
         y_unit="rad",
         span=_span(view),
@@ -91,7 +92,7 @@ def _session(view: Recording, hand: SideView) -> str:
     span = view.seconds(replay[0].begin_ns), view.seconds(replay[0].end_ns)
     session = replay[0].params.get("session", "session")
     return f"<p>The replayed session <code>{escape(session)}</code>, closer:</p>" + chart(
-        f"{hand.side} hand, replayed session: command and state",
+        f"{whose(hand.side)}, replayed session: command and state",
         command_and_state(hand, 0),
         y_unit="rad",
         span=span,
@@ -128,7 +129,7 @@ def _force(view: Recording, hand: SideView) -> str:
         )
         text = f"Torque (tau_est) of each joint.{held}"
     return f"<p>{text}</p>" + chart(
-        f"{hand.side} hand: torque over the whole run",
+        f"{whose(hand.side)}: torque over the whole run",
         [Line("force", "force", states.t, states.tau[:, i]) for i in range(len(hand.joints))],
         y_unit="N m",
         span=_span(view),
@@ -152,14 +153,14 @@ def _timing(view: Recording, hand: SideView) -> str:
         "<p>Time from each state to the next. A good hand has one tall bar; the count axis is "
         "logarithmic, so that single late ones show.</p>"
         + histogram(
-            f"{hand.side} hand: how often which interval between states",
+            f"{whose(hand.side)}: how often which interval between states",
             intervals[good],
             unit="ms",
             levels=levels,
             titled=False,
         )
         + chart(
-            f"{hand.side} hand: intervals between states over the whole run",
+            f"{whose(hand.side)}: intervals between states over the whole run",
             [Line("interval", "state", clock[1:][good], intervals[good])],
             y_unit="ms",
             span=_span(view),

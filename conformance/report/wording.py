@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from dexkit.bodies import BODIES
+from dexkit.conformance.phases import BODY
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.models import MODELS
 
@@ -21,7 +22,9 @@ __all__ = [
     "moment",
     "nature",
     "quantity",
+    "subject",
     "tally",
+    "whose",
 ]
 
 
@@ -107,6 +110,18 @@ def model_title(result: RunResult) -> str:
     name = result.subject.get("model", "")
     known = MODELS.get(name) or BODIES.get(name)
     return known.title if known else "hand"
+
+
+def subject(result: RunResult, *, many: bool = False) -> str:
+    """``hand`` or ``body``: what was judged; with ``many``, ``hands`` where there may be two."""
+    if result.subject.get("model") in BODIES:
+        return "body"
+    return "hands" if many else "hand"
+
+
+def whose(side: str) -> str:
+    """``left hand``, or ``body`` where there are no sides."""
+    return "body" if side == BODY else f"{side} hand"
 
 
 def hand_name(result: RunResult) -> str:
