@@ -790,6 +790,7 @@ _DEX5_ALSO: dict[str, tuple[str, ...]] = {
     "Creeps": (),
     "Hunts": (),
     "Slow": ("TRACK-01",),
+    "Undamped": ("GAIN-02", "SAFE-02", "TRACK-01"),
     "Coupled": ("MOVE-02",),
     "TurnedForce": ("FORCE-03",),
 }
