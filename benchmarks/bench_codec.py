@@ -43,6 +43,24 @@ CASES: list[tuple[str, str, Any, float]] = [
         go.MotorCmds_([go.MotorCmd_(q=1.5)]),
         0.0,
     ),
+    (
+        "LowCmd_ of an H1",
+        "unitree_go::msg::dds_::LowCmd_",
+        go.LowCmd_(motor_cmd=[go.MotorCmd_(1, 0.1 * i, kp=60.0) for i in range(20)]),
+        10.0,
+    ),
+    (
+        "LowState_ of an H1",
+        "unitree_go::msg::dds_::LowState_",
+        go.LowState_(motor_state=[go.MotorState_(1, 0.1 * i) for i in range(20)]),
+        10.0,
+    ),
+    (
+        "LowState_ of a G1",
+        "unitree_hg::msg::dds_::LowState_",
+        hg.LowState_(motor_state=[hg.MotorState_(1, 0.1 * i) for i in range(35)]),
+        10.0,
+    ),
 ]
 
 
