@@ -240,6 +240,15 @@ ZOO: dict[str, tuple[_Entry, ...]] = {
         (SlowToWake, "DEX1-OPER-05", ()),
     ),
     DEX3_1.name: _zoo("DEX3", Dex3Service, {CoarseFingers: ("MOVE-04",)}),
-    DEX5_1.name: _zoo("DEX5", Dex5Service, {}),
+    # its session begins at the open end, and it rests nearer to where it is brought first
+    DEX5_1.name: _zoo(
+        "DEX5",
+        Dex5Service,
+        {
+            SlowToLeave: ("TRACK-01",),
+            FingerDeadBand: ("LIFE-03",),
+            LateFingers: ("GAIN-02",),  # its delay is long beside a step of the light joints
+        },
+    ),
 }
 """By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
