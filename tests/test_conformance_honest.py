@@ -71,6 +71,22 @@ class Quick(ReferenceService):
     hand = _Quick
 
 
+class Hesitates(ReferenceService):
+    """Repeats its position for a tenth of a second more when it begins to move."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.stood = (0.0, 0.0, b"")  # position, until when it is repeated, the repeated state
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        fresh, here = super().payload(sides, length), self.positions(sides[0])[-1]
+        if abs(here - self.stood[0]) < 1e-3:
+            self.stood = (here, self.now + 0.1, fresh)
+        elif self.now >= self.stood[1]:
+            self.stood = (here, 0.0, fresh)
+        return self.stood[2]
+
+
 class Unhurried(ReferenceService):
     """Takes four and a half seconds from one end to the other."""
 
@@ -101,6 +117,12 @@ def test_an_honest_hand_is_warned_at_most(service: type[Service], warned: set[st
     result = judged(service)
     assert blamed(result) == warned
     assert result.overall is Overall.PASS
+
+
+def test_a_hand_that_rests_where_it_is_told_to_be_is_not_frozen() -> None:
+    fresh = of(judge(Recording.of(listened(Hesitates))), "DEX1-FRESH-02")
+    assert fresh.verdict is Verdict.PASS
+    assert 0.08 < fresh.values["frozen_s"] < 0.15  # and not the second of rest before it
 
 
 def test_a_gripper_that_is_quick_for_its_size_is_not_taken_for_percent() -> None:

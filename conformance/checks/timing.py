@@ -191,21 +191,25 @@ def not_frozen(ctx: Context) -> Outcome:
         jump = np.abs(np.diff(q)[changes - 1])[1:]
         # what was sent, not what was missed: a gap in the state is RATE-03's finding
         sent = np.diff(changes)
-        held = t[changes[1:] - 1] - t[changes[:-1]]
+        begin, end = t[changes[:-1]], t[changes[1:] - 1]
         usual = 2 * float(np.percentile(jump, 99))  # a hand that is measured rarely always jumps
         at_once = t[changes[1:]] - t[changes[1:] - 1] < 0.05
         frozen = (jump >= max(ctx.tolerance("min_jump_stroke", joint), usual)) & at_once
         frozen &= sent >= ctx.tolerance("min_samples")
+        held = np.zeros(len(begin))
+        for i in np.flatnonzero(frozen):
+            begin[i] = _at_rest_until(ctx, joint, float(q[changes[i]]), begin[i], end[i])
+            held[i] = end[i] - begin[i]
         if not frozen.any():
             continue
-        i = int(np.argmax(np.where(frozen, held, 0.0)))
+        i = int(np.argmax(held))
         worst = max(worst, float(held[i]))
         if held[i] > limit:
-            at = float(t[changes[i]])
+            at, count = float(begin[i]), int(((t >= begin[i]) & (t <= end[i])).sum())
             return ctx.failed(
                 f"{held[i]:.2f} s",
                 ctx.named(
-                    f"{int(sent[i])} states in a row with q = {q[changes[i]]:.3f} rad over "
+                    f"{count} states in a row with q = {q[changes[i]]:.3f} rad over "
                     f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} rad",
                     joint,
                 ),
@@ -219,6 +223,26 @@ def not_frozen(ctx: Context) -> Outcome:
         f"no position was held for more than {worst:.3f} s and then jumped",
         frozen_s=worst,
     )
+
+
+def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float) -> float:
+    """The last time in [begin, end] at which a hand that stands at q was not told to be elsewhere.
+
+    A hand that rests where it is told to be repeats its position with good reason. ``begin`` where
+    no command is known.
+    """
+    t, told = ctx.commands.t, ctx.commands.q[:, joint]
+    known = np.isfinite(told)
+    t, told = t[known], told[known]
+    first, last = np.searchsorted(t, [begin, end], side="right")
+    first = max(int(first) - 1, 0)  # the one in force when it began
+    elsewhere = np.abs(told[first:last] - q) > ctx.tolerance("min_jump_stroke", joint)
+    if not len(elsewhere):
+        return begin
+    if not elsewhere[-1]:
+        return end
+    there = np.flatnonzero(~elsewhere)
+    return max(begin, float(t[first + there[-1] + 1])) if len(there) else begin
 
 
 @check("DEX1-FRESH-01", "DEX3-FRESH-01")
