@@ -20,7 +20,7 @@ from dexkit.bodies import BODIES, H1, BodyModel, body
 from dexkit.conformance.phases import BODY, RECORD, Stimulus
 from dexkit.conformance.view import Commands, Recording, SideView, States, TraceLike
 from dexkit.conformance.wire import Motor, Motors, Wire
-from dexkit.errors import ConformanceError, WireError
+from dexkit.errors import ConformanceError, UsageError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import Dialect
@@ -245,6 +245,7 @@ def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Sid
 
     :param dialect_name: None to take what the topics show: hands, if there are any.
     :raises ConformanceError: it has none of their topics.
+    :raises UsageError: sides of a body.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
     name = dialect_name
@@ -253,6 +254,8 @@ def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Sid
         found = None if topics & HAND_TOPICS else body_in(trace)
         name = found.name if found else None
     if name in BODIES:
+        if sides not in ((), (BODY,)):
+            raise UsageError("a body has no sides", hint="leave --side out")
         return body_recording(trace, name)
     return Recording.of(trace, dialect_name=name, sides=sides)
 

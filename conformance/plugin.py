@@ -61,7 +61,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "backend",
         metavar="NAME",
         help="hand to judge: a name from 'dexkit backends', package.module:Class, or 'external' "
-        "for a service that already runs",
+        "for a service that already runs; sim-h1 or sim-g1 for an emulated body",
     )
     add(
         "device",
@@ -79,7 +79,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "dialect",
         choices=[*DIALECTS, *BODIES],
-        help="how the hand speaks (default: as its model does; unitree_go with external)",
+        help="how the hand speaks, or which body it is (default: as its model does; unitree_go "
+        "with external)",
     )
     add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")
     add("interface", default="lo", help="network interface (default: lo)")

@@ -43,10 +43,12 @@ from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.body import ReferenceBody
 from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
+from dexkit.hand import Side
 from dexkit.messages import decode
 from dexkit.traces import Recorder, TraceEndpoint, open_trace
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import crc_of, verify_payload
+from tests.conformance_helpers import copy_of, short_run
 
 NAMES = list(BODIES)
 DOCS = Path(__file__).parent.parent / "docs" / "conformance-body.md"
@@ -262,6 +264,21 @@ def test_somebody_elses_recording_shows_what_needs_no_stimulus(tmp_path: Path) -
     assert "wrong type" in other.output
     with pytest.raises(ConformanceError, match="no topic of the H1 body"):
         body_recording(MemoryTrace(), "h1")
+
+
+def test_hands_come_first_and_the_body_is_mentioned(tmp_path: Path) -> None:
+    whole = copy_of(short_run())
+    whole.rows.update(listened("g1").rows)
+    path = write(whole, tmp_path / "robot.mcap", bare=True)
+    hands = CliRunner().invoke(command, [str(path)])
+    assert "DEX1-RATE-01" in hands.output
+    assert "there is a body, too: judge it with --dialect g1" in hands.output
+    body = CliRunner().invoke(command, [str(path), "--dialect", "g1"])
+    assert body.exit_code == 0
+    assert "G1-CRC-01" in body.output
+    assert "DEX1" not in body.output
+    with pytest.raises(UsageError, match="no sides"):
+        recording_of(open_trace(path), "g1", (Side.LEFT,))
 
 
 def test_the_requirements_are_listed_without_a_recording() -> None:

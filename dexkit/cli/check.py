@@ -79,7 +79,7 @@ def command(
     Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
     usable or nothing in it could be judged.
     """
-    from dexkit.conformance.body import recording_of
+    from dexkit.conformance.body import body_in, recording_of
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.report.terminal import print_result
@@ -87,15 +87,15 @@ def command(
     from dexkit.conformance.view import sides_of
     from dexkit.traces import open_trace
 
-    view, model_name = None, None
+    view, model_name, also = None, None, ""
     if dialect != "auto":
         model_name = dialect if dialect in BODIES else DIALECTS[dialect].model
     if recording is not None:
-        view = recording_of(
-            open_trace(recording),
-            None if dialect == "auto" else dialect,
-            sides_of(side) if side else (),
-        )
+        trace = open_trace(recording)
+        wanted = None if dialect == "auto" else dialect
+        view = recording_of(trace, wanted, sides_of(side) if side else ())
+        body = body_in(trace) if dialect == "auto" and view.layer != "body" else None
+        also = f"there is a body, too: judge it with --dialect {body.name}" if body else ""
         model_name = view.model.name
     claims = Claims.load(capabilities, model_name)
     model_name = model_name or claims.hand.get("model")
@@ -119,6 +119,8 @@ def command(
     )
     console = Console(highlight=False, emoji=False)
     print_result(result, console, verbose=verbose, more="-v says why")
+    if also:
+        console.print(also)
     if json_path:
         result.write_json(json_path)
     if junit_path:
