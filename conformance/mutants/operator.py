@@ -247,7 +247,8 @@ ZOO: dict[str, tuple[_Entry, ...]] = {
         {
             SlowToLeave: ("TRACK-01",),
             FingerDeadBand: ("LIFE-03",),
-            LateFingers: ("GAIN-02",),  # its delay is long beside a step of the light joints
+            # its delay is long beside what the light joints take
+            LateFingers: ("GAIN-02", "OPER-02"),
         },
     ),
 }
