@@ -12,9 +12,6 @@ import contextlib
 import multiprocessing
 import os
 import random
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +26,7 @@ from dexkit.hand import Side
 from dexkit.messages import encode
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
 from dexkit.models import dialect
+from dexkit.processes import Tool
 from dexkit.service.realtime import precise_timers, prepare_process, real_time
 
 _ACTUATOR, _GO = dialect("unitree_actuator"), dialect("unitree_go")
@@ -68,25 +66,13 @@ def echoing(source: int, target: int, type_name: str, topic: str) -> Iterator[No
 
 @contextlib.contextmanager
 def bridging(near: int, far: int) -> Iterator[None]:
-    process = subprocess.Popen(
-        [
-            # this process is client and gripper at once, which looks like a bridge back
-            *(sys.executable, "-m", "dexkit", "bridge", "--quiet", "--force"),
-            *("--from", _ACTUATOR.name, "--to", _GO.name),
-            *("--domain", str(near), "--to-domain", str(far)),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None
-        if not process.stdout.readline().startswith("ready: "):
-            raise DexkitError(f"the bridge did not start: {process.communicate()[1].strip()}")
+    # this process is client and gripper at once, which looks like a bridge back: --force
+    with Tool(
+        *("bridge", "--quiet", "--force", "--from", _ACTUATOR.name, "--to", _GO.name),
+        *("--domain", str(near), "--to-domain", str(far)),
+    ) as tool:
+        tool.wait_ready(threading.Event())
         yield
-    finally:
-        process.send_signal(signal.SIGTERM)
-        process.wait(15)
 
 
 @dataclass

@@ -19,10 +19,8 @@ import multiprocessing
 import os
 import random
 import select
-import signal
-import subprocess
-import sys
 import tempfile
+import threading
 import time
 import tty
 from collections.abc import Iterator
@@ -37,10 +35,10 @@ from dexkit.clock import Rate
 from dexkit.dds import DdsNode, Qos
 from dexkit.drivers.ezgripper.servo import exchange_time
 from dexkit.emulators.mx64 import EmulatedProcess, emulated_ezgripper
-from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
 from dexkit.models import DEX1_1, dialect
+from dexkit.processes import Tool
 from dexkit.service.realtime import precise_timers
 from dexkit.service.realtime import real_time as real_time_priority
 from dexkit.wire.dynamixel import Instruction, PacketParser
@@ -59,24 +57,12 @@ _spawn = multiprocessing.get_context("spawn")
 
 @contextlib.contextmanager
 def serving(side: Side, device: str, domain: int, *, real_time: bool) -> Iterator[None]:
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "dexkit", "serve", "ezgripper", "--quiet"),
-            *("--side", side, "--device", device, "--set", _ZERO, "--domain", str(domain)),
-            "--real-time" if real_time else "--no-real-time",
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None
-        if not process.stdout.readline().startswith("ready: "):
-            raise DexkitError(f"the service did not start: {process.communicate()[1].strip()}")
+    with Tool(
+        *("serve", "ezgripper", "--quiet", "--side", side, "--device", device, "--set", _ZERO),
+        *("--domain", str(domain), "--real-time" if real_time else "--no-real-time"),
+    ) as tool:
+        tool.wait_ready(threading.Event())
         yield
-    finally:
-        process.send_signal(signal.SIGTERM)
-        process.wait(15)
 
 
 def bare_loop(seconds: float, real_time: bool, out: Connection) -> None:

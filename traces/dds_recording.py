@@ -12,7 +12,6 @@ import fnmatch
 import threading
 import time
 from collections.abc import Callable, Iterable
-from types import TracebackType
 
 from dexkit.dds import DdsNode, Endpoint, Qos, Reader
 from dexkit.errors import UsageError
@@ -123,12 +122,7 @@ class DdsRecording:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.stop()
 
     def _note(self, endpoint: Endpoint) -> None:

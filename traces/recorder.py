@@ -18,7 +18,6 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 from mcap.writer import CompressionType, Writer
@@ -207,12 +206,7 @@ class Recorder:
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     # -- from any thread -----------------------------------------------------------------------

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from types import TracebackType
 
 from dexkit.bodies import BODIES, BodyModel
 from dexkit.clock import Clock, RealClock
@@ -135,12 +134,7 @@ class EmulatedBody:
     def __enter__(self) -> EmulatedBody:
         return self.start()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.stop()
 
     def _close(self) -> None:
