@@ -49,6 +49,7 @@ from dexkit.traces import Recorder, TraceEndpoint, open_trace
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import crc_of, verify_payload
 from tests.conformance_helpers import copy_of, short_run
+from tests.test_conformance_schema import validate
 
 NAMES = list(BODIES)
 DOCS = Path(__file__).parent.parent / "docs" / "conformance-body.md"
@@ -234,6 +235,7 @@ def test_a_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
     result = CliRunner().invoke(command, [str(path), *files])
     assert result.exit_code == 0, result.output
     found = json.loads((tmp_path / "result.json").read_text())
+    validate(found)
     assert found["subject"]["model"] == name
     assert found["overall"] == "pass"
     assert found["counts"]["pass"] >= 20
