@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -39,8 +40,8 @@ from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
-from dexkit.conformance.virtual import MemoryTrace, run_virtual
-from dexkit.conformance.virtual.body import ReferenceBody
+from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
+from dexkit.conformance.virtual.body import Orders, ReferenceBody
 from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
@@ -211,6 +212,38 @@ def test_a_machine_that_was_busy_is_not_the_bodys_fault() -> None:
     stimulus.beats.t_us, stimulus.beats.late_us = [150_000], [150_000]
     holed.metadata["dexkit.stimulus"] = stimulus.to_metadata()
     assert verdict() is Verdict.BLOCKED
+
+
+class DiesOfNaN(ReferenceBody):
+    """Ends with the first NaN."""
+
+    dead = False
+
+    def accepts(self, orders: Orders) -> bool:
+        self.dead = self.dead or not self.finite(orders)
+        return super().accepts(orders)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.dead else super().publish()
+
+
+class Hiccup(ReferenceBody):
+    """Is kept from publishing for a fifth of a second, when NaNs come."""
+
+    since = math.inf
+
+    def accepts(self, orders: Orders) -> bool:
+        if not self.finite(orders):
+            self.since = min(self.since, self.now)
+        return super().accepts(orders)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.since <= self.now < self.since + 0.25 else super().publish()
+
+
+def test_a_body_that_dies_of_a_command_is_told_from_a_late_one() -> None:
+    assert "H1-SAFE-01" in run_body_mutant(DiesOfNaN, "h1", frozenset({"nan"}))
+    assert run_body_mutant(Hiccup, "h1", frozenset({"nan"})) == set()
 
 
 # --------------------------------------------------------------------------------- recordings

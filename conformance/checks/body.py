@@ -30,7 +30,9 @@ from dexkit.messages import Columns
 
 __all__ = ["body_checks"]
 
-_END = 0.06  # s at the end of a phase, or before it, over which is averaged
+_SOME = 20  # states at the end of a phase, or before it, over which is averaged
+_END = 0.06  # s after a phase in which its last command may still have an effect
+_LATE = 1.0  # s by which a state may be late on a busy machine
 _STICKS = struct.Struct("<4x5f")  # in wireless_remote: behind head and keys
 
 
@@ -381,9 +383,12 @@ def _index(ctx: Context, phase: Phase) -> int:
 
 
 def _silent(ctx: Context, phase: Phase) -> Outcome:
+    """No state where one is needed: a body that has died of it, or one that was late."""
     begin, end = ctx.span(phase)
+    if len(_q(ctx, end, end + _LATE)):
+        return ctx.skipped(f"no state came at the right moment of '{phase.name}', only later")
     place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed("no state", f"no state during '{phase.name}'", place)
+    return ctx.failed("no state", f"no state during '{phase.name}', nor after it", place)
 
 
 def _q(ctx: Context, begin: float, end: float) -> Floats:
@@ -398,7 +403,7 @@ def follows(ctx: Context) -> Outcome:
         if not phase.targets:
             continue
         begin, end = ctx.span(phase)
-        q = _q(ctx, end - _END, end)
+        q = _q(ctx, begin, end)[-_SOME:]
         if not len(q):
             return _silent(ctx, phase)
         ((joint, goal),) = phase.targets[ctx.side].items()
@@ -440,7 +445,7 @@ def stays(ctx: Context) -> Outcome:
     worst, text, where = -1.0, "", (0.0, 0.0)
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before, q = _q(ctx, begin - _END, begin), _q(ctx, begin, end + _END)
+        before, q = _q(ctx, begin - _LATE, begin)[-_SOME:], _q(ctx, begin, end + _END)
         if not len(before) or not len(q):
             return _silent(ctx, phase)
         moved = np.abs(q - before.mean(axis=0)).max(axis=0)
@@ -461,7 +466,10 @@ def stiffness(ctx: Context) -> Outcome:
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
     joint, wanted = _index(ctx, phase), float(phase.params["way"])
-    before, after = _q(ctx, begin - _END, begin)[:, joint], _q(ctx, end - _END, end)[:, joint]
+    before, after = (
+        _q(ctx, begin - _LATE, begin)[-_SOME:, joint],
+        _q(ctx, begin, end)[-_SOME:, joint],
+    )
     if not len(before) or not len(after):
         return _silent(ctx, phase)
     way = float(after.mean() - before.mean())

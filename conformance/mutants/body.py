@@ -603,7 +603,7 @@ _ZOO: tuple[tuple[type[ReferenceBody], str, tuple[str, ...]], ...] = (
     (Sulks, "SAFE-04", ()),
     (AnyMachine, "SAFE-05", ()),
     (GoesOn, "WDOG-01", ()),
-    (AnswersOnly, "WDOG-02", ("WDOG-01",)),
+    (AnswersOnly, "WDOG-02", ()),
     (Latches, "WDOG-03", ("LIFE-02",)),
     (Nervous, "WDOG-04", ()),
     (KnowsItsReaders, "LIFE-01", ()),
