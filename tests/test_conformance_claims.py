@@ -15,7 +15,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.report.wording import hand_name
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
 from dexkit.conformance.results import Result, Verdict
-from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError
 from dexkit.hand import Side
@@ -94,7 +94,7 @@ def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
     claims = Claims.parse(text) if text else Claims()
     (applied,) = claims.apply([requirement])
-    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: "")
+    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: Excuse(False))
 
 
 @pytest.mark.parametrize("met", [None, True])
