@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
+from dexkit.bodies import BODIES
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
 from dexkit.doctor.rules import Readiness, Verdict
@@ -21,6 +22,11 @@ __all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
 SCHEMA_VERSION = 1
 """Of the JSON report; raised when a field changes its meaning or goes."""
 
+_BODY_TOPICS = {
+    topic
+    for body in BODIES.values()
+    for topic in (body.cmd_topic, body.state_topic, body.arm_topic, body.remote_topic)
+}
 _COLOUR = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
 
 
@@ -105,7 +111,8 @@ def print_report(
 def _row(view: DomainView, endpoint: Endpoint) -> tuple[str, ...]:
     stream = view.stream(endpoint)
     rate = f"{stream.rate:.0f}" if stream and stream.samples else ("0" if stream else "")
-    mark = "" if roles(endpoint.topic) else " (not a hand's)"
+    known = roles(endpoint.topic) or endpoint.topic in _BODY_TOPICS
+    mark = "" if known else " (not a hand's)"
     kind = "publishes" if endpoint.kind == "writer" else "reads"
     return (
         str(view.number),
