@@ -11,7 +11,8 @@ RUN := $(UV) run --frozen
 STAMP := .venv/.synced
 
 # An environment activated by the caller must not leak in.
-unexport VIRTUAL_ENV PYTHONPATH
+# Nor may bytecode go unwritten: hundreds of processes would each compile NumPy.
+unexport VIRTUAL_ENV PYTHONPATH PYTHONDONTWRITEBYTECODE
 
 $(UV):
 	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found; set PYTHON=/path/to/python3" >&2; exit 2; }
@@ -20,7 +21,7 @@ $(UV):
 	@$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check "uv==$(UV_VERSION)"
 
 $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
-	@$(UV) sync --frozen --quiet --compile-bytecode
+	@$(UV) sync --frozen --quiet
 	@touch $@
 
 .PHONY: help setup demo test soak lint format bench lock clean

@@ -546,5 +546,10 @@ class Delayed(Service):
         super().live(dt)
 
 
-DILUTED = ("StuttersUnderLoad", "FreezesOnce", "StaleState", "Hunts")
-"""What weighs too much in the mean of a short run, or shows elsewhere by chance of its phase."""
+DILUTED = (
+    *("StuttersUnderLoad", "FreezesOnce", "StaleState", "Hunts"),
+    *("PercentBothWays", "DegreesBothWays"),
+)
+"""What weighs too much in the mean of a short run, shows elsewhere by chance of its phase, or
+shows only after more than its requirement asks for.
+"""
