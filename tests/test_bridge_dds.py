@@ -145,6 +145,7 @@ def test_other_publishers_are_refused(dds_domain: int, dds_node: DdsNode) -> Non
                 pytest.raises(TopicConflict, match=f"already publishes {taken}"),
             ):
                 bridge.start()
+            wait_until(lambda: bridge.others() is None)  # that its end is known, too
         # the other way round that would be a client: nobody is in the way
         with (
             dds_node.writer(GO.topics(LEFT)[0], GO.cmd_type),
