@@ -1,4 +1,4 @@
-"""``dexkit demo``: the whole story on emulators, in under a minute."""
+"""``dexkit demo``: the whole story on emulators, in some 75 seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dexkit emulate``: emulated devices, each on the kind of port that the real one has."""
+"""``dexkit emulate``: devices on the kind of port that the real ones have, bodies, whole robots."""
 
 from __future__ import annotations
 
