@@ -394,6 +394,9 @@ _domains: dict[int, _Domain] = {}
 _domains_lock = threading.Lock()
 # CycloneDDS describes a type when its first topic is made, and not for two threads at once
 _types_lock = threading.RLock()
+# CycloneDDS's Python reads the policies of a discovered endpoint through variables that all threads
+# share: two nodes that discover at once would see each other's
+_policies_lock = threading.Lock()
 
 
 def _acquire_domain(number: int, interface: str) -> None:
@@ -989,7 +992,8 @@ class DdsNode:
 
 def _taken(reader: Any) -> Iterator[Any]:
     while True:
-        samples: Sequence[Any] = reader.take(_TAKE_CHUNK)
+        with _policies_lock:
+            samples: Sequence[Any] = reader.take(_TAKE_CHUNK)
         yield from samples
         if len(samples) < _TAKE_CHUNK:
             return

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -165,6 +166,22 @@ def test_discovery_tells_who_what_and_how(dds_node: DdsNode) -> None:
             (False, "reader"),
         ]
     )
+
+
+def test_nodes_that_discover_at_once_do_not_mix_up_policies(dds_domain: int) -> None:
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ExitStack() as stack:
+            nodes = [stack.enter_context(DdsNode(dds_domain)) for _ in range(4)]
+            kinds = {f"rt/{i}": ("reliable", "best_effort")[i % 2] for i in range(150)}
+            for topic, kind in kinds.items():
+                stack.enter_context(nodes[0].writer(topic, STATES, qos=Qos(kind)))
+            for node in nodes:
+                assert node.discovery.wait(lambda seen: len(seen) == len(kinds), timeout=10)
+                assert {e.topic: e.qos.reliability for e in node.endpoints()} == kinds
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def test_incompatible_qos_does_not_match(dds_node: DdsNode) -> None:
