@@ -28,7 +28,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         ("unitree_hg", BOTH),
         ("unitree_actuator", BOTH),
         ("dex3", BOTH),
-        ("dex5", LEFT),
+        ("dex5", BOTH),
     ],
 )
 def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:

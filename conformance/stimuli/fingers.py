@@ -17,7 +17,7 @@ wrong-id,
 negative,
 foreign
 burst          hundreds of commands at once, of which the last one counts
-stiff, soft    the same step with the client's gains and with a fifth of its stiffness
+stiff, soft    the same step with the client's gains and with a tenth of its stiffness
 limp           zero gains, with a q far towards closed
 lock           the same with the client's gains and status 0 (Dex3-1), or mode 0 (Dex5-1)
 replay         a recorded session, as recorded
@@ -60,7 +60,7 @@ OPEN, CLOSED = 15.0, 50.0
 """Percent of closing between which the hand moves freely."""
 BEYOND = 25.0
 """Percent of closing by which an object is squeezed."""
-SOFTER = 0.2
+SOFTER = 0.1
 """Stiffness of a soft step as a part of the client's."""
 _BOTH_WAYS = 8
 """Motors of a hand up to which each of them closes and opens alone."""
