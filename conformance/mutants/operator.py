@@ -248,7 +248,7 @@ ZOO: dict[str, tuple[_Entry, ...]] = {
             SlowToLeave: ("TRACK-01",),
             FingerDeadBand: ("LIFE-03",),
             # its delay is long beside what the light joints take
-            LateFingers: ("GAIN-02", "OPER-02"),
+            LateFingers: ("OPER-02",),
         },
     ),
 }
