@@ -316,7 +316,8 @@ def test_a_terminal_tells_once_what_holds_for_both_hands() -> None:
     out = io.StringIO()
     print_result(result, Console(file=out, width=80), verbose=True)
     lines = [line.rstrip() for line in out.getvalue().splitlines()]
-    assert max(map(len, lines)) <= 80
+    assert max(map(len, lines[:-1])) <= 80
+    assert lines[-1] == result.sentence()
     failed = next(r.requirement for r in result.results if r.verdict is Verdict.FAIL)
     begin = lines.index(f"{failed.id} ({failed.level}) left and right: fail")
     card = lines[begin + 1 : lines.index("", begin)]

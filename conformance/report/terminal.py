@@ -93,7 +93,12 @@ def print_result(
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
-    console.print(f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]", highlight=False)
+    # one line at any width, for logs are searched for it
+    console.print(
+        f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _print_trouble(group: Sequence[Result], console: Console) -> None:
