@@ -72,6 +72,7 @@ def judge(
         notes=list(recording.notes),
         harness=_harness(recording),
         claims=None if claims.units is None else dict(claims.units),
+        catalogue=len({r.requirement.id for r in results}),
         recorded_at=when.isoformat(timespec="seconds"),
     )
 

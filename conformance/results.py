@@ -218,6 +218,8 @@ class RunResult:
         and ``jitter_p99_ms``, by which it was late itself, and ``starved``, the part of the run,
         0 to 1, in which programs waited for a processor.
     :param claims: by unit, whether the vendor claims it; None where nothing is said.
+    :param catalogue: how many requirements there are for such a run, selected or not; 0 if it is
+        not known.
     """
 
     subject: dict[str, str]
@@ -229,6 +231,12 @@ class RunResult:
     recorded_at: str = ""
     harness: dict[str, float] = field(default_factory=dict)
     claims: dict[str, bool] | None = None
+    catalogue: int = 0
+
+    @property
+    def partial(self) -> bool:
+        """Whether only a part of the catalogue was selected: no proof of a drop-in."""
+        return sum(self.counts().values()) < self.catalogue
 
     @property
     def starved(self) -> float:
@@ -281,7 +289,8 @@ class RunResult:
             if self.judged == 0
             else "INCONCLUSIVE: a MUST could not be judged",
         }
-        return f"{heads[self.overall]} ({total} requirements: {', '.join(parts)})"
+        of = f"{total} of {self.catalogue}" if self.partial else f"{total}"
+        return f"{heads[self.overall]} ({of} requirements: {', '.join(parts)})"
 
     def as_dict(self) -> dict[str, Any]:
         """The result as plain data."""
@@ -295,6 +304,7 @@ class RunResult:
             "stage": {side: str(stage) for side, stage in self.stage.items()},
             "recorded_at": self.recorded_at,
             "duration_s": round(self.duration_s, 3),
+            "catalogue": self.catalogue,
             "counts": {str(v): n for v, n in self.counts().items()},
             "harness": {name: round(value, 4) for name, value in self.harness.items()},
             "environment": dict(self.environment),
@@ -343,6 +353,7 @@ def read_json(path: Path) -> RunResult:
             environment=data["environment"],
             harness=data["harness"],
             claims=data["claims"],
+            catalogue=data["catalogue"],
             recorded_at=data["recorded_at"],
             results=[_result_of(entry) for entry in data["results"]],
         )

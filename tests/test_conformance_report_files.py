@@ -356,3 +356,16 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
         assert isinstance(done.exception, UsageError), args
     assert run("report", tmp_path / "missing.json").exit_code == 2
     assert run("compare").exit_code == 2
+
+
+def test_a_part_of_the_catalogue_is_told_as_a_part(tmp_path: Path) -> None:
+    result = replace(run_named("G", "2026-01-01", TOPIC_01=Verdict.PASS), catalogue=67)
+    assert result.partial
+    assert "(1 of 67 requirements: 1 pass)" in result.sentence()
+    assert badge_text(result)[1].startswith("1/1 pass of 67, partial")
+    assert "#14734a" not in render_badge(result)
+    for text in (render(result), render_markdown(result)):
+        assert "Only 1 of 67 requirements were selected" in text
+    result.write_json(tmp_path / "part.json")
+    assert read_json(tmp_path / "part.json").partial
+    assert not replace(result, catalogue=1).partial

@@ -10,13 +10,15 @@ from dexkit.conformance.results import Overall, RunResult
 __all__ = ["badge_text", "render_badge"]
 
 _COLOURS = {Overall.PASS: "#14734a", Overall.FAIL: "#b3261e", Overall.INCONCLUSIVE: "#6b3fa0"}
+_PARTIAL = "#7a5a00"
 _NARROW, _WIDE = "fijlrtI.,:;'|/()1 ", "mwMW%@"
 
 
 def badge_text(result: RunResult) -> tuple[str, str]:
     """The two halves: what for, and what came of it.
 
-    Only what was judged counts as passed, and whoever reads it learns whether the hand was real.
+    Only what was judged counts as passed, and whoever reads it learns whether the hand was real,
+    and whether only a part of the requirements was tried.
     """
     found = tally(result)
     if result.overall is Overall.INCONCLUSIVE:
@@ -25,6 +27,8 @@ def badge_text(result: RunResult) -> tuple[str, str]:
         text = f"fail, {found.failed} of {found.applicable} not met"
     else:
         text = f"{found.passed}/{found.applicable} pass"
+        if result.partial:
+            text += f" of {result.catalogue}, partial"
         rest = [
             (found.warned, "warn"),
             (found.not_judged + found.open, "not judged"),
@@ -46,6 +50,8 @@ def render_badge(result: RunResult) -> str:
     left, right = badge_text(result)
     a, b = _width(left) + 14, _width(right) + 14
     title = escape(f"{left}: {right}")
+    passed_in_part = result.partial and result.overall is Overall.PASS
+    colour = _PARTIAL if passed_in_part else _COLOURS[result.overall]
 
     def text(words: str, at: int, width: int) -> str:
         return f'<text x="{at}" y="14" textLength="{width}">{escape(words)}</text>'
@@ -55,7 +61,7 @@ def render_badge(result: RunResult) -> str:
         f'aria-label="{title}"><title>{title}</title>'
         f'<clipPath id="r"><rect width="{a + b}" height="20" rx="4"/></clipPath>'
         f'<g clip-path="url(#r)"><rect width="{a}" height="20" fill="#3b424c"/>'
-        f'<rect x="{a}" width="{b}" height="20" fill="{_COLOURS[result.overall]}"/></g>'
+        f'<rect x="{a}" width="{b}" height="20" fill="{colour}"/></g>'
         '<g fill="#fff" font-family="Verdana,DejaVu Sans,sans-serif" font-size="11">'
         f"{text(left, 7, a - 14)}{text(right, a + 7, b - 14)}</g></svg>\n"
     )

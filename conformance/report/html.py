@@ -24,6 +24,7 @@ from dexkit.conformance.report.wording import (
     model_title,
     moment,
     nature,
+    part,
     quantity,
     subject,
     whose,
@@ -137,6 +138,8 @@ def _verdict(result: RunResult) -> str:
             f"<p><b>The testing machine was busy</b>: {escape(about_harness(result))}. What "
             "this can have caused is blocked, not failed; on an idle machine more can be told.</p>"
         )
+    if of := part(result):
+        caution = f"<p><b>{of}</b>: this does not prove a drop-in.</p>{caution}"
     stages = "".join(_stage(side, stage) for side, stage in result.stage.items())
     return (
         f'<header class="verdict {answer.css}">'
@@ -471,7 +474,13 @@ def _what(result: RunResult) -> str:
             "hundred times a second and gets <em>state</em> back 500 times a second. A simulator "
             "can take the robot's place only if it speaks and behaves the same. "
         ]
-    if "backend" in result.subject and subject(result) == "body":
+    if "backend" in result.subject and result.partial:
+        text.append(
+            f"Here a test program led the {subject(result)} with only those commands that the "
+            "selected requirements need, and recorded everything. The verdicts were read off the "
+            "recording.</p>"
+        )
+    elif "backend" in result.subject and subject(result) == "body":
         text.append(
             "Here a test program led it: it listened, moved each joint, sent broken commands, fell "
             "silent and came back. Everything was recorded, and the verdicts were read off the "

@@ -17,6 +17,7 @@ from dexkit.conformance.report.wording import (
     hand_name,
     model_title,
     nature,
+    part,
     whose,
 )
 from dexkit.conformance.requirements import Requirement
@@ -66,6 +67,8 @@ def render_markdown(result: RunResult) -> str:
         + (" A recording was judged, not a live hand." if real == "recorded" else ""),
         "",
     ]
+    if of := part(result):
+        lines += [f"**{of}: this does not prove a drop-in.**", ""]
     lines += [
         f"- {plain(whose(side))} reached: **{stage}**" for side, stage in result.stage.items()
     ]

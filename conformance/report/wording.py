@@ -21,6 +21,7 @@ __all__ = [
     "model_title",
     "moment",
     "nature",
+    "part",
     "quantity",
     "subject",
     "tally",
@@ -131,6 +132,14 @@ def hand_name(result: RunResult) -> str:
     if about.get("hand") and about.get("firmware"):
         name += f" {about['firmware']}"
     return name
+
+
+def part(result: RunResult) -> str:
+    """What to say of a run for which only a part of the catalogue was selected, or nothing."""
+    if not result.partial:
+        return ""
+    n = len(result.by_requirement())
+    return f"Only {n} of {result.catalogue} requirements were selected"
 
 
 def nature(result: RunResult) -> str:
