@@ -228,7 +228,15 @@ def pytest_terminal_summary(
         if why:
             text = f"Nothing was judged, which is not a pass: {why}."
         elif config.stash[OPTIONS_KEY] is not None:
-            text += " No requirement was left to be judged."
+            deselected = terminalreporter.stats.get("deselected", [])
+            if _items(session) or any(i.get_closest_marker(_MARK) for i in deselected):
+                text += " No requirement was left to be judged."
+            else:
+                text += (
+                    " pytest found none of the suite's tests: name them (--pyargs "
+                    "dexkit.conformance), and where your own pytest settings hide them "
+                    "(python_files), add -c /dev/null."
+                )
         else:
             text += (
                 " Name the hand: --backend ezgripper or dex3-usb (emulated), --backend sim-dex1 "

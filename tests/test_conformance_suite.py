@@ -85,7 +85,14 @@ def test_requirements_are_the_test_ids() -> None:
 def test_a_selection_that_leaves_nothing_is_no_success() -> None:
     run = suite("conformance/", "--backend", "sim-dex1", "-k", "nothing-is-called-so")
     assert run.returncode == 2, run.stdout
-    assert "Nothing was judged, which is not a pass" in run.stdout
+    assert "Nothing was judged, which is not a pass. No requirement was left" in run.stdout
+
+
+def test_a_suite_that_a_vendors_pytest_settings_hide_is_said_to_be() -> None:
+    run = suite("conformance/", "--backend", "sim-dex1", "-o", "python_files=check_*.py")
+    assert run.returncode == 2, run.stdout
+    assert "pytest found none of the suite's tests" in run.stdout
+    assert "add -c /dev/null" in run.stdout
 
 
 def test_a_hand_that_cannot_be_reached_is_no_success() -> None:
