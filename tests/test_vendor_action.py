@@ -11,11 +11,13 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,7 @@ exit $(cat {tmp_path}/status)
     command(programs / "python", note)
     command(programs / "dexkit", '#!/bin/bash\necho "table of $2"\n')
     (tmp_path / "status").write_text("0")
+    (tmp_path / "result").write_text("{}")
     return Runner(tmp_path, f"{programs}:{os.environ['PATH']}")
 
 
@@ -165,16 +168,16 @@ def test_every_input_becomes_an_option(pretended: Runner) -> None:
         requirements="DEX1-RATE\nDEX1-MOVE-02",
         arguments="--quick --set 'force=12 N'",
     )
-    assert ran.returncode == 0, ran.stderr
+    assert ran.returncode == 0, ran.stdout + ran.stderr
     arguments = (pretended.home / "arguments").read_text().splitlines()
     assert arguments[:3] == ["-m", "pytest", "--pyargs"]
     given = " ".join(shlex.quote(a) for a in arguments)
     for part in (
         "--backend external --device 'left=/dev/a b' --device right=/dev/c --side both",
         "--dialect unitree_hg --domain 3 --object right=37 --capabilities 'my capabilities.toml'",
-        "--level must --require DEX1-RATE --require DEX1-MOVE-02",
+        "--level must --require DEX1-RATE --require DEX1-MOVE-02 --quick --set 'force=12 N'",
         "--json dexkit-report/result.json --report dexkit-report/report.html",
-        "--junitxml dexkit-report/junit.xml --quick --set 'force=12 N'",
+        "--junitxml dexkit-report/junit.xml",
     ):
         assert part in given
 
@@ -189,18 +192,76 @@ def test_inputs_that_are_left_out_become_none(pretended: Runner) -> None:
 @pytest.mark.parametrize("status", [0, 1, 2, 4, 5])
 def test_the_exit_code_of_the_suite_is_the_steps(pretended: Runner, status: int) -> None:
     (pretended.home / "status").write_text(str(status))
-    if status < 2:
-        (pretended.home / "result").write_text("{}")
+    if status >= 2:
+        (pretended.home / "result").unlink()
     assert pretended("Judge the hand", backend="acme").returncode == status
     assert pretended.outputs["exit-code"] == str(status)
     said = "nothing was judged" if status >= 2 else "table of dexkit-report/result.json"
     assert said in pretended.summary
+    # an output names a file that is there, or nothing
+    result = "dexkit-report/result.json" if status < 2 else ""
+    assert pretended.outputs == {"exit-code": str(status), "result": result, "report": ""}
+
+
+def test_lines_are_trimmed(pretended: Runner) -> None:
+    ran = pretended(
+        "Judge the hand",
+        backend=" acme\r\n",
+        device="\tleft=/dev/a b \r\n  right=/dev/c\n \r\n",
+        requirements="  DEX1-RATE  \r\n\r\n\tDEX1-MOVE-02\t",
+        arguments="--quick\r\n --set 'force=12 N' \r\n",
+        output=" mine \r\n",
+    )
+    assert ran.returncode == 2  # the pretended result is in the default's folder
+    arguments = (pretended.home / "arguments").read_text().splitlines()
+    first = arguments.index("--backend")
+    assert arguments[first : first + 13] == [
+        *("--backend", "acme", "--device", "left=/dev/a b", "--device", "right=/dev/c"),
+        *("--require", "DEX1-RATE", "--require", "DEX1-MOVE-02"),
+        *("--quick", "--set", "force=12 N"),
+    ]
+    assert arguments[-1] == "mine/junit.xml"
+
+
+def test_a_quote_without_end_is_a_wrong_option_and_nothing_runs(pretended: Runner) -> None:
+    ran = pretended("Judge the hand", backend="acme", arguments="--quick --set 'force=12")
+    assert ran.returncode == 4
+    assert pretended.outputs == {"exit-code": "4", "result": "", "report": ""}
+    assert "a quote in it has no end" in ran.stdout
+    assert "a quote in it has no end" in pretended.summary
+    assert not (pretended.home / "arguments").exists()
+
+
+def test_a_success_without_a_result_is_none(pretended: Runner) -> None:
+    (pretended.home / "result").unlink()
+    ran = pretended("Judge the hand", backend="acme", arguments="--list")
+    assert ran.returncode == 2
+    assert pretended.outputs == {"exit-code": "2", "result": "", "report": ""}
+    assert "::error" in ran.stdout
+    assert "the suite ended without a result" in pretended.summary
+
+
+def test_the_files_are_where_the_outputs_say_whatever_the_arguments_name(
+    pretended: Runner,
+) -> None:
+    assert pretended("Judge the hand", backend="acme", arguments="--json m.json").returncode == 0
+    arguments = (pretended.home / "arguments").read_text().splitlines()
+    names = [b for a, b in pairwise(arguments) if a == "--json"]
+    assert names == ["m.json", "dexkit-report/result.json"]  # the last one counts
+
+
+def test_preparing_ends_at_the_first_command_that_fails(pretended: Runner) -> None:
+    assert pretended("Prepare", prepare="echo $((40 + 2)) > it\r\ntrue").returncode == 0
+    assert (pretended.workspace / "it").read_text() == "42\n"
+    assert pretended("Prepare", prepare="(exit 3) | cat\nrm it").returncode == 3
+    assert (pretended.workspace / "it").exists()
 
 
 def test_the_result_of_a_run_before_is_not_taken_for_this_one(pretended: Runner) -> None:
     folder = pretended.home / "workspace" / "dexkit-report"
     folder.mkdir(parents=True)
     (folder / "result.json").write_text("{}")
+    (pretended.home / "result").unlink()
     (pretended.home / "status").write_text("2")
     assert pretended("Judge the hand", backend="acme").returncode == 2
     assert "nothing was judged" in pretended.summary
@@ -208,7 +269,8 @@ def test_the_result_of_a_run_before_is_not_taken_for_this_one(pretended: Runner)
 
 def test_an_installation_that_fails_ends_it(pretended: Runner) -> None:
     (pretended.home / "status").write_text("1")
-    assert pretended("Install dexkit and the backend", install="nothing-of-this-name") != 0
+    ran = pretended("Install dexkit and the backend", install="nothing-of-this-name")
+    assert ran.returncode != 0
     arguments = (pretended.home / "arguments").read_text().splitlines()
     assert arguments[-2:] == [f"{ROOT}[conformance]", "nothing-of-this-name"]
 
@@ -233,19 +295,33 @@ def test_a_half_written_hand_is_told_what_is_missing(tmp_path: Path) -> None:
     assert "nothing was judged" in runner.summary
 
 
+def test_a_list_of_the_requirements_is_no_verdict(tmp_path: Path) -> None:
+    runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    ran = runner("Judge the hand", backend="sim-dex1", arguments="--list")
+    assert "DEX1-TOPIC-01" in ran.stdout
+    assert ran.returncode == 2
+    assert "nothing was judged" in runner.summary
+
+
 # --------------------------------------------------------------------------- the whole of it
 
 
+START = """
+acme-emulator --port 0 > emulator.log 2>&1 &
+echo $! > emulator.pid
+until grep ready: emulator.log; do kill -0 $!; sleep 0.05; done
+"""
+
+
 @contextmanager
-def emulator(runner: Runner, *arguments: str) -> Iterator[str]:
-    """An emulated Acme gripper, as an earlier step of a workflow starts it; its address."""
-    program = Path(runner.path.partition(":")[0]) / "acme-emulator"
-    with subprocess.Popen(
-        [program, "--port", "0", *arguments], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        yield process.stdout.readline().removeprefix("ready: ").strip()
-        process.terminate()
+def emulator(runner: Runner) -> Iterator[str]:
+    """An emulated Acme gripper, as docs/ci.md has it started; its address."""
+    ran = runner("Prepare", prepare=START)
+    try:
+        assert ran.returncode == 0, ran.stderr
+        yield ran.stdout.removeprefix("ready: ").strip()
+    finally:  # it outlives its step; at the end of the job a runner ends it
+        os.kill(int((runner.workspace / "emulator.pid").read_text()), signal.SIGTERM)
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +407,9 @@ def test_the_container_runs_dexkit_on_the_right_python_and_not_as_root() -> None
 
 
 def test_the_container_is_built_from_all_that_the_wheel_needs() -> None:
-    left_out = (ROOT / ".containerignore").read_text().splitlines()
+    # podman reads it, too, as long as there is no .containerignore; docker knows only this one
+    assert not (ROOT / ".containerignore").exists()
+    left_out = (ROOT / ".dockerignore").read_text().splitlines()
     for needed in ("dexkit", "drivers", "emulators", "conformance", "traces", "packaging"):
         assert needed not in left_out
     for heavy in (".git", ".venv"):
