@@ -20,12 +20,13 @@ from dexkit.conformance.report.compare import (
     render_comparison,
     render_comparison_markdown,
 )
+from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.requirements.sources import told
-from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.results import RunResult, Verdict, read_json
 from dexkit.conformance.session import SuiteOptions, judge_recording
 from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError

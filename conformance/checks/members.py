@@ -106,6 +106,15 @@ def mode(ctx: Context) -> Outcome:
     found = np.unique(ctx.states.mode[np.isfinite(ctx.states.mode)])
     seen = " and ".join(f"{m:g}" for m in found)
     if set(found) <= {0.0, ctx.tolerance("driven")}:
+        for phase in ctx.recording.phases("silence", ctx.side):
+            _, end = ctx.span(phase)
+            late = ctx.states.between(end - 0.3, end)
+            if (ctx.states.mode[late, 0] == ctx.tolerance("driven")).any():
+                return ctx.failed(
+                    "driven in silence",
+                    "mode says that the motor is driven when no command is in force any more",
+                    ctx.at(ctx.states.topic, end - 0.3, end),
+                )
         return ctx.passed(seen, f"mode {seen}")
     wrong = next(m for m in found if m not in (0.0, ctx.tolerance("driven")))
     row = int(np.argmax(ctx.states.mode[:, 0] == wrong))

@@ -11,6 +11,7 @@ from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.checks.motion import Step, steps, steps_of
 from dexkit.conformance.checks.timing import gaps, slow, too_slow
 from dexkit.conformance.phases import Phase
+from dexkit.hand import Floats
 
 
 def _recovery(ctx: Context, phase: Phase) -> Step | None:
@@ -191,6 +192,14 @@ def brakes(ctx: Context) -> Outcome:
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=moved,
             )
+        jump, allowed = _jump(ctx, last + timeout, q_late)
+        if jump > allowed:
+            return ctx.failed(
+                f"{jump:.2f} rad",
+                f"went {jump:.2f} rad elsewhere as it braked",
+                ctx.at(states.topic, last + timeout, end),
+                motion_rad=jump,
+            ).if_late(STROKE_S * (jump - allowed) / ctx.joints[0].stroke)
         # at its stop it would stand still without a brake, too
         stroke = ctx.joints[0].stroke
         at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
@@ -221,6 +230,22 @@ def brakes(ctx: Context) -> Outcome:
         )
     figure = "stops" if "motion_rad" in values else "lets go" if values else "says so"
     return ctx.passed(figure, "; ".join(proofs), **values)
+
+
+def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
+    """How far the hand went while it braked, and how far it may: rad.
+
+    What it runs on at the speed that it had; and an object that was pressed pushes it back.
+    """
+    states = ctx.states
+    before = states.between(at - 0.15, at - 0.05)
+    q, t = states.q[before, 0], states.t[before]
+    if len(q) < 2:
+        return 0.0, 0.0
+    speed = abs(float(q[-1] - q[0])) / max(float(t[-1] - t[0]), 1e-3)
+    runs_on = speed * (0.05 + ctx.tolerance("grace_s"))
+    jump = abs(float(np.median(q_late)) - float(q[-1]))
+    return jump, ctx.tolerance("max_jump_stroke") + runs_on
 
 
 @check("DEX1-WDOG-02", "DEX3-WDOG-02")
@@ -254,6 +279,22 @@ def state_in_silence(ctx: Context) -> Outcome:
 @check("DEX1-WDOG-03", "DEX3-WDOG-03")
 def resumes(ctx: Context) -> Outcome:
     """The step after a silence."""
+    limit = ctx.tolerance("max_reaction_s")
+    slowest: tuple[float, Step] | None = None
+    for step in steps(ctx):
+        if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
+            begun = (step.q - step.start) / step.size >= ctx.tolerance("begun_part")
+            after = float(step.t[np.argmax(begun)] if begun.any() else step.end) - step.begin
+            if slowest is None or after > slowest[0]:
+                slowest = after, step
+    if slowest is not None and slowest[0] > limit:
+        after, step = slowest
+        return ctx.failed(
+            f"after {after:.2f} s",
+            f"after a silence: {step}, but was not under way before {after:.2f} s",
+            ctx.at(ctx.states.topic, step.begin, step.begin + after),
+            reaction_s=after,
+        ).if_late(after - limit)
     return arrival(ctx, "after a silence")
 
 

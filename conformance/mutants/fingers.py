@@ -501,14 +501,16 @@ class NegativeGains(FingerService):
     wrong = _NegativeGains
 
 
+def _values(motor: Motor) -> tuple[float, ...]:
+    return motor.q, motor.dq, motor.tau, motor.kp, motor.kd
+
+
 class _NanPerJoint(FingerHand):
     def command(self, motors: tuple[Motor, ...]) -> None:
         now = zip(self.goal.tolist(), self.kp.tolist(), self.kd.tolist(), motors, strict=True)
         super().command(
             tuple(
-                m
-                if all(math.isfinite(v) for v in (m.q, m.dq, m.tau, m.kp, m.kd))
-                else Motor(q, kp=kp, kd=kd, mode=m.mode)
+                m if all(map(math.isfinite, _values(m))) else Motor(q, kp=kp, kd=kd, mode=m.mode)
                 for q, kp, kd, m in now
             )
         )
@@ -518,6 +520,19 @@ class RejectsOnlyTheBadJoint(FingerService):
     """Leaves out the joint with a NaN and moves the others."""
 
     wrong = _NanPerJoint
+
+
+class _NanInTheLast(FingerHand):
+    def command(self, motors: tuple[Motor, ...]) -> None:
+        now = zip(self.goal.tolist(), motors[:-1], strict=False)
+        kept = (m if all(map(math.isfinite, _values(m))) else Motor(q, mode=m.mode) for q, m in now)
+        super().command((*kept, motors[-1]))
+
+
+class LooksAtTheLastJoint(FingerService):
+    """Tests the last joint alone for NaN, and lets any other that has one go limp."""
+
+    wrong = _NanInTheLast
 
 
 class _NoLimits(FingerHand):
@@ -600,6 +615,25 @@ class StuckAfterSilence(FingerService):
     """Takes no command any more after a silence without protection."""
 
     wrong = _LatchesWithoutGuard
+
+
+class _SleepsWithoutGuard(FingerHand):
+    deaf_until = -math.inf
+
+    def expire(self) -> None:
+        super().expire()
+        if not self.guarded.any():
+            self.deaf_until = self.now + 2.0
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        if self.now >= self.deaf_until:
+            super().take(rows, mode)
+
+
+class SleepsWithoutGuard(FingerService):
+    """Takes a while after a silence without protection until it listens again."""
+
+    wrong = _SleepsWithoutGuard
 
 
 # ---------------------------------------------------------------------- time-out protection
@@ -749,10 +783,12 @@ _OWN: tuple[_Entry, ...] = (
     (LongQuaternion, "IMU-01", ()),
     (TurnedForce, "FORCE-01", ()),
     (RejectsOnlyTheBadJoint, "SAFE-01", ()),
+    (LooksAtTheLastJoint, "SAFE-01", ()),
     (NoLimits, "SAFE-02", ()),
     (FillsUpWithZeros, "SAFE-04", ()),
     (KeepsDriving, "WDOG-01", ()),
     (StuckAfterSilence, "WDOG-03", ()),
+    (SleepsWithoutGuard, "WDOG-03", ()),
 )
 
 _DEX3: tuple[_Entry, ...] = (

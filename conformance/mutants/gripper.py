@@ -168,6 +168,12 @@ class OtherRobotsMode(_Filled):
     member, value = "mode", 0x0A
 
 
+class AlwaysDriven(_Filled):
+    """Says all the time that the motor is driven."""
+
+    member, value = "mode", 1
+
+
 class TurnedAcceleration(_Fields):
     """Publishes ddq with the wrong sign."""
 
@@ -441,6 +447,48 @@ class NoWatchdog(ReferenceService):
     hand = _NoWatchdog
 
 
+class _SnapsOpen(ReferenceHand):
+    timeout = ReferenceHand.timeout + 0.15
+
+    def motor_torque(self) -> float:
+        if self.now - self.heard > ReferenceHand.timeout and not self.braking:
+            return self.tau_max
+        return super().motor_torque()
+
+
+class SnapsOpenAtTheTimeOut(ReferenceService):
+    """Opens when commands end, and then brakes: drops what it holds."""
+
+    hand = _SnapsOpen
+
+
+class _Sleeps(ReferenceHand):
+    deaf_until = -math.inf
+
+    def command(self, motor: Motor) -> None:
+        if self.goal is not None and self.braking:
+            self.deaf_until = max(self.deaf_until, self.heard + 3.0)
+        if self.now >= self.deaf_until:
+            super().command(motor)
+
+
+class SleepsAfterSilence(ReferenceService):
+    """Takes a while after a silence until it listens again."""
+
+    hand = _Sleeps
+
+
+class _InfiniteGains(ReferenceHand):
+    def command(self, motor: Motor) -> None:
+        super().command(replace(motor, kp=min(motor.kp, 1e3)))
+
+
+class InfiniteGains(ReferenceService):
+    """Caps the stiffness before it looks whether it is finite."""
+
+    hand = _InfiniteGains
+
+
 class _Latches(ReferenceHand):
     tripped = False
 
@@ -491,6 +539,7 @@ ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
     (PercentWithin, "DEX1-FIELD-14", ()),
     (TurnedVelocity, "DEX1-FIELD-04", ()),
     (OtherRobotsMode, "DEX1-FIELD-05", ()),
+    (AlwaysDriven, "DEX1-FIELD-05", ("DEX1-LIFE-05",)),
     (TurnedAcceleration, "DEX1-FIELD-06", ()),
     (AccelerationPerSample, "DEX1-FIELD-06", ()),
     (NanRaw, "DEX1-FIELD-07", ()),
@@ -525,6 +574,7 @@ ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
     (MilliNewtonMetres, "DEX1-FORCE-04", ("DEX1-FORCE-02",)),
     (SignedForce, "DEX1-FORCE-05", ()),
     (of(shared.NanIsZero, ReferenceService), "DEX1-SAFE-01", ()),
+    (InfiniteGains, "DEX1-SAFE-01", ()),
     (NoLimits, "DEX1-SAFE-02", ()),
     (of(shared.EmptyIsZero, ReferenceService), "DEX1-SAFE-03", ()),
     (of(shared.DiesOfEmpty, ReferenceService), "DEX1-SAFE-03", ()),
@@ -539,9 +589,12 @@ ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
     (of(shared.DropsOldStamps, ReferenceService), "DEX1-ORDER-02", ()),
     (of(shared.StuttersUnderLoad, ReferenceService), "DEX1-LOAD-01", ()),
     (of(shared.WaitsForItsReaders, ReferenceService), "DEX1-LOAD-01", ()),
-    (NoWatchdog, "DEX1-WDOG-01", ()),
+    # it says the truth, which a client cannot tell from a stuck byte
+    (NoWatchdog, "DEX1-WDOG-01", ("DEX1-FIELD-05",)),
+    (SnapsOpenAtTheTimeOut, "DEX1-WDOG-01", ()),
     (of(shared.QuietInSilence, ReferenceService), "DEX1-WDOG-02", ()),
     (LatchesTheBrake, "DEX1-WDOG-03", ()),
+    (SleepsAfterSilence, "DEX1-WDOG-03", ()),
     (of(shared.ServesOnlyTheFirst, ReferenceService), "DEX1-LIFE-01", ()),
     (of(shared.BoundToOneClient, ReferenceService), "DEX1-LIFE-02", ()),
     (of(shared.DeafAfterRestart, ReferenceService), "DEX1-LIFE-03", ()),

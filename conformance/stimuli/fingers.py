@@ -49,7 +49,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.parts import PARTS, Parts
-from dexkit.conformance.stimuli.script import Pose, Script, Steps
+from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Script, Steps
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
 
@@ -198,7 +198,8 @@ class FingerScript(Script):
         good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
         bursts: list[dict[Side, Motors]]
         if name == "nan":
-            bursts = [self._broken(field, value) for field, value in _NOT_FINITE]
+            last = len(self._model.gains) - 1
+            bursts = [self._broken(i, *bad) for bad in NOT_FINITE for i in (last, 0, last // 2)]
         elif name == "out-of-range":
             bursts = [self._all(OPEN, q=q) for q in (1000.0, -1000.0)]
         elif name == "empty":
@@ -232,14 +233,14 @@ class FingerScript(Script):
             for q, j in zip(self._goal[side], self._joints[side], strict=True)
         )
 
-    def _broken(self, field: str, value: float) -> dict[Side, Motors]:
+    def _broken(self, joint: int, field: str, value: float) -> dict[Side, Motors]:
         """One bad field in one joint; all of them are told to go far, to show if one is taken."""
         far = self._other_place()
         hands: dict[Side, Motors] = {}
         for s, pose in far.items():
             motors = list(self._motors(s, pose))
-            bad = replace(motors[-1], **{field: value})  # type: ignore[arg-type]
-            hands[s] = [*motors[:-1], bad]
+            motors[joint] = replace(motors[joint], **{field: value})  # type: ignore[arg-type]
+            hands[s] = motors
         return hands
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
@@ -356,14 +357,3 @@ class FingerScript(Script):
             self._say("... silence: nothing may be left driven by a velocity, a grip is kept")
             yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
-
-
-_NOT_FINITE = [
-    ("q", math.nan),
-    ("q", math.inf),
-    ("q", -math.inf),
-    ("dq", -math.inf),
-    ("tau", math.nan),
-    ("kp", math.nan),
-    ("kd", math.inf),
-]

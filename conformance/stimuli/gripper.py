@@ -35,8 +35,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
-from dexkit.conformance.stimuli.script import Payloads, Plan, Pose, Script, Steps
+from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Script, Steps
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import Side
 
@@ -171,15 +172,11 @@ class GripperScript(Script):
     def _not_finite(self) -> list[Motor]:
         """One bad field each; where it is not q, q is far away, to show whether it was taken."""
         far = self._high()
-        bad = [Motor(q=math.nan), Motor(q=math.inf), Motor(q=-math.inf)]
-        if self._gains_used:
-            bad += [
-                Motor(q=far, kp=math.nan),
-                Motor(q=far, kd=math.inf),
-                Motor(q=far, tau=math.nan),
-                Motor(q=far, dq=-math.inf),
-            ]
-        return bad
+        return [
+            replace(Motor(q=far), **{field: value})  # type: ignore[arg-type]
+            for field, value in NOT_FINITE
+            if field == "q" or self._gains_used
+        ]
 
     def _limp(self) -> Steps:
         self._say("commands without force (zero gains): the hand must not be pulled")

@@ -20,6 +20,7 @@ from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, model
 
 __all__ = [
     "DEFAULT_OBJECTS",
+    "NOT_FINITE",
     "Action",
     "Join",
     "Leave",
@@ -50,6 +51,12 @@ SETTLED = 0.02
 """Part of a joint's range within which it counts as being where it should."""
 PATIENCE = 6.0
 """Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
+NOT_FINITE = [
+    (field, value)
+    for field in ("q", "dq", "tau", "kp", "kd")
+    for value in (math.nan, math.inf, -math.inf)
+]
+"""Field of a command and what it is in a bad one. Who tests field by field forgets some."""
 FLOOD = 500
 """Commands of a burst."""
 LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
