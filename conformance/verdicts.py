@@ -242,7 +242,9 @@ class Judgement:
         if outcome.absent and self._claimed:
             unit = self.requirement.capability
             claim = f"{outcome.reason or outcome.observed}, but the unit '{unit}' is claimed"
-            outcome = replace(outcome, met=False, figure="absent", observed=claim, reason="")
+            outcome = replace(
+                outcome, met=False, figure="absent", observed=claim, reason=""
+            ).because(f"Nothing fills it: either do, or do not claim '{unit}'.")
         if outcome.met is None:
             return self.result(Verdict.NOT_APPLICABLE, outcome)
         if outcome.met:

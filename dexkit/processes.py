@@ -113,7 +113,10 @@ class Tool:
                 return
         if not came or not any(line.startswith("ready:") for line in self._tail):
             what = "is not ready" if came is False else "ended before it was ready"
-            raise self.error(f"{self!r} {what}", hint=self.last_words)
+            silent = (
+                "it printed nothing; a driver whose first exchange() never returns looks like that"
+            )
+            raise self.error(f"{self!r} {what}", hint=self.last_words or silent)
 
     def stop(self) -> bool:
         """End it, politely at first. May be called twice.

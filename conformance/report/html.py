@@ -19,6 +19,7 @@ from dexkit.conformance.report.wording import (
     ANSWERS,
     VERDICTS,
     about_harness,
+    by_gravity,
     causes,
     hand_name,
     model_title,
@@ -250,8 +251,7 @@ def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
         for need, group in result.by_requirement()
     ]
     full = [(n, [r for r in g if not r.blocked_by]) for n, g in groups]
-    full = [(need, group) for need, group in full if group]
-    full.sort(key=lambda item: _TROUBLE.index(worst(r.verdict for r in item[1])))
+    full = by_gravity(result, ((need, group) for need, group in full if group), _TROUBLE)
     blocked = [r for _, group in groups for r in group if r.blocked_by]
     if not full and not blocked:
         return ""

@@ -13,6 +13,7 @@ from dexkit.conformance.report.wording import (
     ANSWERS,
     VERDICTS,
     about_harness,
+    by_gravity,
     causes,
     hand_name,
     model_title,
@@ -99,8 +100,7 @@ def _troubles(result: RunResult) -> list[str]:
         (need, [r for r in group if r.verdict in _TROUBLE])
         for need, group in result.by_requirement()
     ]
-    groups = [(need, group) for need, group in groups if group]
-    groups.sort(key=lambda item: _TROUBLE.index(worst(r.verdict for r in item[1])))
+    groups = by_gravity(result, ((need, group) for need, group in groups if group), _TROUBLE)
     lines: list[str] = []
     for need, group in groups[:MOST_CARDS]:
         lines += _card(need, group)

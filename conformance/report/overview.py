@@ -91,15 +91,18 @@ def _session(view: Recording, hand: SideView) -> str:
         return ""
     span = view.seconds(replay[0].begin_ns), view.seconds(replay[0].end_ns)
     session = replay[0].params.get("session", "session")
-    return f"<p>The replayed session <code>{escape(session)}</code>, closer:</p>" + chart(
-        f"{whose(hand.side)}, replayed session: command and state",
-        command_and_state(hand, 0),
-        y_unit="rad",
-        span=span,
-        levels=_felt(view, hand),
-        include=(0.0, hand.joints[0].stroke),
-        legend=False,
-        titled=False,
+    return (
+        f"<p class='lead'>The replayed session <code>{escape(session)}</code>, closer:</p>"
+        + chart(
+            f"{whose(hand.side)}, replayed session: command and state",
+            command_and_state(hand, 0),
+            y_unit="rad",
+            span=span,
+            levels=_felt(view, hand),
+            include=(0.0, hand.joints[0].stroke),
+            legend=False,
+            titled=False,
+        )
     )
 
 

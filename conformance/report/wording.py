@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from dexkit.bodies import BODIES
 from dexkit.conformance.phases import BODY
+from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.models import MODELS
 
@@ -16,6 +19,7 @@ __all__ = [
     "Tally",
     "Word",
     "about_harness",
+    "by_gravity",
     "causes",
     "hand_name",
     "model_title",
@@ -132,6 +136,17 @@ def hand_name(result: RunResult) -> str:
     if about.get("hand") and about.get("firmware"):
         name += f" {about['firmware']}"
     return name
+
+
+def by_gravity(
+    result: RunResult, groups: Iterable[tuple[Requirement, list[Result]]], order: Sequence[Verdict]
+) -> list[tuple[Requirement, list[Result]]]:
+    """Requirements with their results, worst verdict first, then what blocks most of the others."""
+    blocks = Counter(r.blocked_by for r in result.results)
+    return sorted(
+        groups,
+        key=lambda item: (order.index(worst(r.verdict for r in item[1])), -blocks[item[0].id]),
+    )
 
 
 def part(result: RunResult) -> str:
