@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -19,17 +20,28 @@ from dexkit.dds import DdsNode, Reader, Sample
 __all__ = ["dds_domain", "dds_node", "free_domain", "take_until", "wait_until"]
 
 _random = random.Random(os.getpid() ^ time.time_ns())
-_given: set[int] = set()
+
+
+def _of_this_worker() -> list[int]:
+    """The domains from 100 to 200 that fall to this worker of pytest-xdist, in random order.
+
+    Two workers on one domain would be taken for two robots. Those of other checkouts, which may
+    be tested at once on this machine, are avoided by chance.
+    """
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    domains = [d for d in range(100, 201) if d % count == worker % count]
+    _random.shuffle(domains)
+    return domains
+
+
+_domains = deque(_of_this_worker())
 
 
 def free_domain() -> int:
-    """A domain from 100 to 200 that this process has not used, random to avoid other processes.
-
-    The tests of several checkouts or workers may run at once on one machine.
-    """
-    left = sorted(set(range(100, 201)) - _given)
-    domain = _random.choice(left)
-    _given.add(domain)
+    """A domain from 100 to 200 that no other worker uses, and this one has not used for long."""
+    domain = _domains.popleft()
+    _domains.append(domain)
     return domain
 
 
