@@ -699,10 +699,7 @@ class TestLateAnswers:
                 good += 1
                 assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
             assert good
-            link = hand.statistics.link
-            assert link.late <= link.timeouts
-            if late > 0.11:  # what comes as the read is being cancelled may be lost with it
-                assert link.late == link.timeouts
+            assert hand.statistics.link.late == hand.statistics.link.timeouts
 
     def test_a_lost_one_costs_its_time_only(self) -> None:
         fake = LateHand()
