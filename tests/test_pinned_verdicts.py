@@ -1,0 +1,41 @@
+"""Judging gives the pinned verdicts: of every sample, and of every wrong hand and body."""
+
+from __future__ import annotations
+
+import pytest
+
+from dexkit.conformance.mutants.matrix import Score, Trial, chosen, trials, try_one
+from tests.pinned import BLAMED, SAMPLE_VERDICTS, blamed, blamed_sets, key, load, sample_verdicts
+
+WHERE = "see tests/pinned/__init__.py"
+
+
+def test_samples_get_the_pinned_verdicts() -> None:
+    assert sample_verdicts() == load(SAMPLE_VERDICTS), WHERE
+
+
+def test_every_wrong_hand_is_pinned_with_the_requirements_that_it_breaks() -> None:
+    declared = {key(t): sorted({t.kills, *t.also}) for t in trials()}
+    assert declared == load(BLAMED), WHERE
+
+
+def one_of_each_layer() -> list[Trial]:
+    found: dict[tuple[str, str], Trial] = {}
+    for trial in sorted(trials(), key=lambda t: (t.cost, t.name)):
+        found.setdefault((trial.layer, trial.model), trial)
+    return list(found.values())
+
+
+def test_one_wrong_hand_of_each_layer_gets_the_pinned_blame() -> None:
+    pinned = load(BLAMED)
+    for trial in one_of_each_layer():
+        assert blamed(try_one(trial)) == pinned[key(trial)], f"{key(trial)}: {WHERE}"
+
+
+@pytest.mark.soak
+def test_every_wrong_hand_gets_the_pinned_blame() -> None:
+    requirements, every = chosen()
+    score = Score(requirements)
+    for _ in score.run(every):
+        pass
+    assert blamed_sets(score.outcomes) == load(BLAMED), WHERE
