@@ -5,9 +5,10 @@ scheduled), and what was sent to it meanwhile waits in the socket. After a pause
 have been sent before its end moves a hand; without one, neither does a command that is more than
 :data:`PAUSE` seconds older than its writer's commands usually are.
 
-:class:`PauseWatch` notices pauses, :class:`Ages` says how old a sample is, :class:`Promptly` keeps a
-driver from writing what it was told before a pause. None has a thread or DDS. Times are those of :meth:`dexkit.clock.Clock.since_boot`, which go on while the machine is
-suspended and do not jump with the wall clock.
+:class:`PauseWatch` notices pauses, :class:`Ages` says how old a sample is, :class:`Promptly` keeps
+a driver from writing what it was told before a pause. None has a thread or DDS. Times are those of
+:meth:`dexkit.clock.Clock.since_boot`, which go on while the machine is suspended and do not jump
+with the wall clock.
 
 **How old a sample is.** A sample says when it was written, on its writer's clock. How that clock
 relates to ours is unknown, it may be hours off; but reception minus source timestamp is that

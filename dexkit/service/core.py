@@ -248,11 +248,12 @@ class HandCore:
         return not patient or self._clock.now() - since > _PATIENCE
 
     def paused(self) -> None:
-        """This program stood still until now: the hand brakes until a command comes that was sent
-        after this.
+        """The program stood still until now. The hand brakes until a command comes that was sent
+        later.
         """
         self._resumed = self._clock.now()
-        self._only_newer(self._resumed)
+        # a clock that stands still in suspend: what was sent just before bears the same time
+        self._only_newer(math.nextafter(self._resumed, math.inf))
 
     def closed(self) -> None:
         """The link was given up."""

@@ -425,8 +425,8 @@ class HandService:
         if "paused" not in self._said:
             self._said.add("paused")
             log.warning(
-                "%s: this program stood still for %.2f s (stopped, suspended, or the machine is too "
-                "busy): braking until a command comes that was sent later (counted, said once)",
+                "%s: this program stood still for %.2f s (stopped, suspended, or a machine that is "
+                "too busy): braking until a command comes that was sent later (counted, said once)",
                 self.state_topic,
                 away,
             )
