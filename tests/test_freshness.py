@@ -257,7 +257,7 @@ def clients(draw: st.DrawFn, begin: float, end: float) -> Client:
 
 
 @given(st.data())
-@settings(max_examples=100)
+@settings(max_examples=60)
 def test_nothing_sent_before_a_pause_ends_moves_the_hand_after_it(data: st.DataObject) -> None:
     begin = 2.0
     end = begin + data.draw(st.floats(PAUSE + 0.02, 4.0), "pause")
@@ -280,7 +280,7 @@ def test_nothing_sent_before_a_pause_ends_moves_the_hand_after_it(data: st.DataO
     rate=st.floats(50.0, 500.0),
     suspended=st.booleans(),
 )
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_a_steady_client_is_obeyed_again_after_a_fifth_of_a_second(
     offset: float, drift: float, latency: float, pause: float, rate: float, suspended: bool
 ) -> None:
@@ -344,7 +344,7 @@ def test_a_single_command_after_a_pause_counts_where_that_can_be_told() -> None:
     least=latencies,
     lags=st.lists(st.tuples(st.floats(1.0, 5.0), st.floats(0.0, 2.5)), min_size=1, max_size=4),
 )
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_a_command_that_comes_late_does_not_count(
     offset: float, drift: float, least: float, lags: list[tuple[float, float]]
 ) -> None:
@@ -400,12 +400,12 @@ def test_a_clock_that_jumps_again_and_again_makes_no_client_deaf() -> None:
     assert max(t - s.at for t, s in program.driven if t > 2.5) < 0.05
 
 
-@pytest.mark.parametrize("drift", [-0.5, -0.1, 3.0], ids=["half", "slow", "fast"])
+@pytest.mark.parametrize("drift", [-0.5, 3.0], ids=["slow", "fast"])
 def test_a_clock_of_another_pace_makes_no_client_deaf(drift: float) -> None:
     """Timestamps in other units, say: obeyed at least after a time that no network lags."""
     program = Program()
-    program.run(stream(1, Source(drift=drift), every(0.1, 0.5, 150.0), lambda i: 0.001), 150.0)
-    assert max(t - s.at for t, s in program.driven if t > 140.0) < 0.13
+    program.run(stream(1, Source(drift=drift), every(0.1, 0.5, 40.0), lambda i: 0.001), 40.0)
+    assert max(t - s.at for t, s in program.driven if t > 38.0) < 0.13
 
 
 def test_a_drifting_clock_is_followed_for_hours() -> None:

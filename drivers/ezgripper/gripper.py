@@ -29,7 +29,7 @@ from dexkit.drivers.ezgripper.scaling import (
 )
 from dexkit.drivers.ezgripper.servo import BOOT_TIME, Servo, ServoStatistics, exchange_time
 from dexkit.errors import HandError, HandFault, HandLost, HandRefused, HandTimeout, UsageError
-from dexkit.freshness import Promptly
+from dexkit.freshness import PAUSE, Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import mx64
@@ -354,6 +354,8 @@ class EZGripper:
             raise HandLost("the gripper is not open", hint="call open() first")
         if self._trouble is not _Trouble.NONE:
             last = self._recover(servo, control)
+        if self._clock.now() - last.time > PAUSE:
+            last = self._last = servo.sample()  # the fingers went on; a brake must not go back
         goal = control.plan(command, last)
         if goal.current and not last.torque:
             servo.engage(Goal(last.position, goal.current, goal.profile_velocity), promptly)
