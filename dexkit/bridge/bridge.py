@@ -206,12 +206,13 @@ class _Way:
         self._writers: Mapping[str, Writer] = {
             topic: target.writer(topic, direction.written) for topic in direction.outputs
         }
+        self._ages = Ages()
+        self._watch = PauseWatch(bridge._clock)
+        self._watch.restart()  # from here on samples may wait to be received
         self._readers: Mapping[str, Reader] = {
             topic: source.reader(topic, direction.read, on_data=self._wake.set)
             for topic in direction.inputs
         }
-        self._ages = Ages()
-        self._watch = PauseWatch(bridge._clock)
         self._said: set[str] = set()
         self.thread = threading.Thread(target=self._run, name="dexkit-bridge", daemon=True)
 

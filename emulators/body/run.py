@@ -119,6 +119,7 @@ class EmulatedBody:
             if not self._force:
                 self._refuse_conflict(node)
             model = self.model
+            self._watch.restart()  # from here on commands may wait to be received
             self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
             self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
             self._remote = node.writer(model.remote_topic, model.remote_type)
