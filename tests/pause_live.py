@@ -72,8 +72,6 @@ class Outcome:
 
     name: str
     tries: list[Try] = field(default_factory=list)
-    log: list[str] = field(default_factory=list)
-    error: str = ""
 
     @property
     def moved(self) -> list[Try]:
@@ -121,9 +119,7 @@ class _Hand:
 
 @contextlib.contextmanager
 def _serve(*arguments: object) -> Iterator[Tool]:
-    lines: list[str] = []
-    tool = Tool(*map(str, arguments), on_line=lines.append)
-    tool.lines = lines  # type: ignore[attr-defined]
+    tool = Tool(*map(str, arguments))
     try:
         tool.wait_ready(threading.Event())
         yield tool
@@ -161,7 +157,7 @@ def _published(spoken: Dialect, domain: int) -> Iterator[Callable[[], Array]]:
 
 
 @contextlib.contextmanager
-def _setup(name: str, domain: int) -> Iterator[tuple[Tool, _Hand, int]]:
+def _setup(name: str, domain: int, other: int) -> Iterator[tuple[Tool, _Hand, int]]:
     """(the program to stop, the hand, the client's domain)."""
     with contextlib.ExitStack() as stack:
         enter = stack.enter_context
@@ -194,10 +190,10 @@ def _setup(name: str, domain: int) -> Iterator[tuple[Tool, _Hand, int]]:
         elif name == "bridge":
             enter(_serve("serve", "sim-dex1", *options))
             ends = ("--from", "unitree_actuator", "--to", "unitree_go", "--side", SIDE)
-            domains = ("--domain", domain + 1, "--to-domain", domain)
+            domains = ("--domain", other, "--to-domain", domain)
             tool = enter(_serve("bridge", *ends, *domains))
             look = enter(_published(dialect("unitree_go"), domain))
-            yield tool, _Hand(dialect("unitree_actuator"), look), domain + 1
+            yield tool, _Hand(dialect("unitree_actuator"), look), other
         else:
             spoken = dialect(
                 {"sim-dex1": "unitree_go", "sim-dex3": "dex3", "sim-dex5": "dex5"}[name]
@@ -207,22 +203,21 @@ def _setup(name: str, domain: int) -> Iterator[tuple[Tool, _Hand, int]]:
 
 
 def stop_and_continue(
-    name: str, tries: int, domain: int, *, stops: Sequence[float] = STOPS, seed: int = 0
+    name: str, tries: int, domain: int, other: int, *, stops: Sequence[float] = STOPS
 ) -> Outcome:
     """Stop the program ``tries`` times, for each of ``stops`` seconds in turn.
 
-    :param domain: for the hand; the bridge's client is on the next one.
+    :param domain: for the hand; ``other``: for the bridge's client.
     """
     outcome = Outcome(name)
-    chance = random.Random(seed)
-    with _setup(name, domain) as (tool, hand, client_domain):
+    chance = random.Random(domain)
+    with _setup(name, domain, other) as (tool, hand, client_domain):
         for number in range(tries):
             stopped = stops[number % len(stops)]
             outcome.tries.append(
                 _one(tool, hand, client_domain, stopped, leaves=number % 2 == 0, chance=chance)
             )
             assert tool.running, f"{name} ended: {tool.last_words}"
-        outcome.log = list(getattr(tool, "lines", []))
     return outcome
 
 
@@ -269,8 +264,8 @@ def _one(
     return Try(stopped, went, moved)
 
 
-def _child(name: str, tries: int, domain: int) -> int:
-    outcome = stop_and_continue(name, tries, domain, seed=domain)
+def _child(name: str, tries: int, domain: int, other: int) -> int:
+    outcome = stop_and_continue(name, tries, domain, other)
     worst = max(one.back for one in outcome.tries)
     slowest = max(one.again for one in outcome.tries[1:] or outcome.tries)
     by_stop = ", ".join(
@@ -290,17 +285,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tries", type=int, default=50)
     parser.add_argument("--backend", action="append", choices=BACKENDS)
-    parser.add_argument("--domain", type=int, default=150)
+    parser.add_argument("--domain", type=int, action="append", help="two for each backend")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     names = options.backend or list(BACKENDS)
+    domains = options.domain or list(range(150, 150 + 2 * len(names)))
     if options.child:
-        return min(_child(names[0], options.tries, options.domain), 100)
+        return min(_child(names[0], options.tries, *domains), 100)
     started = [
         subprocess.Popen(
             [
                 *(sys.executable, os.path.abspath(__file__), "--child", "--backend", name),
-                *("--tries", str(options.tries), "--domain", str(options.domain + 2 * i)),
+                *("--tries", str(options.tries)),
+                *(word for d in domains[2 * i : 2 * i + 2] for word in ("--domain", str(d))),
             ]
         )
         for i, name in enumerate(names)

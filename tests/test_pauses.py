@@ -37,6 +37,7 @@ from dexkit.wire import mx64
 from dexkit.wire.low_level import encode_with_crc
 from tests.body_helpers import low_cmd
 from tests.dds_helpers import free_domain, wait_until
+from tests.pause_live import BACKENDS
 from tests.service_helpers import FakeNode, FakeSample, ScriptedHand
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
@@ -371,10 +372,11 @@ def test_an_emulated_body_that_was_suspended_obeys_only_what_was_sent_later() ->
 
 def stop_live(tries: int, *backends: str) -> None:
     chosen: list[Any] = [word for name in backends for word in ("--backend", name)]
+    for _ in backends:
+        chosen += ["--domain", str(free_domain()), "--domain", str(free_domain())]
     script = Path(__file__).with_name("pause_live.py")
-    domain = min(free_domain(), 180)
     done = subprocess.run(
-        [sys.executable, script, "--tries", str(tries), "--domain", str(domain), *chosen],
+        [sys.executable, script, "--tries", str(tries), *chosen],
         capture_output=True,
         text=True,
         check=False,
@@ -388,4 +390,4 @@ def test_stopped_in_motion_and_continued_without_a_client() -> None:
 
 @pytest.mark.soak
 def test_every_backend_and_the_bridge_fifty_times() -> None:
-    stop_live(50)
+    stop_live(50, *BACKENDS)
