@@ -97,7 +97,7 @@ def test_a_service_that_was_suspended_obeys_only_what_was_sent_later(
 ) -> None:
     hand, node, clock = ScriptedHand(), FakeNode(), Suspendable()
     client = Client(node, clock, ahead=-86_400.0)
-    with HandService(hand, node=node, clock=clock) as service:  # type: ignore[arg-type]
+    with HandService(hand, node=node, clock=clock) as service:
         core, counters = service.cores[LEFT], service.counters
         client.until(lambda: hand.q == 2.0, 2.0)
         began = time.monotonic()
@@ -128,7 +128,7 @@ def test_the_state_says_that_the_hand_brakes() -> None:
         data = next(data for topic, data in reversed(node.sent) if topic == STATE)
         return int(message_type(GO.state_type).decode(data).states[0].mode)
 
-    with HandService(hand, node=node, clock=clock):  # type: ignore[arg-type]
+    with HandService(hand, node=node, clock=clock):
         client.until(lambda: node.sent and mode() == 1, 3.0)
         clock.away += 1.0
         wait_until(lambda: mode() == 0)
@@ -139,7 +139,7 @@ def test_an_exchange_that_hangs_is_a_pause_of_that_hand_only() -> None:
     node, clock = FakeNode(), Suspendable()
     topic = ACTUATOR.cmd_topic
     both = encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=2.0, kp=5.0)] * 2))
-    with HandService(list(hands.values()), node=node, clock=clock, dialect=ACTUATOR) as service:  # type: ignore[arg-type]
+    with HandService(list(hands.values()), node=node, clock=clock, dialect=ACTUATOR) as service:
         cores = service.cores
 
         def send() -> None:
@@ -159,7 +159,7 @@ def test_an_exchange_that_hangs_is_a_pause_of_that_hand_only() -> None:
 def test_a_hand_and_a_state_that_are_slow_by_themselves_are_no_pause() -> None:
     hand, node, clock = ScriptedHand(io_rate=3.0), FakeNode(), Suspendable()
     client = Client(node, clock)
-    with HandService(hand, node=node, state_rate=3.0, clock=clock):  # type: ignore[arg-type]
+    with HandService(hand, node=node, state_rate=3.0, clock=clock):
         client.until(lambda: hand.q == 2.0, 2.0)
 
 
