@@ -109,8 +109,8 @@ class Bridge:
                 (self.commands, self.client, self.gripper),
                 (self.states, self.gripper, self.client),
             ):
-                self._ways.append(_Way(self, direction, source.node, target.node))
-            for way in self._ways:
+                way = _Way(self, direction, source.node, target.node)
+                self._ways.append(way)
                 way.thread.start()
         except BaseException:
             self.stop()
@@ -206,13 +206,13 @@ class _Way:
         self._writers: Mapping[str, Writer] = {
             topic: target.writer(topic, direction.written) for topic in direction.outputs
         }
-        self._ages = Ages()
-        self._watch = PauseWatch(bridge._clock)
-        self._watch.restart()  # from here on samples may wait to be received
         self._readers: Mapping[str, Reader] = {
             topic: source.reader(topic, direction.read, on_data=self._wake.set)
             for topic in direction.inputs
         }
+        self._ages = Ages()
+        self._watch = PauseWatch(bridge._clock)
+        self._watch.restart()  # from here on samples may wait to be received
         self._said: set[str] = set()
         self.thread = threading.Thread(target=self._run, name="dexkit-bridge", daemon=True)
 

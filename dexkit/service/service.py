@@ -228,8 +228,8 @@ class HandService:
         if self.low_rate_topic:
             self._low_rate_writer = node.writer(self.low_rate_topic, self.dialect.state_type)
             self._low_rate_every = max(1, round(self.state_rate / self.model.low_rate))
-        self._receive_watch.restart()  # from here on commands may wait to be received
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
+        self._receive_watch.restart()  # from here on commands may wait to be received
         for unit in self._units:
             unit.thread = self._thread(f"exchange-{unit.side}", self._exchange_loop, unit)
             unit.watch.restart()

@@ -119,11 +119,11 @@ class EmulatedBody:
             if not self._force:
                 self._refuse_conflict(node)
             model = self.model
-            self._watch.restart()  # from here on commands may wait to be received
-            self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
-            self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
             self._remote = node.writer(model.remote_topic, model.remote_type)
             self._writer = node.writer(model.state_topic, model.state_type)
+            self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
+            self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
+            self._watch.restart()  # from here on commands may wait to be received
         except BaseException:
             self._close()
             raise
