@@ -14,8 +14,8 @@ with the wall clock.
 relates to ours is unknown, it may be hours off; but reception minus source timestamp is that
 offset plus the sample's latency, so the least difference seen of a writer (its *baseline*) is the
 offset plus its least latency, and what a sample exceeds it by is its age. The baseline moves by
-:data:`DRIFT` to follow clocks that run differently, and is forgotten after :data:`FORGET` seconds
-without a sample.
+:data:`DRIFT` to follow clocks that run differently, and has to be confirmed anew after
+:data:`FORGET` seconds without a sample.
 
 **What can be told after a pause.** With a baseline that was confirmed before, each single sample:
 it counts if it was sent :data:`SETTLE` seconds after the end of the pause or later. That time is
@@ -27,8 +27,9 @@ source timestamps run faster than ours. Samples of a writer that is not confirme
 
 **When the writer's clock jumps** its old baseline is worthless, and a machine that stood still
 with all its clocks (a virtual one) sees the same. The writer counts again when its new baseline is
-confirmed. Timestamps that do not go on, or never agree, are no clock: such a writer is obeyed
-as one without a baseline.
+confirmed, or after :data:`QUIET` seconds; so does one that is late after a long silence (its
+machine was suspended). Timestamps that do not go on are no clock: such a writer is obeyed as one
+without a baseline.
 
 A latency that never was less is not seen: a client whose every sample comes 2.5 s late from the
 first one on looks like one whose clock is 2.5 s behind.
@@ -56,7 +57,7 @@ QUIET = 1.0
 DRIFT = 500e-6
 """Most that a clock runs fast or slow: what NTP slews by (facts: RFC 5905, 500 PPM)."""
 FORGET = 60.0
-"""Seconds without a sample after which a baseline is worth nothing: drift adds up to 0.03 s."""
+"""Seconds without a sample after which a baseline is not trusted: drift adds up to 0.03 s."""
 
 _IN_PACE = 0.02  # seconds by which two samples' latencies may differ to confirm a baseline
 _JUMP = 0.05  # seconds; a timestamp that goes back by more, or a baseline that falls by more
@@ -140,8 +141,7 @@ class _Writer:
     clockless: bool = False
 
     def begin(self, offset: float, source: float, now: float) -> None:
-        """A new baseline, to be confirmed."""
-        self.offset, self.at = offset, now
+        """The baseline is to be confirmed from here on."""
         self.began, self.began_source, self.began_offset = now, source, offset
         self.confirmed = False
 
@@ -180,7 +180,7 @@ class Ages:
 
     def _find(self, writer: int, source: float, now: float) -> _Writer:
         known = self._writers.get(writer)
-        if known is None or now - known.heard > FORGET:
+        if known is None:
             offset = now - source
             known = _Writer(offset, now, source, now, now, now, source, offset)
             known.clockless = source <= 0
@@ -188,29 +188,34 @@ class Ages:
         self._writers.move_to_end(writer)
         if len(self._writers) > _WRITERS:
             self._writers.popitem(last=False)
-        known.heard = now
         return known
 
     def _age(self, known: _Writer, source: float, now: float) -> float:
         """Seconds beyond the baseline, which is kept up to date; infinite while it is in doubt."""
         self._check_clock(known, source, now)
         before, known.source = known.source, source
+        silent, known.heard = now - known.heard > FORGET, now
         if known.clockless:
             return 0.0
         offset = now - source
-        beyond = offset - known.offset - DRIFT * (now - known.at)
-        if before - source > _JUMP or -beyond > _JUMP:
-            # its clock was set, or the samples until now were late
-            if known.confirmed and (before - source > _JUMP or -beyond > PAUSE):
+        drift = DRIFT * (now - known.at)
+        beyond = offset - known.offset - drift
+        ahead = known.offset - drift - offset
+        back = before - source
+        if max(back, ahead) > _JUMP or (silent and beyond > PAUSE):
+            # its clock was set, its samples until now were late, or its machine was suspended
+            if known.confirmed and (back > _JUMP or max(ahead, beyond) > PAUSE):
                 known.doubted = now
+            known.offset, known.at = offset, now
             known.begin(offset, source, now)
         elif beyond < 0:
             known.offset, known.at = offset, now
+        if silent:
+            known.begin(offset, source, now)
         if not known.confirmed:
             self._confirm(known, offset, source, now)
         if known.doubted is not None and now - known.doubted > QUIET:
-            known.clockless = True  # it jumps again and again
-            return 0.0
+            known.doubted = None  # it jumps again and again
         age = max(0.0, offset - known.offset - DRIFT * (now - known.at))
         if age <= PAUSE:
             known.late = None
@@ -231,7 +236,7 @@ class Ages:
     @staticmethod
     def _confirm(known: _Writer, offset: float, source: float, now: float) -> None:
         if offset < known.began_offset - _IN_PACE:
-            known.began, known.began_source, known.began_offset = now, source, offset
+            known.begin(offset, source, now)
         elif (
             offset <= known.began_offset + _IN_PACE
             and now - known.began >= SETTLE

@@ -175,14 +175,15 @@ def _setup(name: str, domain: int, other: int) -> Iterator[tuple[Tool, _Hand, in
                 turned = (servo.get(mx64.PRESENT_POSITION) - _CLOSED_AT + 200) % 4096 - 200
                 return np.array([turned / _TICKS * 5.4])
 
-            zero = ("--set", f"zero={_CLOSED_AT}")
-            tool = enter(_serve("serve", name, "--device", gripper.path, *zero, *options))
+            device = ("--device", gripper.path, "--set", f"zero={_CLOSED_AT}", "--wait-for-device")
+            tool = enter(_serve("serve", name, *device, *options))
             yield tool, _Hand(dialect("unitree_go"), ticks), domain
         elif name == "dex1-serial":
             folder = enter(tempfile.TemporaryDirectory())
             motors = Dex1Motors((SIDE,), links={SIDE: os.path.join(folder, "tty")})
             stack.callback(motors.close)
-            tool = enter(_serve("serve", name, "--device", motors.path, *options))
+            device = ("--device", motors.path, "--wait-for-device")
+            tool = enter(_serve("serve", name, *device, *options))
             hand = _Hand(dialect("unitree_go"), lambda: np.array([motors.motor.q]))
             yield tool, hand, domain
         elif name == "dex3-usb":

@@ -417,12 +417,43 @@ def test_a_drifting_clock_is_followed_for_hours() -> None:
             assert ages.age(1, source.stamp(at), at + 0.002) < 0.01
 
 
-def test_a_baseline_is_forgotten_after_a_minute_of_silence() -> None:
-    ages = Ages()
-    for i in range(100):
-        ages.age(1, Source().stamp(i * 0.01), i * 0.01)
-    late = 2.0 + FORGET
-    assert ages.age(1, Source(0.0, -1e-2).stamp(late), late + 0.001) == 0.0
+class TestLongSilence:
+    """Of a client, without a pause of ours."""
+
+    @staticmethod
+    def ages(source: Source, times: list[float], late: dict[float, float]) -> list[float]:
+        ages = Ages()
+        for i in range(100):
+            ages.age(1, source.stamp(i * 0.01), i * 0.01 + 0.001)
+        return [ages.age(1, source.stamp(t), t + late.get(t, 0.001)) for t in times]
+
+    def test_its_next_command_counts_at_once(self) -> None:
+        for drift in (-DRIFT, 0.0, DRIFT):
+            (age,) = self.ages(Source(9.0, drift), [3600.0], {})
+            assert age <= 1e-3
+
+    def test_what_a_suspended_client_had_sent_before_does_not(self) -> None:
+        """Its machine wakes up after an hour and sends what it still has, then goes on."""
+        old = [1.0, 1.01, 1.02]
+        new = every(0.01, 3600.0, 3601.0)
+        ages = self.ages(Source(9.0), old + new, dict.fromkeys(old, 3599.0))
+        assert ages[:3] == [math.inf] * 3
+        assert [math.isfinite(age) for age in ages[3:]].index(True) in (20, 21)  # 0.2 s
+
+    def test_nor_is_it_deaf_for_ever_to_a_clock_that_was_set_meanwhile(self) -> None:
+        source = Source(9.0, jumps=((1800.0, -10.0),))
+        ages = self.ages(source, every(0.01, 3600.0, 3601.0), {})
+        assert ages[0] == math.inf
+        assert ages[-1] < 0.01
+
+    def test_after_a_pause_it_must_be_confirmed_anew(self) -> None:
+        ages, source = Ages(), Source(9.0)
+        for i in range(100):
+            ages.age(1, source.stamp(i * 0.01), i * 0.01)
+        ages.resumed(2.0 + FORGET)
+        at = 2.0 + FORGET + 2 * SETTLE
+        assert ages.age(1, source.stamp(at), at) == math.inf
+        assert ages.age(1, source.stamp(at + SETTLE), at + SETTLE) < 0.01
 
 
 def test_writers_that_come_and_go_are_not_kept() -> None:
