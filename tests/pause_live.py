@@ -32,6 +32,7 @@ from dexkit.dds import DdsNode
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.m4010 import Dex1Motors
 from dexkit.emulators.mx64 import EmulatedThread, emulated_ezgripper
+from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import unitree_go, unitree_hg
 from dexkit.models import Dialect, dialect, model
@@ -127,6 +128,8 @@ def _serve(*arguments: object) -> Iterator[Tool]:
     try:
         tool.wait_ready(threading.Event())
         yield tool
+    except DexkitError as error:
+        raise AssertionError(f"{error}: {error.hint}") from error
     finally:
         tool._process.send_signal(signal.SIGCONT)
         tool._process.terminate()
