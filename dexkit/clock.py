@@ -15,11 +15,18 @@ from dexkit.errors import UsageError
 __all__ = ["Clock", "ManualClock", "Rate", "RealClock", "wait_until"]
 
 
+_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+
+
 class Clock(Protocol):
     """Monotonic time in seconds and a way to wait for a point in it."""
 
     def now(self) -> float:
         """Seconds on a monotonic clock; the origin has no meaning."""
+        ...
+
+    def since_boot(self) -> float:
+        """Seconds that go on while the machine is suspended, unlike :meth:`now`; for pauses."""
         ...
 
     def sleep_until(self, deadline: float) -> None:
@@ -38,6 +45,10 @@ class RealClock:
         """Seconds of the system's monotonic clock."""
         return time.monotonic()
 
+    def since_boot(self) -> float:
+        """Seconds since the machine was started: CLOCK_BOOTTIME where there is one (Linux)."""
+        return time.clock_gettime(_BOOT)
+
     def sleep_until(self, deadline: float) -> None:
         """Sleep until ``deadline``; an interrupted sleep is resumed by Python."""
         delay = deadline - time.monotonic()
@@ -54,11 +65,21 @@ class ManualClock:
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
+        self._suspended = 0.0
         self._lock = threading.Lock()
 
     def now(self) -> float:
         """The time set so far, seconds."""
         return self._now
+
+    def since_boot(self) -> float:
+        """The time set so far with the time suspended, seconds."""
+        return self._now + self._suspended
+
+    def suspend(self, seconds: float) -> None:
+        """Let time pass that :meth:`now` does not see."""
+        with self._lock:
+            self._suspended += seconds
 
     def advance(self, seconds: float) -> float:
         """Move forward by ``seconds`` and return the new time.

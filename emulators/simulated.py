@@ -11,6 +11,7 @@ from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.emulators.mechanics import FixedSteps
 from dexkit.errors import HandLost, UsageError
+from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandSpec, HandState
 
 __all__ = ["Body", "SimulatedHand", "number"]
@@ -39,8 +40,9 @@ class SimulatedHand:
     """A body on a clock.
 
     :param step: seconds of one step of the body.
-    :param clock: real time unless given; with a manual clock the hand is deterministic. A pause
-        of the caller of more than half a second is not lived through.
+    :param clock: real time unless given; with a manual clock the hand is deterministic. A caller
+        that stays away for more than a quarter of a second finds it braked since, and of more
+        than half a second only the end is lived through.
     """
 
     def __init__(self, spec: HandSpec, body: Body, step: float, clock: Clock | None = None) -> None:
@@ -48,6 +50,7 @@ class SimulatedHand:
         self._body = body
         self._clock: Clock = clock or RealClock()
         self._steps = FixedSteps(step, most=0.5)
+        self._last = 0.0  # when the last exchange was
         self._open = False
 
     @property
@@ -58,7 +61,8 @@ class SimulatedHand:
     def open(self) -> None:
         """Start to live; brakes until the first command."""
         self._body.brake()
-        self._steps.restart(self._clock.now())
+        self._last = self._clock.now()
+        self._steps.restart(self._last)
         self._open = True
 
     def close(self) -> None:
@@ -74,6 +78,9 @@ class SimulatedHand:
         if not self._open:
             raise HandLost("the simulated hand is not open")
         now = self._clock.now()
+        if now - self._last > PAUSE:
+            self._body.brake()
+        self._last = now
         self._body.step(self._steps.due(now))
         self._body.use(command)
         return self._body.state(now)

@@ -71,6 +71,8 @@ class ScriptedHand:
 @dataclass(frozen=True)
 class FakeSample:
     data: bytes
+    source_timestamp_ns: int = field(default_factory=time.time_ns)
+    writer: int = 1
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
+from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import Backoff, Estimation, HandCore
@@ -113,6 +114,52 @@ def test_commands_outside_the_limits_are_clamped_and_counted() -> None:
     bench.command(99.0)
     assert bench.exchange().q[0] == pytest.approx(5.4)
     assert bench.core.counters.clamped == 1
+
+
+class TestPauses:
+    def test_it_brakes_until_a_command_that_was_sent_later(self) -> None:
+        bench = Bench()
+        bench.command(2.0)
+        assert not bench.exchange().is_brake
+        bench.clock.advance(0.5)
+        bench.core.paused()
+        assert bench.exchange().is_brake
+        now = bench.clock.now()
+        for sent in (now - 0.6, now - 0.1, now, -math.inf):
+            assert not bench.core.submit(HandCommand.position(3.0), sent)
+            assert bench.exchange().is_brake
+        counters = bench.core.counters
+        assert (counters.brakes, counters.stale, counters.accepted) == (1, 4, 1)
+        bench.clock.advance(0.1)
+        assert bench.core.submit(HandCommand.position(3.0), now + 0.05)
+        assert bench.exchange().q[0] == 3.0
+
+    def test_a_command_is_as_old_as_when_it_was_sent(self) -> None:
+        bench = Bench()
+        now = bench.clock.now()
+        bench.clock.advance(1.0)
+        assert not bench.core.submit(HandCommand.position(3.0), now + 1.0 - PAUSE - 0.01)
+        assert bench.core.submit(HandCommand.position(3.0), now + 1.0 - PAUSE + 0.01)
+        bench.clock.advance(TIMEOUT - PAUSE)
+        assert not bench.exchange().is_brake
+        bench.clock.advance(0.01)
+        assert bench.exchange().is_brake
+
+    def test_a_stale_command_does_not_feed_the_watchdog(self) -> None:
+        bench = Bench()
+        bench.command(2.0)
+        for _ in range(11):
+            bench.clock.advance(TIMEOUT / 10)
+            bench.core.submit(HandCommand.position(2.0), bench.clock.now() - 2.0)
+        assert bench.exchange().is_brake
+
+    def test_the_link_is_not_given_up_for_a_pause(self) -> None:
+        bench = Bench()
+        bench.clock.advance(5.0)
+        bench.core.paused()
+        assert not bench.core.failed(HandTimeout("nothing was sent"))
+        bench.clock.advance(0.6)
+        assert bench.core.failed(HandTimeout("no answer"))
 
 
 class TestLostLink:

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -316,6 +317,28 @@ class TestTimeouts:
         assert bench.modes == [0x80 | i for i in range(N)]
         assert not bench.core.driving
         assert (bench.core.counters.brakes, bench.core.counters.holds) == (1, 0)
+
+    def test_after_a_pause_joints_without_protection_brake_too(self) -> None:
+        bench = Bench()
+        bench.send(OFF)
+        assert not bench.exchange().is_brake
+        bench.clock.advance(3 * TIMEOUT)
+        bench.core.paused()
+        assert bench.exchange().is_brake
+        assert not bench.core.holding
+        assert bench.core.tripped == ()
+        bench.clock.advance(0.01)
+        bench.send(OFF)
+        assert not bench.exchange().is_brake
+
+    def test_a_stale_command_with_the_bit_clear_does_not_clear_it(self) -> None:
+        bench = Bench()
+        bench.send(ON)
+        bench.after(TIMEOUT)
+        old = replace(HandCommand.position(np.zeros(N)), timeout=np.array(OFF))
+        assert not bench.core.submit(old, bench.clock.now() - 0.5)
+        assert bench.core.tripped == tuple(range(N))
+        assert bench.exchange().is_brake
 
     def test_it_stays_braked_until_a_command_with_the_bit_clear(self) -> None:
         bench = Bench()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -15,8 +16,9 @@ from typing import Any
 
 from dexkit.bridge.core import Commands, Direction, Outgoing, States
 from dexkit.clock import Clock, RealClock
-from dexkit.dds import DdsNode, Endpoint, Reader, Writer
+from dexkit.dds import DdsNode, Endpoint, Reader, Sample, Writer
 from dexkit.errors import DexkitError, TopicConflict, UsageError
+from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
@@ -27,6 +29,7 @@ _log = logging.getLogger("dexkit.bridge")
 _counters_log = logging.getLogger("dexkit.bridge.counters")
 
 _DISCOVERY = 0.3  # seconds to look for other publishers, as dexkit serve does
+_TICK = 0.05  # seconds after which a direction looks at the clock when nothing comes
 _JOIN = 2.0  # seconds that a stopping thread is given; a write blocks for 0.1 at most
 
 
@@ -106,8 +109,8 @@ class Bridge:
                 (self.commands, self.client, self.gripper),
                 (self.states, self.gripper, self.client),
             ):
-                self._ways.append(_Way(self, direction, source.node, target.node))
-            for way in self._ways:
+                way = _Way(self, direction, source.node, target.node)
+                self._ways.append(way)
                 way.thread.start()
         except BaseException:
             self.stop()
@@ -207,7 +210,10 @@ class _Way:
             topic: source.reader(topic, direction.read, on_data=self._wake.set)
             for topic in direction.inputs
         }
-        self._complained = False
+        self._ages = Ages()
+        self._watch = PauseWatch(bridge._clock)
+        self._watch.restart()  # from here on samples may wait to be received
+        self._said: set[str] = set()
         self.thread = threading.Thread(target=self._run, name="dexkit-bridge", daemon=True)
 
     @property
@@ -233,28 +239,62 @@ class _Way:
     def _turn(self) -> None:
         clock, direction = self._bridge._clock, self.direction
         due = direction.due
-        self._wake.wait(None if due is None else max(0.0, due - clock.now()))
+        self._wake.wait(_TICK if due is None else min(_TICK, max(0.0, due - clock.now())))
         self._wake.clear()
+        self._stood_still()
         for topic, reader in self._readers.items():
             for sample in reader.take():
-                self._send(direction.receive(topic, sample.data, clock.now()))
+                self._receive(topic, sample)
         self._send(direction.flush(clock.now()))
+
+    def _receive(self, topic: str, sample: Sample) -> None:
+        # in this order: if it stands still in between, the sample only looks older
+        now = self._bridge._clock.now()
+        received = self._bridge._clock.since_boot()
+        self._stood_still()
+        age = self._ages.age(sample.writer, sample.source_timestamp_ns, received)
+        if age <= PAUSE:
+            self._send(self.direction.receive(topic, sample.data, now))
+            return
+        self.direction.counts.received += 1
+        self.direction.counts.stale += 1
+        if math.isfinite(age):
+            self._say(
+                "stale",
+                f"{topic}: a message came {age:.1f} s later than usual for its writer; what is "
+                f"more than {PAUSE:g} s old is not forwarded (counted, said once)",
+            )
+
+    def _stood_still(self) -> bool:
+        """Whether this thread did; then what came before counts no more."""
+        away = self._watch.look()
+        if not away:
+            return False
+        self._ages.resumed(self._bridge._clock.since_boot())
+        self.direction.paused()
+        self._say(
+            "paused",
+            f"this program stood still for {away:.2f} s (stopped, suspended, or a machine that is "
+            f"too busy): only what was sent later is forwarded to {', '.join(self._writers)} "
+            "(counted, said once)",
+        )
+        return True
 
     def _send(self, messages: Sequence[Outgoing]) -> None:
         for message in messages:
-            if self._bridge._stop.is_set():
+            if self._bridge._stop.is_set() or self._stood_still():
                 return
             try:
                 written = self._writers[message.topic].write_raw(message.payload)
             except DexkitError as error:
-                self._complain(f"cannot publish {message.topic}: {error}")
+                self._say("write", f"cannot publish {message.topic}: {error}")
             else:
                 if not written:
-                    self._complain(f"a reliable reader of {message.topic} does not keep up")
+                    self._say("write", f"a reliable reader of {message.topic} does not keep up")
 
-    def _complain(self, text: str) -> None:
-        if not self._complained:
-            self._complained = True
+    def _say(self, kind: str, text: str) -> None:
+        if kind not in self._said:
+            self._said.add(kind)
             _log.warning("%s", text)
 
 

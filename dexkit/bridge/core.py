@@ -9,6 +9,7 @@ sent. The rules, in both directions:
 * Where two topics become one message, the newest parts of both sides go out together: at once
   when the other side's has come too, otherwise ``PATIENCE`` later; a side that kept the other
   waiting in vain is not waited for again until it comes.
+* Nothing from before a pause of the bridge (:meth:`Direction.paused`) is sent after it.
 
 That one message has a place for a side of which nothing new is known. :class:`Commands` and
 :class:`States` say what is put there.
@@ -16,6 +17,7 @@ That one message has a place for a side of which nothing new is known. :class:`C
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -55,6 +57,8 @@ class Counts:
     :ivar undecodable: of those, samples that are not the message that they claim to be.
     :ivar short: samples with too few motors for a side that is bridged.
     :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
+    :ivar stale: samples that were old, or may have been sent before a pause of the bridge ended.
+    :ivar pauses: times that the bridge stood still for more than a quarter of a second.
     :ivar rejected: parts with NaN or infinity.
     :ivar blank: parts of a gripper that is not there: all 0, and never anything else before.
     :ivar sent: messages sent.
@@ -66,6 +70,8 @@ class Counts:
     undecodable: int = 0
     short: int = 0
     overlong: int = 0
+    stale: int = 0
+    pauses: int = 0
     rejected: int = 0
     blank: int = 0
     sent: int = 0
@@ -136,6 +142,13 @@ class Direction(ABC):
         """What has waited long enough for the other side."""
         due = self.due
         return self._send_shared(now) if due is not None and now >= due else []
+
+    def paused(self) -> None:
+        """The bridge stood still until now: nothing that came before counts any more."""
+        self.counts.pauses += 1
+        self._pending.clear()
+        self._waits_since = None
+        self._newest = {s: newest._replace(came=-math.inf) for s, newest in self._newest.items()}
 
     # -- what differs -----------------------------------------------------------------------
 
@@ -253,6 +266,15 @@ class States(Direction):
         """Where a gripper was last seen, rad of its own dialect, bridged or not."""
         return self._positions.get(side)
 
+    def forget_positions(self) -> None:
+        """Where the grippers are is not known until they are heard again."""
+        self._positions.clear()
+
+    def paused(self) -> None:
+        """As of any direction; nor does anybody know where the grippers are now."""
+        super().paused()
+        self.forget_positions()
+
     def _heard(self, topic: str) -> Sequence[Side]:
         return tuple(Side) if self._together else super()._heard(topic)
 
@@ -312,6 +334,12 @@ class Commands(Direction):
         self._scale = source.q_open / target.q_open
         self._loses_gains = loses_gains(source, target)
         self._reachable = {side: Reachable() for side in self.sides}
+
+    def paused(self) -> None:
+        """As of any direction; no gripper is told to stay where it was before."""
+        super().paused()
+        self._resting.clear()
+        self._states.forget_positions()  # the other direction may not have noticed yet
 
     def _translated(self, part: Any, side: Side, now: float) -> Any | None:
         if not self._loses_gains:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dexkit.clock import Clock
 from dexkit.errors import CommandRejected, HandError, HandFault, HandTimeout
+from dexkit.freshness import PAUSE
 from dexkit.hand import (
     CommandGate,
     Floats,
@@ -108,12 +109,13 @@ class HandCore:
         self._starting = self._soft_start
         self._start_q: Floats | None = None
         self._start_time = 0.0
-        self._command: tuple[HandCommand, float] | None = None
+        self._command: tuple[HandCommand, float] | None = None  # and when it was sent
         # the newest command, and what is left of it when it is too old
         self._held: tuple[tuple[HandCommand, float], HandCommand] | None = None
         self._tripped: tuple[bool, ...] = ()  # per joint; empty where none has
         self._late: tuple[HandCommand, float] | None = None  # the command found too old
-        self._not_before = clock.now()
+        self._not_before = clock.now()  # what was sent earlier does not count
+        self._resumed = -math.inf  # when the last pause of this program ended
         self._driving = False
         self._holding = False
         self._connected = False
@@ -127,26 +129,39 @@ class HandCore:
 
     # -- what happened ----------------------------------------------------------------------
 
-    def submit(self, command: HandCommand) -> bool:
-        """A command came. False when it was rejected: the one before stays in force, and the
-        watchdog is not fed.
+    def submit(self, command: HandCommand, sent: float | None = None) -> bool:
+        """A command came. False when it does not count: the one before stays in force, and the
+        watchdog is not fed. It may have been rejected, or be stale: sent more than
+        :data:`~dexkit.freshness.PAUSE` seconds ago, or before the link was opened, a fault ended
+        or a pause did.
+
+        :param sent: when it was sent, on the core's clock: as it was received, less its age;
+            minus infinity if it may be older than a pause. None: just now.
         """
+        now = self._clock.now()
+        if sent is None:
+            sent = now
+        if now - sent > PAUSE:
+            self.counters.stale += 1
+            return False
         try:
             admitted = self._gate.admit(command)
         except CommandRejected:
             self.counters.rejected = self._gate.rejected
             return False
-        self.counters.accepted += 1
-        self.counters.clamped = self._gate.clamped
-        now = self._clock.now()
         with self._lock:
+            if sent < self._not_before:
+                self.counters.stale += 1
+                return False
+            self.counters.accepted += 1
+            self.counters.clamped = self._gate.clamped
             self._time_out(now)  # before this one hides how long there was none
             if admitted.timeout is not None and self._tripped:
                 # a command without the bit clears it
                 still = np.array(self._tripped) & admitted.timeout
                 self._tripped = tuple(still.tolist()) if still.any() else ()
                 admitted = _braked(admitted, still)
-            self._command = (admitted, now)
+            self._command = (admitted, sent)
             if self._connected and not self._starting and self._faulted is None:
                 self._follow(admitted, now)
         return True
@@ -167,7 +182,7 @@ class HandCore:
         self._slow = self.spec.io_rate < self._min_rate
         self._window = (now, 0)
         self._answered = now
-        self._not_before = now
+        self._only_newer(now)
         self._faulted = None
         self._starting = self._soft_start
         self._start_q = None
@@ -195,7 +210,7 @@ class HandCore:
         self._missed = 0
         if self._faulted is not None:  # what was commanded before or during a fault is stale
             self._faulted = None
-            self._not_before = now
+            self._only_newer(now)
         self.counters.exchanges += 1
         if self.predicting:
             with self._lock:
@@ -229,7 +244,16 @@ class HandCore:
         elif isinstance(error, HandFault):
             self._faulted = bits
         patient = isinstance(error, (HandTimeout, HandFault, CommandRejected))
-        return not patient or self._clock.now() - self._answered > _PATIENCE
+        since = max(self._answered, self._resumed)  # the device had no chance during a pause
+        return not patient or self._clock.now() - since > _PATIENCE
+
+    def paused(self) -> None:
+        """The program stood still until now. The hand brakes until a command comes that was sent
+        later.
+        """
+        self._resumed = self._clock.now()
+        # a clock that stands still in suspend: what was sent just before bears the same time
+        self._only_newer(math.nextafter(self._resumed, math.inf))
 
     def closed(self) -> None:
         """The link was given up."""
@@ -282,8 +306,8 @@ class HandCore:
     def next_command(self) -> HandCommand:
         """What the next exchange sends: the newest command, or the brake.
 
-        The brake before the first command, during a fault, and after a (re)connection or a
-        fault until a command comes that is newer.
+        The brake before the first command, during a fault, and after a (re)connection, a fault or
+        a pause until a command comes that is newer.
 
         When the newest command is older than the model's command time-out: the brake, where the
         dialect has no time-out bit. Where it has one (seed 002, RIS_Mode), a joint whose bit
@@ -326,6 +350,11 @@ class HandCore:
         return view
 
     # -- details ----------------------------------------------------------------------------
+
+    def _only_newer(self, now: float) -> None:
+        """What was sent until now does not count any more."""
+        with self._lock:
+            self._not_before = now
 
     def _in_force(self, now: float) -> HandCommand:
         late = self._time_out(now)

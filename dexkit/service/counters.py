@@ -15,6 +15,8 @@ class TopicCounters:
     :ivar undecodable: of those, samples that are not the message they claim to be.
     :ivar short: samples with too few motors for a hand that is served here; ignored.
     :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
+    :ivar pauses: times that the service stood still for more than a quarter of a second (stopped,
+        suspended, starved); the hands brake then until a command comes that was sent later.
     :ivar published: state samples written.
     :ivar publish_misses: publish deadlines missed by a whole period.
     :ivar publish_errors: samples that DDS or the codec refused.
@@ -24,6 +26,7 @@ class TopicCounters:
     undecodable: int = 0
     short: int = 0
     overlong: int = 0
+    pauses: int = 0
     published: int = 0
     publish_misses: int = 0
     publish_errors: int = 0
@@ -38,6 +41,8 @@ class HandCounters:
     """Counts of one hand.
 
     :ivar accepted: commands that are in force or were.
+    :ivar stale: commands that did not count because they were old, or may have been sent before
+        a pause, a reconnection or the end of a fault.
     :ivar rejected: commands with NaN or infinity.
     :ivar clamped: accepted commands that had to be brought within the limits.
     :ivar wrong_ids: accepted commands with a mode byte whose id is not the motor's index.
@@ -53,6 +58,7 @@ class HandCounters:
     """
 
     accepted: int = 0
+    stale: int = 0
     rejected: int = 0
     clamped: int = 0
     wrong_ids: int = 0

@@ -10,6 +10,9 @@ Three activities, each with its own clock:
 
 All three share one interpreter lock, so the publishing thread does little: it writes bytes that
 were encoded once for each new state.
+
+Each of them notices when it stood still (:class:`~dexkit.freshness.PauseWatch`): whoever does tells
+the cores, which brake until a command comes that was sent later.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from dexkit.errors import (
     UsageError,
     WireError,
 )
+from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model
@@ -52,6 +56,7 @@ _JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-
 # seconds between the last state and the good-bye: a busy reader that learns of the good-bye
 # first drops the state, as from nobody, and goes on believing that the hand is driven
 _LAST_WORDS = 0.05
+_TICK = 0.05  # seconds after which the receiving thread looks at the clock when nothing comes
 
 
 class _Writer(Protocol):
@@ -80,9 +85,10 @@ class Node(Protocol):
 class _Unit:
     """One served hand and its thread."""
 
-    def __init__(self, hand: Hand, core: HandCore) -> None:
+    def __init__(self, hand: Hand, core: HandCore, clock: Clock) -> None:
         self.hand = hand
         self.core = core
+        self.watch = PauseWatch(clock)
         self.side: Side = hand.spec.side
         self.thread: threading.Thread | None = None
         self.problem = ""  # the last error logged, to log each only once
@@ -160,6 +166,7 @@ class HandService:
                     estimation=estimation,
                     soft_start=soft_start,
                 ),
+                self._clock,
             )
             for hand in group
         ]
@@ -167,6 +174,11 @@ class HandService:
         self._cmd_type = message_type(self.dialect.cmd_type)
         self._stop = threading.Event()
         self._wake = threading.Event()
+        self._ages = Ages()
+        self._receive_watch = PauseWatch(self._clock)
+        self._publish_watch = PauseWatch(self._clock)
+        self._pause_lock = threading.Lock()
+        self._resumed = -math.inf  # when the last pause ended
         self._receiving: threading.Thread | None = None
         self._low_rate_every = 0
         self._ticks = 0
@@ -217,8 +229,10 @@ class HandService:
             self._low_rate_writer = node.writer(self.low_rate_topic, self.dialect.state_type)
             self._low_rate_every = max(1, round(self.state_rate / self.model.low_rate))
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
+        self._receive_watch.restart()  # from here on commands may wait to be received
         for unit in self._units:
             unit.thread = self._thread(f"exchange-{unit.side}", self._exchange_loop, unit)
+            unit.watch.restart()
         self._receiving = self._thread("receive", self._receive_loop)
         for thread in [self._receiving, *(u.thread for u in self._units)]:
             assert thread is not None
@@ -309,12 +323,19 @@ class HandService:
     def _receive_loop(self) -> None:
         assert self._reader is not None
         while not self._stop.is_set():
-            self._wake.wait()
+            self._wake.wait(_TICK)
             self._wake.clear()
+            self._look_received()
             for sample in self._reader.take():
-                self._receive(sample.data)
+                self._receive(sample)
 
-    def _receive(self, data: bytes) -> None:
+    def _receive(self, sample: Any) -> None:
+        # in this order: if it stands still in between, the sample only looks older
+        now = self._clock.now()
+        received = self._clock.since_boot()
+        self._look_received()
+        age = self._ages.age(sample.writer, sample.source_timestamp_ns, received)
+        data: bytes = sample.data
         count = self.counters
         count.received += 1
         try:
@@ -334,16 +355,19 @@ class HandService:
             if command is None:
                 short = True
             else:
-                self._obey(unit, command, message)
+                self._obey(unit, command, message, now - age)
         if short:
             count.short += 1
             self._say("short", f"ignored, {motors} motor(s) where {self._map.length} are needed")
 
-    def _obey(self, unit: _Unit, command: HandCommand, message: Any) -> None:
+    def _obey(self, unit: _Unit, command: HandCommand, message: Any, sent: float) -> None:
         counters = unit.core.counters
-        clamped = counters.clamped
-        if not unit.core.submit(command):
-            self._say("rejected", "rejected, it is not finite")
+        clamped, rejected = counters.clamped, counters.rejected
+        if not unit.core.submit(command, sent):
+            if counters.rejected != rejected:
+                self._say("rejected", "rejected, it is not finite")
+            else:
+                self._say_stale(sent)
             return
         if counters.clamped != clamped:
             for name, text in _beyond(unit.core.spec, command):
@@ -364,6 +388,49 @@ class HandService:
         if kind not in self._said:
             self._said.add(kind)
             log.warning("%s: a command was odd (counted, said once): %s", self.cmd_topic, text)
+
+    def _say_stale(self, sent: float) -> None:
+        age = self._clock.now() - sent
+        if age > PAUSE and math.isfinite(age):
+            self._say(
+                "stale",
+                f"ignored, it came {age:.1f} s later than usual for its client; is the network "
+                f"slow? What is more than {PAUSE:g} s old never moves a hand",
+            )
+
+    # -- pauses -----------------------------------------------------------------------------
+
+    def _look(self, watch: PauseWatch, units: Sequence[_Unit], allowed: float = PAUSE) -> bool:
+        """Whether a loop of this service stood still; then these hands brake until a command comes
+        that was sent later.
+        """
+        away = watch.look(allowed)
+        if not away:
+            return False
+        now = self._clock.since_boot()
+        with self._pause_lock:
+            first = now - away > self._resumed  # another loop may have told of it already
+            self._resumed = now
+            for unit in units:
+                unit.core.paused()
+        if first:
+            self.counters.pauses += 1
+            self._say_paused(away)
+        return True
+
+    def _look_received(self) -> None:
+        if self._look(self._receive_watch, self._units):
+            self._ages.resumed(self._clock.since_boot())
+
+    def _say_paused(self, away: float) -> None:
+        if "paused" not in self._said:
+            self._said.add("paused")
+            log.warning(
+                "%s: this program stood still for %.2f s (stopped, suspended, or a machine that is "
+                "too busy): braking until a command comes that was sent later (counted, said once)",
+                self.state_topic,
+                away,
+            )
 
     # -- exchange ---------------------------------------------------------------------------
 
@@ -396,6 +463,7 @@ class HandService:
         unit.hand.open()
         speeds = getattr(unit.hand, "joint_speeds", None)
         unit.core.opened(unit.hand.spec, speeds)
+        unit.watch.restart()
         if unit.core.predicting and speeds is None:
             log.warning("%s: the speed of the hand is not known; predictions will jump", unit.side)
         try:
@@ -427,9 +495,17 @@ class HandService:
 
     def _exchange(self, unit: _Unit, command: HandCommand | None = None) -> bool:
         core = unit.core
+        # a hand that is slow by itself is no pause
+        period = 1.0 / min(core.spec.io_rate, core.measured_rate)
+        allowed = max(PAUSE, 2 * period + core.spec.exchange_timeout)
         try:
-            core.measured(unit.hand.exchange(command or core.next_command()))
+            if command is None:
+                command = core.next_command()
+                if self._look(unit.watch, [unit], allowed):
+                    command = core.next_command()
+            core.measured(unit.hand.exchange(command))
         except Exception as error:  # a backend is other people's code
+            self._look(unit.watch, [unit], allowed)
             self._report(unit, error)
             if core.failed(error):
                 core.closed()
@@ -475,6 +551,7 @@ class HandService:
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
             return
+        self._look(self._publish_watch, self._units, PAUSE + 1.0 / self.state_rate)
         self.counters.publish_misses += missed
         self._ticks += 1
         every = self._low_rate_every

@@ -15,6 +15,7 @@ from dexkit.drivers.dex1_serial.discovery import find_motor
 from dexkit.drivers.dex1_serial.line import LATE, LineStatistics, MotorLine
 from dexkit.drivers.dex1_serial.settings import SETTINGS, Dex1Settings, from_options
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
+from dexkit.freshness import Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire.m4010 import (
@@ -166,12 +167,15 @@ class Dex1Serial:
         """Send one command frame, return what the motor answers.
 
         :raises HandLost: the port has gone, or the hand is not open.
-        :raises HandTimeout: no intact answer in time.
+        :raises HandTimeout: no intact answer in time, or this program stood still before the
+            command was written.
         """
+        promptly = Promptly(self._clock)
         line = self._line
         if line is None:
             raise HandLost("the gripper is not open", hint="call open() first")
-        data = line.exchange(self._frame(command), self.id, self.configuration.timeout)
+        frame = self._frame(command)
+        data = line.exchange(frame, self.id, self.configuration.timeout, promptly)
         stamp = self._clock.now()
         self._look_at(data)
         return _state(data, stamp)

@@ -22,6 +22,7 @@ import serial
 
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
+from dexkit.freshness import Promptly
 from dexkit.wire.m4010 import DATA, FrameParser, MotorData
 
 __all__ = ["LATE", "LineStatistics", "MotorLine", "acquire", "is_shared"]
@@ -86,12 +87,15 @@ class MotorLine:
         """Whether it must be opened again."""
         return self._port is None
 
-    def exchange(self, command: bytes, number: int, timeout: float) -> MotorData:
+    def exchange(
+        self, command: bytes, number: int, timeout: float, before: Promptly | None = None
+    ) -> MotorData:
         """Send a command, return the data of that motor.
 
         :param command: a frame that motor ``number`` answers.
         :param timeout: seconds until the answer.
-        :raises HandTimeout: no intact answer of that motor.
+        :param before: asked right before the command is written.
+        :raises HandTimeout: no intact answer of that motor, or ``before`` refuses.
         :raises HandLost: the port has gone away.
         """
         with self._lock:
@@ -100,7 +104,7 @@ class MotorLine:
                 raise HandLost(f"the port {self.path} has gone away")
             try:
                 with port_errors(self.path):
-                    return self._exchange(port.fileno(), command, number, timeout)
+                    return self._exchange(port.fileno(), command, number, timeout, before)
             except HandTimeout:
                 raise
             except HandError:
@@ -110,7 +114,9 @@ class MotorLine:
                 self._owed = True
                 raise
 
-    def _exchange(self, fd: int, command: bytes, number: int, timeout: float) -> MotorData:
+    def _exchange(
+        self, fd: int, command: bytes, number: int, timeout: float, before: Promptly | None
+    ) -> MotorData:
         statistics, parser = self.statistics, self._parser
         if self._owed:
             self._owed = False
@@ -118,6 +124,8 @@ class MotorLine:
         while data := self._read(fd):
             statistics.stray += len(data)
         parser.reset()
+        if before is not None:
+            before.check()
         if os.write(fd, command) != len(command):
             raise HandLost(f"the port {self.path} takes no more bytes")
         deadline = time.monotonic() + timeout

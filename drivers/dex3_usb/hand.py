@@ -14,6 +14,7 @@ from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
 from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, WireError
+from dexkit.freshness import Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, CommandLayout, HandCodec, parse_state
@@ -244,8 +245,10 @@ class Dex3Usb:
         shows ``MotorError.HOST_SAW_MOTOR_TIMEOUT``.
 
         :raises HandLost: the hand has gone, or is not open.
-        :raises HandTimeout: no answer in time, none that is intact, or a stalled endpoint.
+        :raises HandTimeout: no answer in time, none that is intact, a stalled endpoint, or this
+            program stood still before the command was sent.
         """
+        promptly = Promptly(self._clock)
         link = self._link
         if link is None:
             raise HandLost("the hand is not open", hint="call open() first")
@@ -253,16 +256,18 @@ class Dex3Usb:
         if tripped is not None:
             # one lock frame with bit 7 = 0 clears a motor that stopped by itself
             command, protect = _locked(command, tripped), protect & ~tripped
-        _, state = self._transfer(link, self._codec.encode(command, protect))
+        _, state = self._transfer(link, self._codec.encode(command, protect), promptly)
         if self._codec.missing_motors or self._some_missed:
             self._fill_in(state)
         self._look_for_trips(state)
         self._last = state
         return state
 
-    def _transfer(self, link: UsbLink, frame: bytes) -> tuple[bytes, HandState]:
+    def _transfer(
+        self, link: UsbLink, frame: bytes, before: Promptly | None = None
+    ) -> tuple[bytes, HandState]:
         configuration = self.configuration
-        answer = link.exchange(frame, configuration.send_timeout, configuration.timeout)
+        answer = link.exchange(frame, configuration.send_timeout, configuration.timeout, before)
         try:
             state = self._codec.decode(answer, self._clock.now())
         except WireError as error:

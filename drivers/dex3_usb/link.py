@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
+from dexkit.freshness import Promptly
 
 __all__ = ["Backend", "Endpoints", "LinkStatistics", "UsbLink", "hand_error", "read_serial"]
 
@@ -182,13 +183,21 @@ class UsbLink:
             except (OSError, NotImplementedError) as error:  # a device that is gone
                 log.debug("closing %s: %s", self.name, error)
 
-    def exchange(self, data: bytes, send_timeout: float, timeout: float) -> bytes:
+    def exchange(
+        self,
+        data: bytes,
+        send_timeout: float,
+        timeout: float,
+        before: Promptly | None = None,
+    ) -> bytes:
         """Send one buffer, return the one that answers it.
 
         :param data: a whole command frame.
         :param send_timeout: seconds that the device may take to accept it.
         :param timeout: seconds until the answer.
-        :raises HandTimeout: no answer in time, or a stalled endpoint, which was cleared.
+        :param before: asked right before it is sent.
+        :raises HandTimeout: no answer in time, a stalled endpoint, which was cleared, or
+            ``before`` refuses.
         :raises HandLost: the device has gone.
         :raises HandRefused, HandError: anything else that libusb may say.
         """
@@ -196,6 +205,8 @@ class UsbLink:
             raise HandLost(f"{self.name} is not open")
         if self._drain:
             self._wait_for_late()
+        if before is not None:
+            before.check()
         try:
             answer = self._transfer(data, send_timeout, timeout)
         except HandError:

@@ -41,6 +41,7 @@ from dexkit.errors import (
     HandTimeout,
     UsageError,
 )
+from dexkit.freshness import Promptly
 from dexkit.wire import dynamixel, mx64
 from dexkit.wire.dynamixel import Instruction
 
@@ -109,6 +110,7 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
         self._received = bytearray()
         self._held = b""
         self.hold_next = False
+        self.before: Promptly | None = None
 
     # names are the SDK's
     def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
@@ -162,7 +164,10 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
         """Write a whole packet, or as much as goes within the timeout.
 
         With ``hold_next`` set the packet is kept and leaves together with the next one: one
-        system call and, on a USB adapter, one transfer instead of two.
+        system call and, on a USB adapter, one transfer instead of two. ``before`` is asked right
+        before they do.
+
+        :raises HandTimeout: ``before`` refuses; nothing was written.
         """
         data = bytes(packet)
         if self.hold_next:
@@ -171,7 +176,10 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
             return len(data)
         held = len(self._held)
         data, self._held = self._held + data, b""
+        before, self.before = self.before, None
         sent = 0
+        if before is not None:
+            before.check()
         deadline = time.monotonic() + self.timeout
         while sent < len(data):
             try:
@@ -187,6 +195,7 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
         self.is_using = False
         self.hold_next = False
         self._held = b""
+        self.before = None
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         """Start the clock for a reply of ``packet_length`` bytes."""
@@ -363,14 +372,23 @@ class ServoBus:
         self.write(servo_id, item.address, item.encode(value))
 
     def write_unacknowledged(
-        self, servo_id: int, address: int, data: bytes, *, with_next: bool = False
+        self,
+        servo_id: int,
+        address: int,
+        data: bytes,
+        *,
+        with_next: bool = False,
+        before: Promptly | None = None,
     ) -> None:
         """Write without a status packet (a Sync Write to one servo): half the time, no reply.
 
         :param with_next: let it leave together with the next transaction.
+        :param before: asked right before it leaves. What it raises comes from here, or from the
+            next transaction.
         :raises HandLost: the port has gone away or takes no more bytes.
         """
         self._port.hold_next = with_next
+        self._port.before = before
         with self._line():
             result = self._packets.syncWriteTxOnly(
                 self._port, address, len(data), [servo_id, *data], 1 + len(data)

@@ -29,6 +29,7 @@ from dexkit.drivers.ezgripper.scaling import (
 )
 from dexkit.drivers.ezgripper.servo import BOOT_TIME, Servo, ServoStatistics, exchange_time
 from dexkit.errors import HandError, HandFault, HandLost, HandRefused, HandTimeout, UsageError
+from dexkit.freshness import PAUSE, Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import mx64
@@ -344,17 +345,21 @@ class EZGripper:
         :raises HandFault: the servo has shut down, or is being restarted; further calls carry
             the recovery on, one bounded step each.
         :raises HandLost: the port has gone away, or the gripper is not open.
-        :raises HandTimeout: no intact answer to any of the attempts.
+        :raises HandTimeout: no intact answer to any of the attempts, or this program stood still
+            before the goal was written.
         """
+        promptly = Promptly(self._clock)
         servo, control, last = self._servo, self._control, self._last
         if servo is None or control is None or last is None:
             raise HandLost("the gripper is not open", hint="call open() first")
         if self._trouble is not _Trouble.NONE:
             last = self._recover(servo, control)
+        if self._clock.now() - last.time > PAUSE:
+            last = self._last = servo.sample()  # the fingers went on; a brake must not go back
         goal = control.plan(command, last)
         if goal.current and not last.torque:
-            servo.engage(Goal(last.position, goal.current, goal.profile_velocity))
-        sample = servo.exchange(goal)
+            servo.engage(Goal(last.position, goal.current, goal.profile_velocity), promptly)
+        sample = servo.exchange(goal, promptly)
         self._examine(servo, control, command, sample, engaged=goal.current > 0)
         self._commanded = command
         self._last = sample

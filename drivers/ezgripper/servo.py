@@ -15,6 +15,7 @@ from dexkit.drivers.ezgripper.settings import (
     hold_here,
 )
 from dexkit.errors import HandTimeout
+from dexkit.freshness import Promptly
 from dexkit.wire import mx64
 
 __all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "exchange_time"]
@@ -77,15 +78,18 @@ class Servo:
         """Set and verify all registers. Raises as :func:`settings.apply_settings`."""
         return apply_settings(self.bus, self.id)
 
-    def exchange(self, goal: Goal) -> Sample:
+    def exchange(self, goal: Goal, before: Promptly | None = None) -> Sample:
         """One write, one read.
 
-        :raises HandTimeout: no answer.
+        :param before: asked right before the goal is written.
+        :raises HandTimeout: no answer, or ``before`` refuses.
         :raises HandLost: the port has gone away.
         """
         started = self._clock.now()
         data = block.encode(goal)
-        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, data, with_next=True)
+        self.bus.write_unacknowledged(
+            self.id, block.WRITE_ADDRESS, data, with_next=True, before=before
+        )
         sample = self._read(started + self._to_measurement)
         self.statistics.exchanges += 1
         if sample.goal_current != goal.current or sample.goal_position != goal.position:
@@ -109,9 +113,10 @@ class Servo:
         """Switch the motor; raises as the bus, and ServoError in a shutdown."""
         self.bus.write_item(self.id, mx64.TORQUE_ENABLE, int(on))
 
-    def engage(self, goal: Goal) -> None:
+    def engage(self, goal: Goal, before: Promptly | None = None) -> None:
         """Switch the motor on with ``goal`` already in its registers."""
-        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, block.encode(goal))
+        data = block.encode(goal)
+        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, data, before=before)
         self.set_torque(True)
 
     def rearm_watchdog(self) -> None:

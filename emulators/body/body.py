@@ -50,6 +50,8 @@ class Counters:
     :ivar bad_machine: commands ignored because their ``mode_machine`` is another robot's.
     :ivar malformed: samples that are no such message at all.
     :ivar wrong_mode: commands obeyed that hold a mode byte which its motor does not know.
+    :ivar stale: commands ignored because they were old, or may have been sent before a pause ended.
+    :ivar pauses: times that the program stood still; the body damps then until a new command.
     :ivar timeouts: times the body began to damp because commands stopped.
     :ivar states: published.
     """
@@ -61,6 +63,8 @@ class Counters:
     bad_machine: int = 0
     malformed: int = 0
     wrong_mode: int = 0
+    stale: int = 0
+    pauses: int = 0
     timeouts: int = 0
     states: int = 0
 
@@ -278,7 +282,10 @@ class Body:
         """Live until ``now``; after a pause of more than 0.1 s, only its last 0.1 s."""
         for order in (self._order, self._arm_order):
             if order is not None and now - order.since > self.timeout:
-                self._expire(order)
+                self.counters.timeouts += 1
+                topic = self._expire(order)
+                text = f"{topic}: no command for {self.timeout:g} s; its motors damp"
+                self._say(f"timeout {topic}", text)
         for _ in range(self._steps.due(now)):
             self.joints.step(self._law)
             self._lived += 1
@@ -286,8 +293,20 @@ class Body:
                 self.supply.step()
                 self._show_supply()
 
-    def _expire(self, order: _Order) -> None:
-        self.counters.timeouts += 1
+    def paused(self) -> None:
+        """The program stood still until now: no command from before counts any more."""
+        self.counters.pauses += 1
+        for order in (self._order, self._arm_order):
+            if order is not None:
+                self._expire(order)
+        self._say(
+            "paused",
+            "this program stood still (stopped, suspended, or a machine that is too busy); the "
+            "motors damp until a command comes that was sent later",
+        )
+
+    def _expire(self, order: _Order) -> str:
+        """A command counts no more; the topic that it came on."""
         if order is self._order:
             self._order = None
             self._lost = True
@@ -296,9 +315,7 @@ class Body:
             self._arm_order = None
             topic = self.model.arm_topic
         self._settle()
-        self._say(
-            f"timeout {topic}", f"{topic}: no command for {self.timeout:g} s; its motors damp"
-        )
+        return topic
 
     # states
 

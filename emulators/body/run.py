@@ -19,6 +19,7 @@ from dexkit.dds import DdsNode, Reader, Writer
 from dexkit.emulators.body.body import Body
 from dexkit.emulators.body.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
+from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.service import Publisher
 
 __all__ = ["EmulatedBody", "run_body"]
@@ -67,6 +68,8 @@ class EmulatedBody:
         self._own_node: DdsNode | None = None
         self._publisher = publisher or Publisher(model.state_rate, self._clock)
         self._force = force
+        self._ages = Ages()
+        self._watch = PauseWatch(self._clock)
         self._remote_every = round(model.state_rate / model.remote_rate)
         self._writer: Writer | None = None
         self._remote: Writer | None = None
@@ -116,10 +119,11 @@ class EmulatedBody:
             if not self._force:
                 self._refuse_conflict(node)
             model = self.model
-            self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
-            self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
             self._remote = node.writer(model.remote_topic, model.remote_type)
             self._writer = node.writer(model.state_topic, model.state_type)
+            self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
+            self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
+            self._watch.restart()  # from here on commands may wait to be received
         except BaseException:
             self._close()
             raise
@@ -184,10 +188,20 @@ class EmulatedBody:
         assert self._commands is not None
         assert self._arm_commands is not None
         self.missed += missed
-        for sample in self._commands.take():
-            body.command(sample.data, now)
-        for sample in self._arm_commands.take():
-            body.arm_command(sample.data, now)
+        if self._watch.look(PAUSE + 1.0 / self._publisher.hz):
+            self._ages.resumed(self._clock.since_boot())
+            body.paused()
+        for reader, obey in (
+            (self._commands, body.command),
+            (self._arm_commands, body.arm_command),
+        ):
+            for sample in reader.take():
+                received = self._clock.since_boot()
+                age = self._ages.age(sample.writer, sample.source_timestamp_ns, received)
+                if age > PAUSE:
+                    body.counters.stale += 1
+                else:
+                    obey(sample.data, now - age)
         body.advance(now)
         self._writer.write_raw(body.state(now))
         if body.counters.states % self._remote_every == 0:
