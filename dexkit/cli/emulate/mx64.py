@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from dexkit.cli.common import stop_on_signals
-from dexkit.cli.emulate.stdin import read_faults
+from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.clock import RealClock
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.files import update_file
@@ -163,6 +163,8 @@ def emulate_mx64(
         if port.overruns:
             summary += f", {port.overruns} bytes not read by the client"
         click.echo(f"stopped: {summary}")
+        if bus.failure is not None:
+            raise EmulatorError(f"the emulator failed inside: {bus.failure!r}", hint=A_MISTAKE)
 
 
 class _EepromFile:
