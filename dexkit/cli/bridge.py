@@ -124,6 +124,8 @@ def command(
             sys.stdout.flush()
             trouble = _watch(bridge, stop, duration, status, force)
         bridge.log_counters()
+    if isinstance(bridge.failure, TopicConflict):
+        raise bridge.failure
     if bridge.failure is not None:
         raise DexkitError(f"the bridge died: {bridge.failure}")
     if trouble:
@@ -165,8 +167,6 @@ def _watch(
 
 def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
     commands, states = bridge.commands, bridge.states
-    if found := bridge.others():
-        yield f"{found}, too; the two fight"
     for direction, who in ((commands, "client"), (states, "gripper")):
         counts, topics = direction.counts, " and ".join(direction.inputs)
         for count, what in (

@@ -20,7 +20,7 @@ from dexkit.cli.common import (
     log_to_stderr,
     stop_on_signals,
 )
-from dexkit.errors import DexkitError, UsageError
+from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Hand, Side
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
@@ -200,6 +200,8 @@ def command(
         for service in services:
             service.log_counters()
     for service in services:
+        if isinstance(service.failure, TopicConflict):
+            raise service.failure
         if service.failure is not None:
             raise DexkitError(f"the service died: {service.failure}")
     return 0

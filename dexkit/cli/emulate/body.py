@@ -21,7 +21,7 @@ from dexkit.cli.common import (
     stop_on_signals,
 )
 from dexkit.cli.emulate.stdin import read_faults
-from dexkit.errors import DdsError
+from dexkit.errors import DdsError, TopicConflict
 
 if TYPE_CHECKING:
     from dexkit.emulators.body import EmulatedBody
@@ -85,6 +85,8 @@ def _command(model: BodyModel) -> click.Command:
             )
             sys.stdout.flush()
             _watch(robot, stop, duration, status=status, as_json=as_json)
+        if isinstance(robot.failure, TopicConflict):
+            raise robot.failure
         if robot.failure is not None:
             raise DdsError(f"the {chosen.name} died: {robot.failure}") from robot.failure
         if not as_json:
