@@ -11,13 +11,19 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from dexkit.bodies import G1
 from dexkit.dds import DdsNode
+from dexkit.emulators.body import run_body
 from dexkit.emulators.sim_hand import SimHand
 from dexkit.errors import TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.service import HandService
 from dexkit.sole import LOOK, SETTLE, Claim, Place, SolePublisher
+from dexkit.teleop import Operator, client_for, profile
+from dexkit.teleop.live import LiveClient
+from dexkit.traces import sample_path
+from tests.cli_helpers import running
 from tests.dds_helpers import free_domain, wait_until
 
 TOPIC = "rt/dex1/left/state"
@@ -287,3 +293,60 @@ def test_a_service_that_finds_an_earlier_one_late_brakes_and_ends() -> None:
         with service(near) as served, far.writer(TOPIC, GO.state_type):
             wait_until(lambda: served.snapshot()["rivals"] == 1)
             assert served.failure is None  # the vendor's came later: told, and no more
+
+
+def test_a_recording_gives_way_to_whoever_comes() -> None:
+    domain = free_domain()
+    topic = GO.topics(Side.LEFT)[0]
+    arguments = ("--no-wait", "--loop", "--domain", domain)
+    with running("replay", sample_path("dex1_pick_place"), *arguments) as replay:
+        stdout = replay._popen.stdout
+        assert stdout is not None
+        assert any(line.startswith("ready:") for line in stdout)
+        with DdsNode(domain) as client, client.writer(topic, GO.cmd_type):
+            code, _, errors = replay.end()
+    assert code == 1, errors
+    assert f"publishes {topic} on domain {domain}, too" in errors
+    assert "Traceback" not in errors
+
+
+def test_the_teleoperation_client_gives_way_without_a_last_word() -> None:
+    domain = free_domain()
+    topic = GO.topics(Side.LEFT)[0]
+    steps = profile("steps", "dex1-1")
+    with DdsNode(domain) as near, DdsNode(domain) as far, service(far):
+        client = client_for(GO, (Side.LEFT,), release=None, simulated=True)
+        live = LiveClient(near, client)
+        assert live.wait_ready(threading.Event(), lambda missing, seconds: None)
+        with DdsNode(domain) as other, other.writer(topic, GO.cmd_type):
+            near.discovery.wait(lambda es: sum(e.topic == topic for e in es) >= 3, 10)
+            with pytest.raises(TopicConflict, match=f"commands {topic}"):
+                live.perform(Operator(steps, GO), 60.0, threading.Event())
+            sent: list[object] = []
+            live._send = sent.append  # type: ignore[method-assign]
+            live.leave()
+            assert sent == []
+
+
+def test_bodies_started_together_leave_one() -> None:
+    domain = free_domain()
+    stop = threading.Event()
+    ended: list[TopicConflict] = []
+    barrier = threading.Barrier(2)
+
+    def live() -> None:
+        barrier.wait()
+        try:
+            run_body(G1, domain=domain, stop=stop)
+        except TopicConflict as error:
+            ended.append(error)
+
+    threads = [threading.Thread(target=live) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    wait_until(lambda: ended)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert len(ended) == 1
+    assert "rt/lowstate" in str(ended[0])
