@@ -585,7 +585,7 @@ def test_a_servo_that_has_cooled_down_is_restarted_by_whoever_comes_next(tmp_pat
 def test_a_supply_dip_that_resets_the_servo(tmp_path: Path) -> None:
     with (
         emulated(start=80.0) as gripper,
-        gripper_on(gripper.path, configured(tmp_path, timeout=0.03)) as hand,
+        gripper_on(gripper.path, configured(tmp_path, timeout=0.1)) as hand,
     ):
         drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
         gripper.inject("brown-out:volts=5,for=200ms")
