@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import StopRequest, dds_options, log_to_stderr, stop_on_signals
+from dexkit.cli.common import (
+    MOST_REMARKS,
+    StopRequest,
+    dds_options,
+    log_to_stderr,
+    stop_on_signals,
+)
 from dexkit.errors import DexkitError, TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, dialect
@@ -154,7 +160,7 @@ def _watch(
         if not force and (found := bridge.reverse()):
             return found
         for text in _hints(bridge, time.monotonic() - started):
-            if text not in said:
+            if text not in said and len(said) < MOST_REMARKS:
                 said.add(text)
                 _log.warning("%s", text)
         line = next(rates)

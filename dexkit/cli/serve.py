@@ -14,6 +14,7 @@ import click
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.common import (
+    MOST_REMARKS,
     StatusLine,
     StopRequest,
     dds_options,
@@ -286,7 +287,7 @@ def _watch(services: Sequence[HandService], stop: StopRequest, status: StatusLin
             return
         for service in services:
             for text in _mismatches(service):
-                if text not in said:
+                if text not in said and len(said) < MOST_REMARKS:
                     said.add(text)
                     log.warning("%s", text)
         lonely = lonely and not any(service.clients for service in services)

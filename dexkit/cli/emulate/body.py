@@ -14,6 +14,7 @@ import click
 
 from dexkit.bodies import G1, H1, BodyModel
 from dexkit.cli.common import (
+    MOST_REMARKS,
     StatusLine,
     StopRequest,
     dds_options,
@@ -179,7 +180,7 @@ def _watch(
     while not over:
         left = float("inf") if end is None else end - time.monotonic()
         over = stop.wait(max(0.0, min(period, left))) or left <= period or bool(robot.failure)
-        for text in set(robot.mismatches()) - said:
+        for text in sorted(set(robot.mismatches()) - said)[: MOST_REMARKS - len(said)]:
             said.add(text)
             log.warning("%s", text)
         now = time.monotonic()
