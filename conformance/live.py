@@ -37,9 +37,10 @@ from dexkit.conformance.stimuli import (
 from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.wire import Wire
 from dexkit.dds import DdsNode, Qos, Reader, Writer
-from dexkit.errors import ConformanceError, TopicConflict, WireError
+from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
+from dexkit.sole import Place, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
 
@@ -104,7 +105,7 @@ def record_run(
     :param stop: ends the run early when set; what was recorded is kept.
     :returns: False when it was ended early.
     :raises ConformanceError: the hand's process cannot be started, or has died.
-    :raises TopicConflict: somebody else commands this hand.
+    :raises TopicConflict: somebody else commands this hand, or begins to.
     """
     rig_options = options.rig
     stop = stop or threading.Event()
@@ -132,11 +133,19 @@ def record_run(
             return False
         if rig_options.backend == EXTERNAL:
             _expect_somebody(recorder_node, options)
-        _refuse_company(recorder_node, options)
+        # two clients on one hand would fight, and a real one may carry something
+        sole = SolePublisher(
+            [Place(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
+            hint="stop that client, or choose another --domain",
+            force=options.force,
+            yields=True,
+        )
+        sole.look()
         plan = options.plan()
         script = script_for(plan, say)
         heart = stack.enter_context(Heartbeat())
-        driver = stack.enter_context(_Driver(rig, plan))
+        driver = stack.enter_context(_Driver(rig, plan, sole))
+        sole.settle()
         _meet(recorder_node, plan)
         finished = driver.go_through(script, stop)
         recording.stop()
@@ -171,27 +180,6 @@ def _judge_usb(
 
 def _node(options: RigOptions) -> DdsNode:
     return DdsNode(domain=options.domain, interface=options.interface)
-
-
-def _refuse_company(node: DdsNode, options: LiveOptions) -> None:
-    """Two clients on one hand would fight, and a real one may carry something."""
-    dialect = options.rig.dialect
-    commanded = {dialect.topics(s)[0] for s in options.rig.sides}
-
-    def strangers() -> set[str]:
-        return {
-            e.topic
-            for e in node.endpoints()
-            if e.kind == "writer" and e.topic in commanded and not e.own
-        }
-
-    node.discovery.wait(lambda endpoints: strangers(), timeout=0.3)
-    if strangers() and not options.force:
-        raise TopicConflict(
-            f"somebody else publishes {', '.join(sorted(strangers()))} on domain "
-            f"{options.rig.domain}",
-            hint="stop that client, or choose another --domain",
-        )
 
 
 def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
@@ -231,6 +219,7 @@ class _Driver:
 
     rig: Rig
     plan: Plan
+    sole: SolePublisher
     _newest: dict[str, bytes] = field(default_factory=dict)
     _others: dict[Role, _Client | _Monitor] = field(default_factory=dict)
     _stopped: dict[str, float | None] = field(default_factory=dict)
@@ -264,6 +253,7 @@ class _Driver:
         steps = script.run()
         action = next(steps)
         while not stop.is_set():
+            self.sole.poll()
             self._do(action)
             dead = self.rig.dead()
             if dead is not None:
@@ -303,7 +293,8 @@ class _Driver:
         self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
 
     def _new_client(self, type_name: str | None = None) -> _Client:
-        return _Client(self.rig.options, self._wire, self.plan.sides, type_name)
+        claim = self.sole.announce()
+        return _Client(self.rig.options, self._wire, self.plan.sides, claim, type_name)
 
     def _joining(self, role: Role) -> _Client | _Monitor:
         if role is Role.RIVAL:
@@ -356,11 +347,17 @@ class _Driver:
 class _Client:
     """The kit as the commanding program, with the official clients' quality of service.
 
+    :param claim: announced by all clients of one run, which are company to each other.
     :param type_name: the type of its commands, if it is a stranger.
     """
 
     def __init__(
-        self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...], type_name: str | None = None
+        self,
+        rig: RigOptions,
+        wire: Wire,
+        sides: tuple[Side, ...],
+        claim: bytes,
+        type_name: str | None = None,
     ) -> None:
         self._node = _node(rig)
         commands = {wire.command_topics[s] for s in sides}
@@ -368,7 +365,8 @@ class _Client:
         self._states = states
         kind = type_name or wire.command
         self._writers: dict[str, Writer] = {
-            t: self._node.writer(t, kind, qos=Qos.writer_default()) for t in commands
+            t: self._node.writer(t, kind, qos=Qos.writer_default(), user_data=claim)
+            for t in commands
         }
         self._readers: dict[str, Reader] = {
             t: self._node.reader(t, wire.state, qos=Qos.reader_default()) for t in states

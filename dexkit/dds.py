@@ -164,6 +164,7 @@ class Endpoint:
     :param own: it belongs to this node.
     :param key: unique id of the endpoint; ``participant`` that of its participant.
     :param process: name and pid of the process that it lives in, if known.
+    :param user_data: what its owner says of it (USER_DATA), or empty.
     :param type_hash: hash of the complete type if the other side announces one, or empty; two
         endpoints whose ``type_name`` is the same but whose hash differs disagree on the layout.
     """
@@ -177,6 +178,7 @@ class Endpoint:
     participant: str
     process: str = ""
     type_hash: str = ""
+    user_data: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -474,6 +476,7 @@ class _Handle:
         self.topic = topic
         self.type = kind
         self.qos = qos
+        self.user_data = b""
         self._entity: Any = None
         self._ref = 0
         self._token = 0
@@ -535,8 +538,11 @@ class Writer(_Handle):
     :ivar timeouts: writes given up after 100 ms because a reliable reader did not keep up.
     """
 
-    def __init__(self, node: DdsNode, topic: str, kind: MessageType, qos: Qos) -> None:
+    def __init__(
+        self, node: DdsNode, topic: str, kind: MessageType, qos: Qos, user_data: bytes = b""
+    ) -> None:
         super().__init__(node, topic, kind, qos)
+        self.user_data = user_data
         self.timeouts = 0
         self._write = _cyclone().layer.ddspy_write
         self._write_ts = _cyclone().layer.ddspy_write_ts
@@ -814,16 +820,24 @@ class DdsNode:
         """Whether :meth:`close` has been called."""
         return self._closed
 
-    def writer(self, topic: str, type_name: str | MessageType, *, qos: Qos | None = None) -> Writer:
+    def writer(
+        self,
+        topic: str,
+        type_name: str | MessageType,
+        *,
+        qos: Qos | None = None,
+        user_data: bytes = b"",
+    ) -> Writer:
         """A writer on ``topic``.
 
         :param topic: DDS name, ``rt/`` included.
         :param type_name: a name that :func:`dexkit.messages.message_type` takes, or its result.
         :param qos: default :meth:`Qos.writer_default`.
+        :param user_data: is announced to other participants (:attr:`Endpoint.user_data`).
         :raises DdsSetupError: the endpoint cannot be made.
         """
         kind = type_name if isinstance(type_name, MessageType) else message_type(type_name)
-        writer = Writer(self, topic, kind, qos or Qos.writer_default())
+        writer = Writer(self, topic, kind, qos or Qos.writer_default(), user_data)
         self._add(writer, _cyclone().pub.DataWriter, _cyclone().publication_matched)
         return writer
 
@@ -904,7 +918,9 @@ class DdsNode:
                 raise DdsError(f"{self!r} is closed")
             try:
                 topic = self._topic(handle.topic, handle.type)
-                handle._entity = factory(self._participant, topic, qos=_policies(handle.qos))
+                handle._entity = factory(
+                    self._participant, topic, qos=_policies(handle.qos, handle.user_data)
+                )
             except (cyclone.error, UnicodeError) as error:
                 raise DdsSetupError(
                     f"cannot make a {type(handle).__name__.lower()} on {handle.topic!r}: {error}"
@@ -1028,10 +1044,16 @@ def _endpoint(sample: Any, kind: str, owner: Participant | None, own_key: str) -
         participant=key,
         process=owner.process if owner else "",
         type_hash=hashed,
+        user_data=_user_data(sample.qos),
     )
 
 
-def _policies(qos: Qos) -> Any:
+def _user_data(policies: Any) -> bytes:
+    found = policies[_cyclone().qos.Policy.Userdata]  # None where there is none
+    return bytes(found.data) if found is not None else b""
+
+
+def _policies(qos: Qos, user_data: bytes = b"") -> Any:
     policy = _cyclone().qos.Policy
     reliability = (
         policy.Reliability.Reliable(max_blocking_time=100_000_000)  # 100 ms (F A.5)
@@ -1045,7 +1067,8 @@ def _policies(qos: Qos) -> Any:
         "persistent": policy.Durability.Persistent,
     }[qos.durability]
     history = policy.History.KeepAll if qos.depth is None else policy.History.KeepLast(qos.depth)
-    return _cyclone().qos.Qos(reliability, durability, history)
+    more = (policy.Userdata(data=user_data),) if user_data else ()
+    return _cyclone().qos.Qos(reliability, durability, history, *more)
 
 
 def _qos_of(policies: Any) -> Qos:

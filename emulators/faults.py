@@ -242,8 +242,8 @@ def _parse(text: str, family: FaultFamily) -> Fault:
         if key == "for" and kind.lasting:
             duration = _duration(value)
         elif key == "id" and kind.targets_device:
-            if not value.isdecimal() or int(value) > family.max_id:
-                raise _Bad(f"{value!r} is not an id (0 to {family.max_id})")
+            if not value.isdecimal() or len(value) > 9 or int(value) > family.max_id:
+                raise _Bad(f"{value[:20]!r} is not an id (0 to {family.max_id})")
             device = int(value)
         elif key == "side" and family.sided:
             try:

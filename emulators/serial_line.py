@@ -11,6 +11,7 @@ Not modelled: USB scheduling beyond that, collisions of a host that talks while 
 from __future__ import annotations
 
 import heapq
+import logging
 import math
 import random
 from abc import ABC, abstractmethod
@@ -21,6 +22,8 @@ from dexkit.emulators.faults import Fault, FaultSchedule
 from dexkit.errors import UsageError
 
 __all__ = ["BITS_PER_BYTE", "LineCounters", "SerialLine"]
+
+log = logging.getLogger("dexkit.emulators")
 
 BITS_PER_BYTE = 10.0
 """8N1: start bit, eight data bits, stop bit."""
@@ -37,6 +40,7 @@ class LineCounters:
     dropped: int = 0
     corrupted: int = 0
     delayed: int = 0
+    failures: int = 0  # messages on which a device failed inside
 
     def summary(self) -> str:
         """One line for the end of a run: what is not zero."""
@@ -56,6 +60,7 @@ class SerialLine(ABC):
     :ivar host_baudrate: bits a second that the host has set, or None if that is not known;
         devices at another rate hear nothing.
     :ivar unplugged: the adapter is away.
+    :ivar failure: the first exception inside a device, a mistake in the emulator, if any.
     """
 
     counters: LineCounters
@@ -75,6 +80,7 @@ class SerialLine(ABC):
         self.latency_timer = latency_timer
         self.host_baudrate: int | None = None
         self.unplugged = False
+        self.failure: Exception | None = None
         self.schedule = FaultSchedule(faults, start=start)
         self._random = random.Random(seed)
         self._start = start
@@ -111,6 +117,10 @@ class SerialLine(ABC):
             times.append(fault)
         return min(times, default=None)
 
+    def behind(self, now: float) -> float:
+        """Seconds that the line still needs for what was sent already."""
+        return max(0.0, self._line_free - now) if self.line_time else 0.0
+
     def due(self, now: float) -> bytes:
         """The bytes that have reached the host by ``now``."""
         out = b""
@@ -123,6 +133,13 @@ class SerialLine(ABC):
         """Take note of an ``unplug`` that began or ended; what was on its way is lost."""
         self.unplugged = bool(self.schedule.of("unplug"))
         self._out.clear()
+
+    def _failed(self, error: Exception, message: object) -> None:
+        """A device failed inside on ``message``: say so, and go on without an answer."""
+        self.counters.failures += 1
+        if self.failure is None:
+            self.failure = error
+            log.error("the emulated device failed on %r (said once)", message, exc_info=error)
 
     def _send(self, begin: float, data: bytes, rate: int) -> None:
         """Send ``data`` from a device, its first bit at ``begin``; a fault may strike it."""

@@ -33,6 +33,9 @@ _CHUNK = 4096
 _SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
 _BUSY_TICK = 4e-3
 _IDLE_TICK = 20e-3
+_MOST_BEHIND = 0.1
+"""Seconds of line time from which nothing more is read: a client that floods the line waits for
+it, as it waits for the buffers of an adapter, instead of filling this program's memory."""
 
 
 def client_baudrate(fd: int) -> int | None:
@@ -202,7 +205,9 @@ class Port:
         sharp = next_time is not None and next_time < deadline
         if sharp and next_time is not None:
             deadline = next_time
-        fds = [self._wake_read] + ([self._master] if self._master >= 0 else [])
+        fds = [self._wake_read]
+        if self._master >= 0 and self.line.behind(self._clock.now()) < _MOST_BEHIND:
+            fds.append(self._master)
         while True:
             left = deadline - self._clock.now()
             if left <= 0:

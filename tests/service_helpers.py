@@ -82,6 +82,8 @@ class FakeEndpoint:
     kind: str
     own: bool = False
     process: str = ""
+    user_data: bytes = b""
+    key: str = ""
 
 
 @dataclass
@@ -96,7 +98,7 @@ class FakeNode:
     open_entities: int = 0
     closed: bool = False
 
-    def writer(self, topic: str, type_name: str) -> FakeWriter:
+    def writer(self, topic: str, type_name: str, *, user_data: bytes = b"") -> FakeWriter:
         self.types[topic] = type_name
         self.open_entities += 1
         return FakeWriter(self, topic)

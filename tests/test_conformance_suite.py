@@ -261,7 +261,7 @@ def test_it_refuses_to_start_beside_another_client(tmp_path: Path) -> None:
     rig = RigOptions(EXTERNAL, (Side.LEFT,), chosen, domain)
     with DdsNode(domain, "lo") as other:
         other.writer("rt/dex1/left/cmd", chosen.cmd_type)
-        with pytest.raises(TopicConflict, match="somebody else publishes rt/dex1/left/cmd"):
+        with pytest.raises(TopicConflict, match="already publishes rt/dex1/left/cmd"):
             record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap")
 
 

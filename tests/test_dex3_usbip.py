@@ -26,7 +26,9 @@ from dexkit.emulators.dex3_mcu import (
     Firmware,
     Server,
     emulated_dex3,
+    server,
 )
+from dexkit.emulators.dex3_mcu.server import MOST_CONNECTIONS, MOST_PARKED
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
@@ -434,6 +436,139 @@ def test_a_hand_has_one_client_and_the_next_may_follow() -> None:
             second.settimeout(0.1)
             with pytest.raises(TimeoutError):
                 reply(second)  # the first one's answer is not for the second
+
+
+# --- what a client can make it hold
+
+
+def broken(*_: object) -> None:
+    raise IndexError("a mistake")
+
+
+def held(hands: Dex3Hands) -> int:
+    return sum(len(c.parked) for c in hands._server._connections.values())
+
+
+def test_reads_that_wait_are_bounded_and_a_polite_client_is_served() -> None:
+    with emulated_dex3(BOTH) as hands:
+        port = inside(hands).port
+        with imported(port) as hog:
+            many = MOST_PARKED + 500
+            for seqnum in range(1, many + 1):
+                submit(hog, seqnum, IN, 1, b"")
+            for seqnum in range(MOST_PARKED + 1, many + 1):
+                assert reply(hog) == (protocol.RET_SUBMIT, seqnum, -errno.ENOMEM, 0)
+            assert held(inside(hands)) == MOST_PARKED
+            # control transfers and writes are served all the same, and an answer makes room
+            submit(hog, many + 1, OUT, 2, brake())
+            assert {reply(hog)[1] for _ in range(1)} == {1}
+            protocol._recvall(hog, STATE.size)
+            assert reply(hog)[:3] == (protocol.RET_SUBMIT, many + 1, 0)
+            with host(port) as computer:
+                exchange(computer.find(Side.RIGHT), side=Side.RIGHT)
+        wait_for(lambda: not inside(hands)._server._connections)
+        assert held(inside(hands)) == 0
+        with host(port) as computer:
+            exchange(computer.find())
+
+
+def test_setting_the_configuration_ends_what_waits() -> None:
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        for seqnum in (1, 2):
+            submit(sock, seqnum, IN, 1, b"")
+        setup = bytes((0, 9, 1, 0, 0, 0, 0, 0))
+        sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 3, 0x10002, OUT, 0, 0, 0, 0, 0, 0, setup))
+        for seqnum in (1, 2):
+            assert reply(sock) == (protocol.RET_SUBMIT, seqnum, -errno.ESHUTDOWN, 0)
+        assert reply(sock)[:3] == (protocol.RET_SUBMIT, 3, 0)
+        assert held(inside(hands)) == 0
+
+
+def test_a_number_in_use_is_no_conversation() -> None:
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        submit(sock, 7, IN, 1, b"")
+        submit(sock, 7, IN, 1, b"")
+        assert protocol._recvall(sock, 1) is None
+
+
+def test_a_reply_never_claims_more_than_it_carries() -> None:
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        # a read whose setup packet says write: 255 bytes wanted, none there
+        setup = bytes((0x00, 5, 1, 0, 0, 0, 255, 0))
+        sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 1, 0x10002, IN, 0, 0, 255, 0, 0, 0, setup))
+        assert reply(sock) == (protocol.RET_SUBMIT, 1, 0, 0)
+        # a descriptor of 18 bytes into a transfer of 8
+        setup = bytes((0x80, 6, 0, 1, 0, 0, 18, 0))
+        sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 2, 0x10002, IN, 0, 0, 8, 0, 0, 0, setup))
+        assert reply(sock) == (protocol.RET_SUBMIT, 2, 0, 8)
+
+
+def test_connections_are_bounded_and_the_newest_is_served() -> None:
+    with emulated_dex3(BOTH) as hands, contextlib.ExitStack() as opened:
+        port = inside(hands).port
+        with imported(port, b"1-2") as other:
+            for _ in range(3 * MOST_CONNECTIONS):
+                sock = opened.enter_context(socket.create_connection(("127.0.0.1", port), 5.0))
+                sock.sendall(b"\x01")  # half a header, for ever
+            with host(port) as computer:
+                exchange(computer.find())
+            assert len(inside(hands)._server._connections) <= MOST_CONNECTIONS
+            submit(other, 1, OUT, 2, brake(Side.RIGHT))  # who has a hand keeps it
+            assert reply(other)[:3] == (protocol.RET_SUBMIT, 1, 0)
+
+
+def test_who_never_comes_to_the_point_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "GREETING", 0.05)
+    with emulated_dex3() as hands:
+        port = inside(hands).port
+        with imported(port) as quiet, socket.create_connection(("127.0.0.1", port), 5.0) as half:
+            half.sendall(b"\x01\x11")
+            assert half.recv(1) == b""
+            submit(quiet, 1, OUT, 2, brake())  # who has a hand may be silent
+            assert reply(quiet)[:3] == (protocol.RET_SUBMIT, 1, 0)
+
+
+def test_no_file_descriptor_left_is_no_busy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    with emulated_dex3() as hands:
+        machine = inside(hands)._server
+        tries = []
+
+        class Exhausted:
+            """The listener of a process without file descriptors, three times."""
+
+            def __init__(self, listener: socket.socket) -> None:
+                self._listener = listener
+
+            def accept(self) -> tuple[socket.socket, Any]:
+                tries.append(time.monotonic())
+                if len(tries) <= 3:
+                    raise OSError(errno.EMFILE, "Too many open files")
+                return self._listener.accept()
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(self._listener, name)
+
+            def fileno(self) -> int:
+                return self._listener.fileno()
+
+        monkeypatch.setattr(machine, "_listener", Exhausted(machine._listener))
+        with imported(inside(hands).port) as sock:
+            submit(sock, 1, OUT, 2, brake())
+            assert reply(sock)[:3] == (protocol.RET_SUBMIT, 1, 0)
+        assert len(tries) <= 5  # one for each pause, not thousands
+
+
+def test_a_mistake_in_the_device_costs_one_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    with emulated_dex3(BOTH) as hands:
+        port = inside(hands).port
+        monkeypatch.setattr(inside(hands).device(Side.LEFT), "exchange", broken)
+        with imported(port) as sock:
+            submit(sock, 1, OUT, 2, brake())
+            assert protocol._recvall(sock, 1) is None
+        with host(port) as computer:
+            exchange(computer.find(Side.RIGHT), side=Side.RIGHT)
+        assert isinstance(inside(hands).failure, IndexError)
+        assert inside(hands).error is None
 
 
 def test_no_such_bus() -> None:

@@ -264,7 +264,7 @@ def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
         answer = opened.ask(dxl.encode(9, Instruction.READ, b"\x26\0\2\0"))
         assert answer is not None
         assert answer.data == b"\x40\6"
-    assert [p.name for p in tmp_path.iterdir()] == ["eeprom.json"]
+    assert {p.name for p in tmp_path.iterdir()} == {"eeprom.json", ".eeprom.json.lock"}
 
 
 def test_eeprom_file_without_a_directory_is_an_error_at_once(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ from dexkit.errors import (
     HandTimeout,
     UsageError,
 )
-from dexkit.hand import HandCommand, HandState, MotorError, Side
+from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
 
@@ -384,6 +384,23 @@ def test_ctrl_c_in_an_exchange_switches_the_motor_off(
         assert not gripper.servo.torque
 
 
+def test_a_brake_before_any_command_exerts_no_torque(tmp_path: Path) -> None:
+    with (
+        emulated() as gripper,
+        gripper_on(gripper.path, configured(tmp_path)) as hand,
+    ):
+        state = drive_for(hand, BRAKE, 0.1)
+        assert int(state.mode[0]) == JointMode.BRAKE
+        assert not gripper.servo.torque
+        drive(hand, HALF, at(2.7))
+        drive_for(hand, BRAKE, 0.1)
+        assert gripper.servo.torque, "now there is something to brake"
+        hand.close()
+        hand.open()  # a link that came back
+        drive_for(hand, BRAKE, 0.1)
+        assert not gripper.servo.torque
+
+
 def test_zero_gains_leave_it_alone_and_brake_holds(tmp_path: Path) -> None:
     with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
         before = travel(gripper)
@@ -501,7 +518,7 @@ def test_overload_in_motion_is_recovered_without_a_new_motion(tmp_path: Path) ->
         for command in (CLOSE, BRAKE, CLOSE):
             drive_for(hand, command, 0.15)
         assert travel(gripper) == pytest.approx(stopped, abs=10)
-        assert gripper.servo.torque, "and holds"
+        assert not gripper.servo.torque, "nobody has asked for torque since"
         drive(hand, OPEN, at(5.4))
 
 
@@ -568,7 +585,7 @@ def test_a_servo_that_has_cooled_down_is_restarted_by_whoever_comes_next(tmp_pat
 def test_a_supply_dip_that_resets_the_servo(tmp_path: Path) -> None:
     with (
         emulated(start=80.0) as gripper,
-        gripper_on(gripper.path, configured(tmp_path, timeout=0.03)) as hand,
+        gripper_on(gripper.path, configured(tmp_path, timeout=0.1)) as hand,
     ):
         drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
         gripper.inject("brown-out:volts=5,for=200ms")
@@ -587,6 +604,9 @@ def test_a_supply_dip_that_resets_the_servo(tmp_path: Path) -> None:
         assert bits == (MotorError.ABNORMAL_RESET,)
         state = until_recovered(hand, CLOSE)
         stopped = travel(gripper)
+        for command in (BRAKE, CLOSE, BRAKE):
+            drive_for(hand, command, 0.05)
+            assert not gripper.servo.torque, "nobody has asked for torque since"
         assert float(state.q[0]) == pytest.approx(stopped * 5.4 / 2500, abs=0.05)
         drive_for(hand, CLOSE, 0.3)
         assert travel(gripper) == pytest.approx(stopped, abs=10)

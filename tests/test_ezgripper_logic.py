@@ -345,6 +345,7 @@ def test_position_command_goes_to_q_in_the_servos_present_turn() -> None:
 
 def test_brake_holds_where_it_began_at_rest() -> None:
     control = Control(ZERO)
+    control.plan(LIMP, _sample(-0.1, ZERO + 600))
     held = control.plan(BRAKE, _sample(0.0, ZERO + 600))
     assert (held.position, held.current) == (ZERO + 600, 240)
     # it drifts, is pushed, is told to brake again: the goal stays
@@ -353,6 +354,22 @@ def test_brake_holds_where_it_began_at_rest() -> None:
         assert control.plan(BRAKE, sample).position == ZERO + 600
     control.plan(OPEN, _sample(0.1, ZERO + 650))
     assert control.plan(BRAKE, _sample(0.12, ZERO + 800)).position == ZERO + 800
+
+
+def test_nobody_asked_for_torque_before_the_first_command() -> None:
+    for control in (Control(ZERO), Control(ZERO)):
+        for i, position in enumerate((600, 650, 700)):  # the springs open the fingers
+            goal = control.plan(BRAKE, _sample(0.01 * i, ZERO + position, velocity=50))
+            assert (goal.position, goal.current) == (ZERO + position, 0)
+            assert control.phase is Phase.BRAKE
+        # a command, then silence: the service brakes, and the fingers are held
+        assert control.plan(CLOSE, _sample(1.0, ZERO + 700)).current == 800
+        assert control.plan(BRAKE, _sample(1.1, ZERO + 600)).current == 240
+        # a restart of the servo: it begins anew
+        control.recovered(CLOSE)
+        assert control.plan(BRAKE, _sample(2.0, ZERO + 600)).current == 0
+        assert control.plan(CLOSE, _sample(2.1, ZERO + 600)).current == 0
+        assert control.plan(OPEN, _sample(2.2, ZERO + 600)).current == 800
 
 
 def test_brake_in_motion_stops_and_does_not_come_back() -> None:
@@ -431,7 +448,8 @@ def test_after_a_recovery_nothing_moves_until_the_command_changes() -> None:
         command = BRAKE if i % 10 == 5 else CLOSE
         goal = control.plan(command, _sample(1.0 + i * 0.01, folded))
         assert goal.position == folded
-        assert goal.current == 240
+        assert goal.current == 0
+        assert control.phase is Phase.BRAKE
     # a new command acts, but with no more than the hold effort against the same load
     squeeze = control.plan(HandCommand.position(0.1), _sample(3.0, folded))
     assert squeeze.position < folded
@@ -471,6 +489,7 @@ def test_goals_stay_within_stroke_and_effort(
 ) -> None:
     control = Control(zero, ControlSettings(effort=40, hold_effort=20))
     now = 0.0
+    commanded = False
     for command, relative, dt, temperature in steps:
         now += dt
         position = (zero + relative) % 4096 if fold else zero + relative
@@ -481,8 +500,9 @@ def test_goals_stay_within_stroke_and_effort(
             continue
         assert goal.profile_velocity in (FULL, SLOW)
         target = scaling.relative_position(goal.position, zero)
+        commanded = commanded or not command.is_brake
         if command.is_brake:
-            assert goal.current in (320, 640)
+            assert goal.current in ((320, 640) if commanded else (0,))
         elif command.kp[0] == 0:
             assert goal.current == 0
             assert goal.position == position
@@ -572,7 +592,8 @@ def test_store_keeps_what_it_does_not_know(tmp_path: Path) -> None:
     assert store.read("B#2").force_table == DEFAULT_FORCE_TABLE
     assert json.loads(path.read_text())["left"] == "/dev/ttyUSB0"
     assert store.keys() == ["A", "B#2"]
-    assert [p.name for p in path.parent.iterdir()] == ["file.json"], "no temporary file stays"
+    there = sorted(p.name for p in path.parent.iterdir())
+    assert there == [".file.json.lock", "file.json"], "no temporary file stays"
 
 
 def test_a_file_of_seed_003_reads(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import logging
 import math
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,13 +22,13 @@ from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
+from dexkit.sole import LOOK, Place, SolePublisher
 
 __all__ = ["Bridge", "End"]
 
 _log = logging.getLogger("dexkit.bridge")
 _counters_log = logging.getLogger("dexkit.bridge.counters")
 
-_DISCOVERY = 0.3  # seconds to look for other publishers, as dexkit serve does
 _TICK = 0.05  # seconds after which a direction looks at the clock when nothing comes
 _JOIN = 2.0  # seconds that a stopping thread is given; a write blocks for 0.1 at most
 
@@ -85,6 +85,17 @@ class Bridge:
         self._clock: Clock = clock if clock is not None else RealClock()
         self._stop = threading.Event()
         self._ways: list[_Way] = []
+        self._sole = SolePublisher(
+            [
+                Place(end.node, frozenset(topics), _of_type(kind))
+                for end, topics, kind in (
+                    (client, self.states.outputs, client.dialect.state_type),
+                    (gripper, self.commands.outputs, gripper.dialect.cmd_type),
+                )
+            ],
+            hint=self.COMPANY_HINT,
+            force=force,
+        )
 
     # -- life -------------------------------------------------------------------------------
 
@@ -102,15 +113,19 @@ class Bridge:
             the other way what this would carry (unless ``force``).
         :raises DdsSetupError: an endpoint cannot be made.
         """
+        sole = self._sole
         if not self._force:
-            self._refuse_company()
+            self._refuse_loop()
+        sole.look()
+        claim = sole.announce()
         try:
             for direction, source, target in (
                 (self.commands, self.client, self.gripper),
                 (self.states, self.gripper, self.client),
             ):
-                way = _Way(self, direction, source.node, target.node)
-                self._ways.append(way)
+                self._ways.append(_Way(self, direction, source.node, target.node, claim))
+            sole.settle(self._stirred)
+            for way in self._ways:
                 way.thread.start()
         except BaseException:
             self.stop()
@@ -119,8 +134,13 @@ class Bridge:
     def stop(self) -> None:
         """Leave the topics. The grippers hear no more commands, and brake. May be called twice."""
         self._stop.set()
+        self._sole.close()
         for way in self._ways:
             way.close()
+
+    def _stirred(self) -> None:
+        for way in self._ways:
+            way.wake()
 
     # -- what it says of itself ---------------------------------------------------------------
 
@@ -141,13 +161,15 @@ class Bridge:
 
     def snapshot(self) -> dict[str, dict[str, int]]:
         """All counters by direction."""
-        return {
+        found = {
             name: {
                 **direction.counts.snapshot(),
                 **{str(side): n for side, n in direction.parts.items()},
             }
             for name, direction in (("commands", self.commands), ("states", self.states))
         }
+        found["company"] = {"rivals": self._sole.rivals}
+        return found
 
     def log_counters(self) -> None:
         """Log :meth:`snapshot` as one line of JSON."""
@@ -156,18 +178,8 @@ class Bridge:
     # -- company ------------------------------------------------------------------------------
 
     def others(self) -> str | None:
-        """Who else publishes what this bridge publishes; None: nobody.
-
-        Publishers of another type on a topic of that name do not count: they never match.
-        """
-        for end, topics, type_name in (
-            (self.client, self.states.outputs, self.client.dialect.state_type),
-            (self.gripper, self.commands.outputs, self.gripper.dialect.cmd_type),
-        ):
-            for e in _foreign_writers(end.node, topics, type_name):
-                who = e.process or "somebody"
-                return f"{who} already publishes {e.topic} on domain {end.node.domain}"
-        return None
+        """Who else publishes what this bridge publishes; None: nobody."""
+        return self._sole.company()
 
     def reverse(self) -> str | None:
         """Who plays the client's role here and the gripper's there: a bridge back; or None."""
@@ -187,10 +199,10 @@ class Bridge:
                 )
         return None
 
-    def _refuse_company(self) -> None:
+    def _refuse_loop(self) -> None:
         for node in {self.client.node, self.gripper.node}:
-            node.discovery.wait(lambda _: self.others() or self.reverse(), _DISCOVERY)
-        if found := self.others() or self.reverse():
+            node.discovery.wait(lambda _: self.reverse() or self.others(), LOOK)
+        if found := self.reverse():
             raise TopicConflict(found, hint=self.COMPANY_HINT)
 
 
@@ -198,13 +210,19 @@ class _Way:
     """One direction on DDS."""
 
     def __init__(
-        self, bridge: Bridge, direction: Direction, source: DdsNode, target: DdsNode
+        self,
+        bridge: Bridge,
+        direction: Direction,
+        source: DdsNode,
+        target: DdsNode,
+        claim: bytes,
     ) -> None:
         self.direction = direction
         self._bridge = bridge
         self._wake = threading.Event()
         self._writers: Mapping[str, Writer] = {
-            topic: target.writer(topic, direction.written) for topic in direction.outputs
+            topic: target.writer(topic, direction.written, user_data=claim)
+            for topic in direction.outputs
         }
         self._readers: Mapping[str, Reader] = {
             topic: source.reader(topic, direction.read, on_data=self._wake.set)
@@ -220,6 +238,9 @@ class _Way:
     def writers(self) -> list[Writer]:
         return list(self._writers.values())
 
+    def wake(self) -> None:
+        self._wake.set()
+
     def close(self) -> None:
         self._wake.set()
         if self.thread.ident is not None:
@@ -232,6 +253,8 @@ class _Way:
         try:
             while not self._bridge._stop.is_set():
                 self._turn()
+        except TopicConflict as error:
+            self._bridge.failure = error
         except Exception as error:  # nothing may die in silence
             _log.exception("the bridge died")
             self._bridge.failure = error
@@ -242,6 +265,7 @@ class _Way:
         self._wake.wait(_TICK if due is None else min(_TICK, max(0.0, due - clock.now())))
         self._wake.clear()
         self._stood_still()
+        self._bridge._sole.poll()
         for topic, reader in self._readers.items():
             for sample in reader.take():
                 self._receive(topic, sample)
@@ -296,6 +320,11 @@ class _Way:
         if kind not in self._said:
             self._said.add(kind)
             _log.warning("%s", text)
+
+
+def _of_type(name: str) -> Callable[[Any], bool]:
+    """A publisher of another type on a topic of that name never matches."""
+    return lambda endpoint: bool(endpoint.type_name == name)
 
 
 def _foreign_writers(node: DdsNode, topics: Mapping[str, Any], type_name: str) -> list[Endpoint]:

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import StopRequest, dds_options, log_to_stderr, stop_on_signals
+from dexkit.cli.common import (
+    MOST_REMARKS,
+    StopRequest,
+    dds_options,
+    log_to_stderr,
+    stop_on_signals,
+)
 from dexkit.errors import DexkitError, TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, dialect
@@ -124,6 +130,8 @@ def command(
             sys.stdout.flush()
             trouble = _watch(bridge, stop, duration, status, force)
         bridge.log_counters()
+    if isinstance(bridge.failure, TopicConflict):
+        raise bridge.failure
     if bridge.failure is not None:
         raise DexkitError(f"the bridge died: {bridge.failure}")
     if trouble:
@@ -152,7 +160,7 @@ def _watch(
         if not force and (found := bridge.reverse()):
             return found
         for text in _hints(bridge, time.monotonic() - started):
-            if text not in said:
+            if text not in said and len(said) < MOST_REMARKS:
                 said.add(text)
                 _log.warning("%s", text)
         line = next(rates)
@@ -165,8 +173,6 @@ def _watch(
 
 def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
     commands, states = bridge.commands, bridge.states
-    if found := bridge.others():
-        yield f"{found}, too; the two fight"
     for direction, who in ((commands, "client"), (states, "gripper")):
         counts, topics = direction.counts, " and ".join(direction.inputs)
         for count, what in (

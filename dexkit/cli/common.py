@@ -15,6 +15,7 @@ from dexkit.stopping import StopRequest, stop_on_signals
 F = TypeVar("F", bound=Callable[..., Any])
 
 __all__ = [
+    "MOST_REMARKS",
     "STATUS_LINES",
     "StatusLine",
     "StopRequest",
@@ -23,6 +24,8 @@ __all__ = [
     "stop_on_signals",
 ]
 
+MOST_REMARKS = 100
+"""Different warnings about peers in one run: what they announce is theirs to make up."""
 STATUS_LINES = "DEXKIT_STATUS_LINES"
 """Environment variable: set by a command that starts others and shows what they are doing."""
 

@@ -13,17 +13,15 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
-from dexkit.errors import DdsError, TopicConflict, TraceUnsupported
+from dexkit.errors import DdsError, TraceUnsupported
+from dexkit.sole import Place, SolePublisher
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
-    from dexkit.traces import Player, Trace
+    from dexkit.traces import Player, Trace, TraceMessage
 
 __all__ = ["command"]
 
-#: Seconds in which other publishers on the topics are looked for; discovery on one machine takes
-#: a few tens of milliseconds.
-LOOK = 1.0
 # Seconds from a match seen here to the first message, for the other side to see it too: what comes
 # before is lost to it. Unitree's SDK sleeps as long after making a writer (facts/unitree-dex A.6).
 _SETTLE = 0.2
@@ -83,8 +81,8 @@ def command(
     """Publish the commands in a recording on DDS, with their recorded timing.
 
     Waits until each topic is subscribed, then plays. Refuses to play while somebody else
-    publishes on the same topics. The default domain is 1, the simulation's: --domain 0 with a
-    robot's interface moves real hands.
+    publishes on the same topics, and ends when somebody comes who does. The default domain is 1,
+    the simulation's: --domain 0 with a robot's interface moves real hands.
     """
     from dexkit.dds import DdsNode
     from dexkit.traces import Player, open_trace
@@ -99,9 +97,20 @@ def command(
         + (", looped" if loop else "")
     )
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        if not force:
-            _refuse_company(node, player)
-        writers = {topic: node.writer(topic, name) for topic, name in player.topics.items()}
+        # two sources of commands fight over the hand: a recording gives way to whoever comes
+        sole = SolePublisher(
+            [Place(node, player.topics)],
+            hint="stop that publisher, choose another --domain, or play anyway with --force",
+            force=force,
+            yields=True,
+        )
+        sole.look()
+        claim = sole.announce()
+        writers = {
+            topic: node.writer(topic, name, user_data=claim)
+            for topic, name in player.topics.items()
+        }
+        sole.settle()
         if not no_wait:
             _wait_for_readers(node, writers, wait, stop)
             stop.wait(_SETTLE)
@@ -109,9 +118,12 @@ def command(
             return 130
         click.echo(f"ready: playing on domain {domain}, {interface}")
         with _smooth(), _status(player):
-            stats = player.play(
-                lambda message: writers[message.topic].write_raw(message.data), stop=stop.event
-            )
+
+            def send(message: TraceMessage) -> object:
+                sole.poll()
+                return writers[message.topic].write_raw(message.data)
+
+            stats = player.play(send, stop=stop.event)
         time.sleep(_LINGER)
     click.echo(
         f"sent {stats.sent} messages in {stats.duration:.1f} s"
@@ -131,27 +143,6 @@ def _check_types(trace: Trace, player: Player) -> None:
                 f"{channel.topic} cannot be played: {channel.problem}",
                 hint="choose other topics with --topic",
             )
-
-
-def _refuse_company(node: DdsNode, player: Player) -> None:
-    """Two sources of commands fight over the hand.
-
-    :raises TopicConflict: somebody else publishes on a topic that is to be played.
-    """
-
-    def others() -> list[str]:
-        return sorted(
-            f"{e.topic} ({e.process or 'unknown process'})"
-            for e in node.endpoints()
-            if e.kind == "writer" and not e.own and e.topic in player.topics
-        )
-
-    node.discovery.wait(lambda _: others(), timeout=LOOK)
-    if found := others():
-        raise TopicConflict(
-            f"somebody else publishes on domain {node.domain}: {', '.join(found)}",
-            hint="stop that publisher, choose another --domain, or play anyway with --force",
-        )
 
 
 def _wait_for_readers(

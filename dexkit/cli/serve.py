@@ -14,13 +14,14 @@ import click
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.common import (
+    MOST_REMARKS,
     StatusLine,
     StopRequest,
     dds_options,
     log_to_stderr,
     stop_on_signals,
 )
-from dexkit.errors import DexkitError, UsageError
+from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Hand, Side
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
@@ -200,6 +201,8 @@ def command(
         for service in services:
             service.log_counters()
     for service in services:
+        if isinstance(service.failure, TopicConflict):
+            raise service.failure
         if service.failure is not None:
             raise DexkitError(f"the service died: {service.failure}")
     return 0
@@ -284,7 +287,7 @@ def _watch(services: Sequence[HandService], stop: StopRequest, status: StatusLin
             return
         for service in services:
             for text in _mismatches(service):
-                if text not in said:
+                if text not in said and len(said) < MOST_REMARKS:
                     said.add(text)
                     log.warning("%s", text)
         lonely = lonely and not any(service.clients for service in services)

@@ -148,9 +148,7 @@ def command(
         if record_path is not None:
             _record(stack, record_path, spoken, domain, interface)
         node = stack.enter_context(DdsNode(domain=domain, interface=interface))
-        if not force:
-            LiveClient.refuse_company(node, spoken, sides)
-        live = LiveClient(node, client)
+        live = LiveClient(node, client, force=force)
         waiting = _Waiting(node, spoken, patience)
         if not live.wait_ready(stop.event, waiting):
             return 130

@@ -45,13 +45,14 @@ from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
 from dexkit.service.publisher import Publisher, align
+from dexkit.sole import Place, SolePublisher
 
 __all__ = ["HandService", "Node"]
 
 log = logging.getLogger("dexkit.service")
 _counters_log = logging.getLogger("dexkit.service.counters")
 
-_DISCOVERY = 0.3  # seconds to look for another publisher of the state topic
+_CONFLICT_HINT = "stop the other service, choose another --domain, or add --force"
 _JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-out
 # seconds between the last state and the good-bye: a busy reader that learns of the good-bye
 # first drops the state, as from nobody, and goes on believing that the hand is driven
@@ -74,7 +75,9 @@ class _Reader(Protocol):
 class Node(Protocol):
     """The part of :class:`dexkit.dds.DdsNode` that the service needs."""
 
-    def writer(self, topic: str, type_name: str) -> _Writer: ...  # noqa: D102
+    def writer(  # noqa: D102
+        self, topic: str, type_name: str, *, user_data: bytes = b""
+    ) -> _Writer: ...
     def reader(  # noqa: D102
         self, topic: str, type_name: str, *, on_data: Callable[[], object] | None = None
     ) -> _Reader: ...
@@ -105,8 +108,11 @@ class HandService:
     :param phase: when in a period the hand is exchanged with, 0 to 1; state is published at 0.
     :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
-    :param force: start even if somebody else publishes the state topic.
+    :param force: start, and go on, even if somebody else publishes the state topic.
     :raises UsageError: hands and dialect do not fit.
+
+    A service that is to give way to another one after its start (:mod:`dexkit.sole`) brakes and
+    releases its hands; :attr:`failure` then is a :class:`~dexkit.errors.TopicConflict`.
 
     A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
     and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.
@@ -156,6 +162,7 @@ class HandService:
         self._publisher = publisher or Publisher(self.state_rate, self._clock)
         self._node, self._own_node = node, node is None
         self._wait_for_device, self._force = wait_for_device, force
+        self._sole: SolePublisher | None = None
         self._units = [
             _Unit(
                 hand,
@@ -221,12 +228,22 @@ class HandService:
             from dexkit.dds import DdsNode
 
             node = self._node = DdsNode(domain=self.domain, interface=self.interface)
-        self._refuse_conflict(node)
+        # no hand is touched before it is certain that no other service has these topics
+        topics = {self.state_topic, self.low_rate_topic} - {""}
+        sole = self._sole = SolePublisher(
+            [Place(node, topics)], hint=_CONFLICT_HINT, force=self._force
+        )
+        sole.look()
+        claim = sole.announce()
+        self._writer = node.writer(self.state_topic, self.dialect.state_type, user_data=claim)
+        if self.low_rate_topic:
+            self._low_rate_writer = node.writer(
+                self.low_rate_topic, self.dialect.state_type, user_data=claim
+            )
+        sole.settle(self._wake.set)
         for unit in self._units:
             self._open_first(unit)
-        self._writer = node.writer(self.state_topic, self.dialect.state_type)
         if self.low_rate_topic:
-            self._low_rate_writer = node.writer(self.low_rate_topic, self.dialect.state_type)
             self._low_rate_every = max(1, round(self.state_rate / self.model.low_rate))
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
         self._receive_watch.restart()  # from here on commands may wait to be received
@@ -247,6 +264,8 @@ class HandService:
     def _release(self) -> None:
         self._stop.set()
         self._wake.set()
+        if self._sole is not None:
+            self._sole.close()
         self._publisher.remove(self._tick)
         for unit in self._units:
             thread = unit.thread
@@ -259,7 +278,8 @@ class HandService:
                 self._close_hand(unit)
         if self._receiving is not None and self._receiving.ident is not None:
             self._receiving.join()
-        if self._writer is not None and self._receiving is not None:
+        gave_way = isinstance(self.failure, TopicConflict)
+        if self._writer is not None and self._receiving is not None and not gave_way:
             self._publish(self._compose(), low_rate=True)
             if self.clients:
                 time.sleep(_LAST_WORDS)
@@ -274,6 +294,9 @@ class HandService:
         def run() -> None:
             try:
                 target(*args)
+            except TopicConflict as error:
+                log.error("%s; this service ends", error)
+                self.failure = error
             except Exception as error:  # nothing may die in silence
                 log.exception("the %s thread died", name)
                 self.failure = error
@@ -311,6 +334,7 @@ class HandService:
             "cmd_topic": self.cmd_topic,
             "state_topic": self.state_topic,
             **self.counters.snapshot(),
+            "rivals": self._sole.rivals if self._sole is not None else 0,
             "hands": hands,
         }
 
@@ -322,10 +346,12 @@ class HandService:
 
     def _receive_loop(self) -> None:
         assert self._reader is not None
+        assert self._sole is not None
         while not self._stop.is_set():
             self._wake.wait(_TICK)
             self._wake.clear()
             self._look_received()
+            self._sole.poll()
             for sample in self._reader.take():
                 self._receive(sample)
 
@@ -606,31 +632,6 @@ class HandService:
         self.counters.publish_errors += 1
         if self.counters.publish_errors == 1:
             log.error("%s: cannot publish: %s", self.state_topic, error)
-
-    # -- conflicts --------------------------------------------------------------------------
-
-    def _refuse_conflict(self, node: Node) -> None:
-        if self._force:
-            return
-
-        def others() -> list[Any]:
-            return [
-                e
-                for e in node.endpoints()
-                if e.topic in (self.state_topic, self.low_rate_topic)
-                and e.kind == "writer"
-                and not e.own
-            ]
-
-        discovery = getattr(node, "discovery", None)
-        if discovery is not None:
-            discovery.wait(lambda *_: bool(others()), _DISCOVERY)
-        if found := others():
-            who = ", ".join(sorted({e.process for e in found if e.process})) or "somebody"
-            raise TopicConflict(
-                f"{who} already publishes {self.state_topic} on domain {self.domain}",
-                hint="stop the other service, choose another --domain, or add --force",
-            )
 
 
 def _beyond(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:

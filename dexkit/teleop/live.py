@@ -17,18 +17,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.dds import DdsNode, Qos
-from dexkit.errors import TopicConflict, WireError
+from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
+from dexkit.sole import Place, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator
 from dexkit.teleop.wire import ClientWire
 
-__all__ = ["LOOK", "LiveClient", "Session"]
+__all__ = ["LiveClient", "Session"]
 
-LOOK = 0.5
-"""Seconds in which other writers of the command topics are looked for."""
 _LEAVING = 0.25  # seconds of commands to stay where it is, at the end
 _NAP = 0.1
 
@@ -84,9 +83,13 @@ class LiveClient:
     """A client's endpoints on a node, and its loops.
 
     :param client: fresh, for the sides that it is to drive.
+    :param force: command beside others. Two clients on one hand would fight, and a real one may
+        carry something: this one gives way to whoever is there or comes.
+    :raises TopicConflict: somebody else commands one of these hands. So do :meth:`wait_ready` and
+        :meth:`perform`, when somebody comes.
     """
 
-    def __init__(self, node: DdsNode, client: TeleopClient) -> None:
+    def __init__(self, node: DdsNode, client: TeleopClient, *, force: bool = False) -> None:
         self._node = node
         self._client = client
         self._wire = ClientWire(client.dialect)
@@ -94,38 +97,26 @@ class LiveClient:
         dialect: Dialect = client.dialect
         commands = dict.fromkeys(self._wire.command_topics[s] for s in client.sides)
         states = dict.fromkeys(self._wire.state_topics[s] for s in client.sides)
+        self._sole = SolePublisher(
+            [Place(node, commands)],
+            verb="commands",
+            hint="stop that client, choose another --domain, or go on with --force",
+            force=force,
+            yields=True,
+        )
+        self._sole.look()
+        claim = self._sole.announce()
         self._writers = {
-            topic: node.writer(topic, dialect.cmd_type, qos=Qos.writer_default())
+            topic: node.writer(topic, dialect.cmd_type, qos=Qos.writer_default(), user_data=claim)
             for topic in commands
         }
+        self._sole.settle(self._arrived.set)
         self._readers = {
             topic: node.reader(
                 topic, dialect.state_type, qos=Qos.reader_default(), on_data=self._arrived.set
             )
             for topic in states
         }
-
-    @staticmethod
-    def refuse_company(node: DdsNode, spoken: Dialect, sides: Sequence[Side]) -> None:
-        """Two clients on one hand would fight, and a real one may carry something.
-
-        :raises TopicConflict: somebody else publishes commands to one of these hands.
-        """
-        topics = {spoken.topics(s)[0] for s in sides}
-
-        def strangers() -> list[str]:
-            return sorted(
-                f"{e.topic} ({e.process or 'unknown process'})"
-                for e in node.endpoints()
-                if e.kind == "writer" and not e.own and e.topic in topics
-            )
-
-        node.discovery.wait(lambda _: strangers(), timeout=LOOK)
-        if found := strangers():
-            raise TopicConflict(
-                f"somebody else commands this hand on domain {node.domain}: {', '.join(found)}",
-                hint="stop that client, choose another --domain, or go on with --force",
-            )
 
     def wait_ready(
         self, stop: threading.Event, say: Callable[[Mapping[Side, str], float], object]
@@ -139,6 +130,7 @@ class LiveClient:
         told = 0.0
         while not stop.is_set():
             now = time.monotonic()
+            self._sole.poll()
             self._read(now)
             if self._client.ready and all(w.matched for w in self._writers.values()):
                 return True
@@ -175,6 +167,7 @@ class LiveClient:
             now = time.monotonic()
             if now - start >= duration:
                 break
+            self._sole.poll()
             session.note(session.states, now - start, self._read(now))
             inputs = operator.inputs(now - start, self._client.sides)
             commands = self._client.step(now, {}, inputs)
@@ -197,6 +190,8 @@ class LiveClient:
         Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
         to stay where it is, a Dex3-1 or Dex5-1 with its motors locked (status 0 of the mode byte).
         """
+        if self._sole.lost:  # somebody else commands them now
+            return
         poses = self._client.receiver.seen
         stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
         end = time.monotonic() + _LEAVING

@@ -7,7 +7,7 @@ byte before its data. (facts/mx64 A1 to A5.)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -22,6 +22,7 @@ __all__ = [
     "CLEAR_POSITION_KEY",
     "HEADER",
     "MAX_ID",
+    "MAX_LENGTH",
     "MAX_PACKET",
     "ErrorNumber",
     "Instruction",
@@ -30,6 +31,7 @@ __all__ = [
     "crc16",
     "decode",
     "encode",
+    "fast_length",
     "fast_status",
     "split_fast_status",
     "status",
@@ -44,6 +46,8 @@ ALERT = 0x80
 """Bit of a status packet's error byte: Hardware Error Status is not zero."""
 MAX_PACKET = 1024
 """Longest packet, header and CRC included: the bound of ROBOTIS' own SDK (facts/mx64 A1)."""
+MAX_LENGTH = MAX_PACKET - 7
+"""Largest value of a packet's length field."""
 CLEAR_POSITION_KEY = bytes.fromhex("0144584c22")
 BACKUP_KEY = b"CTRL"
 
@@ -189,6 +193,14 @@ def status(packet_id: int, error: int = 0, data: bytes = b"") -> bytes:
     return encode(packet_id, Instruction.STATUS, bytes((error,)) + data)
 
 
+def fast_length(sizes: Iterable[int]) -> int:
+    """Length field of the combined status of a fast read.
+
+    :param sizes: data bytes of each device.
+    """
+    return 1 + sum(4 + size for size in sizes)
+
+
 def fast_status(parts: Sequence[tuple[int, int, bytes]]) -> bytes:
     """Combined status of a fast sync or bulk read, which is never stuffed.
 
@@ -200,7 +212,7 @@ def fast_status(parts: Sequence[tuple[int, int, bytes]]) -> bytes:
     """
     if not parts:
         raise EncodeError("a combined status needs at least one device")
-    length = 1 + sum(4 + len(data) for _, _, data in parts)
+    length = fast_length(len(data) for _, _, data in parts)
     if length + _OVERHEAD > MAX_PACKET:
         raise OversizeError(f"a packet of {length + _OVERHEAD} bytes; at most {MAX_PACKET}")
     out = bytearray(HEADER)

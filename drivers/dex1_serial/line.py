@@ -32,6 +32,10 @@ log = logging.getLogger(__name__)
 LATE = 0.01
 """Seconds that a late answer is waited for, before the next command is sent."""
 _CHUNK = 4096
+_MOST_STRAY = 64
+"""Chunks that are passed over before a command: more than an adapter and the kernel hold."""
+_LATE_LOOKS = 8
+"""Chunks that are looked at after the deadline of an answer, for the same reason."""
 
 
 @dataclass
@@ -121,7 +125,9 @@ class MotorLine:
         if self._owed:
             self._owed = False
             select.select([fd], [], [], LATE)
-        while data := self._read(fd):
+        for _ in range(_MOST_STRAY):  # a device that never stops must not keep this for ever
+            if not (data := self._read(fd)):
+                break
             statistics.stray += len(data)
         parser.reset()
         if before is not None:
@@ -130,9 +136,14 @@ class MotorLine:
             raise HandLost(f"the port {self.path} takes no more bytes")
         deadline = time.monotonic() + timeout
         skipped, errors = parser.skipped, parser.crc_errors
+        late = 0
         try:
-            # a look after the deadline, too: the answer may be there, and this process was late
-            while select.select([fd], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            # looks after the deadline, too: the answer may be there, and this process was late
+            while late < _LATE_LOOKS:
+                left = deadline - time.monotonic()
+                late += left <= 0
+                if not select.select([fd], [], [], max(0.0, left))[0]:
+                    break
                 data = self._read(fd)
                 if not data:
                     raise HandLost(f"the port {self.path} has gone away: no data")

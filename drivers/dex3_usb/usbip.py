@@ -37,8 +37,10 @@ _TIMEVAL = struct.Struct("@ll")
 _CMD_SUBMIT, _CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 1, 2, 3, 4
 _OUT, _IN = 0, 1
 _NO_SETUP = bytes(8)
-_CONNECT_TIMEOUT = 1.0  # seconds to connect, list and import
+_CONNECT_TIMEOUT = 1.0  # seconds to connect, and for each piece of a list or an import
+_GREETING = 3.0  # seconds for all of a list, or all of an import
 _CONTROL_TIMEOUT = 1000  # milliseconds of a control transfer that names no time-out
+_LATE_LOOKS = 8  # chunks of the receive buffer
 _LARGEST = 1 << 16  # bytes of an answer; the largest descriptor that there can be
 
 
@@ -63,6 +65,7 @@ class _Connection:
         self._view = memoryview(self._buffer)
         self._begin = self._end = 0  # of what was received and not yet looked at
         self._broken = ""
+        self._late = 0  # times that bytes were taken after the deadline of what is waited for
 
     def close(self) -> None:
         """Give the device back. May be called twice."""
@@ -190,6 +193,11 @@ class _Connection:
 
     def _fill(self, deadline: float) -> None:
         self._check()
+        # what is there already is looked at, for this process may be late; but not for ever
+        self._late = self._late + 1 if time.monotonic() > deadline else 0
+        if self._late > _LATE_LOOKS:
+            self._late = 0
+            raise USBTimeoutError("no answer over USB/IP", errno=errno.ETIMEDOUT)
         if self._begin == self._end:
             self._begin = self._end = 0
         elif self._begin:
@@ -235,14 +243,44 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__(host, port, _CONNECT_TIMEOUT)
+        self._deadline = math.inf  # of a list or an import
+
+    def enumerate_devices(self) -> list[Any]:
+        """The devices that the server lists."""
+        self._deadline = time.monotonic() + _GREETING
+        try:
+            return list(super().enumerate_devices())
+        finally:
+            self._deadline = math.inf
+
+    def _recv_exact(self, sock: socket.socket, size: int) -> bytes:
+        """Bytes of a list or an import: all of it within a time, however slowly it comes."""
+        received = bytearray()
+        while len(received) < size:
+            if time.monotonic() > self._deadline:
+                raise USBTimeoutError("the USB/IP server is too slow", errno=errno.ETIMEDOUT)
+            piece = sock.recv(size - len(received))
+            if not piece:
+                raise USBError("the USB/IP server closed the connection", errno=errno.ECONNRESET)
+            received += piece
+        return bytes(received)
+
+    def _get_config_data(self, dev: Any, config_index: int) -> Any:
+        try:
+            return super()._get_config_data(dev, config_index)
+        except (ValueError, IndexError, struct.error) as error:
+            raise USBError(f"a broken configuration: {error}", errno=errno.EPROTO) from error
 
     def _import_device(self, dev: Any) -> _Connection:
+        self._deadline = time.monotonic() + _GREETING
         try:
             imported = super()._import_device(dev)
         except USBError as error:
             if "import failed" in str(error):  # it is listed, but not to be had
                 raise USBError(str(error), errno=errno.EBUSY) from error
             raise
+        finally:
+            self._deadline = math.inf
         return _Connection(imported.sock, dev.devid)
 
     def close_device(self, dev_handle: _Connection) -> None:

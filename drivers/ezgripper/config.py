@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ import platformdirs
 
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.errors import UsageError
+from dexkit.files import update_file
 from dexkit.wire import mx64
 
 __all__ = ["ENVIRONMENT", "GripperRecord", "Store", "default_path", "record_key"]
@@ -81,6 +81,9 @@ class Store:
             return {}
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"cannot read {self.path}: {error}") from error
+        return self._parse(text)
+
+    def _parse(self, text: str) -> dict[str, Any]:
         try:
             # NaN and Infinity are no JSON, and no calibration either
             content = json.loads(text, parse_constant=_refuse_constant)
@@ -153,11 +156,19 @@ class Store:
     def write(self, key: str, record: GripperRecord) -> None:
         """Store what ``record`` knows; what it does not know stays as it is in the file.
 
-        The file is replaced in one step, so that it is whole at any moment.
+        What other programs store at the same time is kept (:func:`dexkit.files.update_file`).
 
         :raises UsageError: the file cannot be read or written.
         """
-        content = self._load()
+
+        def change(text: str | None) -> str:
+            content = {} if text is None else self._parse(text)
+            self._enter(content, key, record)
+            return json.dumps(content, indent=2, sort_keys=True) + "\n"
+
+        update_file(self.path, change)
+
+    def _enter(self, content: dict[str, Any], key: str, record: GripperRecord) -> None:
         if record.zero is not None:
             content[_ZERO] = self._section(content, _ZERO) | {
                 key: record.zero % mx64.TICKS_PER_TURN
@@ -173,22 +184,6 @@ class Store:
             content[_FORCE] = self._section(content, _FORCE) | {
                 key: record.force_table.to_mapping()
             }
-        text = json.dumps(content, indent=2, sort_keys=True) + "\n"
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(
-                "w", dir=self.path.parent, prefix=self.path.name, delete=False, encoding="utf-8"
-            ) as file:
-                try:
-                    file.write(text)
-                    file.flush()
-                    os.fsync(file.fileno())
-                    os.replace(file.name, self.path)
-                except BaseException:
-                    os.unlink(file.name)
-                    raise
-        except OSError as error:
-            raise UsageError(f"cannot write {self.path}: {error}") from error
 
 
 def _refuse_constant(name: str) -> float:

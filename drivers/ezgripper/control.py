@@ -5,7 +5,9 @@ Pure logic on the injected time. The phases:
 - *limp*: command with kp = 0. The motor carries no current (the springs open the fingers), as
   the vendor's motor with zero gains (facts/unitree-dex B.2, D 10). tau and kd do not act.
 - *brake*: command mode BRAKE, and the time after a recovery until a new command comes. The
-  fingers are stopped and then held where they came to rest, at hold effort.
+  fingers are stopped and then held where they came to rest, at hold effort. Before the first FOC
+  command since opening or since a recovery there is nothing to brake: the motor carries no current,
+  as the servo itself leaves it off at power-up (facts/mx64 B5), and nobody has asked for torque.
 - *moving*: the fingers go to q at most at the effort limit, or rest there.
 - *contact*: they are stopped short of q (:mod:`contact`). For ``hold_after`` seconds the effort
   stays, so that the grip closes.
@@ -128,6 +130,7 @@ class Control:
         self._braked_at: int | None = None
         self._braking = 0
         self._refused: HandCommand | None = None
+        self._commanded = False  # since opening or the last recovery
         self._overloaded_at: float | None = None
         self._warm = False
         self._start_up()
@@ -152,7 +155,7 @@ class Control:
         return relative_position(sample.position, self.zero)
 
     def recovered(self, command: HandCommand | None, *, overload_at: float | None = None) -> None:
-        """The servo has been restarted: hold still until a command differs from ``command``.
+        """The servo has been restarted: no torque until a command differs from ``command``.
 
         :param command: the one in force when the fault came; None lets any command through.
         :param overload_at: position of the overload, ticks from the zero, or None for another
@@ -160,6 +163,7 @@ class Control:
             there, so that the same load does not trip it again.
         """
         self._refused = command
+        self._commanded = False
         if overload_at is not None:
             self._overloaded_at = overload_at
         self._braked_at = None
@@ -177,7 +181,12 @@ class Control:
         if self._refused is not None and not braking and not command.same_as(self._refused):
             self._refused = None
         goal: Goal
-        if self._refused is not None or braking:
+        if self._refused is None and not braking:
+            self._commanded = True
+        if not self._commanded:
+            self._leave_drive(Phase.BRAKE)
+            goal = Goal(_bounded(sample.position), 0, self._profile())
+        elif braking:
             goal = self._brake(sample, position, base)
         elif command.kp[0] <= 0:
             self._leave_drive(Phase.LIMP)

@@ -129,8 +129,9 @@ class EZGripper:
     :param configuration: how to reach it and how it shall behave.
 
     ``open`` finds the servo, sets its registers and loads the calibration; nothing moves
-    (unless asked to calibrate). The motor is first energised by the first command that needs
-    it. ``close`` switches it off. If the process dies, the servo's own watchdog stops it within
+    (unless asked to calibrate). The motor is first energised by the first FOC command with a
+    stiffness, and so it is after the servo has restarted: a brake before that exerts no torque.
+    ``close`` switches it off. If the process dies, the servo's own watchdog stops it within
     half a second.
     """
 
@@ -456,8 +457,8 @@ class EZGripper:
     def _recover(self, servo: Servo, control: Control) -> Sample:
         """One bounded step towards a working servo; the sample when it works again.
 
-        Nothing moves: torque is off after the restart, and the control holds the position
-        where the fingers then are, until a command comes that differs from the last one.
+        Nothing moves: torque is off after the restart, and stays off until a command comes that
+        differs from the last one.
         """
         now = self._clock.now()
         if self._trouble is _Trouble.FAULT:
@@ -486,7 +487,7 @@ class EZGripper:
         self._trouble = _Trouble.NONE
         self._fault = MotorError.NONE
         self._last = sample
-        log.warning("the servo works again; holding until a new command comes")
+        log.warning("the servo works again; its motor is off until a new command comes")
         return sample
 
     def _reboot(self, servo: Servo, now: float) -> None:

@@ -53,7 +53,7 @@ def motor_error(error: int, voltage: float, voltage_min: float, voltage_max: flo
 def describe(error: int) -> str:
     """The error bits in words."""
     names = [e.name.lower().replace("_", " ") for e in HardwareError if e & error and e.name]
-    return " and ".join(names) or "no error"
+    return " and ".join(names) or (f"unknown error 0x{error:02X}" if error else "no error")
 
 
 @dataclass

@@ -235,9 +235,11 @@ class Body:
 
     def _numbers(self, topic: str) -> Array | None:
         """q, dq, tau, kp, kd of the used motors, shape (5, n); None if one is no number."""
-        numbers: Array = self._orders[self._used].astype(np.float64).T
-        # a sum shows what is not finite: of some singles, in double precision, it cannot overflow
-        return numbers if self._finite(float(numbers.sum()), topic) else None
+        with np.errstate(invalid="ignore"):  # what is not finite is found below, and said
+            numbers: Array = self._orders[self._used].astype(np.float64).T
+            # in double precision a sum of some singles cannot overflow
+            total = float(numbers.sum())
+        return numbers if self._finite(total, topic) else None
 
     def _finite(self, number: float, topic: str) -> bool:
         if math.isfinite(number):

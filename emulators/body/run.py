@@ -15,18 +15,18 @@ import threading
 
 from dexkit.bodies import BODIES, BodyModel
 from dexkit.clock import Clock, RealClock
-from dexkit.dds import DdsNode, Reader, Writer
+from dexkit.dds import DdsNode, Endpoint, Reader, Writer
 from dexkit.emulators.body.body import Body
 from dexkit.emulators.body.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
 from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.service import Publisher
+from dexkit.sole import Place, SolePublisher
 
 __all__ = ["EmulatedBody", "run_body"]
 
 log = logging.getLogger("dexkit.body")
 
-_DISCOVERY = 0.3  # seconds to look for another publisher of the state
 _DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
 _WATCH = 0.2  # seconds between looks whether it still lives
 
@@ -70,6 +70,8 @@ class EmulatedBody:
         self._force = force
         self._ages = Ages()
         self._watch = PauseWatch(self._clock)
+        self._heard = False  # a state of somebody else
+        self._sole: SolePublisher | None = None
         self._remote_every = round(model.state_rate / model.remote_rate)
         self._writer: Writer | None = None
         self._remote: Writer | None = None
@@ -116,11 +118,17 @@ class EmulatedBody:
         if node is None:
             node = self._own_node = DdsNode(self.domain, self.interface)
         try:
-            if not self._force:
-                self._refuse_conflict(node)
             model = self.model
+            sole = self._sole = SolePublisher(
+                [Place(node, {model.state_topic}, self._counts)],
+                hint="stop the other robot, choose another --domain, or add --force",
+                force=self._force,
+            )
+            self._look(node, sole)
+            claim = sole.announce()
             self._remote = node.writer(model.remote_topic, model.remote_type)
-            self._writer = node.writer(model.state_topic, model.state_type)
+            self._writer = node.writer(model.state_topic, model.state_type, user_data=claim)
+            sole.settle()
             self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
             self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
             self._watch.restart()  # from here on commands may wait to be received
@@ -142,6 +150,8 @@ class EmulatedBody:
         self.stop()
 
     def _close(self) -> None:
+        if self._sole is not None:
+            self._sole.close()
         for handle in (self._commands, self._arm_commands, self._remote, self._writer):
             if handle is not None:
                 handle.close()
@@ -150,33 +160,34 @@ class EmulatedBody:
             self._own_node.close()
             self._own_node = None
 
-    def _refuse_conflict(self, node: DdsNode) -> None:
-        """States must arrive: some clients have a writer for them, which they never use.
-
-        A writer of another type is another robot's; its states cannot arrive.
-        """
+    def _look(self, node: DdsNode, sole: SolePublisher) -> None:
+        """States must arrive: some clients have a writer for them, which they never use."""
         model = self.model
         with node.reader(model.state_topic, model.state_type) as reader:
-            arrived = reader.wait(_DISCOVERY) and bool(reader.take())
-        writers = [
-            e
-            for e in node.endpoints()
-            if e.topic == model.state_topic and e.kind == "writer" and not e.own
-        ]
-        if not arrived:
-            writers = [e for e in writers if e.type_name != model.state_type]
-        if arrived or writers:
-            who = sorted({e.process or "somebody" for e in writers}) or ["somebody"]
-            raise TopicConflict(
-                f"{', '.join(who)} already publishes {model.state_topic} on domain {self.domain}",
-                hint="stop the other robot, choose another --domain, or add --force",
-            )
+            sole.look()
+            if not reader.take() or self._force:
+                return
+        self._heard = True
+        sole.check()
+        raise TopicConflict(  # it has gone meanwhile, or cannot be seen
+            f"somebody already publishes {model.state_topic} on domain {self.domain}",
+            hint="stop the other robot, choose another --domain, or add --force",
+        )
+
+    def _counts(self, endpoint: Endpoint) -> bool:
+        """A writer of another type is another robot's; its states cannot arrive."""
+        return self._heard or endpoint.type_name != self.model.state_type
 
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
             return
         try:
+            if self._sole is not None:
+                self._sole.poll()
             self._live(missed)
+        except TopicConflict as error:
+            self.failure = error
+            log.error("%s; this %s ends", error, self.model.name)
         except Exception as error:  # the thread may be somebody else's as well
             self.failure = error
             log.error("the %s died: %s: %s", self.model.name, type(error).__name__, error)
@@ -230,5 +241,7 @@ def run_body(
         if ready is not None:
             ready.set()
         while not stop.wait(_WATCH):
+            if isinstance(robot.failure, TopicConflict):
+                raise robot.failure
             if robot.failure is not None:
                 raise DdsError(f"the {model.name} died: {robot.failure}") from robot.failure

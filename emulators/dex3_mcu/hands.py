@@ -107,6 +107,11 @@ class Dex3Hands:
         """What ended the server, or None."""
         return self._server.error
 
+    @property
+    def failure(self) -> Exception | None:
+        """The first exception on a client's message, which the server has survived, if any."""
+        return self._server.failure
+
     def device(self, side: Side = Side.LEFT) -> Dex3Mcu:
         """The hand's processor."""
         return self._usb[side].mcu

@@ -6,16 +6,30 @@ has accepted, so nothing can be unplugged; it cannot say which free port it took
 only live while a client talks to them.
 
 One client at a time has a device, as on a real host: a second import is refused as busy.
+
+What a client can make this program hold is bounded:
+
+* :data:`MOST_PARKED` transfers that wait for data; one more ends with -ENOMEM, as a host
+  controller's driver ends one for which its ring has no room (Linux ``xhci-ring.c``);
+* :data:`MOST_PAYLOAD` bytes of a transfer and :data:`MOST_UNREAD` of replies that it does not
+  read: beyond, it is cut off;
+* :data:`MOST_CONNECTIONS`: a further one takes the place of the oldest that has no device, and is
+  turned away if there is none;
+* :data:`GREETING` seconds to list or import, and :data:`DEAD` until a peer that has vanished from
+  the network is noticed; a client that has a device may be silent for as long as it likes.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import logging
+import math
 import select
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -25,15 +39,41 @@ from usbip.device import USBDevice
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
 
-__all__ = ["Plug", "Server"]
+__all__ = [
+    "DEAD",
+    "GREETING",
+    "MOST_CONNECTIONS",
+    "MOST_PARKED",
+    "MOST_PAYLOAD",
+    "MOST_UNREAD",
+    "Plug",
+    "Server",
+]
+
+log = logging.getLogger("dexkit.emulators")
+
+MOST_PARKED = 1024
+"""IN transfers of one client that wait for data. A hand's driver has one; 256 fit into a segment of
+a Linux xHCI ring (TRBS_PER_SEGMENT)."""
+MOST_PAYLOAD = 1 << 20
+"""Bytes of a transfer. A frame to a hand has 1234; usbfs of Linux has 16 MB for all programs."""
+MOST_UNREAD = 1 << 18
+"""Bytes of replies that a client may leave unread: some 200 answers of a hand."""
+MOST_CONNECTIONS = 32
+"""Clients at a time. Two can have a hand; the others list."""
+GREETING = 10.0
+"""Seconds from a connection to its import. A list and an import take milliseconds."""
+DEAD = 30
+"""Seconds after which a peer that no longer acknowledges anything is dropped."""
 
 _REQUEST = 8  # bytes: version, code, status
 _BUSID = 32
 _COMMAND = 48
 _FIELDS = struct.Struct(">I8xI8xI")  # of a command: its code, direction, length of the data
-_MOST_PAYLOAD = 1 << 20  # no client of a hand sends as much; a longer one is not a client
-_MOST_UNREAD = 1 << 18  # bytes of replies that a client may leave unread
 _ST_DEV_BUSY = 2  # of the kernel's usbip_common.h
+_RETURN = struct.Struct(">IIIIIi24x")
+_SET_CONFIGURATION = b"\x00\x09"
+_DEAF = 0.1  # seconds without accepting, where the system has no more file descriptors
 _UNLINKED = -errno.ECONNRESET  # what vhci expects of a transfer that was called back
 _TICK = 4e-3
 _SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
@@ -74,6 +114,8 @@ class Server:
 
     :ivar port: the port taken.
     :ivar error: what ended the thread, or None.
+    :ivar failure: the first exception on a message of a client, a mistake in the emulator, if any;
+        that client was cut off.
     """
 
     def __init__(
@@ -86,6 +128,8 @@ class Server:
     ) -> None:
         self.host = host
         self.error: BaseException | None = None
+        self.failure: Exception | None = None
+        self._deaf_until = 0.0
         self._clock: Clock = clock or RealClock()
         self._plugs = list(plugs)
         for index, plug in enumerate(self._plugs):
@@ -154,7 +198,16 @@ class Server:
                     self._drop(connection)
                 else:
                     self._flush(connection)
+            self._look_after(time.monotonic())
             self._wait(clock, due)
+
+    def _look_after(self, now: float) -> None:
+        """Drop who does not come to the point; listen again after a pause."""
+        for connection in [c for c in self._connections.values() if c.until < now]:
+            self._drop(connection)
+        if self._deaf_until and now >= self._deaf_until:
+            self._deaf_until = 0.0
+            self._poll.modify(self._listener, select.EPOLLIN)
 
     def _wait(self, clock: Clock, due: float | None) -> None:
         """Serve what comes within a tick, or until ``due`` if that is sooner."""
@@ -181,14 +234,40 @@ class Server:
     # --- connections
 
     def _accept(self) -> None:
+        for _ in range(MOST_CONNECTIONS):
+            if not self._accept_one():
+                return
+
+    def _accept_one(self) -> bool:
+        """Whether there may be another one."""
         try:
             sock, _ = self._listener.accept()
-        except OSError:
-            return
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
+                # it would be reported again and again: not to be a busy loop
+                self._deaf_until = time.monotonic() + _DEAF
+                self._poll.modify(self._listener, 0)
+            return False
+        if len(self._connections) >= MOST_CONNECTIONS:
+            # the eldest first: dictionaries keep their order
+            idle = next((c for c in self._connections.values() if c.plug is None), None)
+            if idle is None:
+                sock.close()
+                return True
+            self._drop(idle)
         sock.setblocking(False)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._connections[sock.fileno()] = _Connection(sock)
+        for level, option, value in (
+            (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+            (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+            (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, DEAD // 2),
+            (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, DEAD // 6),
+            (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3),
+            (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, DEAD * 1000),
+        ):
+            sock.setsockopt(level, option, value)
+        self._connections[sock.fileno()] = _Connection(sock, time.monotonic() + GREETING)
         self._poll.register(sock, select.EPOLLIN)
+        return True
 
     def _drop(self, connection: _Connection) -> None:
         if self._connections.pop(connection.sock.fileno(), None) is None:
@@ -208,12 +287,19 @@ class Server:
         if not data:
             self._drop(connection)
             return
+        if connection.closing:  # it is only still there for what it has not read
+            return
         connection.inbox += data
         try:
             while connection.inbox and self._serve(connection):
                 pass
         except (_Nonsense, struct.error):
-            connection.closing = True
+            connection.close_soon()
+        except Exception as error:  # one client must not end the others' service
+            if self.failure is None:
+                self.failure = error
+                log.error("the emulated device failed (said once)", exc_info=error)
+            connection.close_soon()
         self._flush(connection)
 
     def _flush(self, connection: _Connection) -> None:
@@ -227,7 +313,7 @@ class Server:
                 self._drop(connection)
                 return
             del outbox[:sent]
-            if len(outbox) > _MOST_UNREAD:
+            if len(outbox) > MOST_UNREAD:
                 self._drop(connection)
                 return
         if connection.waiting != bool(outbox):
@@ -239,8 +325,6 @@ class Server:
 
     def _serve(self, connection: _Connection) -> bool:
         """Serve one message if a whole one is there."""
-        if connection.closing:
-            return False
         if connection.plug is None:
             return self._greet(connection)
         inbox = connection.inbox
@@ -250,9 +334,9 @@ class Server:
         if command not in (protocol.CMD_SUBMIT, protocol.CMD_UNLINK):
             raise _Nonsense
         if command == protocol.CMD_SUBMIT:
-            if length > _MOST_PAYLOAD:
+            if length > MOST_PAYLOAD or direction > 1:
                 raise _Nonsense
-            if direction == 0 and len(inbox) < _COMMAND + length:
+            if direction == protocol.OUT and len(inbox) < _COMMAND + length:
                 return False
         urb = protocol.read_cmd(connection)
         device = connection.plug.device
@@ -263,10 +347,23 @@ class Server:
                 device.cancel_urb(urb.flags)
             connection.unlinked(urb, 0 if late else _UNLINKED)
         else:
-            connection.parked.add(urb.seqnum)
-            if device.handle_urb(urb, connection.respond) is not None:
-                connection.respond(urb)
+            self._submit(connection, device, urb)
         return True
+
+    def _submit(self, connection: _Connection, device: USBDevice, urb: Any) -> None:
+        parked = connection.parked
+        if urb.seqnum in parked:  # whose answer would be whose?
+            raise _Nonsense
+        if urb.direction == protocol.IN and urb.ep and len(parked) >= MOST_PARKED:
+            connection.fail(urb, -errno.ENOMEM)
+            return
+        if urb.ep == 0 and urb.setup[:2] == _SET_CONFIGURATION:
+            # it resets the endpoints: what waits there ends as where one is disabled
+            for waiting in list(parked.values()):
+                connection.fail(waiting, -errno.ESHUTDOWN)
+        parked[urb.seqnum] = urb
+        if device.handle_urb(urb, connection.respond) is not None:
+            connection.respond(urb)
 
     def _greet(self, connection: _Connection) -> bool:
         """Serve a list or an import."""
@@ -284,15 +381,16 @@ class Server:
                     connection.outbox += struct.pack(
                         ">HHI", protocol.VERSION, protocol.OP_REP_IMPORT, _ST_DEV_BUSY
                     )
-                    connection.closing = True
+                    connection.close_soon()
                     return False
         elif code != protocol.OP_REQ_DEVLIST:
             raise _Nonsense
         device = protocol.serve_handshake(connection, [plug.device for plug in present])
         connection.plug = next((p for p in present if p.device is device), None)
         if connection.plug is None:
-            connection.closing = True
+            connection.close_soon()
             return False
+        connection.until = math.inf
         connection.plug.attached()
         return True
 
@@ -338,14 +436,21 @@ class _Connection:
     header and data of a reply leave in one piece.
     """
 
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, until: float) -> None:
         self.sock = sock
         self.inbox = bytearray()
         self.outbox = bytearray()
         self.plug: Plug | None = None
-        self.parked: set[int] = set()
+        self.parked: dict[int, Any] = {}  # transfers under way, by number
+        self.until = until  # when it is dropped unless it has come to the point
         self.closing = False
         self.waiting = False
+
+    def close_soon(self) -> None:
+        """Close it when it has read what there is for it, or has had the time to."""
+        self.closing = True
+        self.inbox.clear()
+        self.until = time.monotonic() + GREETING
 
     @property
     def cut_off(self) -> bool:
@@ -367,25 +472,25 @@ class _Connection:
 
     def complete(self, seqnum: int) -> bool:
         """Take a transfer off the list; True if it was completed before."""
-        if seqnum in self.parked:
-            self.parked.discard(seqnum)
-            return False
-        return True
+        return self.parked.pop(seqnum, None) is None
 
     def respond(self, urb: Any) -> None:
-        if not self.complete(urb.seqnum):
-            protocol.write_ret(self, urb)
+        if self.complete(urb.seqnum):
+            return
+        if urb.direction == protocol.IN:  # as many bytes as there are and were asked for
+            urb.actual = min(urb.actual, len(urb.buffer), urb.length)
+        protocol.write_ret(self, urb)
+
+    def fail(self, urb: Any, status: int) -> None:
+        """End a transfer without data."""
+        self.complete(urb.seqnum)
+        self._return(protocol.RET_SUBMIT, urb, status)
 
     def unlinked(self, urb: Any, status: int) -> None:
-        self.outbox += struct.pack(
-            ">IIIIIi24x",
-            protocol.RET_UNLINK,
-            urb.seqnum,
-            urb.devid,
-            urb.direction,
-            urb.ep,
-            status,
-        )
+        self._return(protocol.RET_UNLINK, urb, status)
+
+    def _return(self, command: int, urb: Any, status: int) -> None:
+        self.outbox += _RETURN.pack(command, urb.seqnum, urb.devid, urb.direction, urb.ep, status)
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -393,7 +498,7 @@ def _listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        listener.listen(16)
+        listener.listen(MOST_CONNECTIONS)
     except OSError as error:
         listener.close()
         hint = "--host takes an address of this machine"

@@ -27,6 +27,7 @@ SERIAL = {Side.LEFT: "2024061800", Side.RIGHT: "2024061801"}
 MAX_PACKET = 512
 """Bytes of a high-speed bulk packet."""
 _MOST_TRANSFER = 4096  # BUF_SIZE of the manual
+_MOST_HELD = 64  # answers that a fault delays; a host asks for one at a time
 _VENDOR_CLASS = 0xFF
 
 
@@ -123,6 +124,9 @@ class Dex3Usb:
             if self._held:
                 due = max(due, self._held[-1][0])  # answers do not overtake each other
             self._held.append((due, answer))
+            if len(self._held) > _MOST_HELD:
+                self._held.popleft()
+                self.mcu.counters.unread += 1
         else:
             self._answer(answer)
 

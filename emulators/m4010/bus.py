@@ -111,7 +111,10 @@ class Bus(SerialLine):
         self._line_free = self._last_byte = arrival
         for frame in self._parser.feed(data):
             assert isinstance(frame, MotorCmd)
-            self._dispatch(frame, hearing, arrival)
+            try:
+                self._dispatch(frame, hearing, arrival)
+            except Exception as error:  # one frame must not end the others' service
+                self._failed(error, frame)
         counters.crc_errors, counters.skipped = self._parser.crc_errors, self._parser.skipped
 
     def _dispatch(self, command: MotorCmd, hearing: Sequence[Motor], at: float) -> None:

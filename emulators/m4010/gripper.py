@@ -110,6 +110,11 @@ class Dex1Motors:
         return next((port.error for port in self._lines if port.error is not None), None)
 
     @property
+    def failure(self) -> Exception | None:
+        """The first exception on a message, which a line has survived, if any."""
+        return next((p.line.failure for p in self._lines if p.line.failure is not None), None)
+
+    @property
     def ready_lines(self) -> list[str]:
         """One a line: where it is and who answers there."""
         lines = []

@@ -154,7 +154,10 @@ class Bus(SerialLine):
         for packet in self._parser.feed(data):
             for servo in self.servos:
                 servo.advance_to(arrival)
-            self._dispatch(packet, hearing, arrival)
+            try:
+                self._dispatch(packet, hearing, arrival)
+            except Exception as error:  # one packet must not end the others' service
+                self._failed(error, packet)
         self.counters.crc_errors = self._parser.crc_errors
         self.counters.skipped = self._parser.skipped
 
@@ -236,6 +239,10 @@ class Bus(SerialLine):
         wanted = self._wanted(packet)
         if wanted is None:
             return
+        # the first servo announces the length of all; what no packet can hold is not answered
+        whole = dxl.fast_length([length for _, _, length in wanted])
+        if fast and whole > dxl.MAX_LENGTH:
+            return
         parts: list[tuple[int, int, bytes]] = []
         for servo_id, address, length in wanted:
             servo = by_id.get(servo_id)
@@ -261,8 +268,6 @@ class Bus(SerialLine):
             # a chain that breaks leaves the first part's length unfulfilled
             data = dxl.fast_status(parts)
             if len(parts) < len(wanted):
-                sizes = [length for _, _, length in wanted]
-                whole = 1 + sum(4 + size for size in sizes)
                 data = data[:5] + whole.to_bytes(2, "little") + data[7:]
             self._answer(at, data, rate)
 

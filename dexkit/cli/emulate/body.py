@@ -14,6 +14,7 @@ import click
 
 from dexkit.bodies import G1, H1, BodyModel
 from dexkit.cli.common import (
+    MOST_REMARKS,
     StatusLine,
     StopRequest,
     dds_options,
@@ -21,7 +22,7 @@ from dexkit.cli.common import (
     stop_on_signals,
 )
 from dexkit.cli.emulate.stdin import read_faults
-from dexkit.errors import DdsError
+from dexkit.errors import DdsError, TopicConflict
 
 if TYPE_CHECKING:
     from dexkit.emulators.body import EmulatedBody
@@ -85,6 +86,8 @@ def _command(model: BodyModel) -> click.Command:
             )
             sys.stdout.flush()
             _watch(robot, stop, duration, status=status, as_json=as_json)
+        if isinstance(robot.failure, TopicConflict):
+            raise robot.failure
         if robot.failure is not None:
             raise DdsError(f"the {chosen.name} died: {robot.failure}") from robot.failure
         if not as_json:
@@ -177,7 +180,7 @@ def _watch(
     while not over:
         left = float("inf") if end is None else end - time.monotonic()
         over = stop.wait(max(0.0, min(period, left))) or left <= period or bool(robot.failure)
-        for text in set(robot.mismatches()) - said:
+        for text in sorted(set(robot.mismatches()) - said)[: MOST_REMARKS - len(said)]:
             said.add(text)
             log.warning("%s", text)
         now = time.monotonic()

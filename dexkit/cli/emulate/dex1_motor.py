@@ -7,7 +7,7 @@ import sys
 import click
 
 from dexkit.cli.common import stop_on_signals
-from dexkit.cli.emulate.stdin import read_faults
+from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import Side
 from dexkit.wire import m4010
@@ -132,6 +132,8 @@ def emulate_dex1_motor(
                 raise EmulatorError(f"the emulator stopped: {motors.error}") from motors.error
     for line in motors.summaries():
         click.echo(f"stopped: {line}")
+    if motors.failure is not None:
+        raise EmulatorError(f"the emulator failed inside: {motors.failure!r}", hint=A_MISTAKE)
 
 
 def _places(links: tuple[str, ...], sides: tuple[Side, ...]) -> dict[Side, str]:

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 import click
 
 from dexkit.cli.common import stop_on_signals
-from dexkit.cli.emulate.stdin import read_faults
+from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.errors import EmulatorError
 from dexkit.hand import Side
 
@@ -131,6 +131,8 @@ def emulate_dex3_usb(
         for one in sides:
             summary = hands.device(one).counters.summary() or "nothing was sent"
             click.echo(f"stopped: {one}: {summary}")
+        if hands.failure is not None:
+            raise EmulatorError(f"the emulator failed inside: {hands.failure!r}", hint=A_MISTAKE)
 
 
 def _how_to(url: str, host: str, busids: list[str]) -> list[str]:

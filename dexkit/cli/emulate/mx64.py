@@ -6,15 +6,15 @@ import dataclasses
 import json
 import os
 import sys
-import tempfile
 from pathlib import Path
 
 import click
 
 from dexkit.cli.common import stop_on_signals
-from dexkit.cli.emulate.stdin import read_faults
+from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.clock import RealClock
-from dexkit.errors import EmulatorError
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.files import update_file
 from dexkit.wire import mx64
 
 __all__ = ["emulate_mx64"]
@@ -163,6 +163,8 @@ def emulate_mx64(
         if port.overruns:
             summary += f", {port.overruns} bytes not read by the client"
         click.echo(f"stopped: {summary}")
+        if bus.failure is not None:
+            raise EmulatorError(f"the emulator failed inside: {bus.failure!r}", hint=A_MISTAKE)
 
 
 class _EepromFile:
@@ -193,13 +195,9 @@ class _EepromFile:
         return self._contents[index] if index < len(self._contents) else None
 
     def save(self, contents: list[bytes]) -> None:
-        """Replace the file atomically."""
+        """Replace the file; a disk that is full does not stop the emulator."""
         text = json.dumps({"device": "mx64", "eeprom": [c.hex() for c in contents]}, indent=1)
-        fd, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.")
         try:
-            with os.fdopen(fd, "w") as file:
-                file.write(text + "\n")
-            os.replace(temporary, self.path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+            update_file(self.path, lambda _: text + "\n")
+        except UsageError as error:
+            click.echo(f"warning: the EEPROM is not kept: {error.message}", err=True)

@@ -11,7 +11,11 @@ import click
 from dexkit.cli.common import StopRequest
 from dexkit.errors import DexkitError
 
-__all__ = ["read_faults"]
+__all__ = ["A_MISTAKE", "read_faults"]
+
+A_MISTAKE = "this is a mistake in dexkit; what was sent is in the log above: please report it"
+
+_LONGEST = 4096  # bytes of a line
 
 
 def read_faults(inject: Callable[[str], None], request: StopRequest) -> None:
@@ -25,13 +29,23 @@ def read_faults(inject: Callable[[str], None], request: StopRequest) -> None:
 def _read(inject: Callable[[str], None], request: StopRequest) -> None:
     # not sys.stdin: a daemon thread inside a buffered reader can crash the interpreter's exit
     pending = b""
-    while data := os.read(0, 4096):
+    while data := _more():
         *lines, pending = (pending + data).split(b"\n")
         for line in lines:
             if not line.strip():
                 continue
             try:
-                inject(line.decode(errors="replace"))
+                inject(line[:_LONGEST].decode(errors="replace"))
             except DexkitError as error:
                 click.echo(f"error: {error.message}", err=True)
+            except Exception as error:  # a mistake in dexkit must not end the device in silence
+                click.echo(f"error: {type(error).__name__}: {error}", err=True)
+        pending = pending[:_LONGEST]  # what is longer is no specification, however it goes on
     request.set()
+
+
+def _more() -> bytes:
+    try:
+        return os.read(0, 4096)
+    except OSError:  # a terminal that went away is an end of input, too
+        return b""

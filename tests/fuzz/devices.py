@@ -1,0 +1,524 @@
+"""Hostile hosts: bytes for the emulated devices, most of them in good frames.
+
+Whatever comes, a device answers as its wire format says or is silent; it never raises, and holds
+no more than a bounded number of bytes. Virtual time throughout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import random
+import select
+import socket
+import struct
+from collections.abc import Callable
+
+from dexkit.bodies import BODIES, BodyModel
+from dexkit.clock import ManualClock
+from dexkit.emulators.body.body import Body
+from dexkit.emulators.body.settings import Settings
+from dexkit.emulators.dex3_mcu import Dex3Hands
+from dexkit.emulators.dex3_mcu.device import Dex3Mcu
+from dexkit.emulators.dex3_mcu.settings import Firmware as Dex3Firmware
+from dexkit.emulators.dex3_mcu.usb import Dex3Usb
+from dexkit.emulators.faults import (
+    DEX3_FAULTS,
+    M4010_FAULTS,
+    MX64_FAULTS,
+    FaultFamily,
+    parse_fault,
+)
+from dexkit.emulators.m4010.bus import Bus as MotorBus
+from dexkit.emulators.m4010.motor import Motor
+from dexkit.emulators.mx64 import Bus, Firmware, Servo
+from dexkit.emulators.mx64.protocol1 import Protocol1Servo
+from dexkit.errors import DexkitError
+from dexkit.hand import Side
+from dexkit.messages import message_type
+from dexkit.wire import dynamixel as dxl
+from dexkit.wire import low_level, m4010, mx64
+from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, MOTOR_CMD, N_BUSES
+from dexkit.wire.dynamixel import Instruction
+
+__all__ = [
+    "FUZZERS",
+    "bodies",
+    "dex3",
+    "faults",
+    "m4010_line",
+    "mx64_line",
+    "packet",
+    "usbip_server",
+]
+
+_BLOCK = 200  # inputs to one device, then there is a new one
+_EDGES = (0, 1, 2, 3, 4, 5, 127, 128, 255, 256, 512, 660, 661, 1016, 1017, 1024, 32767, 32768)
+_EDGES += (65534, 65535, 2**31 - 1, 2**31, 2**32 - 1)
+
+
+class _Case:
+    """The random choices of one input, and how to say what went wrong with it."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        self.name, self.seed, self.number = name, seed, 0
+        self.random = random.Random(f"{name} {seed}")
+        self.data = b""
+
+    def run(self, data: bytes, function: Callable[[], object]) -> None:
+        self.data = data
+        self.number += 1
+        try:
+            function()
+        except Exception as error:
+            raise AssertionError(
+                f"{self.name}, seed {self.seed}, input {self.number}: {type(error).__name__}: "
+                f"{error}; input {data.hex()}"
+            ) from error
+
+    def number_of(self, size: int) -> int:
+        """An integer of so many bytes, often at an edge of something."""
+        chance = self.random.random()
+        most = 1 << 8 * size
+        if chance < 0.5:
+            return self.random.choice(_EDGES) % most
+        return self.random.randrange(most)
+
+    def spoil(self, data: bytes) -> bytes:
+        """Mostly ``data``; sometimes damaged, cut, doubled, or behind noise."""
+        rnd = self.random
+        chance = rnd.random()
+        if chance < 0.8 or not data:
+            return data
+        if chance < 0.86:
+            spoilt = bytearray(data)
+            spoilt[rnd.randrange(len(spoilt))] ^= 1 << rnd.randrange(8)
+            return bytes(spoilt)
+        if chance < 0.9:
+            return data[: rnd.randrange(len(data))]
+        if chance < 0.94:
+            return data + data
+        if chance < 0.98:
+            return rnd.randbytes(rnd.randrange(40)) + data
+        return rnd.randbytes(rnd.choice((1, 10, 300, 4096)))
+
+
+# --- MX-64
+
+_CODES = [int(i) for i in Instruction]
+_ITEMS = list(mx64.TABLE.values())
+
+
+def packet(packet_id: int, instruction: int, params: bytes) -> bytes:
+    """An instruction packet with a true length and CRC, whatever its id and size."""
+    body = dxl.stuff(bytes((instruction,)) + params)
+    length = len(body) + 2
+    data = dxl.HEADER + bytes((packet_id, length & 0xFF, length >> 8 & 0xFF)) + body
+    return data + dxl.crc16(data).to_bytes(2, "little")
+
+
+def _instruction(case: _Case) -> bytes:
+    rnd = case.random
+    code = rnd.choice(_CODES) if rnd.random() < 0.95 else rnd.randrange(256)
+    single = rnd.random() < 0.5
+    target = rnd.choice((1, 2, 9)) if single else rnd.choice((1, 2, 252, 253, 254, 255, 0))
+
+    def address() -> bytes:
+        if rnd.random() < 0.7:
+            return rnd.choice(_ITEMS).address.to_bytes(2, "little")
+        return case.number_of(2).to_bytes(2, "little")
+
+    def size() -> int:
+        return rnd.choice((1, 2, 4, 10, 24, 100)) if rnd.random() < 0.7 else case.number_of(2)
+
+    def ids() -> list[int]:
+        found = [rnd.choice((1, 2, 3, 9, 252, 254, 255)) for _ in range(rnd.randrange(1, 5))]
+        return list(dict.fromkeys(found)) if rnd.random() < 0.9 else found
+
+    params = b""
+    if code in (Instruction.READ,):
+        params = address() + size().to_bytes(2, "little")
+    elif code in (Instruction.WRITE, Instruction.REG_WRITE):
+        if rnd.random() < 0.7:
+            item = rnd.choice(_ITEMS)
+            value = case.number_of(item.size) if rnd.random() < 0.7 else rnd.randrange(3)
+            params = item.address.to_bytes(2, "little") + value.to_bytes(item.size, "little")
+        else:
+            params = address() + rnd.randbytes(min(size(), 700))
+    elif code == Instruction.FACTORY_RESET:
+        params = bytes((rnd.choice((0xFF, 1, 2, 3)),))
+    elif code == Instruction.CLEAR:
+        params = dxl.CLEAR_POSITION_KEY
+    elif code == Instruction.CONTROL_TABLE_BACKUP:
+        params = bytes((rnd.choice((1, 2, 3)),)) + dxl.BACKUP_KEY
+    elif code in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
+        target = 254 if rnd.random() < 0.95 else target
+        params = address() + size().to_bytes(2, "little") + bytes(ids())
+    elif code in (Instruction.BULK_READ, Instruction.FAST_BULK_READ):
+        target = 254 if rnd.random() < 0.95 else target
+        params = b"".join(bytes((i,)) + address() + size().to_bytes(2, "little") for i in ids())
+    elif code == Instruction.SYNC_WRITE:
+        target = 254
+        n = min(size(), 200)
+        params = address() + n.to_bytes(2, "little")
+        params += b"".join(bytes((i,)) + rnd.randbytes(n) for i in ids())
+    elif code == Instruction.BULK_WRITE:
+        target = 254
+        for i in ids():
+            n = min(size(), 100)
+            params += bytes((i,)) + address() + n.to_bytes(2, "little") + rnd.randbytes(n)
+    elif rnd.random() < 0.3:
+        params = rnd.randbytes(rnd.randrange(20))
+    if rnd.random() < 0.05:
+        params = params[: rnd.randrange(len(params) + 1)]
+    elif rnd.random() < 0.05:
+        params += rnd.randbytes(rnd.randrange(1, 5))
+    return packet(target, code, params)
+
+
+def _protocol_1(case: _Case) -> bytes:
+    rnd = case.random
+    params = rnd.randbytes(rnd.choice((0, 1, 2, 2, 2, 3, 20)))
+    body = bytes((rnd.choice((3, 254, 1)), len(params) + 2, rnd.choice((1, 2, 3, 0x83)))) + params
+    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+
+
+def _servos(case: _Case, now: float) -> Bus:
+    rnd = case.random
+
+    def flip() -> bool:
+        return rnd.random() < 0.5
+
+    firmware = Firmware(
+        fast_reads=rnd.random() < 0.8,
+        backup=flip(),
+        read_across_gaps=flip(),
+        answer_bad_crc=flip(),
+        sync_write_clamps=flip(),
+        missing_id_stalls=flip(),
+        level_0_answers_sync=flip(),
+        watchdog_resumes=flip(),
+        profile_velocity_limited=flip(),
+        boot_time=0.001,
+    )
+    return Bus(
+        [Servo(i, firmware=firmware, now=now) for i in (1, 2)],
+        line_time=flip(),
+        latency_timer=rnd.choice((0.0, 1e-3)),
+        start=now,
+        protocol_1=[Protocol1Servo(3)] if flip() else (),
+    )
+
+
+def mx64_line(seed: int, count: int) -> int:
+    """Two MX-64 with Protocol 2.0 firmware, and at times one with 1.0, on one line."""
+    case = _Case("mx64 line", seed)
+    now = 100.0
+    for i in range(count):
+        if i % _BLOCK == 0:
+            bus = _servos(case, now)
+        chance = case.random.random()
+        data = _protocol_1(case) if chance < 0.05 else _instruction(case)
+        data = case.spoil(data)
+        now += case.random.choice((0.0, 1e-4, 1e-3, 2e-3, 5e-3, 0.02))
+        case.run(data, lambda bus=bus, data=data, now=now: _talk(case, bus, data, now))  # type: ignore[misc]
+        if (i + 1) % _BLOCK == 0:
+            now += 60.0  # 4 KiB at 9600 baud take 4 s
+            case.run(b"", lambda bus=bus, now=now: _still_there(bus, now))  # type: ignore[misc]
+    return count
+
+
+def _talk(case: _Case, bus: Bus | MotorBus, data: bytes, now: float) -> bytes:
+    bus.advance_to(now)
+    bus.receive(data, now)
+    assert bus._parser.pending <= dxl.MAX_PACKET, "the parser holds more than a packet"
+    if bus.failure is not None:
+        raise bus.failure
+    late = 0.3  # all that was asked is out by then
+    out = bus.due(now + late)
+    assert len(out) <= 64 * (len(data) + dxl.MAX_PACKET), f"{len(out)} bytes of answers"
+    return out
+
+
+def _still_there(bus: Bus, now: float) -> None:
+    bus.due(now)
+    for servo in bus.servos:  # a fuzzed id may be anybody's; a delay of 0.5 ms at most is not
+        assert servo.id <= dxl.MAX_ID
+    bus.advance_to(now)
+    bus.receive(packet(dxl.BROADCAST_ID, Instruction.PING, b""), now)
+    answers = bus.due(now + 1.0)
+    found = dxl.PacketParser().feed(answers)
+    assert any(p.is_status for p in found), "nobody answers a broadcast ping"
+
+
+def faults(seed: int, count: int) -> int:
+    """Lines of standard input for the emulators: parsed, or refused with a typed error."""
+    case = _Case("faults", seed)
+    families = (MX64_FAULTS, M4010_FAULTS, DEX3_FAULTS)
+    for _ in range(count):
+        family = case.random.choice(families)
+        text = _fault_text(case, family)
+        case.run(text.encode(errors="surrogateescape"), lambda f=family, t=text: _parsed(t, f))  # type: ignore[misc]
+    return count
+
+
+def _parsed(text: str, family: FaultFamily) -> None:
+    with contextlib.suppress(DexkitError):
+        parse_fault(text, family)
+
+
+def _fault_text(case: _Case, family: FaultFamily) -> str:
+    rnd = case.random
+    words = ["drop", "corrupt", "delay", "unplug", "overload", "silent", "stuck", "short", "stray"]
+    words += ["brown-out", "overheat", "pause", "stall"]
+    values = ["0", "1", "0.5", "-1", "nan", "inf", "1e400", "9" * 5000, "²", "٣", "", "1e5", "x"]
+    keys = ["p", "ms", "id", "side", "for", "c", "volts", "before", "after", "bytes", "q"]
+    text = rnd.choice(words)
+    if rnd.random() < 0.4:
+        text += "@" + rnd.choice(values) + rnd.choice(("", "s", "ms", "m"))
+    if rnd.random() < 0.7:
+        pairs = [f"{rnd.choice(keys)}={rnd.choice(values)}" for _ in range(rnd.randrange(1, 4))]
+        text += ":" + ",".join(pairs)
+    if rnd.random() < 0.1:
+        text = "".join(
+            chr(rnd.choice((0, 10, 27, 0xB2, 0x1F600))) if rnd.random() < 0.1 else c for c in text
+        )
+    return text
+
+
+# --- M4010
+
+
+def m4010_line(seed: int, count: int) -> int:
+    """Both motors of a pair of Dex1-1 on one line."""
+    case = _Case("m4010 line", seed)
+    now = 100.0
+    for i in range(count):
+        if i % _BLOCK == 0:
+            bus = MotorBus(
+                [Motor(0, now=now), Motor(1, now=now)],
+                line_time=case.random.random() < 0.5,
+                start=now,
+            )
+        data = case.spoil(_motor_frame(case))
+        now += case.random.choice((0.0, 1e-4, 1e-3, 5e-3, 0.05))
+        case.run(data, lambda bus=bus, data=data, now=now: _talk(case, bus, data, now))  # type: ignore[misc]
+        if (i + 1) % _BLOCK == 0:
+            now += 2.0
+            case.run(b"", lambda bus=bus, now=now: _motors_answer(bus, now))  # type: ignore[misc]
+    return count
+
+
+def _motor_frame(case: _Case) -> bytes:
+    rnd = case.random
+    number = rnd.choice((0, 1, 2, 15))
+    mode = number | rnd.choice((0, 1, 1, 1, 2, 5, 6, 7)) << 4 | rnd.choice((0, 0x80))
+    body = b"\xfe\xee" + bytes((mode, rnd.randrange(256)))
+    if rnd.random() < 0.1:  # a calibration is told by these
+        body += struct.pack("<h", -0x400)
+    else:
+        body += case.number_of(2).to_bytes(2, "little")
+    body += case.number_of(2).to_bytes(2, "little") + case.number_of(4).to_bytes(4, "little")
+    body += case.number_of(2).to_bytes(2, "little") + case.number_of(2).to_bytes(2, "little")
+    return body + crc32_words(body).to_bytes(4, "little")
+
+
+def _motors_answer(bus: MotorBus, now: float) -> None:
+    bus.due(now)
+    bus.advance_to(now)
+    for number in (0, 1):
+        bus.receive(m4010.MotorCmd(number, m4010.Status.BRAKE).pack(), now)
+        answer = bus.due(now + 1.0)
+        assert m4010.MotorData.parse(answer).id == number
+
+
+# --- Dex3-1
+
+
+def dex3(seed: int, count: int) -> int:
+    """A Dex3-1's processor behind its USB endpoints."""
+    case = _Case("dex3", seed)
+    clock = ManualClock(100.0)
+    for i in range(count):
+        if i % _BLOCK == 0:
+            rnd = case.random
+            firmware = Dex3Firmware(
+                answer_bad_frame=rnd.random() < 0.8,
+                queue=rnd.choice((1, 3)),
+                other_status_brakes=rnd.random() < 0.5,
+                unaddressed_motors_answer=rnd.random() < 0.5,
+            )
+            usb = Dex3Usb(Dex3Mcu(Side.LEFT, clock=clock, firmware=firmware), clock)
+        data = case.spoil(_hand_frame(case))
+        clock.advance(case.random.choice((0.0, 1e-4, 1e-3, 5e-3)))
+        case.run(data, lambda usb=usb, data=data: _transfer(usb, data))  # type: ignore[misc]
+    return count
+
+
+def _hand_frame(case: _Case) -> bytes:
+    rnd = case.random
+    layout = rnd.choice(COMMAND_LAYOUTS)
+    buses = []
+    sizes = []
+    for _ in range(N_BUSES):
+        packets = b""
+        for _ in range(rnd.choice((0, 1, 2, 3, 7))):
+            body = MOTOR_CMD.head + bytes((rnd.randrange(256), rnd.randrange(256)))
+            body += b"".join(case.number_of(n).to_bytes(n, "little") for n in (2, 2, 4, 2, 2))
+            packets += case.spoil(body + crc32_words(body).to_bytes(4, "little"))
+        packets = packets[: layout.bus_size]
+        sizes.append(len(packets) if rnd.random() < 0.9 else case.number_of(4))
+        buses.append(packets.ljust(layout.bus_size, b"\0"))
+    frame = rnd.choice((b"\xfe\xfd", rnd.randbytes(2))) + rnd.randbytes(4)
+    frame += struct.pack(f"<{N_BUSES}I", *sizes) + b"".join(buses) + rnd.randbytes(4)
+    return frame + crc32_words(frame[2:]).to_bytes(4, "little")
+
+
+def _transfer(usb: Dex3Usb, data: bytes) -> None:
+    usb._received(usb._out, data)
+    usb.advance()
+    assert len(usb._transfer) <= 3 * 4096
+    assert len(usb._held) <= 64
+
+
+# --- bodies
+
+
+def bodies(seed: int, count: int) -> int:
+    """An H1 and a G1: samples of their command topics, most of them with a good CRC."""
+    case = _Case("bodies", seed)
+    now = 100.0
+    for i in range(count):
+        rnd = case.random
+        if i % _BLOCK == 0:
+            model = rnd.choice(list(BODIES.values()))
+            body = Body(model, Settings(lenient=rnd.random() < 0.3), now=now)
+            image = _body_command(case, model)
+        data = bytearray(image)
+        for _ in range(rnd.choice((0, 0, 3, 40, 400))):
+            at = rnd.randrange(4, len(data) - 4)
+            if rnd.random() < 0.3:
+                data[at] = rnd.randrange(256)
+            else:
+                at -= at % 4
+                data[at : at + 4] = struct.pack("<f", rnd.choice(_FLOATS))
+        payload = _sealed(model.cmd_type, bytes(data)) if rnd.random() < 0.8 else bytes(data)
+        payload = case.spoil(payload)
+        now += rnd.choice((0.0, 1e-3, 2e-3, 0.01))
+
+        def act(body: Body = body, payload: bytes = payload, now: float = now) -> None:
+            (body.command if len(payload) % 3 else body.arm_command)(payload, now)
+            body.advance(now)
+            body.state(now)
+
+        case.run(payload, act)
+    return count
+
+
+_FLOATS = (0.0, 1.0, -1.0, 1e3, 1e-30, 2.1e9, 3.4e38, -3.4e38, math.inf, math.nan, 16000.0)
+
+
+def _body_command(case: _Case, model: BodyModel) -> bytes:
+    """A command that is obeyed, of gains that may be monstrous."""
+    rnd = case.random
+    kind = message_type(model.cmd_type)
+    message = kind.cls()
+    for slot in model.used:
+        motor = message.motor_cmd[slot]
+        motor.mode = model.enable[slot]
+        motor.q, motor.dq, motor.tau = (rnd.choice(_FLOATS[:-2]) for _ in range(3))
+        motor.kp, motor.kd = rnd.choice((60.0, 3.4e38)), rnd.choice((1.5, 3.4e38))
+    if model.mode_machine is not None:
+        message.mode_machine = model.mode_machine
+    return kind.encode(message)
+
+
+def _sealed(name: str, payload: bytes) -> bytes:
+    try:
+        crc = low_level.crc_of_payload(name, payload)
+    except DexkitError:
+        return payload
+    return payload[:-4] + crc.to_bytes(4, "little")
+
+
+# --- the USB/IP server
+
+_SUBMIT = struct.Struct(">IIIIIIiiii8s")
+_REQUESTS = (
+    bytes((0x80, 6, 0, 1, 0, 0, 18, 0)),  # device descriptor
+    bytes((0x80, 6, 0, 2, 0, 0, 255, 255)),
+    bytes((0x80, 6, 2, 3, 9, 4, 255, 0)),
+    bytes((0x00, 9, 1, 0, 0, 0, 0, 0)),  # set configuration
+    bytes((0x02, 1, 0, 0, 0x81, 0, 0, 0)),  # clear halt
+    bytes((0x02, 3, 0, 0, 0x81, 0, 0, 0)),  # set halt
+    bytes((0x02, 3, 0, 0, 0x02, 0, 0, 0)),
+    bytes((0x40, 1, 0, 0, 0, 0, 255, 255)),
+)
+
+
+def usbip_server(seed: int, count: int) -> int:
+    """Clients of the USB/IP server: valid, hostile and broken messages, in any pieces."""
+    case = _Case("USB/IP server", seed)
+    with Dex3Hands((Side.LEFT, Side.RIGHT), seed=seed) as hands:
+        made = 0
+        while made < count:
+            stream = b"".join(_message(case) for _ in range(min(40, count - made)))
+            made += min(40, count - made)
+            case.number = made
+            case.run(stream, lambda stream=stream: _client(case, hands, stream))  # type: ignore[misc]
+    return made
+
+
+def _message(case: _Case) -> bytes:
+    rnd = case.random
+    number = rnd.choice((1, 2, rnd.randrange(1, 1000), case.number_of(4)))
+    endpoint = rnd.choice((0, 1, 2, 2, 1, 15, case.number_of(4)))
+    direction = rnd.choice((0, 1)) if rnd.random() < 0.99 else case.number_of(4)
+    if rnd.random() < 0.2:
+        return struct.pack(">IIIIII24x", 2, number, 2, direction, endpoint, rnd.randrange(1000))
+    length = rnd.choice((0, 8, 512, 1234, 2048)) if rnd.random() < 0.97 else case.number_of(4)
+    setup = rnd.choice(_REQUESTS) if rnd.random() < 0.8 else rnd.randbytes(8)
+    data = b""
+    if direction == 0 and length < 5000:
+        data = _hand_frame(case)[:length].ljust(length, b"\0")
+    signed = length - (1 << 32) if length >> 31 else length
+    command = 1 if rnd.random() < 0.99 else case.number_of(4)
+    some = (rnd.choice((0, -1, 3)), rnd.choice((0, -1, 5)), 0)
+    header = _SUBMIT.pack(command, number, 2, direction, endpoint, 0, signed, *some, setup)
+    return case.spoil(header + data) if rnd.random() < 0.1 else header + data
+
+
+def _client(case: _Case, hands: Dex3Hands, stream: bytes) -> None:
+    rnd = case.random
+    address = ("127.0.0.1", hands.port)
+    with contextlib.suppress(OSError), socket.create_connection(address, 5.0) as sock:
+        greeting = struct.pack(">HHI32s", 0x111, 0x8003, 0, rnd.choice((b"1-1", b"1-2", b"1-3")))
+        sock.sendall(case.spoil(greeting))
+        pieces = rnd.choice((1, 1, 3, 10))
+        for i in range(pieces):
+            sock.sendall(stream[len(stream) * i // pieces : len(stream) * (i + 1) // pieces])
+        sock.setblocking(False)
+        for _ in range(rnd.choice((0, 1, 5))):
+            if not select.select([sock], [], [], 0.01)[0] or not sock.recv(1 << 16):
+                break
+    for problem in (hands.error, hands.failure):
+        if problem is not None:
+            raise AssertionError(f"the server failed: {problem!r}") from problem
+    with socket.create_connection(address, 5.0) as polite:
+        polite.sendall(struct.pack(">HHI", 0x111, 0x8005, 0))
+        answer = b""
+        while piece := polite.recv(4096):
+            answer += piece
+        assert answer[:12] == struct.pack(">HHII", 0x111, 5, 0, 2), answer[:12]
+
+
+FUZZERS: dict[str, Callable[[int, int], int]] = {
+    "mx64-line": mx64_line,
+    "m4010-line": m4010_line,
+    "dex3": dex3,
+    "bodies": bodies,
+    "faults": faults,
+    "usbip-server": usbip_server,
+}
+"""All of this module, by name: ``FUZZERS[name](seed, count)``."""
