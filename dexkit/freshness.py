@@ -67,7 +67,7 @@ _WRITERS = 64  # remembered; the one heard longest ago is forgotten first
 
 
 class PauseWatch:
-    """Notices when a loop stood still. For one thread.
+    """Notices when a loop stood still. For one thread, but for :meth:`away`.
 
     :param clock: :meth:`~dexkit.clock.Clock.since_boot` of it is used.
     """
@@ -79,6 +79,11 @@ class PauseWatch:
     def restart(self) -> None:
         """The loop was away on purpose."""
         self._last = self._clock.since_boot()
+
+    def away(self) -> float:
+        """Seconds since the last look or restart, for another thread; 0 before the first."""
+        last = self._last
+        return 0.0 if last is None else self._clock.since_boot() - last
 
     def look(self, allowed: float = PAUSE) -> float:
         """Seconds since the last look if they are more than ``allowed``; else 0."""

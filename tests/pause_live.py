@@ -169,6 +169,7 @@ def _setup(name: str, domain: int, other: int) -> Iterator[tuple[Tool, _Hand, in
     with contextlib.ExitStack() as stack:
         enter = stack.enter_context
         options = ("--side", SIDE, "--domain", domain)
+        patient = ("--set", "timeout=0.3", "--wait-for-device")  # emulators on a busy machine
         if name == "ezgripper":
             gripper = enter(emulated_ezgripper(start=5.0, closed_at=_CLOSED_AT))
             assert isinstance(gripper, EmulatedThread)
@@ -178,21 +179,20 @@ def _setup(name: str, domain: int, other: int) -> Iterator[tuple[Tool, _Hand, in
                 turned = (servo.get(mx64.PRESENT_POSITION) - _CLOSED_AT + 200) % 4096 - 200
                 return np.array([turned / _TICKS * 5.4])
 
-            device = ("--device", gripper.path, "--set", f"zero={_CLOSED_AT}", "--wait-for-device")
-            tool = enter(_serve("serve", name, *device, *options))
+            device = ("--device", gripper.path, "--set", f"zero={_CLOSED_AT}")
+            tool = enter(_serve("serve", name, *device, *patient, *options))
             yield tool, _Hand(dialect("unitree_go"), ticks), domain
         elif name == "dex1-serial":
             folder = enter(tempfile.TemporaryDirectory())
             motors = Dex1Motors((SIDE,), links={SIDE: os.path.join(folder, "tty")})
             stack.callback(motors.close)
-            device = ("--device", motors.path, "--wait-for-device")
-            tool = enter(_serve("serve", name, *device, *options))
+            tool = enter(_serve("serve", name, "--device", motors.path, *patient, *options))
             hand = _Hand(dialect("unitree_go"), lambda: np.array([motors.motor.q]))
             yield tool, hand, domain
         elif name == "dex3-usb":
             hands = enter(Dex3Hands((SIDE,)))
             joints = hands.device(SIDE).body.joints
-            tool = enter(_serve("serve", name, "--usb", hands.url, *options))
+            tool = enter(_serve("serve", name, "--usb", hands.url, *patient, *options))
             hand = _Hand(dialect("dex3"), lambda: np.array([joint.q for joint in joints]))
             yield tool, hand, domain
         elif name == "bridge":

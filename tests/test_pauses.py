@@ -156,6 +156,17 @@ def test_an_exchange_that_hangs_is_a_pause_of_that_hand_only() -> None:
         assert service.counters.pauses >= 1
 
 
+def test_an_exchange_that_may_take_long_by_itself_does_not_hide_a_stop() -> None:
+    """The exchange thread goes on first: that the publishing loop has not looked is enough."""
+    hand, node, clock = ScriptedHand(io_rate=2.0), FakeNode(), Suspendable()
+    client = Client(node, clock)
+    with HandService(hand, node=node, clock=clock) as service:  # type: ignore[arg-type]
+        core = service.cores[LEFT]
+        client.until(lambda: core.driving, 2.0)
+        service._publisher.remove(service._tick)  # it hangs
+        client.until(lambda: not core.driving, 2.0)
+
+
 def test_a_hand_and_a_state_that_are_slow_by_themselves_are_no_pause() -> None:
     hand, node, clock = ScriptedHand(io_rate=3.0), FakeNode(), Suspendable()
     client = Client(node, clock)

@@ -184,6 +184,7 @@ class HandService:
         self._ages = Ages()
         self._receive_watch = PauseWatch(self._clock)
         self._publish_watch = PauseWatch(self._clock)
+        self._publish_allowed = PAUSE + 1.0 / self.state_rate
         self._pause_lock = threading.Lock()
         self._resumed = -math.inf  # when the last pause ended
         self._receiving: threading.Thread | None = None
@@ -444,6 +445,16 @@ class HandService:
             self._say_paused(away)
         return True
 
+    def _stood_still(self, unit: _Unit, allowed: float) -> bool:
+        """Whether a hand's exchanges did, or the publishing loop does: where exchanges may take
+        long, a stop of the process is seen there, and this thread may be the first to go on.
+        """
+        stood = self._look(unit.watch, [unit], allowed)
+        if self._publish_watch.away() > self._publish_allowed:
+            unit.core.paused()
+            return True
+        return stood
+
     def _look_received(self) -> None:
         if self._look(self._receive_watch, self._units):
             self._ages.resumed(self._clock.since_boot())
@@ -527,7 +538,7 @@ class HandService:
         try:
             if command is None:
                 command = core.next_command()
-                if self._look(unit.watch, [unit], allowed):
+                if self._stood_still(unit, allowed):
                     command = core.next_command()
             core.measured(unit.hand.exchange(command))
         except Exception as error:  # a backend is other people's code
@@ -577,7 +588,7 @@ class HandService:
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
             return
-        self._look(self._publish_watch, self._units, PAUSE + 1.0 / self.state_rate)
+        self._look(self._publish_watch, self._units, self._publish_allowed)
         self.counters.publish_misses += missed
         self._ticks += 1
         every = self._low_rate_every
