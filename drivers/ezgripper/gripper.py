@@ -116,8 +116,9 @@ _LATENCY_TIMER = 1e-3
 """Seconds, assumed of an adapter whose timer the system does not show: a full-speed USB adapter
 without one is still asked once in a frame of 1 ms."""
 _TURNAROUND = 0.5e-3
-"""Seconds that the service is given from an answer to its next request; CPython needs about
-0.3 ms where nothing else runs (benchmarks/bench_serial.py)."""
+"""Seconds that the service is given from an answer to its next request. An exchange costs CPython
+0.1 ms of processor time (benchmarks/bench_serial.py); the rest is for what else wants the
+processor."""
 
 _LONGEST_PAUSE = 2.0
 """Seconds that opening waits for a restart to be due; a later one is left to a later opening."""
