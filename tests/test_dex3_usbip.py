@@ -31,6 +31,7 @@ from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import PRODUCT, PRODUCT_ID, STATE, VENDOR_ID, HandCodec
+from tests.patience import PATIENCE
 
 OUT_EP, IN_EP = 0x02, 0x81
 BOTH = (Side.LEFT, Side.RIGHT)
@@ -80,7 +81,7 @@ def exchange(device: Any, frame: bytes = b"", side: Side = Side.LEFT) -> HandSta
     return HandCodec(DEX3_1.joints[side]).decode(answer, 0.0)
 
 
-def wait_for(what: object, seconds: float = 5.0) -> None:
+def wait_for(what: object, seconds: float = PATIENCE) -> None:
     deadline = time.monotonic() + seconds
     assert callable(what)
     while not what():
@@ -184,7 +185,7 @@ def test_a_read_without_a_write_times_out() -> None:
         with pytest.raises(usb.core.USBError) as caught:
             device.read(IN_EP, STATE.size, 100)
         assert caught.value.errno == errno.ETIMEDOUT
-        assert 0.09 < time.monotonic() - started < 2.0
+        assert time.monotonic() - started > 0.09
         exchange(device)
 
 

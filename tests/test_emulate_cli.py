@@ -37,6 +37,7 @@ from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
+from tests.patience import PATIENCE
 
 PING = dxl.encode(1, Instruction.PING)
 
@@ -51,7 +52,7 @@ class Client:
         settings[4] = settings[5] = speed
         termios.tcsetattr(self.fd, termios.TCSANOW, settings)
 
-    def ask(self, data: bytes, timeout: float = 5.0) -> Packet | None:
+    def ask(self, data: bytes, timeout: float = PATIENCE) -> Packet | None:
         os.write(self.fd, data)
         parser = dxl.PacketParser()
         deadline = time.monotonic() + timeout
@@ -77,7 +78,7 @@ def client(path: str, speed: int = termios.B1000000) -> Iterator[Client]:
         opened.close()
 
 
-def wait_for(what: object, seconds: float = 5.0) -> None:
+def wait_for(what: object, seconds: float = PATIENCE) -> None:
     deadline = time.monotonic() + seconds
     assert callable(what)
     while not what():
@@ -85,7 +86,7 @@ def wait_for(what: object, seconds: float = 5.0) -> None:
         time.sleep(0.005)
 
 
-def ping(path: str, servo_id: int = 1, timeout: float = 5.0) -> bool:
+def ping(path: str, servo_id: int = 1, timeout: float = PATIENCE) -> bool:
     with client(path) as opened:
         return opened.ask(dxl.encode(servo_id, Instruction.PING), timeout) is not None
 

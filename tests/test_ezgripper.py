@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import subprocess
 import sys
 import time
@@ -59,11 +60,12 @@ from dexkit.errors import (
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
+from tests.patience import PATIENCE, waits_of
 
 ZERO = 1510
 """Where the emulated gripper's fingers are closed, by default."""
 QUICK = ControlSettings(startup_speed=150.0)
-LONG = 10.0
+LONG = PATIENCE
 """Seconds to wait for something that should take far less, on a busy machine."""
 
 OPEN, HALF, CLOSE = (HandCommand.position(q) for q in (5.4, 2.7, 0.0))
@@ -354,12 +356,13 @@ def test_it_follows_measures_and_switches_off(tmp_path: Path) -> None:
             assert start.measured
             moving = drive(hand, OPEN, lambda s: float(s.dq[0]) > 1.0)
             assert float(moving.tau_est[0]) == 0.0
+            before = time.monotonic()
             opened = drive(hand, OPEN, at(5.4))
             assert travel(gripper) == pytest.approx(2500, abs=30)
             assert float(opened.voltage[0]) == pytest.approx(12.0, abs=0.3)
             assert 20 <= float(opened.temperature[0]) <= 40
             assert opened.fault[0] == 0
-            assert 0 <= time.monotonic() - opened.stamp < 1.0
+            assert before <= opened.stamp <= time.monotonic()
             drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
             drive(hand, HALF, at(2.7))
             assert gripper.servo.torque
@@ -724,22 +727,24 @@ def test_damaged_and_lost_answers_are_retried_and_counted(tmp_path: Path) -> Non
             assert statistics.retries == statistics.corrupt + statistics.timeouts
 
 
-def test_silence_is_a_timeout_within_the_stated_time(tmp_path: Path) -> None:
+def test_silence_is_a_timeout_within_the_stated_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with emulated() as gripper:
         with gripper_on(gripper.path, configured(tmp_path, timeout=0.03)) as hand:
             hand.exchange(BRAKE)
             gripper.inject("drop:for=600ms")
             deadline = time.monotonic() + LONG
+            waits = waits_of(monkeypatch, select, "select", lambda *given: given[3])
             while True:
-                started = time.monotonic()
+                waits.clear()
                 try:
                     hand.exchange(BRAKE)
                 except HandTimeout:
-                    took = time.monotonic() - started
                     break
                 assert time.monotonic() < deadline
-            # 10 ms more for a busy machine
-            assert took < hand.spec.exchange_timeout + 0.01
+            monkeypatch.undo()
+            assert 0 < sum(waits) <= hand.spec.exchange_timeout
             assert hand.bus_statistics.timeouts >= 3
             while True:
                 try:

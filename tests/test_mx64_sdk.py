@@ -16,6 +16,7 @@ import pytest
 
 from dexkit.emulators.mx64 import EmulatedProcess, emulated_ezgripper
 from dexkit.wire import mx64
+from tests.patience import PATIENCE
 
 OK = (sdk.COMM_SUCCESS, 0)
 
@@ -51,7 +52,7 @@ def port(pair: EmulatedProcess) -> Iterator[sdk.PortHandler]:
 PACKETS = sdk.PacketHandler(2.0)
 
 
-def eventually(what: Callable[[], bool], seconds: float = 5.0) -> None:
+def eventually(what: Callable[[], bool], seconds: float = PATIENCE) -> None:
     deadline = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < deadline

@@ -46,9 +46,7 @@ def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int)
                      "500 Hz", f"domain {dds_domain}"):  # fmt: skip
             assert part in ready
         assert dds_node.discovery.wait(lambda _: there(), 10)
-        start = time.monotonic()
         code, out, err = process.end(number)
-        assert time.monotonic() - start < 5
         # the participant said goodbye: its endpoints go now, not when a lease runs out (10 s)
         assert dds_node.discovery.wait(lambda _: not there(), 3)
     assert (code, out) == (0, "")
