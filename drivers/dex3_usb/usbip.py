@@ -47,6 +47,8 @@ class _Connection:
 
     The keyword arguments of :meth:`submit` are those of the package's own connection, whose
     place it takes.
+
+    :ivar passed_over: answers that came while their read was being cancelled.
     """
 
     def __init__(self, sock: socket.socket, devid: int) -> None:
@@ -63,6 +65,7 @@ class _Connection:
         self._view = memoryview(self._buffer)
         self._begin = self._end = 0  # of what was received and not yet looked at
         self._broken = ""
+        self.passed_over = 0
 
     def close(self) -> None:
         """Give the device back. May be called twice."""
@@ -95,6 +98,7 @@ class _Connection:
                 number, status, data = self._reply(deadline)
                 if number == seq:
                     return status, data
+                self.passed_over += bool(data)
         except USBTimeoutError:
             self._cancel(seq, ep, direction)
             raise
@@ -121,6 +125,8 @@ class _Connection:
                         self._cancel(read, in_ep, _IN)
                         return status, 0, b""
                     deadline = _deadline(timeout_ms)
+                else:
+                    self.passed_over += bool(answer)
         except USBTimeoutError:
             self._cancel(write, out_ep, _OUT)
             self._cancel(read, in_ep, _IN)
