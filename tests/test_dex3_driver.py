@@ -1007,6 +1007,7 @@ class TestUsbIpClient:
         server.sendall(self.reply(1) + self.reply(2, b"late") + self.reply(3, command=4))
         server.sendall(self.reply(4, command=4) + self.reply(5) + self.reply(6, b"right"))
         assert self.exchange(connection, 2000) == (0, 0, b"right")
+        assert connection.passed_over == 1  # the link behind it is told
         connection.close()
         server.close()
 
