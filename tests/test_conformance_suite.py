@@ -312,7 +312,7 @@ def test_whoever_ends_the_suite_early_ends_the_hand_in_order(
         if "moving slowly" in line or "large steps" in line:
             run.send_signal(signum)
             break
-    seen += run.communicate(timeout=30)[0]
+    seen += run.communicate(timeout=60)[0]
     assert run.returncode == 128 + signum, seen
     assert f"the run was stopped ({signum.name}); nothing was judged, which is not a pass" in seen
     # the record is written once every process has ended as it was asked to

@@ -35,7 +35,7 @@ with SdkClient(1) as sdk, DdsNode(1, "lo") as node:
     reader, writer = node.reader("rt/cmd", CMDS), node.writer("rt/state", STATES)
     sdk.subscribe("rt/state", STATES)
     sdk.stream("rt/cmd", CMDS, MotorCmds_([MotorCmd_(q=1.5)]), hz=100)
-    print("matched", reader.wait_matched(20), writer.wait_matched(20))
+    print("matched", reader.wait_matched(60), writer.wait_matched(60))
     reader.wait(10)
     print("command", reader.take()[-1].message.cmds[0].q)
     writer.write(MotorStates_([MotorState_(q=2.5)]))

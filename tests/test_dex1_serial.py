@@ -130,7 +130,7 @@ def test_both_hands_on_one_line_take_turns() -> None:
             for thread in threads:
                 thread.start()
             for thread in threads:
-                thread.join(20)
+                thread.join(60)
             assert motors.motors[Side.LEFT].q == pytest.approx(4.0, abs=0.1)
             assert motors.motors[Side.RIGHT].q == pytest.approx(2.0, abs=0.1)
             assert left.line_statistics is right.line_statistics

@@ -700,15 +700,15 @@ class TestLateAnswers:
             except HandTimeout:
                 assert time.monotonic() - before >= 0.09
             begin = time.monotonic()
-            good = 0
-            while not good or time.monotonic() < begin + 0.4:
+            while True:
                 assert time.monotonic() < begin + PATIENCE
                 try:
                     state = hand.exchange(GO)
                 except HandTimeout:
                     continue
-                good += 1
                 assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
+                if time.monotonic() > begin + 0.4:
+                    break  # behind an answer: none of a time-out is still on its way
             assert hand.statistics.link.late == hand.statistics.link.timeouts
 
     def test_a_lost_one_costs_its_time_only(self) -> None:

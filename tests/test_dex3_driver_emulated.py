@@ -173,7 +173,7 @@ class TestTimeoutProtection:
             assert isinstance(emulated, Dex3Hands)
             device = emulated.device()
             hand.exchange(go(GOAL[Side.LEFT]))
-            wait_until(lambda: all(device.tripped), 3.0, "the motors to stop")
+            wait_until(lambda: all(device.tripped), what="the motors to stop")
             state = hand.exchange(go(GOAL[Side.LEFT]))
             assert (state.fault & TRIPPED).all()
             drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault.any())

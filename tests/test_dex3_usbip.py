@@ -375,7 +375,7 @@ def test_a_dropped_answer_is_a_time_out_and_nothing_stale_follows() -> None:
 
 @contextlib.contextmanager
 def imported(port: int, busid: bytes = b"1-1") -> Iterator[socket.socket]:
-    with socket.create_connection(("127.0.0.1", port), timeout=5.0) as sock:
+    with socket.create_connection(("127.0.0.1", port), timeout=60.0) as sock:
         protocol.client_import(sock, busid)
         yield sock
 
@@ -459,7 +459,7 @@ def test_no_such_bus() -> None:
 def test_who_does_not_speak_usbip_is_cut_off(garbage: bytes) -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
-        with socket.create_connection(("127.0.0.1", port), timeout=5.0) as sock:
+        with socket.create_connection(("127.0.0.1", port), timeout=60.0) as sock:
             sock.sendall(garbage)
             with contextlib.suppress(ConnectionResetError):
                 assert sock.recv(100) == b""
@@ -506,7 +506,7 @@ def test_a_client_that_reads_nothing_is_cut_off() -> None:
     with emulated_dex3(BOTH) as hands, socket.socket() as deaf:
         port = inside(hands).port
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        deaf.settimeout(5.0)
+        deaf.settimeout(60.0)
         deaf.connect(("127.0.0.1", port))
         protocol.client_import(deaf, b"1-1")
         with pytest.raises(ConnectionError):

@@ -123,7 +123,7 @@ def test_ready_answer_stop_and_nothing_left(tmp_path: Path, signum: signal.Signa
     assert answer is not None
     assert answer.id == 7
     process.send_signal(signum)
-    out, err = process.communicate(timeout=10)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert "stopped: 10 bytes in, 14 bytes out" in out.decode()
     assert err == b""
@@ -180,7 +180,7 @@ def test_process_ends_with_its_parent(tmp_path: Path) -> None:
         assert isinstance(gripper, EmulatedProcess)
         assert gripper.process.stdin is not None
         gripper.process.stdin.close()
-        assert gripper.process.wait(10) == 0
+        assert gripper.process.wait(60) == 0
         gripper.process.stdin = None
     assert list(tmp_path.iterdir()) == []
 
@@ -209,7 +209,7 @@ def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, says: str)
     if arguments:
         arguments = ["--link", str(tmp_path / "g"), *arguments]
     process = emulate(*arguments)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == code
     assert says in err.decode()
     assert "Traceback" not in err.decode()
@@ -270,7 +270,7 @@ def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
 
 def test_eeprom_file_without_a_directory_is_an_error_at_once(tmp_path: Path) -> None:
     process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(tmp_path / "no" / "e.json"))
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
     assert b"directory" in errors
     assert not os.path.lexists(tmp_path / "g")
@@ -281,7 +281,7 @@ def test_broken_eeprom_file_is_an_error(tmp_path: Path, text: str) -> None:
     file = tmp_path / "eeprom.json"
     file.write_text(text)
     process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(file))
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "EEPROM" in err.decode()
     assert file.read_text() == text
@@ -441,7 +441,7 @@ def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.S
         handle.bulk_out(0x02, bytes(1234))
         assert len(handle.bulk_in(0x81, 1270)) == 1270
         process.send_signal(signum)  # with a client attached
-        out, err = process.communicate(timeout=10)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert out.decode().splitlines() == [
         "stopped: left: nothing was sent",
@@ -452,7 +452,7 @@ def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.S
 
 def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     process = emulate_dex3("--faults-from-stdin", "--fault", "drop@1h:for=1s")
-    _, err = process.communicate(timeout=10)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert b"'1h' is not a time" in err
     assert b"silent" in err  # the hint names what a hand can have
@@ -466,7 +466,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     process.stdin.write(b"fire\nunplug\n")
     process.stdin.flush()
     wait_for(lambda: usbip.host.list_devices(transport) == [])
-    _, err = process.communicate(timeout=10)  # closes its input
+    _, err = process.communicate(timeout=60)  # closes its input
     assert process.returncode == 0
     assert b"there is no kind 'fire'" in err
     assert b"Traceback" not in err
@@ -484,7 +484,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     ],
 )
 def test_hand_that_cannot_be(arguments: list[str], says: str) -> None:
-    _, err = emulate_dex3(*arguments).communicate(timeout=20)
+    _, err = emulate_dex3(*arguments).communicate(timeout=60)
     assert says in err.decode()
     assert "Traceback" not in err.decode()
 

@@ -135,7 +135,7 @@ class TestLink:
             hand.plugged = True
             wait_until(lambda: newest(node).lost == 0)
             assert newest(node).reserve[0] == 0
-            seen = [hand.commands.get(timeout=1) for _ in range(20)]
+            seen = [hand.commands.get(timeout=60) for _ in range(20)]
             assert all(command.is_brake for command in seen)
             assert hand.q == 2.0
             node.deliver(CMD, cmd(4.0))

@@ -45,10 +45,10 @@ def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int)
         for part in ("sim-dex1 left", "rt/dex1/left/cmd", "rt/dex1/left/state", "unitree_go",
                      "500 Hz", f"domain {dds_domain}"):  # fmt: skip
             assert part in ready
-        assert dds_node.discovery.wait(lambda _: there(), 10)
+        assert dds_node.discovery.wait(lambda _: there(), 60)
         code, out, err = process.end(number)
         # the participant said goodbye: its endpoints go now, not when a lease runs out (10 s)
-        assert dds_node.discovery.wait(lambda _: not there(), 3)
+        assert dds_node.discovery.wait(lambda _: not there(), 8)
     assert (code, out) == (0, "")
     assert "Traceback" not in err
     last = counters(next(line for line in err.splitlines() if "counters" in line))

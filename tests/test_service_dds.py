@@ -34,7 +34,7 @@ class Client:
             STATE, GO.state_type, qos=Qos("best_effort", depth=5000)
         )
         self.commands: Writer = self.node.writer(CMD, GO.cmd_type)
-        assert self.commands.wait_matched(10)
+        assert self.commands.wait_matched(60)
 
     def command(self, q: float, kp: float = 5.0) -> None:
         self.commands.write(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=kp, kd=0.05)]))
@@ -110,7 +110,7 @@ def test_the_qos_is_that_of_unitrees_software(service: HandService, dds_node: Dd
     def mine() -> list[object]:
         return [e for e in dds_node.endpoints() if e.topic in (CMD, STATE)]
 
-    assert dds_node.discovery.wait(lambda _: len(mine()) == 2, 10)
+    assert dds_node.discovery.wait(lambda _: len(mine()) == 2, 60)
     reader, writer = sorted(
         (e for e in dds_node.endpoints() if e.topic in (CMD, STATE)), key=lambda e: e.kind
     )
@@ -191,5 +191,5 @@ def test_leaving_leaves_nothing(dds_domain: int, dds_node: DdsNode) -> None:
         return any(e.topic in (CMD, STATE) for e in dds_node.endpoints())
 
     with HandService(ScriptedHand(Side.LEFT), domain=dds_domain):
-        assert dds_node.discovery.wait(lambda _: there(), 10)
-    assert dds_node.discovery.wait(lambda _: not there(), 10)
+        assert dds_node.discovery.wait(lambda _: there(), 60)
+    assert dds_node.discovery.wait(lambda _: not there(), 60)
