@@ -66,6 +66,25 @@ def test_under_nohup_a_hangup_is_nothing() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+def test_started_in_the_background_under_nohup_it_outlives_the_terminal(dds_domain: int) -> None:
+    """A hangup is ignored as it was asked for; an interrupt that is sent still ends it in order."""
+    ignored = (signal.SIGHUP, signal.SIGINT)
+    before = [signal.signal(number, signal.SIG_IGN) for number in ignored]
+    try:
+        process = Process("serve", "sim-dex1", "--side", "left", "--domain", dds_domain, "--quiet")
+    finally:
+        for number, handler in zip(ignored, before, strict=True):
+            signal.signal(number, handler)
+    try:
+        process.ready()
+        process.signal(signal.SIGHUP)
+        process.signal(signal.SIGUSR1)
+        assert counters(process.line("counters"))["state_topic"] == "rt/dex1/left/state"
+        assert process.end(signal.SIGINT)[0] == 0
+    finally:
+        process.end(signal.SIGKILL)
+
+
 def test_sigusr1_logs_the_counters(dds_domain: int) -> None:
     with serving("sim-dex1", "--side", "right", "--domain", dds_domain, "--quiet") as process:
         process.ready()
