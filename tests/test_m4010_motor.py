@@ -427,7 +427,7 @@ def test_faults_of_other_devices_are_refused(spec: str, says: str) -> None:
 # --- the command
 
 
-def exchange(port: serial.Serial, command: MotorCmd, timeout: float = 2.0) -> MotorData | None:
+def exchange(port: serial.Serial, command: MotorCmd, timeout: float = 60.0) -> MotorData | None:
     parser = FrameParser((DATA,))
     port.write(command.pack())
     end = time.monotonic() + timeout

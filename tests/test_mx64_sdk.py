@@ -58,6 +58,11 @@ def eventually(what: Callable[[], bool], seconds: float = PATIENCE) -> None:
         assert time.monotonic() < deadline
 
 
+def _come(port: sdk.PortHandler, count: int) -> None:
+    """Wait until so many bytes are there, and leave them."""
+    eventually(lambda: port.ser.in_waiting >= count)
+
+
 def test_ping(port: sdk.PortHandler) -> None:
     assert PACKETS.ping(port, 1) == (mx64.MODEL, *OK)
     assert PACKETS.ping(port, 3)[1] == sdk.COMM_RX_TIMEOUT
@@ -83,7 +88,7 @@ def test_reads_and_writes_of_every_size(port: sdk.PortHandler) -> None:
 def test_tx_only_and_rx_apart(port: sdk.PortHandler) -> None:
     assert PACKETS.write1ByteTxOnly(port, 1, mx64.LED.address, 0) == sdk.COMM_SUCCESS
     port.is_using = False
-    time.sleep(0.02)  # the status of the write is flushed by the next request
+    _come(port, 11)  # the status of the write, dropped by the next request
     assert PACKETS.read4ByteTx(port, 1, mx64.PRESENT_POSITION.address) == sdk.COMM_SUCCESS
     value, result, error = PACKETS.read4ByteRx(port, 1)
     assert (result, error) == OK
@@ -95,7 +100,7 @@ def test_register_and_act(port: sdk.PortHandler) -> None:
     assert PACKETS.read1ByteTxRx(port, 1, mx64.REGISTERED_INSTRUCTION.address)[0] == 1
     assert PACKETS.action(port, 1) == sdk.COMM_SUCCESS
     port.is_using = False
-    time.sleep(0.05)  # the SDK does not take the answer: let it come, the next request drops it
+    _come(port, 11)  # the SDK does not take the answer; the next request drops it
     assert PACKETS.read1ByteTxRx(port, 1, mx64.REGISTERED_INSTRUCTION.address)[0] == 0
     assert PACKETS.read1ByteTxRx(port, 1, mx64.LED.address)[0] == 1
 

@@ -113,3 +113,11 @@ def test_every_file_that_may_skip_a_test_is_in_the_list() -> None:
 def test_the_files_in_the_list_exist(optional: Optional) -> None:
     for name in optional.tests:
         assert " " in name or (HERE / f"test_{name}.py").is_file(), name
+
+
+def test_no_test_says_by_when_something_has_happened() -> None:
+    """How fast it is depends on the machine: benchmarks say that, with what they compare to."""
+    bound = re.compile(r"\s*assert .*time\.(monotonic|perf_counter|time)\(\) - \w+(\[\d+\])? <")
+    for path in sorted(HERE.glob("*.py")):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            assert not bound.match(line), f"{path.name}:{number}: use tests/patience.py"
