@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -71,6 +72,14 @@ LONG = PATIENCE
 OPEN, HALF, CLOSE = (HandCommand.position(q) for q in (5.4, 2.7, 0.0))
 LIMP = HandCommand.position(5.4, kp=0.0, kd=0.0)
 BRAKE = HandCommand.brake(1)
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command's grippers get the time that :func:`configured` gives those of the tests."""
+    monkeypatch.setattr(
+        "dexkit.cli.calibrate.GripperSettings", partial(GripperSettings, timeout=0.2)
+    )
 
 
 @contextmanager
