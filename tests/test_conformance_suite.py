@@ -229,7 +229,8 @@ def test_a_hand_that_asks_for_history_is_caught_on_dds(tmp_path: Path) -> None:
     assert failed(result) == {("DEX1-QOS-01", "left")}
 
 
-def test_nobody_there_is_one_clear_error(tmp_path: Path) -> None:
+def test_nobody_there_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dexkit.conformance.live.DISCOVERY_TIMEOUT", 0.3)  # there is nobody
     rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
     with pytest.raises(ConformanceError, match="nobody publishes rt/dex1/left/state") as caught:
         record_run(LiveOptions(rig, frozenset({"step"})), tmp_path / "run.mcap")
