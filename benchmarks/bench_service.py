@@ -9,7 +9,7 @@ that does nothing but keep the same deadlines, runs at the same time with the sa
 that both see the same machine.
 
 For latency a tap sits between a service and its gripper and notes when the bytes of each goal
-arrive. The peer is one exchange: a command that comes while one is under way waits for it.
+arrive. The peer is one period: a command that comes while an exchange is under way waits for it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from benchmarks import Result
 from dexkit.clock import Rate
 from dexkit.dds import DdsNode, Qos
-from dexkit.drivers.ezgripper.servo import exchange_time
+from dexkit.drivers.ezgripper import EZGripper
 from dexkit.emulators.mx64 import EmulatedProcess, emulated_ezgripper
 from dexkit.hand import Side
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
@@ -214,13 +214,13 @@ def latency(domain: int, device: str) -> list[Result]:
         if i >= 0:
             taken.setdefault(i, (stamp - sent[i]) / 1e6)
     ms = np.array(list(taken.values())[10:])  # the first ones switch the motor on
-    bound = 1e3 * exchange_time(1_000_000)
+    bound = 1e3 / EZGripper(device).spec.io_rate
     return [
         Result(
             name=f"DDS command to serial byte, p{q:g}",
             value=float(np.percentile(ms, q)),
             unit="ms",
-            peer="one exchange on the line",
+            peer="one period of the exchanges",
             peer_value=bound,
             ratio=bound / float(np.percentile(ms, q)),
             note=f"{len(ms)} of {_COMMANDS} commands, a tap on the line" if q == 50 else "",

@@ -133,7 +133,8 @@ class HandSpec:
     :param model: name in :data:`dexkit.models.MODELS`, for example ``"dex1-1"``.
     :param side: which hand.
     :param joints: in the order of the DDS sequences.
-    :param io_rate: exchanges a second that the backend can do; the service asks for no more.
+    :param io_rate: exchanges a second that can be expected of the backend when nothing is wrong:
+        the service asks for no more, and counts what it gets.
     :param exchange_timeout: seconds after which ``exchange`` has returned or raised.
     :param n_sensors: pressure sensor packets in a state.
     :param simulated: no real device moves when this hand is commanded.

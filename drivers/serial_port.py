@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import termios
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout
 
 __all__ = [
     "Device",
+    "exchange_period",
     "find_device",
     "latency_timer",
     "latency_warning",
@@ -86,19 +88,52 @@ def latency_timer(path: str, sysfs: Path = Path("/sys")) -> int | None:
         return None
 
 
+def exchange_period(line_time: float, latency_timer: float, turnaround: float = 0.0) -> float:
+    """Seconds from one exchange to the next of a host that asks again as soon as it can.
+
+    The latency timer runs freely: the adapter hands over what has come at the ticks ``k * T`` of
+    its timer, whenever that came. So a host gets an answer at a tick; call it 0. The host sends
+    the next request at ``h`` (turnaround), the answer is complete at ``h + t`` (line time), and is
+    handed over at the first tick that is not earlier::
+
+        period = ceil((h + t) / T) * T          T > 0
+        period = h + t                          no timer
+
+    That is a tick again, so every following period is the same. It grows with ``h``: with
+    ``h = 0`` it is the shortest that the line allows, and 1 / period an upper bound of the rate
+    whatever the host. It is shorter than ``h + t + T``, what an exchange takes at most that begins
+    at any moment. Of the first exchange nothing is known but ``t``, so ``n`` in a row take
+    ``t + (n - 1) * period`` at least.
+
+    It holds for one answer in an exchange that fits into one USB packet (62 bytes of an FTDI
+    chip: a full packet leaves at once). ``tests/test_line_time.py`` compares it with the
+    emulated line.
+
+    :param line_time: seconds from the first bit of the request to the last of the answer: the
+        bytes at the baud rate, and what the device waits before it answers.
+    :param latency_timer: seconds; 0 for an adapter without one.
+    :param turnaround: seconds that the host needs from an answer to the next request.
+    """
+    busy = line_time + turnaround
+    if latency_timer <= 0:
+        return busy
+    # a multiple of the timer may come out a rounding error above itself
+    return max(1, math.ceil(busy / latency_timer - 1e-9)) * latency_timer
+
+
 def latency_warning(path: str, sysfs: Path = Path("/sys")) -> str:
     """What to tell the user of the latency timer, or an empty text when it is well set.
 
-    An FTDI chip holds a short answer back until its timer ends; at the usual 16 ms that leaves
-    some 60 exchanges a second (facts/mx64 C2). Nothing is changed here.
+    An FTDI chip holds a short answer back until the next tick of its timer; at the usual 16 ms
+    that leaves 62 exchanges a second at most (facts/mx64 C2). Nothing is changed here.
     """
     milliseconds = latency_timer(path, sysfs)
     if milliseconds is None or milliseconds <= 1:
         return ""
     name = Path(path).resolve().name
     return (
-        f"the latency timer of {path} is {milliseconds} ms, which allows about "
-        f"{1000 // (milliseconds + 1)} exchanges a second; set it to 1 ms: "
+        f"the latency timer of {path} is {milliseconds} ms, which allows at most "
+        f"{1000 // milliseconds} exchanges a second; set it to 1 ms: "
         f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer, or for good with "
         'the udev rule: ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", '
         'ATTR{latency_timer}="1"'

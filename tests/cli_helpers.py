@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
 
+from tests.patience import PATIENCE
+
 __all__ = ["Process", "running"]
 
 
@@ -48,7 +50,7 @@ class Process:
         if number is not None and self._popen.poll() is None:
             self._popen.send_signal(number)
         try:
-            out, err = self._popen.communicate(timeout=15)
+            out, err = self._popen.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:
             self._popen.kill()
             raise

@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+import os
+
+import pytest
 from hypothesis import HealthCheck, settings
+
+from tests import surroundings
+from tests.optional import header
 
 # A machine that is busy with something else makes examples slow, not wrong.
 settings.register_profile("dexkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("dexkit")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.add_cleanup(surroundings.settle())
+
+
+def pytest_report_header() -> str | None:
+    # the workers of a distributed run print none
+    return None if "PYTEST_XDIST_WORKER" in os.environ else header()

@@ -66,7 +66,7 @@ class CppSdk(JsonChild):
         self,
         condition: Callable[[dict[str, Any]], object],
         read: Callable[[], dict[str, Any]] | None = None,
-        timeout: float = 15.0,
+        timeout: float = 60.0,
     ) -> dict[str, Any]:
         """The first state (or what ``read`` gives) that ``condition`` accepts."""
         read = read or self.state

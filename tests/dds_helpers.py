@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from tests.patience import PATIENCE
+
 pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
 
 from dexkit.dds import DdsNode, Reader, Sample
@@ -59,7 +61,7 @@ def dds_node(dds_domain: int) -> Iterator[DdsNode]:
 
 
 def take_until(
-    reader: Reader, enough: Callable[[list[Sample]], bool], timeout: float = 10.0
+    reader: Reader, enough: Callable[[list[Sample]], bool], timeout: float = PATIENCE
 ) -> list[Sample]:
     """Samples taken until ``enough`` says so; fails the test on time-out."""
     samples: list[Sample] = []
@@ -73,7 +75,7 @@ def take_until(
     return samples
 
 
-def wait_until(condition: Callable[[], object], timeout: float = 10.0) -> None:
+def wait_until(condition: Callable[[], object], timeout: float = PATIENCE) -> None:
     """Poll ``condition`` every 5 ms; for state that no event announces."""
     deadline = time.monotonic() + timeout
     while not condition():

@@ -52,7 +52,7 @@ class JsonChild:
         line = self._process.stdout.readline()
         watchdog.cancel()
         if not line:
-            raise ChildError(f"the child has gone (exit code {self._process.wait(10)})")
+            raise ChildError(f"the child has gone (exit code {self._process.wait(60)})")
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
             raise ChildError(answer["error"])
@@ -74,7 +74,7 @@ class JsonChild:
             assert self._process.stdin is not None
             self._process.stdin.close()
             try:
-                self._process.wait(10)
+                self._process.wait(60)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()

@@ -13,6 +13,7 @@ from dexkit.clock import Clock, RealClock
 from dexkit.errors import HandLost
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, Side
 from dexkit.models import DEX1_1
+from tests.patience import PATIENCE
 
 
 class ScriptedHand:
@@ -150,7 +151,7 @@ class FakeReader:
         self.node.open_entities -= 1
 
 
-def wait_until(condition: Callable[[], Any], timeout: float = 5.0, what: str = "") -> None:
+def wait_until(condition: Callable[[], Any], timeout: float = PATIENCE, what: str = "") -> None:
     """Poll ``condition`` until it holds; fails the test after ``timeout`` seconds."""
     deadline = time.monotonic() + timeout
     while not condition():

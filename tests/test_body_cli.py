@@ -56,7 +56,7 @@ def test_process(node: DdsNode) -> None:
 
         elbow = G1.slot("left_elbow")
         order = low_cmd(G1, {elbow: 1.0})
-        assert commands.wait_matched(10)
+        assert commands.wait_matched(60)
 
         def there(samples: list[Sample]) -> bool:
             # again and again: the other side may not know this writer yet
@@ -76,7 +76,7 @@ def test_process(node: DdsNode) -> None:
         process.stdin.flush()
         take_until(states, lambda s: any(not any(x.message.wireless_remote) for x in s))
         process.send_signal(signal.SIGINT)
-        assert process.wait(15) == 0  # with its input open: the end of that would stop it, too
+        assert process.wait(60) == 0  # with its input open: the end of that would stop it, too
         rest, errors = process.communicate()
         lines = [json.loads(text) for text in rest.splitlines()]
         assert lines[-1]["bad_crc"] > 0
@@ -97,7 +97,7 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
     )
     thread.start()
     try:
-        assert ready.wait(10)
+        assert ready.wait(60)
         refused = CliRunner().invoke(command, arguments, standalone_mode=False)
         assert isinstance(refused.exception, TopicConflict)
         assert f"already publishes rt/lowstate on domain {node.domain}" in str(refused.exception)

@@ -47,7 +47,7 @@ class Client:
         self._scale = spoken.q_open / GO.q_open
         self.states: dict[Side, Any] = {}
         for writer in self._writers.values():
-            writer.wait_matched(5)
+            writer.wait_matched(60)
 
     def read(self) -> dict[Side, Any]:
         """The newest motor of each side."""
@@ -74,7 +74,7 @@ class Client:
 
     def drive(self, q: Mapping[Side, float]) -> None:
         """Until both are there."""
-        deadline = time.monotonic() + 15
+        deadline = time.monotonic() + 60
         while True:
             self.command(q)
             time.sleep(0.005)
@@ -217,7 +217,7 @@ def test_a_bridge_in_a_program(dds_node: DdsNode) -> None:
                 Bridge(End(other, ACTUATOR), End(other, GO)).start()
             states = other.reader(ACTUATOR.state_topic, ACTUATOR.state_type)
             hand = other.writer(GO.topics(RIGHT)[1], GO.state_type)
-            assert hand.wait_matched(5)
+            assert hand.wait_matched(60)
             wait_until(lambda: bridge.clients == 1)
             message = unitree_go.MotorStates_([unitree_go.MotorState_(q=1.25)])
             wait_until(lambda: hand.write(message) and states.wait(0.05))

@@ -102,8 +102,8 @@ class TestRate:
 @pytest.mark.realtime
 def test_the_real_clock_is_the_systems_monotonic_one() -> None:
     clock = RealClock()
-    assert abs(clock.now() - time.monotonic()) < 0.1
-    start = time.monotonic()
+    before, now, start = time.monotonic(), clock.now(), time.monotonic()
+    assert before <= now <= start
     clock.sleep_until(start + 0.02)
     assert time.monotonic() >= start + 0.02
     clock.sleep_until(start)  # the past: at once
@@ -111,9 +111,11 @@ def test_the_real_clock_is_the_systems_monotonic_one() -> None:
 
 @pytest.mark.realtime
 def test_a_real_rate_does_not_drift() -> None:
-    """Tolerance: the last of 50 deadlines within 20 ms, on a busy machine."""
+    """No deadline is early, and each is where the first says, however late the machine is."""
     rate = Rate(500.0, spin=100e-6)
-    start = time.monotonic()
+    first = rate.deadline
     while rate.loops + rate.misses < 50:
+        due = rate.deadline
         rate.wait()
-    assert 0.098 <= time.monotonic() - start < 0.12
+        assert time.monotonic() >= due
+        assert rate.deadline == pytest.approx(first + (rate.loops + rate.misses) * 2e-3)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 from html import escape, unescape
 from pathlib import Path
@@ -19,9 +18,9 @@ from dexkit.conformance.report.compare import Comparison, render_comparison
 from dexkit.conformance.report.html import render
 from dexkit.conformance.view import Recording
 from dexkit.traces import open_trace, sample_path
+from tests.optional import chromium
 from tests.report_helpers import result_of_every_kind
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 PHONE = 390
 MEASURE = """
 <script>
@@ -46,7 +45,8 @@ def seen(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[dict[str, dict[str, object]], list[str]]:
     """What the browser measured in each page, and what its console said."""
-    if CHROMIUM is None:
+    browser = chromium()
+    if browser is None:
         pytest.skip("no chromium here")
     view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
     result = judge(view)
@@ -69,7 +69,7 @@ def seen(
     (folder / "all.html").write_text(f"<!doctype html>{frames}{MEASURE}", encoding="utf-8")
     done = subprocess.run(
         [
-            CHROMIUM,
+            browser,
             "--headless",
             "--no-sandbox",
             "--disable-gpu",

@@ -242,7 +242,7 @@ def test_a_failure_is_explained_in_full() -> None:
 def test_the_heartbeat_measures_its_own_lateness() -> None:
     begin = time.time_ns()
     with Heartbeat() as heart:
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while len(heart.beats.t_us) < 5 and time.monotonic() < deadline:
             time.sleep(0.01)
     assert len(heart.beats.t_us) == len(heart.beats.late_us) >= 5

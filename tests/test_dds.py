@@ -28,8 +28,8 @@ def test_a_sample_travels_unchanged_with_its_timestamp(dds_node: DdsNode) -> Non
     with DdsNode(dds_node.domain, "lo") as other:
         reader = other.reader("rt/t1", STATES)
         writer = dds_node.writer("rt/t1", STATES)
-        assert writer.wait_matched(10)
-        assert reader.wait_matched(10)
+        assert writer.wait_matched(60)
+        assert reader.wait_matched(60)
         message = MotorStates_([MotorState_(q=1.5, tau_est=-0.5)])
         before = time.time_ns()
         assert writer.write(message, source_timestamp_ns=123_456_789_000)
@@ -77,10 +77,10 @@ def test_on_data_wakes_once_per_arrival_and_never_after_close(dds_node: DdsNode)
     arrived = threading.Semaphore(0)
     reader = dds_node.reader("rt/t3", STATES, on_data=arrived.release)
     writer = dds_node.writer("rt/t3", STATES)
-    assert writer.wait_matched(10)
+    assert writer.wait_matched(60)
     for _ in range(20):
         writer.write(MotorStates_([]))
-        assert arrived.acquire(timeout=10)
+        assert arrived.acquire(timeout=60)
         assert len(reader.take()) == 1
     reader.close()
     reader.close()
@@ -103,10 +103,10 @@ def test_a_callback_may_close_its_reader_and_its_node(dds_domain: int) -> None:
 
         reader = node.reader("rt/t11", STATES, on_data=close)
         writer = other.writer("rt/t11", STATES)
-        assert reader.wait_matched(10)
-        assert writer.wait_matched(10)
+        assert reader.wait_matched(60)
+        assert writer.wait_matched(60)
         writer.write(MotorStates_([]))
-        assert done.wait(10)
+        assert done.wait(60)
         assert node.closed
         node.close()
 
@@ -122,11 +122,11 @@ def test_a_failing_callback_is_logged_and_the_node_lives_on(
 
     dds_node.reader("rt/t4", STATES, on_data=fail)
     writer = dds_node.writer("rt/t4", STATES)
-    assert writer.wait_matched(10)
+    assert writer.wait_matched(60)
     with caplog.at_level(logging.ERROR, logger="dexkit.dds"):
         for _ in range(2):
             writer.write(MotorStates_([]))
-            assert called.acquire(timeout=10)
+            assert called.acquire(timeout=60)
         writer.close()
     assert "on purpose" in caplog.text
 
@@ -142,7 +142,7 @@ def test_discovery_tells_who_what_and_how(dds_node: DdsNode) -> None:
         writer = other.writer("rt/t5", STATES)
         other.reader("rt/t5", CMDS, qos=Qos("reliable", "transient_local", None))
         mine = dds_node.reader("rt/t5", STATES, depth=7)
-        assert dds_node.discovery.wait(lambda e: len(on_topic(e)) == 3, 10)
+        assert dds_node.discovery.wait(lambda e: len(on_topic(e)) == 3, 60)
         found = {(e.kind, e.type_name, e.own): e for e in on_topic(dds_node.endpoints())}
         assert found["writer", STATES, False].qos == Qos.writer_default()
         assert found["reader", CMDS, False].qos == Qos("reliable", "transient_local", None)
@@ -150,11 +150,11 @@ def test_discovery_tells_who_what_and_how(dds_node: DdsNode) -> None:
         assert len({e.participant for e in found.values()}) == 2
         # same process: the other node says who it is
         assert f"(pid {__import__('os').getpid()})" in found["writer", STATES, False].process
-        assert mine.wait_matched(10)
+        assert mine.wait_matched(60)
         assert mine.matched == 1  # the reader of another type is not a match
         writer.close()
-        assert dds_node.discovery.wait(lambda e: len(on_topic(e)) == 2, 10)
-    assert dds_node.discovery.wait(lambda e: len(on_topic(e)) == 1, 10)
+        assert dds_node.discovery.wait(lambda e: len(on_topic(e)) == 2, 60)
+    assert dds_node.discovery.wait(lambda e: len(on_topic(e)) == 1, 60)
     unsubscribe()
     seen = [(e.appeared, e.endpoint.kind) for e in events if e.endpoint.topic == "rt/t5"]
     assert sorted(seen) == sorted(
@@ -178,7 +178,7 @@ def test_nodes_that_discover_at_once_do_not_mix_up_policies(dds_domain: int) -> 
             for topic, kind in kinds.items():
                 stack.enter_context(nodes[0].writer(topic, STATES, qos=Qos(kind)))
             for node in nodes:
-                assert node.discovery.wait(lambda seen: len(seen) == len(kinds), timeout=10)
+                assert node.discovery.wait(lambda seen: len(seen) == len(kinds), timeout=60)
                 assert {e.topic: e.qos.reliability for e in node.endpoints()} == kinds
     finally:
         sys.setswitchinterval(interval)
@@ -188,7 +188,7 @@ def test_incompatible_qos_does_not_match(dds_node: DdsNode) -> None:
     reader = dds_node.reader("rt/t6", STATES, qos=Qos("reliable"))
     writer = dds_node.writer("rt/t6", STATES, qos=Qos("best_effort"))
     good = dds_node.writer("rt/t6", STATES)
-    assert good.wait_matched(10)
+    assert good.wait_matched(60)
     assert reader.matched == 1
     assert not writer.wait_matched(0.05)
 
@@ -198,7 +198,7 @@ def test_two_domains_in_one_process_do_not_mix() -> None:
         reader = b.reader("rt/t7", STATES)
         near = a.reader("rt/t7", STATES)
         writer = a.writer("rt/t7", STATES)
-        assert near.wait_matched(10)
+        assert near.wait_matched(60)
         writer.write(MotorStates_([]))
         assert take_until(near, bool)
         assert reader.take() == []
@@ -210,7 +210,7 @@ def test_a_domain_can_be_opened_again_after_the_last_node_closed() -> None:
     for _ in range(3):
         with DdsNode(domain) as node:
             reader, writer = node.reader("rt/t8", CMDS), node.writer("rt/t8", CMDS)
-            assert writer.wait_matched(10)
+            assert writer.wait_matched(60)
             writer.write(MotorCmds_([MotorCmd_(q=1.0)]))
             assert take_until(reader, bool)
         node.close()
@@ -234,7 +234,7 @@ def test_a_node_that_closes_frees_waiters(dds_domain: int) -> None:
         thread.start()
     node.close()
     for thread in threads:
-        thread.join(10)
+        thread.join(60)
     # a waiter that comes after the close is refused instead, but none hangs
     assert all(r is False for r in results)
 
@@ -269,7 +269,7 @@ def test_bad_use_is_refused(dds_node: DdsNode) -> None:
 def test_bytes_that_are_no_message_travel_and_raise_when_decoded(dds_node: DdsNode) -> None:
     reader = dds_node.reader("rt/t12", CMDS)
     writer = dds_node.writer("rt/t12", CMDS)
-    assert writer.wait_matched(10)
+    assert writer.wait_matched(60)
     writer.write_raw(b"\x00\x01\x00\x00\xff\xff\xff\xff")
     (sample,) = take_until(reader, bool)
     with pytest.raises(WireError):
@@ -296,7 +296,7 @@ for _ in range(2):
     with DdsNode(foreign._id) as node, DdsNode(foreign._id) as other:
         writer = node.writer("rt/x", "{CMDS}")
         reader = other.reader("rt/x", "{CMDS}")
-        print(writer.wait_matched(10), len(records))
+        print(writer.wait_matched(60), len(records))
 participant = DomainParticipant(foreign._id)
 print(len(foreign.get_participants()))
 """
@@ -351,7 +351,7 @@ with dds.DdsNode({dds_node.domain}) as node:
         assert theirs.type_hash not in ("", type_hash(name))
         assert not reader.wait_matched(0.2)
     finally:
-        output, _ = process.communicate(timeout=30)
+        output, _ = process.communicate(timeout=60)
     assert output == "up\n0\n"
 
 
@@ -400,7 +400,7 @@ def test_nothing_reaches_stderr_and_exit_without_close_is_clean() -> None:
         "from dexkit.dds import DdsNode\n"
         f"node = DdsNode({free_domain()})\n"
         f"r = node.reader('rt/x', '{CMDS}'); w = node.writer('rt/x', '{CMDS}')\n"
-        "print(w.wait_matched(10))\n"
+        "print(w.wait_matched(60))\n"
     )
     assert _run(script) == "True\n"
 
@@ -422,7 +422,7 @@ def callback(event):
 
 node.discovery.subscribe(lambda event: event.endpoint.own or callback(event))
 other.writer("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
-assert inside.wait(10)
+assert inside.wait(60)
 """
 
 

@@ -7,7 +7,6 @@ like, and nothing of this machine is changed.
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -16,20 +15,10 @@ from pathlib import Path
 import pytest
 
 import tests.dds_helpers  # noqa: F401  (skips this module where CycloneDDS is missing)
+from tests.optional import UNSHARE, namespaces
 
 if find_spec("unitree_sdk2py") is None:
     pytest.skip("needs the unitree-sdk2 package", allow_module_level=True)
-
-_UNSHARE = ["unshare", "--user", "--map-root-user", "--net"]
-
-
-def _namespaces_work() -> bool:
-    if shutil.which("unshare") is None or shutil.which("ip") is None:
-        return False
-    probe = subprocess.run(
-        [*_UNSHARE, "ip", "link", "set", "lo", "up"], capture_output=True, check=False
-    )
-    return probe.returncode == 0
 
 
 _SCRIPT = """
@@ -46,7 +35,7 @@ with SdkClient(1) as sdk, DdsNode(1, "lo") as node:
     reader, writer = node.reader("rt/cmd", CMDS), node.writer("rt/state", STATES)
     sdk.subscribe("rt/state", STATES)
     sdk.stream("rt/cmd", CMDS, MotorCmds_([MotorCmd_(q=1.5)]), hz=100)
-    print("matched", reader.wait_matched(20), writer.wait_matched(20))
+    print("matched", reader.wait_matched(60), writer.wait_matched(60))
     reader.wait(10)
     print("command", reader.take()[-1].message.cmds[0].q)
     writer.write(MotorStates_([MotorState_(q=2.5)]))
@@ -54,12 +43,12 @@ with SdkClient(1) as sdk, DdsNode(1, "lo") as node:
 """
 
 
-@pytest.mark.skipif(not _namespaces_work(), reason="needs unshare, ip and user namespaces")
+@pytest.mark.skipif(not namespaces(), reason="needs unshare, ip and user namespaces")
 @pytest.mark.parametrize("flag", ["on", "off"])
 def test_a_node_and_the_sdk_meet_on_loopback(flag: str) -> None:
     setup = f'ip link set lo up && ip link set lo multicast {flag} && exec "$0" -c "$1"'
     done = subprocess.run(
-        [*_UNSHARE, "sh", "-c", setup, sys.executable, _SCRIPT],
+        [*UNSHARE, "sh", "-c", setup, sys.executable, _SCRIPT],
         capture_output=True,
         text=True,
         timeout=120,

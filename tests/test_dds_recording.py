@@ -22,7 +22,7 @@ def test_a_topic_in_use_is_read_as_the_type_that_it_has(tmp_path: Path) -> None:
         hand.reader(CMD, CMD_TYPE)
         with DdsRecording(node, out, [STATE, "/dex1/left/cmd"]) as recording:
             expected = {(STATE, STATE_TYPE), (CMD, CMD_TYPE)}
-            assert hand.discovery.wait(lambda _: types_read(hand) >= expected, timeout=10)
+            assert hand.discovery.wait(lambda _: types_read(hand) >= expected, timeout=60)
             assert types_read(hand) == expected
         assert recording.subscribed == [CMD, STATE]
 
@@ -37,7 +37,7 @@ def test_a_topic_of_a_model_is_read_before_anybody_is_there(tmp_path: Path) -> N
         DdsRecording(node, out, [CMD, "/unknown/topic"]) as recording,
     ):
         assert recording.subscribed == [CMD]
-        assert other.discovery.wait(lambda _: types_read(other) == expected, timeout=10)
+        assert other.discovery.wait(lambda _: types_read(other) == expected, timeout=60)
 
 
 def test_a_type_that_is_told_is_not_guessed(tmp_path: Path) -> None:
@@ -48,5 +48,5 @@ def test_a_type_that_is_told_is_not_guessed(tmp_path: Path) -> None:
         Recorder(tmp_path / "a.mcap") as out,
         DdsRecording(node, out, [CMD], types={CMD: CMD_TYPE}),
     ):
-        assert other.discovery.wait(lambda _: types_read(other), timeout=10)
+        assert other.discovery.wait(lambda _: types_read(other), timeout=60)
         assert types_read(other) == {(CMD, CMD_TYPE)}

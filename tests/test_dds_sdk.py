@@ -78,7 +78,7 @@ def test_we_publish_and_the_sdk_receives(
     topic = f"rt/{name[8:10]}/state"
     writer = dds_node.writer(topic, name)
     sdk.subscribe(topic, name)
-    assert writer.wait_matched(10)
+    assert writer.wait_matched(60)
     writer.write(message)
     (sample,) = sdk.wait(topic)
     assert sample.data == message_type(name).encode(message)
@@ -89,7 +89,7 @@ def test_the_sdks_types_and_qos_are_ours(dds_node: DdsNode, sdk: SdkClient) -> N
     topic = "rt/types"
     reader = dds_node.reader(topic, name)
     sdk.stream(topic, name, go.MotorCmds_([]), hz=100)
-    assert reader.wait_matched(10)
+    assert reader.wait_matched(60)
     assert len(take_until(reader, lambda s: len(s) >= 10)) >= 10
     (writer,) = [e for e in dds_node.endpoints() if e.topic == topic and e.kind == "writer"]
     (mine,) = [e for e in dds_node.endpoints() if e.topic == topic and e.own]
@@ -104,8 +104,8 @@ def test_the_sdks_types_and_qos_are_ours(dds_node: DdsNode, sdk: SdkClient) -> N
 def test_the_sdk_reads_best_effort(dds_node: DdsNode, sdk: SdkClient) -> None:
     topic = "rt/qos"
     sdk.subscribe(topic, GO + "MotorStates_")
-    assert dds_node.discovery.wait(lambda found: any(e.topic == topic for e in found), 10)
+    assert dds_node.discovery.wait(lambda found: any(e.topic == topic for e in found), 60)
     (reader,) = [e for e in dds_node.endpoints() if e.topic == topic]
     assert reader.qos == Qos.reader_default()
     best_effort = dds_node.writer(topic, GO + "MotorStates_", qos=Qos("best_effort"))
-    assert best_effort.wait_matched(10)
+    assert best_effort.wait_matched(60)

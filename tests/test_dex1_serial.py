@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from dexkit.emulators.m4010 import Dex1Motors, Dex1Process, Firmware
 from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.wire.m4010 import MotorCmd
+from tests.patience import PATIENCE, waits_of
 
 BRAKE = HandCommand.brake(1)
 OPEN = HandCommand.position(5.4)
@@ -45,7 +47,10 @@ def opened(
 
 
 def drive(
-    hand: Dex1Serial, command: HandCommand, until: Callable[[HandState], bool], timeout: float = 8.0
+    hand: Dex1Serial,
+    command: HandCommand,
+    until: Callable[[HandState], bool],
+    timeout: float = PATIENCE,
 ) -> HandState:
     end = time.monotonic() + timeout
     while True:
@@ -56,7 +61,7 @@ def drive(
         time.sleep(0.002)
 
 
-def wait_for(condition: Callable[[], object], timeout: float = 8.0) -> None:
+def wait_for(condition: Callable[[], object], timeout: float = PATIENCE) -> None:
     end = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < end
@@ -81,12 +86,13 @@ def test_it_follows_measures_and_brakes_at_the_end() -> None:
             way = drive(hand, OPEN, moving)
             assert way.mode[0] == JointMode.FOC
             assert float(way.tau_est[0]) > 0
+            before = time.monotonic()
             end = drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
             assert float(end.temperature[0]) == pytest.approx(25, abs=5)
             assert end.winding_temperature is not None
             assert float(end.voltage[0]) == 24.0
             assert end.fault[0] == 0
-            assert 0 <= time.monotonic() - end.stamp < 1
+            assert before <= end.stamp <= time.monotonic()
             assert motors.motor.body.joint.q == pytest.approx(float(end.q[0]), abs=0.05)
             drive(hand, CLOSE, moving)
         assert motors.motor.body.mode is JointMode.BRAKE
@@ -124,7 +130,7 @@ def test_both_hands_on_one_line_take_turns() -> None:
             for thread in threads:
                 thread.start()
             for thread in threads:
-                thread.join(20)
+                thread.join(60)
             assert motors.motors[Side.LEFT].q == pytest.approx(4.0, abs=0.1)
             assert motors.motors[Side.RIGHT].q == pytest.approx(2.0, abs=0.1)
             assert left.line_statistics is right.line_statistics
@@ -299,15 +305,17 @@ def test_an_answer_that_is_late_is_not_taken_for_the_next() -> None:
         assert hand.exchange(LIMP).mode[0] == JointMode.FOC  # and not that of the brake
 
 
-def test_an_exchange_is_bounded_in_time() -> None:
+def test_an_exchange_is_bounded_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     with Dex1Motors() as motors, opened(motors, timeout=0.1) as hand:
         motors.inject("silent")
         wait_for(lambda: motors.motor.silent)
+        waits = waits_of(monkeypatch, select, "select", lambda *given: given[3])
         for _ in range(5):
-            begin = time.monotonic()
+            waits.clear()
             with pytest.raises(HandTimeout):
                 hand.exchange(BRAKE)
-            assert time.monotonic() - begin < hand.spec.exchange_timeout + 0.2
+            assert 0 < sum(waits) <= hand.spec.exchange_timeout
+        monkeypatch.undo()
         assert hand.line_statistics.timeouts >= 5
 
 

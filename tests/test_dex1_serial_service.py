@@ -49,18 +49,18 @@ def test_unplugged_in_motion_it_says_so_and_moves_for_nothing_stale() -> None:
             node.deliver(command, message(5.4))
             wait_until(lambda: motor.q > 1.5)
             motors.inject("unplug:for=1500ms")
-            wait_until(lambda: not core.connected, 5.0, "the loss")
+            wait_until(lambda: not core.connected, what="the loss")
             sent = len(node.sent)
             wait_until(lambda: len(node.sent) > sent + 10)
             state = newest(node, side)
             assert state.lost > 0
             assert state.reserve[0] & LOST
             # the motor stops by itself; the last command does not count when the cable is back
-            wait_until(lambda: motor.tripped, 3.0, "the protection")
+            wait_until(lambda: motor.tripped, what="the protection")
             node.deliver(command, message(0.5))
-            wait_until(lambda: core.connected, 8.0, "the reconnection")
+            wait_until(lambda: core.connected, what="the reconnection")
             done = core.counters.exchanges
-            wait_until(lambda: core.counters.exchanges > done + 20, 5.0)
+            wait_until(lambda: core.counters.exchanges > done + 20)
             assert not core.driving
             assert motor.body.mode is JointMode.BRAKE
             assert not motor.tripped
@@ -82,7 +82,7 @@ def test_a_fault_is_published_with_the_temperatures() -> None:
                     node.sent and newest(node, Side.RIGHT).reserve[0] & MotorError.OVERCURRENT
                 )
 
-            wait_until(shown, 5.0)
+            wait_until(shown)
             assert newest(node, Side.RIGHT).temperature == 25
 
 
@@ -105,9 +105,9 @@ def test_two_hands_on_one_line_in_one_process(tmp_path: Path) -> None:
                 time.sleep(0.01)
                 return all(abs(motors.motors[s].q - goal) < 0.15 for s, goal in goals.items())
 
-            wait_until(there, 15.0)
+            wait_until(there)
             for side, goal in goals.items():
-                wait_until(lambda s=side, g=goal: abs(newest(nodes[s], s).q - g) < 0.15, 5.0)
+                wait_until(lambda s=side, g=goal: abs(newest(nodes[s], s).q - g) < 0.15)
         finally:
             for service in services:
                 service.stop()

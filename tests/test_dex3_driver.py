@@ -53,9 +53,12 @@ from tests.dex3_driver_helpers import (
     serving,
     usb_error,
 )
+from tests.patience import PATIENCE, waits_of
 
 GO = HandCommand.position(np.full(7, 0.1), kp=1.5, kd=0.2)
 QUICK = Dex3Settings(timeout=0.05, send_timeout=0.05)
+SHORT = 0.1
+"""Seconds for hands that shall be silent for longer."""
 
 
 @pytest.fixture
@@ -74,15 +77,20 @@ def at(server: Any) -> Server:
     return parse_server(server.url)[0]
 
 
-def hand_on(server: Any, **values: Any) -> Dex3Usb:
+def hand_on(server: Any, timeout: float = 5.0, **values: Any) -> Dex3Usb:
+    """A hand whose answers come in the end, on a busy machine too; SHORT where they do not."""
     return Dex3Usb(
-        Side.LEFT, Dex3Settings(server=at(server), timeout=0.1, send_timeout=0.1, **values)
+        Side.LEFT, Dex3Settings(server=at(server), timeout=timeout, send_timeout=timeout, **values)
     )
 
 
 def fake_hand(fake: FakeBackend, monkeypatch: pytest.MonkeyPatch) -> Dex3Usb:
     monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: fake)
     return Dex3Usb(Side.LEFT, QUICK)
+
+
+def _to_the_deadline(connection: _Connection, deadline: float) -> float:
+    return max(1e-3, deadline - time.monotonic())
 
 
 def exchange_often(hand: Dex3Usb) -> None:
@@ -478,17 +486,18 @@ class TestOpening:
         with serving(RawDevice(lambda data: [])) as server:
             for _ in range(2):
                 with pytest.raises(HandTimeout):
-                    hand_on(server).open()
+                    hand_on(server, SHORT).open()
         assert "closed" not in caplog.text
 
-    def test_a_device_that_says_nothing(self) -> None:
+    def test_a_device_that_says_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         device = RawDevice(lambda data: [])
         with serving(device) as server:
-            hand = hand_on(server)
-            before = time.monotonic()
+            hand = hand_on(server, SHORT)
+            waits = waits_of(monkeypatch, _Connection, "_fill", _to_the_deadline)
             with pytest.raises(HandTimeout, match="does not answer") as caught:
                 hand.open()
-            assert time.monotonic() - before < 2.0
+            assert sum(waits) < 1.0
+            hand.configuration = replace(hand.configuration, timeout=5.0, send_timeout=5.0)
             assert "--set frame=734" in caught.value.hint
             assert device.plugged  # and is free again:
             device.script = FakeHand()
@@ -525,10 +534,11 @@ class TestExchange:
         with serving(device) as server, hand_on(server) as hand:
             sent = len(device.received)
             for count in range(1, 20):
+                before = time.monotonic()
                 state = hand.exchange(GO)
                 assert len(device.received) == sent + count
                 assert state.q[0] == pytest.approx(device.script.q(device.script.count), abs=1e-4)  # type: ignore[attr-defined]
-                assert abs(state.stamp - time.monotonic()) < 1.0
+                assert before <= state.stamp <= time.monotonic()
 
     @pytest.mark.parametrize("layout", [COMMAND_1234, COMMAND_734])
     def test_what_is_on_the_wire(self, layout: Any) -> None:
@@ -680,7 +690,7 @@ class TestLateAnswers:
     @pytest.mark.parametrize("late", [0.105, 0.115, 0.15, 0.3])
     def test_over_usbip(self, late: float) -> None:
         fake = LateHand()
-        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+        with serving(RawDevice(fake)) as server, hand_on(server, SHORT) as hand:
             hand.exchange(GO)
             fake.next_late = late
             before = time.monotonic()
@@ -689,24 +699,27 @@ class TestLateAnswers:
                 assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
             except HandTimeout:
                 assert time.monotonic() - before >= 0.09
-            until = time.monotonic() + 0.4
-            good = 0
-            while time.monotonic() < until:
+            begin = time.monotonic()
+            while True:
+                assert time.monotonic() < begin + PATIENCE
                 try:
                     state = hand.exchange(GO)
                 except HandTimeout:
                     continue
-                good += 1
                 assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
-            assert good
+                if time.monotonic() > begin + 0.4:
+                    break  # behind an answer: none of a time-out is still on its way
             assert hand.statistics.link.late == hand.statistics.link.timeouts
 
     def test_a_lost_one_costs_its_time_only(self) -> None:
         fake = LateHand()
         with serving(RawDevice(fake)) as server, hand_on(server) as hand:
+            patient = hand.configuration
+            hand.configuration = replace(patient, timeout=SHORT)
             fake.next_late = None
             with pytest.raises(HandTimeout):
                 hand.exchange(GO)
+            hand.configuration = patient
             for _ in range(5):
                 state = hand.exchange(GO)
                 assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
@@ -906,28 +919,30 @@ class TestTroubleOnTheWay:
             assert hand.exchange(GO).q.shape == (7,)
             hand.close()
 
-    def test_a_server_that_stops_answering(self) -> None:
+    def test_a_server_that_stops_answering(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Time-outs are kept by the client, whatever the server does."""
         frozen = threading.Event()
         fake = FakeHand()
 
         def script(data: bytes) -> Answer:
             if len(device.received) == 3:
-                frozen.wait(5.0)  # the server's only thread
+                frozen.wait(PATIENCE)  # the server's only thread
             return fake(data)
 
         device = RawDevice(script)
         with serving(device) as server:
-            hand = hand_on(server)
+            hand = hand_on(server, SHORT)
             hand.open()
             hand.exchange(GO)
+            waits = waits_of(monkeypatch, _Connection, "_fill", _to_the_deadline)
             for _ in range(3):
-                before = time.monotonic()
+                waits.clear()
                 with pytest.raises(HandTimeout):
                     hand.exchange(GO)
-                assert time.monotonic() - before < hand.spec.exchange_timeout + 0.5
+                assert 0 < sum(waits) <= hand.spec.exchange_timeout
+            monkeypatch.undo()
             frozen.set()
-            until = time.monotonic() + 5.0
+            until = time.monotonic() + PATIENCE
             while True:
                 try:
                     state = hand.exchange(GO)
@@ -951,7 +966,7 @@ class TestUsbIpClient:
 
     def connected(self) -> tuple[_Connection, socket.socket]:
         client, server = socket.socketpair()
-        server.settimeout(5.0)
+        server.settimeout(PATIENCE)
         return _Connection(client, 0x10002), server
 
     def exchange(self, connection: _Connection, timeout: int = 50) -> tuple[int, int, bytes]:
@@ -976,12 +991,15 @@ class TestUsbIpClient:
         connection.close()
         server.close()
 
-    def test_a_cancelled_transfer_is_not_taken_for_another(self) -> None:
+    def test_a_cancelled_transfer_is_not_taken_for_another(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         connection, server = self.connected()
-        before = time.monotonic()
+        waits = waits_of(monkeypatch, _Connection, "_fill", _to_the_deadline)
         with pytest.raises(USBTimeoutError):
             self.exchange(connection, 20)
-        assert time.monotonic() - before < 1.0
+        assert sum(waits) < 0.05
+        monkeypatch.undo()
         sent = server.recv(4096)
         numbers = [struct.unpack_from(">II", sent, at) for at in (0, 55, 103, 151)]
         assert numbers == [(1, 1), (1, 2), (2, 3), (2, 4)]  # two transfers, two calls back
@@ -989,6 +1007,7 @@ class TestUsbIpClient:
         server.sendall(self.reply(1) + self.reply(2, b"late") + self.reply(3, command=4))
         server.sendall(self.reply(4, command=4) + self.reply(5) + self.reply(6, b"right"))
         assert self.exchange(connection, 2000) == (0, 0, b"right")
+        assert connection.passed_over == 1  # the link behind it is told
         connection.close()
         server.close()
 

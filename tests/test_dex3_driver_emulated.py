@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from dexkit.errors import HandError, HandLost, HandNotFound, HandTimeout
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
-from dexkit.service import HandService
+from dexkit.service import Backoff, HandService
+from tests.patience import PATIENCE
 from tests.service_helpers import FakeNode, wait_until
 
 GOAL = {
@@ -30,8 +32,8 @@ TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 LOST = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
 
 
-def hand_at(url: str, side: Side = Side.LEFT) -> Dex3Usb:
-    return Dex3Usb(side, Dex3Settings(server=parse_server(url)[0]))
+def hand_at(url: str, side: Side = Side.LEFT, **values: Any) -> Dex3Usb:
+    return Dex3Usb(side, Dex3Settings(server=parse_server(url)[0], **values))
 
 
 def go(q: np.ndarray, **values: float) -> HandCommand:  # type: ignore[type-arg]
@@ -42,7 +44,7 @@ def drive(
     hand: Dex3Usb,
     command: HandCommand,
     until: Callable[[HandState], object],
-    timeout: float = 5.0,
+    timeout: float = PATIENCE,
 ) -> HandState:
     """Exchange, time-outs allowed, until the state is as wanted."""
     deadline = time.monotonic() + timeout
@@ -171,7 +173,7 @@ class TestTimeoutProtection:
             assert isinstance(emulated, Dex3Hands)
             device = emulated.device()
             hand.exchange(go(GOAL[Side.LEFT]))
-            wait_until(lambda: all(device.tripped), 3.0, "the motors to stop")
+            wait_until(lambda: all(device.tripped), what="the motors to stop")
             state = hand.exchange(go(GOAL[Side.LEFT]))
             assert (state.fault & TRIPPED).all()
             drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault.any())
@@ -204,8 +206,8 @@ for count in range(10**9):
             killed = time.monotonic()
             process.wait()
             process.stdout.close()
-            wait_until(lambda: all(device.tripped), 3.0, "the motors to stop")
-            assert 0.9 < time.monotonic() - killed < 2.0
+            wait_until(lambda: all(device.tripped), what="the motors to stop")
+            assert time.monotonic() - killed > 0.9
             # whoever comes next finds a hand that works
             with hand_at(emulated.url) as hand:
                 assert not hand.exchange(HandCommand.brake(7)).fault.any()
@@ -225,14 +227,14 @@ for count in range(10**9):
 class TestCable:
     def test_lost_quickly_and_found_again(self) -> None:
         with emulated_dex3() as emulated:
-            hand = hand_at(emulated.url)
+            hand = hand_at(emulated.url, timeout=5.0, send_timeout=5.0)
             hand.open()
             hand.exchange(go(GOAL[Side.LEFT]))
             emulated.inject("unplug:for=300ms")
-            pulled = time.monotonic()
             with pytest.raises(HandLost):
                 drive(hand, go(GOAL[Side.LEFT]), lambda s: False)
-            assert time.monotonic() - pulled < 0.25
+            assert not hand.statistics.link.timeouts
+            deadline = time.monotonic() + PATIENCE
             hand.close()
             with pytest.raises(HandNotFound):
                 hand.open()
@@ -241,7 +243,7 @@ class TestCable:
                     hand.open()
                     break
                 except HandError:
-                    assert time.monotonic() - pulled < 1.3
+                    assert time.monotonic() < deadline
                     time.sleep(0.01)
             assert np.isfinite(hand.exchange(HandCommand.brake(7)).q).all()
             hand.close()
@@ -277,11 +279,9 @@ class TestService:
                 wait_until(lambda: core.driving)
                 emulated.inject("unplug:for=1500ms")
                 wait_until(lambda: not device.plugged)
-                pulled = time.monotonic()
-                wait_until(lambda: not core.connected, 0.5, "the loss")
+                wait_until(lambda: not core.connected, what="the loss")
                 sent = len(node.sent)
-                time.sleep(0.2)
-                assert len(node.sent) - sent > 15
+                wait_until(lambda: len(node.sent) > sent + 15, what="more states")
                 view = core.view()
                 assert view is not None
                 assert all(bits & LOST for bits in view.fault)
@@ -289,13 +289,11 @@ class TestService:
                 assert all(motor.motorstate & LOST for motor in lost.motor_state)
                 # the motors stop by themselves; the last command, and one sent meanwhile, do not
                 # count any more when the cable is back
-                wait_until(lambda: all(device.tripped), 2.0, "the protection")
+                wait_until(lambda: all(device.tripped), what="the protection")
                 still = np.array(device.body.q)
                 node.deliver(CMD, message(-0.5 * GOAL[Side.LEFT]))
-                wait_until(lambda: device.plugged, 3.0)
-                back = time.monotonic()
-                assert back - pulled > 1.0
-                wait_until(lambda: core.connected, 1.0, "the reconnection")
+                wait_until(lambda: device.plugged)
+                wait_until(lambda: core.connected, what="the reconnection")
                 done = core.counters.exchanges
                 wait_until(lambda: core.counters.exchanges > done + 50)
                 assert not core.driving
@@ -308,23 +306,29 @@ class TestService:
                 wait_until(lambda: core.driving)
                 assert core.counters.reconnects == 1
 
-    def test_attempts_to_reopen_keep_coming(self) -> None:
-        """After a long absence too, a hand is found within half a second of its return."""
+    def test_attempts_to_reopen_keep_coming(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """After a long absence too, a hand is looked for every half second."""
+        pauses: list[float] = []
+
+        class Noted(Backoff):
+            def next(self) -> float:
+                pauses.append(super().next())
+                return pauses[-1]
+
+        monkeypatch.setattr("dexkit.service.service.Backoff", Noted)
         node = FakeNode()
         with emulated_dex3() as emulated:
             hand = hand_at(emulated.url)
-            tried: list[float] = []
             opening = hand.open
 
-            def noted() -> None:
-                tried.append(time.monotonic())
+            def away_for_long() -> None:
+                if 0 < len(pauses) < 5:
+                    raise HandNotFound("away")
                 opening()
 
-            hand.open = noted  # type: ignore[method-assign]
+            hand.open = away_for_long  # type: ignore[method-assign]
             with HandService(hand, node=node, dialect="dex3", state_rate=100.0) as service:  # type: ignore[arg-type]
-                emulated.inject("unplug:for=2500ms")
+                emulated.inject("unplug:for=100ms")
                 core = service.cores[Side.LEFT]
-                wait_until(lambda: core.counters.reconnects == 1, 8.0)
-                gaps = np.diff(tried[1:])
-                assert len(gaps) >= 3
-                assert gaps.max() < hand.reconnect_interval + 0.3
+                wait_until(lambda: core.counters.reconnects == 1)
+            assert max(pauses) == hand.reconnect_interval == 0.5

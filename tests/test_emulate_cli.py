@@ -37,6 +37,7 @@ from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
+from tests.patience import PATIENCE
 
 PING = dxl.encode(1, Instruction.PING)
 
@@ -51,7 +52,7 @@ class Client:
         settings[4] = settings[5] = speed
         termios.tcsetattr(self.fd, termios.TCSANOW, settings)
 
-    def ask(self, data: bytes, timeout: float = 5.0) -> Packet | None:
+    def ask(self, data: bytes, timeout: float = PATIENCE) -> Packet | None:
         os.write(self.fd, data)
         parser = dxl.PacketParser()
         deadline = time.monotonic() + timeout
@@ -77,7 +78,7 @@ def client(path: str, speed: int = termios.B1000000) -> Iterator[Client]:
         opened.close()
 
 
-def wait_for(what: object, seconds: float = 5.0) -> None:
+def wait_for(what: object, seconds: float = PATIENCE) -> None:
     deadline = time.monotonic() + seconds
     assert callable(what)
     while not what():
@@ -85,7 +86,7 @@ def wait_for(what: object, seconds: float = 5.0) -> None:
         time.sleep(0.005)
 
 
-def ping(path: str, servo_id: int = 1, timeout: float = 5.0) -> bool:
+def ping(path: str, servo_id: int = 1, timeout: float = PATIENCE) -> bool:
     with client(path) as opened:
         return opened.ask(dxl.encode(servo_id, Instruction.PING), timeout) is not None
 
@@ -122,7 +123,7 @@ def test_ready_answer_stop_and_nothing_left(tmp_path: Path, signum: signal.Signa
     assert answer is not None
     assert answer.id == 7
     process.send_signal(signum)
-    out, err = process.communicate(timeout=10)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert "stopped: 10 bytes in, 14 bytes out" in out.decode()
     assert err == b""
@@ -179,7 +180,7 @@ def test_process_ends_with_its_parent(tmp_path: Path) -> None:
         assert isinstance(gripper, EmulatedProcess)
         assert gripper.process.stdin is not None
         gripper.process.stdin.close()
-        assert gripper.process.wait(10) == 0
+        assert gripper.process.wait(60) == 0
         gripper.process.stdin = None
     assert list(tmp_path.iterdir()) == []
 
@@ -208,7 +209,7 @@ def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, says: str)
     if arguments:
         arguments = ["--link", str(tmp_path / "g"), *arguments]
     process = emulate(*arguments)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == code
     assert says in err.decode()
     assert "Traceback" not in err.decode()
@@ -269,7 +270,7 @@ def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
 
 def test_eeprom_file_without_a_directory_is_an_error_at_once(tmp_path: Path) -> None:
     process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(tmp_path / "no" / "e.json"))
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
     assert b"directory" in errors
     assert not os.path.lexists(tmp_path / "g")
@@ -280,7 +281,7 @@ def test_broken_eeprom_file_is_an_error(tmp_path: Path, text: str) -> None:
     file = tmp_path / "eeprom.json"
     file.write_text(text)
     process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(file))
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "EEPROM" in err.decode()
     assert file.read_text() == text
@@ -440,7 +441,7 @@ def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.S
         handle.bulk_out(0x02, bytes(1234))
         assert len(handle.bulk_in(0x81, 1270)) == 1270
         process.send_signal(signum)  # with a client attached
-        out, err = process.communicate(timeout=10)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert out.decode().splitlines() == [
         "stopped: left: nothing was sent",
@@ -451,7 +452,7 @@ def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.S
 
 def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     process = emulate_dex3("--faults-from-stdin", "--fault", "drop@1h:for=1s")
-    _, err = process.communicate(timeout=10)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert b"'1h' is not a time" in err
     assert b"silent" in err  # the hint names what a hand can have
@@ -465,7 +466,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     process.stdin.write(b"fire\nunplug\n")
     process.stdin.flush()
     wait_for(lambda: usbip.host.list_devices(transport) == [])
-    _, err = process.communicate(timeout=10)  # closes its input
+    _, err = process.communicate(timeout=60)  # closes its input
     assert process.returncode == 0
     assert b"there is no kind 'fire'" in err
     assert b"Traceback" not in err
@@ -483,7 +484,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     ],
 )
 def test_hand_that_cannot_be(arguments: list[str], says: str) -> None:
-    _, err = emulate_dex3(*arguments).communicate(timeout=20)
+    _, err = emulate_dex3(*arguments).communicate(timeout=60)
     assert says in err.decode()
     assert "Traceback" not in err.decode()
 

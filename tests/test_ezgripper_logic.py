@@ -17,7 +17,6 @@ from dexkit.drivers.ezgripper.contact import MIN_FREE_SPEED, ContactDetector
 from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
 from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE, ForceTable
 from dexkit.drivers.ezgripper.recovery import RebootPolicy, describe, motor_error
-from dexkit.drivers.ezgripper.servo import exchange_bytes, exchange_time
 from dexkit.errors import TruncatedError, UsageError
 from dexkit.hand import HandCommand, MotorError
 from dexkit.wire import mx64
@@ -175,12 +174,6 @@ def test_mapping_lists_every_byte_once_in_order() -> None:
     assert goal == b"\xf4\x01\x00\x00" + b"\x40\x01" + b"\x20\xd1\xff\xff"
 
 
-def test_exchange_time_is_that_of_the_bytes() -> None:
-    assert exchange_bytes() == (39, 35)
-    assert exchange_time(1_000_000, 0.0) == pytest.approx(744e-6)
-    assert 1 / exchange_time(1_000_000) > 500
-
-
 # --- contact
 
 
@@ -208,7 +201,7 @@ def _run(
 @given(
     speed=st.floats(MIN_FREE_SPEED, 220.0),
     closing=st.booleans(),
-    rate=st.sampled_from([60.0, 200.0, 573.0, 1000.0]),
+    rate=st.sampled_from([60.0, 200.0, 500.0, 1000.0]),
     noise=st.lists(st.sampled_from([-1, 0, 1]), min_size=1, max_size=7),
 )
 def test_free_motion_is_never_contact(
@@ -234,7 +227,7 @@ def test_free_motion_is_never_contact(
     speed=st.floats(5.0, 220.0),
     stop=st.integers(100, 2300),
     closing=st.booleans(),
-    rate=st.sampled_from([100.0, 200.0, 573.0]),
+    rate=st.sampled_from([100.0, 200.0, 500.0]),
 )
 def test_contact_is_found_within_150_ms(
     speed: float, stop: int, closing: bool, rate: float

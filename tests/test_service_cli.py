@@ -45,12 +45,10 @@ def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int)
         for part in ("sim-dex1 left", "rt/dex1/left/cmd", "rt/dex1/left/state", "unitree_go",
                      "500 Hz", f"domain {dds_domain}"):  # fmt: skip
             assert part in ready
-        assert dds_node.discovery.wait(lambda _: there(), 10)
-        start = time.monotonic()
+        assert dds_node.discovery.wait(lambda _: there(), 60)
         code, out, err = process.end(number)
-        assert time.monotonic() - start < 5
         # the participant said goodbye: its endpoints go now, not when a lease runs out (10 s)
-        assert dds_node.discovery.wait(lambda _: not there(), 3)
+        assert dds_node.discovery.wait(lambda _: not there(), 8)
     assert (code, out) == (0, "")
     assert "Traceback" not in err
     last = counters(next(line for line in err.splitlines() if "counters" in line))
@@ -66,6 +64,25 @@ def test_under_nohup_a_hangup_is_nothing() -> None:
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_started_in_the_background_under_nohup_it_outlives_the_terminal(dds_domain: int) -> None:
+    """A hangup is ignored as it was asked for; an interrupt that is sent still ends it in order."""
+    ignored = (signal.SIGHUP, signal.SIGINT)
+    before = [signal.signal(number, signal.SIG_IGN) for number in ignored]
+    try:
+        process = Process("serve", "sim-dex1", "--side", "left", "--domain", dds_domain, "--quiet")
+    finally:
+        for number, handler in zip(ignored, before, strict=True):
+            signal.signal(number, handler)
+    try:
+        process.ready()
+        process.signal(signal.SIGHUP)
+        process.signal(signal.SIGUSR1)
+        assert counters(process.line("counters"))["state_topic"] == "rt/dex1/left/state"
+        assert process.end(signal.SIGINT)[0] == 0
+    finally:
+        process.end(signal.SIGKILL)
 
 
 def test_sigusr1_logs_the_counters(dds_domain: int) -> None:

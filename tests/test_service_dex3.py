@@ -577,7 +577,7 @@ if find_spec("unitree_sdk2py") is not None:
     __all__ = ["dds_domain"]
 
     def until(
-        sdk: SdkClient, topic: str, arrived: Callable[[Any], bool], timeout: float = 15.0
+        sdk: SdkClient, topic: str, arrived: Callable[[Any], bool], timeout: float = 60.0
     ) -> Any:
         deadline = time.monotonic() + timeout
         while True:

@@ -40,7 +40,7 @@ def hg(q: float) -> Any:
     return unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=q)])
 
 
-def until(sdk: SdkClient, topic: str, arrived: Callable[[Any], bool], timeout: float = 10.0) -> Any:
+def until(sdk: SdkClient, topic: str, arrived: Callable[[Any], bool], timeout: float = 60.0) -> Any:
     """The first state that ``arrived`` accepts."""
     deadline = time.monotonic() + timeout
     while True:

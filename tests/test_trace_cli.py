@@ -65,7 +65,7 @@ def running(*args: object) -> Iterator[subprocess.Popen[str]]:
 
 def interrupt(process: subprocess.Popen[str], signum: int = signal.SIGINT) -> tuple[str, str]:
     process.send_signal(signum)
-    return process.communicate(timeout=20)
+    return process.communicate(timeout=60)
 
 
 # -- info ------------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ def test_record_finds_topics_that_appear_later_and_ends_on_sigterm(tmp_path: Pat
     with running("record", out, "--domain", domain) as rec, DdsNode(domain) as node:
         for topic, kind, data in ((STATE, STATE_TYPE, state(1.0)), ("rt/any", CMD_TYPE, cmd(2.0))):
             writer = node.writer(topic, kind)
-            assert writer.wait_matched(20)
+            assert writer.wait_matched(60)
             for _ in range(10):
                 writer.write_raw(data)
                 time.sleep(0.005)
@@ -187,7 +187,7 @@ def test_a_recorder_killed_leaves_what_it_had(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     with running("record", out, "--domain", domain) as rec, DdsNode(domain) as node:
         writer = node.writer(STATE, STATE_TYPE)
-        assert writer.wait_matched(20)
+        assert writer.wait_matched(60)
         begin = time.monotonic()
         while time.monotonic() - begin < 1.2:
             writer.write_raw(state(time.monotonic() - begin))

@@ -91,7 +91,7 @@ class SdkClient(JsonChild):
         """End a stream; returns how many messages it has written."""
         return int(self.call("stop", topic=topic)["written"])
 
-    def wait(self, topic: str, count: int = 1, timeout: float = 10.0) -> list[SdkSample]:
+    def wait(self, topic: str, count: int = 1, timeout: float = 60.0) -> list[SdkSample]:
         """Samples received since the last call, at least ``count`` of them.
 
         :raises ChildError: fewer arrived within ``timeout`` seconds.

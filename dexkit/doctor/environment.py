@@ -74,7 +74,7 @@ def uri_problem(uri: str) -> str:
         if not part.startswith("<"):
             path = Path(unquote(urlsplit(part).path) if part.startswith("file:") else part)
             try:
-                text = path.read_text()
+                text = path.read_text(encoding="utf-8")
             except (OSError, UnicodeDecodeError) as error:
                 reason = getattr(error, "strerror", None) or "it is not text"
                 return f"{path} cannot be read: {reason}"

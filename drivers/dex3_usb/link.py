@@ -141,6 +141,7 @@ class UsbLink:
         self._drain = True  # whoever had it before may have left an answer behind
         self._owed = 0  # answers that were waited for in vain, and may still come
         self._watch_until = 0.0
+        self._passed_over = 0  # of the late answers, those that the backend has dropped
         self._buffer = array.array("B", bytes(_ANSWER_ROOM))
         self._exchange = getattr(backend, "exchange", None)
         try:
@@ -215,6 +216,7 @@ class UsbLink:
             self._expect_late()
             raise
         if self._owed:
+            self._count_passed_over()
             answer = self._newest(answer)
         self.statistics.exchanges += 1
         return answer
@@ -279,11 +281,20 @@ class UsbLink:
             data = self._read(_DRAIN_TIMEOUT)
         except OSError as error:
             if error.errno in _LATE:
+                self._count_passed_over()
                 return None
             raise self._failed(error) from error
-        self.statistics.late += 1
-        self._owed = max(0, self._owed - 1)
+        self._came_late(1)
         return data
+
+    def _count_passed_over(self) -> None:
+        """The USB/IP client drops an answer that crosses the cancelling of its read."""
+        before, self._passed_over = self._passed_over, getattr(self._handle, "passed_over", 0)
+        self._came_late(self._passed_over - before)
+
+    def _came_late(self, count: int) -> None:
+        self.statistics.late += count
+        self._owed = max(0, self._owed - count)
 
     def _late(self, what: str) -> HandTimeout:
         self.statistics.timeouts += 1

@@ -49,6 +49,8 @@ class _Connection:
 
     The keyword arguments of :meth:`submit` are those of the package's own connection, whose
     place it takes.
+
+    :ivar passed_over: answers that came while their read was being cancelled.
     """
 
     def __init__(self, sock: socket.socket, devid: int) -> None:
@@ -66,6 +68,7 @@ class _Connection:
         self._begin = self._end = 0  # of what was received and not yet looked at
         self._broken = ""
         self._late = 0  # times that bytes were taken after the deadline of what is waited for
+        self.passed_over = 0
 
     def close(self) -> None:
         """Give the device back. May be called twice."""
@@ -98,6 +101,7 @@ class _Connection:
                 number, status, data = self._reply(deadline)
                 if number == seq:
                     return status, data
+                self.passed_over += bool(data)
         except USBTimeoutError:
             self._cancel(seq, ep, direction)
             raise
@@ -124,6 +128,8 @@ class _Connection:
                         self._cancel(read, in_ep, _IN)
                         return status, 0, b""
                     deadline = _deadline(timeout_ms)
+                else:
+                    self.passed_over += bool(answer)
         except USBTimeoutError:
             self._cancel(write, out_ep, _OUT)
             self._cancel(read, in_ep, _IN)

@@ -14,8 +14,9 @@ so their bytes are mapped side by side through Indirect Address 1 to 28 (facts/m
 - Because goal current and goal position are read back in the same block, a write that was lost
   or refused (bus watchdog tripped) shows in the very next sample; torque, hardware error and
   watchdog are seen in every sample too.
-- At 1 Mbaud: 250 µs write, 140 µs read instruction, 350 µs answer, 4 µs return delay, up to
-  1 ms latency timer: at most 1.74 ms, or 573 exchanges a second.
+- At 1 Mbaud: 250 µs write, 140 µs read instruction, 4 µs return delay, 350 µs answer: 744 µs.
+  With a latency timer of 1 ms that is 1000 exchanges a second for a host that sends the next one
+  within 256 µs, 500 for one that needs up to 1.256 ms (serial_port.exchange_period).
 
 A spanning write of 102..119 would be 18 bytes and would touch Goal Velocity, a read of 102..146
 45 bytes, without torque and error (facts/mx64 C1).

@@ -19,7 +19,13 @@ from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BusStatistics, Ping, ServoBus
 from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
-from dexkit.drivers.ezgripper.discovery import Device, find_device, find_servo, latency_warning
+from dexkit.drivers.ezgripper.discovery import (
+    Device,
+    find_device,
+    find_servo,
+    latency_timer,
+    latency_warning,
+)
 from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE, ForceTable
 from dexkit.drivers.ezgripper.recovery import RebootPolicy, describe, motor_error
 from dexkit.drivers.ezgripper.scaling import (
@@ -27,7 +33,8 @@ from dexkit.drivers.ezgripper.scaling import (
     joint_of_ticks,
     joint_speed,
 )
-from dexkit.drivers.ezgripper.servo import BOOT_TIME, Servo, ServoStatistics, exchange_time
+from dexkit.drivers.ezgripper.servo import BOOT_TIME, Servo, ServoStatistics, line_time
+from dexkit.drivers.serial_port import exchange_period
 from dexkit.errors import HandError, HandFault, HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.freshness import PAUSE, Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
@@ -106,6 +113,14 @@ class GripperStatistics:
     resets: int = 0
 
 
+_LATENCY_TIMER = 1e-3
+"""Seconds, assumed of an adapter whose timer the system does not show: a full-speed USB adapter
+without one is still asked once in a frame of 1 ms."""
+_TURNAROUND = 0.5e-3
+"""Seconds that the service is given from an answer to its next request. An exchange costs CPython
+0.1 ms of processor time (benchmarks/bench_serial.py); the rest is for what else wants the
+processor."""
+
 _LONGEST_PAUSE = 2.0
 """Seconds that opening waits for a restart to be due; a later one is left to a later opening."""
 
@@ -168,18 +183,23 @@ class EZGripper:
         self._was_warm = False
         self._spec = self._make_spec(side, self.configuration.baudrate or 1_000_000)
 
-    def _make_spec(self, side: Side, baudrate: int) -> HandSpec:
+    def _make_spec(self, side: Side, baudrate: int, timer: float = _LATENCY_TIMER) -> HandSpec:
         attempts = 1 + self.configuration.retries
+        busy = line_time(baudrate)
         return DEX1_1.spec(
             side,
-            io_rate=1.0 / exchange_time(baudrate),
+            io_rate=1.0 / exchange_period(busy, timer, _TURNAROUND),
             # the first exchange switches the motor on: two transactions
-            exchange_timeout=2 * attempts * (self.configuration.timeout + exchange_time(baudrate)),
+            exchange_timeout=2 * attempts * (self.configuration.timeout + busy + timer),
         )
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is; ``io_rate`` is that of the line at its baud rate."""
+        """What this hand is.
+
+        ``io_rate`` is what a host gets that needs half a millisecond between two exchanges, at
+        the line's baud rate and, once it is open, the latency timer of its adapter.
+        """
         return self._spec
 
     @property
@@ -263,7 +283,10 @@ class EZGripper:
             self.ping = find_servo(bus, configuration.id, configuration.baudrate, progress)
             servo = Servo(bus, self.ping.id, self._clock)
             self._servo = servo
-            self._spec = self._make_spec(self._spec.side, bus.baudrate)
+            timer = latency_timer(device.path)
+            self._spec = self._make_spec(
+                self._spec.side, bus.baudrate, _LATENCY_TIMER if timer is None else timer * 1e-3
+            )
             self._clear_shutdown(servo)
             self._limits = servo.configure()
         except BaseException:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from dexkit.clock import Clock, RealClock
 from dexkit.drivers.ezgripper import block
 from dexkit.drivers.ezgripper.block import Goal, Sample
-from dexkit.drivers.ezgripper.bus import ServoBus
+from dexkit.drivers.ezgripper.bus import BITS_PER_BYTE, ServoBus
 from dexkit.drivers.ezgripper.settings import (
     WATCHDOG_UNITS,
     ServoLimits,
@@ -18,7 +18,7 @@ from dexkit.errors import HandTimeout
 from dexkit.freshness import Promptly
 from dexkit.wire import mx64
 
-__all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "exchange_time"]
+__all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "line_time"]
 
 BOOT_TIME = 5.0
 """Seconds after which a rebooted servo should answer again; the real time is not published
@@ -27,7 +27,7 @@ BOOT_TIME = 5.0
 _SYNC_WRITE_OVERHEAD = 15
 _READ_INSTRUCTION = 14
 _STATUS_OVERHEAD = 11
-_RETURN_DELAY = 4e-6
+_RETURN_DELAY = 4e-6  # as settings.py sets it
 
 
 def exchange_bytes() -> tuple[int, int]:
@@ -36,9 +36,15 @@ def exchange_bytes() -> tuple[int, int]:
     return sent, _STATUS_OVERHEAD + block.READ_SIZE
 
 
-def exchange_time(baudrate: int, latency_timer: float = 1e-3) -> float:
-    """Least seconds of one exchange: time on the line and one wait for the USB adapter."""
-    return sum(exchange_bytes()) * 10 / baudrate + _RETURN_DELAY + latency_timer
+def line_time(baudrate: int, return_delay: float = _RETURN_DELAY) -> float:
+    """Seconds that one exchange takes on the line, without the USB adapter.
+
+    What the adapter makes of it: :func:`dexkit.drivers.serial_port.exchange_period`.
+
+    :param baudrate: bits a second.
+    :param return_delay: seconds that the servo waits before it answers.
+    """
+    return sum(exchange_bytes()) * BITS_PER_BYTE / baudrate + return_delay
 
 
 @dataclass

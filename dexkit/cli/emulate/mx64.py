@@ -180,7 +180,7 @@ class _EepromFile:
             )
         if path.exists():
             try:
-                data = json.loads(path.read_text())
+                data = json.loads(path.read_text(encoding="utf-8"))
                 if data["device"] != "mx64":
                     raise ValueError(f"it is for a {data['device']}")
                 self._contents = [bytes.fromhex(text) for text in data["eeprom"]]

@@ -1,0 +1,123 @@
+"""The tests find the same wherever they run, and say what they cannot try."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.optional import OPTIONAL, Optional, header
+
+HERE = Path(__file__).parent
+
+CHILD = """
+import json, locale, os, signal, subprocess, sys
+from tests.surroundings import settle
+clean = settle()
+child = subprocess.run([sys.executable, "-c", '''
+import json, os, signal
+names = "HUP INT QUIT TERM USR1 CHLD".split()
+print(json.dumps({
+    "ignored": [n for n in names if signal.getsignal(getattr(signal, "SIG" + n)) is signal.SIG_IGN],
+    "blocked": len(signal.pthread_sigmask(signal.SIG_BLOCK, ())),
+    "environment": {n: os.environ.get(n) for n in ("TZ", "LC_ALL", "TERM", "COLUMNS", "NO_COLOR",
+                    "FORCE_COLOR", "DEXKIT_DDS_LOG", "CYCLONEDDS_URI", "PYTEST_ADDOPTS")},
+    "umask": os.umask(0), "home": os.access(os.environ["HOME"], os.W_OK),
+    "stdin": os.fstat(0).st_rdev == os.stat(os.devnull).st_rdev,
+}))
+'''], stdout=subprocess.PIPE, check=True).stdout
+with open(os.environ["HOME"] + "/text", "w") as file:  # what a test would write and not say how
+    file.write("\\u011f")
+encoded = open(os.environ["HOME"] + "/text", "rb").read()
+os.kill(os.getpid(), signal.SIGHUP)  # the terminal goes; the run under nohup does not
+home = os.environ["HOME"]
+clean()
+sys.stdout.write(json.dumps([json.loads(child), encoded.hex(), os.path.exists(home)]))
+"""
+SETTINGS = {
+    "TZ": "Pacific/Kiritimati",
+    "LC_ALL": "tr_TR.ISO-8859-9",
+    "TERM": "dumb",
+    "COLUMNS": "20",
+    "NO_COLOR": "1",
+    "FORCE_COLOR": "1",
+    "DEXKIT_DDS_LOG": "/nonexistent/log",
+    "CYCLONEDDS_URI": "nonsense",
+    "PYTEST_ADDOPTS": "--collect-only",
+    "HOME": "/nonexistent",
+}
+
+
+def test_nothing_that_a_shell_leaves_reaches_a_test() -> None:
+    python = f"exec {shlex.quote(sys.executable)} -c {shlex.quote(CHILD)} <&-"
+    script = f"trap '' HUP INT QUIT TERM USR1 CHLD; umask 077; {python}"
+    path = {"PATH": os.environ["PATH"], "PYTHONPATH": str(HERE.parent)}
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR2])
+    try:
+        done = subprocess.run(
+            ["sh", "-c", script], env=path | SETTINGS, capture_output=True, text=True, check=False
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGUSR2])
+    assert done.returncode == 0, done.stderr
+    found, encoded, home_is_left = json.loads(done.stdout)
+    nothing = dict.fromkeys(SETTINGS)
+    del nothing["HOME"]
+    assert found == {
+        "ignored": [],
+        "blocked": 0,
+        "environment": nothing | {"TZ": "UTC", "LC_ALL": "C.UTF-8", "TERM": "xterm"},
+        "umask": 0o022,
+        "home": True,
+        "stdin": True,
+    }
+    assert encoded == "ğ".encode().hex()
+    assert not home_is_left
+
+
+def test_these_tests_run_in_settled_surroundings() -> None:
+    assert os.environ["LC_ALL"] == "C.UTF-8"
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        assert signal.getsignal(number) is not signal.SIG_IGN
+
+
+def test_what_is_missing_is_told_in_one_line_with_the_tests_that_are_skipped() -> None:
+    there = Optional("here", lambda: True, ("a",))
+    assert header([there]) == "optional: everything is here, no test is skipped"
+    gone = [Optional("Chromium", lambda: None, ("b", "c")), Optional("a yak", lambda: 0, ("d",))]
+    assert header([there, *gone]) == (
+        "not on this machine, so their tests are skipped: "
+        "Chromium (tests of b, c), a yak (tests of d)"
+    )
+
+
+def test_every_file_that_may_skip_a_test_is_in_the_list() -> None:
+    listed = {name for optional in OPTIONAL for name in optional.tests}
+    skips = re.compile(r"pytest\.skip\(|mark\.skipif\(|pytest\.importorskip\(")
+    for path in sorted(HERE.glob("test_*.py")):
+        if path == Path(__file__) or not skips.search(path.read_text(encoding="utf-8")):
+            continue
+        name = path.stem.removeprefix("test_")
+        if name != "teleop":  # its benchmark comes with every checkout
+            assert name in listed, f"{path.name} skips tests: name it in tests/optional.py"
+
+
+@pytest.mark.parametrize("optional", OPTIONAL, ids=lambda o: o.name)
+def test_the_files_in_the_list_exist(optional: Optional) -> None:
+    for name in optional.tests:
+        assert " " in name or (HERE / f"test_{name}.py").is_file(), name
+
+
+def test_no_test_says_by_when_something_has_happened() -> None:
+    """How fast it is depends on the machine: benchmarks say that, with what they compare to."""
+    bound = re.compile(r"\s*assert .*time\.(monotonic|perf_counter|time)\(\) - \w+(\[\d+\])? <")
+    for path in sorted(HERE.glob("*.py")):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            assert not bound.match(line), f"{path.name}:{number}: use tests/patience.py"
