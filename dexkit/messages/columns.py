@@ -63,8 +63,10 @@ class Columns:
         if len(sizes) and (sizes == sizes[0]).all():
             self._append(aligned(rows_at(data, starts, int(sizes[0]))), rows, int(sizes[0]))
             return
-        for size in np.unique(sizes).tolist():
-            some = sizes == size
+        order = np.argsort(sizes, kind="stable")
+        ends = np.flatnonzero(np.diff(sizes[order])) + 1
+        for some in np.split(order, ends) if len(order) else ():
+            size = int(sizes[some[0]])
             self._append(aligned(rows_at(data, starts[some], size)), rows[some], size)
 
     def reorder(self, order: NDArray[np.intp]) -> None:
