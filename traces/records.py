@@ -256,7 +256,8 @@ def metadata_index(body: bytes) -> tuple[int, int, str]:
 def statistics(body: bytes) -> Statistics:
     """A Statistics record."""
     fields = _Fields(body)
-    return Statistics(*fields.take(_STATISTICS), fields.numbers())
+    counts = fields.take(_STATISTICS)
+    return Statistics._make((*counts, fields.numbers()))
 
 
 def summary_offset(body: bytes) -> tuple[int, int, int]:
