@@ -332,7 +332,7 @@ class Container:
             likely = np.flatnonzero((least > 0) & (lengths >= least) & (lengths < room))
             for place in likely.tolist():
                 if self._follows(file, base + place):
-                    return base + place
+                    return base + int(place)
         return None
 
     def _follows(self, file: BinaryIO, at: int) -> bool:
@@ -527,7 +527,7 @@ class Container:
                 return
             known, channel = self.channels[key[1]], records.channel(body)
             if known != channel:
-                both = f", for {known.topic} and for {channel.topic}"
+                both = f", for {known.topic[:200]} and for {channel.topic[:200]}"
                 self.hurt(
                     f"channel {key[1]} is defined twice{both * (known.topic != channel.topic)}, "
                     f"again at byte {at}, differently; the first is used"
