@@ -33,10 +33,10 @@ __all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "Se
 
 MAX_CHUNK = 256 * 2**20
 """Largest chunk that is unpacked, bytes. Writers default to 1 to 4 MiB."""
-MAX_RATIO = 500
+MAX_RATIO = 300
 """Most bytes that a file's chunks may unpack to in all, for each byte of the file. An idle body's
 states, of which little more than the times changes, reach about 130."""
-SPARE = 16 * 2**20
+SPARE = 8 * 2**20
 """Bytes that may be unpacked beyond that, so that a short recording is no exception."""
 
 # Largest schema, channel, metadata or index record that is believed, bytes.
@@ -181,7 +181,9 @@ class Container:
                 self.profile, self.library = records.header(file.read(length))
                 if close:
                     self.hurt("the first 8 bytes are not quite those of an mcap file")
-                return end
+                if end == self._size or self._is_record(file, end) or not self._closed(file):
+                    return end
+                problem = "the header is followed by nonsense"
             except BadRecord as error:
                 problem = f"the header cannot be read ({error})"
         else:
