@@ -45,6 +45,7 @@ class Columns:
         self._limit = max_size(kind)
         self._sequences = [f.name for f in kind.fields if f.sequence]
         self.errors: dict[int, WireError] = {}
+        self._bad: dict[str, WireError] = {}
         self._groups: dict[_Shape, _Group] = {}
         self._usual: dict[int, _Group] = {}  # by length of the samples
         self._paths: dict[str, _Steps] = {}
@@ -112,7 +113,9 @@ class Columns:
             big = is_big(data, self._limit, self._kind.name)
             return big, _counts(self._kind, data, big), size
         except WireError as error:
-            self.errors[row] = error.with_traceback(None)  # which holds the samples
+            # without its traceback, which holds the samples; one error for all that are alike
+            known = self._bad.setdefault(str(error), error.with_traceback(None))
+            self.errors[row] = known
             return None
 
     def _group(self, shape: _Shape, first: NDArray[np.uint32]) -> _Group:
