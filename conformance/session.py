@@ -363,7 +363,13 @@ def run_suite(
             if not record_run(live_options(options, domain), path, say=say, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")
             say("judging the recording")
-            view = recording_of(open_trace(path), options.dialect.name, options.sides)
+            trace = open_trace(path)
+            view = recording_of(trace, options.dialect.name, options.sides)
+            if trace.damage:
+                raise ConformanceError(
+                    f"the run's recording is damaged, nothing is judged: {trace.damage[0]}",
+                    hint=f"look after the disk that holds {path}",
+                )
             result = judge_recording(options, view)
     return result
 

@@ -70,6 +70,7 @@ def mcap_bytes(
     message_encoding: str = "cdr",
     metadata: dict[str, dict[str, str]] | None = None,
     profile: str = "ros2",
+    data_crc: bool = False,
 ) -> bytes:
     types = types or {CMD: CMD_TYPE, STATE: STATE_TYPE}
     out = io.BytesIO()
@@ -83,6 +84,7 @@ def mcap_bytes(
         repeat_schemas=shape.summary,
         use_statistics=shape.summary,
         use_summary_offsets=shape.summary,
+        enable_data_crcs=data_crc,
     )
     writer.start(profile=profile, library="a test")
     for name, values in (metadata or {}).items():

@@ -177,7 +177,8 @@ class Recorder:
             ) from None
         except OSError as error:
             raise TraceError(f"cannot create {self.path}: {error.strerror}") from error
-        self._writer = Writer(self._file, compression=self._compression)
+        # with the data section's checksum, every byte of a finished recording is under one
+        self._writer = Writer(self._file, compression=self._compression, enable_data_crcs=True)
         self._schema_ids: dict[str, int] = {}
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()

@@ -21,6 +21,10 @@ ENCODINGS = ("ros2msg", "ros2idl", "omgidl")
 
 # A schema text is a few kilobytes; far above that it is not a schema.
 _MAX_TEXT = 1_000_000
+# Longest word or name in one. Scopes are prefixed to names, so long ones would cost their square.
+_MAX_WORD = 256
+# Differences, and names in one of them, that are told.
+_MAX_TOLD = 8
 _MAX_DEPTH = 16
 
 _ROS_PRIMITIVES = {
@@ -111,6 +115,8 @@ def parse(encoding: str, name: str, text: str) -> Struct:
     :param name: the schema's name, in any spelling.
     :raises TraceUnsupported: the encoding is unknown, or the text cannot be understood.
     """
+    if len(name) > _MAX_WORD:
+        raise TraceUnsupported(f"the schema's name is {len(name)} characters long")
     if len(text) > _MAX_TEXT:
         raise TraceUnsupported(f"the schema of {name} is {len(text)} characters long")
     if encoding == "ros2msg":
@@ -131,7 +137,13 @@ def differences(recorded: Struct, ours: Struct) -> tuple[list[str], list[str]]:
     breaking: list[str] = []
     harmless: list[str] = []
     _compare("", recorded, ours, breaking, harmless)
-    return breaking, harmless
+    return _some(breaking), _some(harmless)
+
+
+def _some(found: list[str]) -> list[str]:
+    """The first of them, and how many more: a schema may differ in a hundred thousand fields."""
+    more = len(found) - _MAX_TOLD
+    return [*found[:_MAX_TOLD], f"and {more} more"] if more > 0 else found
 
 
 def _compare(path: str, theirs: Node, ours: Node, breaking: list[str], harmless: list[str]) -> None:
@@ -140,10 +152,11 @@ def _compare(path: str, theirs: Node, ours: Node, breaking: list[str], harmless:
         our_names = [f.name for f in ours.fields]
         where = f"{path or theirs.name}: "
         if len(their_names) != len(our_names):
-            missing = [n for n in our_names if n not in their_names]
+            known = set(their_names)
+            missing = [n for n in our_names if n not in known]
             extra = [n for n in their_names if n not in our_names]
-            what = [f"lacks {', '.join(missing)}"] if missing else []
-            what += [f"has {', '.join(extra)}"] if extra else []
+            what = [f"lacks {', '.join(_some(missing))}"] if missing else []
+            what += [f"has {', '.join(_some(extra))}"] if extra else []
             breaking.append(where + (" and ".join(what) or "has another number of fields"))
             return
         if their_names != our_names and sorted(their_names) == sorted(our_names):
@@ -233,7 +246,7 @@ def _parse_msg(name: str, text: str) -> _Structs:
         if not line or set(line) == {"="}:
             continue
         if line.startswith("MSG:"):
-            current = dds_type(line[4:].strip())
+            current = dds_type(_word(line[4:].strip()))
             structs[current] = []
             continue
         parts = line.split(None, 1)
@@ -246,7 +259,7 @@ def _parse_msg(name: str, text: str) -> _Structs:
         if rest[match.end() :].lstrip().startswith("="):
             continue  # a constant
         package = current.split("::", 1)[0]
-        structs[current].append((match.group(), _msg_type(type_text, package)))
+        structs[current].append((_word(match.group()), _msg_type(_word(type_text), package)))
     return structs
 
 
@@ -265,16 +278,33 @@ def _msg_type(text: str, package: str) -> object:
     return Array(element, _length(size))  # type: ignore[arg-type]
 
 
+def _word(text: str) -> str:
+    if len(text) > _MAX_WORD:
+        raise TraceUnsupported(f"the schema has a name of {len(text)} characters")
+    return text
+
+
 def _length(digits: str) -> int:
     if len(digits) > 9:
         raise TraceUnsupported(f"the schema has an array of {digits[:12]}... elements")
     return int(digits)
 
 
-_TOKEN = re.compile(r"::|[A-Za-z_]\w*|\d[\w.+-]*|\"(?:\\.|[^\"\\])*\"|'[^']*'|\S")
-_COMMENT = re.compile(
-    r"//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^=+\s*$|^IDL:[^\n]*$", re.DOTALL | re.MULTILINE
+# One pass, in which no place is looked at twice: what is opened and not closed ends with the text.
+_TOKEN = re.compile(
+    r"//[^\n]*|/\*.*?(?:\*/|\Z)|^[^\S\n]*#[^\n]*|^=+[^\S\n]*$|^IDL:[^\n]*$"  # left out
+    r"|(::|[A-Za-z_]\w*|\d[\w.+-]*|\"(?:\\.|[^\"\\])*(?:\"|\\?\Z)|'[^']*(?:'|\Z)|[^\s])",
+    re.DOTALL | re.MULTILINE,
 )
+
+
+def _tokens(text: str) -> list[str]:
+    found = []
+    for match in _TOKEN.finditer(text):
+        token = match[1]
+        if token is not None:
+            found.append(token if token[0] in "\"'" else _word(token))
+    return found
 
 
 class _IdlParser:
@@ -285,7 +315,7 @@ class _IdlParser:
     """
 
     def __init__(self, text: str) -> None:
-        self._tokens = _TOKEN.findall(_COMMENT.sub(" ", text))
+        self._tokens = _tokens(text)
         self._at = 0
         self._scope: list[str] = []
         self._structs: _Structs = {}
@@ -310,7 +340,7 @@ class _IdlParser:
     def _expect(self, token: str) -> None:
         found = self._next()
         if found != token:
-            raise TraceUnsupported(f"the schema has {found!r} where {token!r} belongs")
+            raise TraceUnsupported(f"the schema has {found[:40]!r} where {token!r} belongs")
 
     def _skip_annotations(self) -> None:
         while self._peek() == "@":

@@ -10,7 +10,7 @@ import numpy as np
 
 from dexkit.conformance.view import Commands, Recording
 from dexkit.conformance.wire import Motor, Motors
-from dexkit.errors import ConformanceError
+from dexkit.errors import ConformanceError, TraceError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, model
 from dexkit.traces import open_trace, sample_path
@@ -42,7 +42,13 @@ class Session:
         :raises ConformanceError: it holds no commands to a hand of the family.
         :raises TraceError: it cannot be read.
         """
-        recording = Recording.of(open_trace(path))
+        trace = open_trace(path)
+        recording = Recording.of(trace)
+        if trace.damage:
+            raise TraceError(
+                f"{path.name} is damaged, and not replayed: {trace.damage[0]}",
+                hint="'dexkit info' names all of the damage",
+            )
         found = {s: v.commands for s, v in recording.sides.items() if len(v.commands)}
         if not found:
             raise ConformanceError(

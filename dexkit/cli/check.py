@@ -77,7 +77,7 @@ def command(
     the recording of a conformance run with all its stimuli.
 
     Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
-    usable or nothing in it could be judged.
+    usable or damaged (what is left is judged all the same), or nothing in it could be judged.
     """
     from dexkit.conformance.body import body_in, recording_of
     from dexkit.conformance.claims import Claims
@@ -92,6 +92,8 @@ def command(
         model_name = dialect if dialect in BODIES else DIALECTS[dialect].model
     if recording is not None:
         trace = open_trace(recording)
+        for text in trace.damage:
+            click.echo(f"warning: {text}", err=True)
         wanted = None if dialect == "auto" else dialect
         view = recording_of(trace, wanted, sides_of(side) if side else ())
         body = body_in(trace) if dialect == "auto" and view.layer != "body" else None
@@ -136,5 +138,10 @@ def command(
         raise ConformanceError(
             "nothing was judged, which is not a pass",
             hint="dexkit check -v says what each requirement needs",
+        )
+    if trace.damage:
+        raise ConformanceError(
+            f"the recording is damaged, and the verdict is of what is left: {trace.damage[0]}",
+            hint="'dexkit info' names all of the damage; record again, or copy the file again",
         )
     sys.exit(result.overall.exit_code)

@@ -48,6 +48,7 @@ def summary(trace: Trace) -> dict[str, Any]:
         "duration_s": trace.duration,
         "messages": trace.message_count,
         "truncated": trace.truncated,
+        "damaged": bool(trace.damage),
         "topics": topics,
         "endpoints": [
             {
@@ -62,17 +63,21 @@ def summary(trace: Trace) -> dict[str, Any]:
         ],
         "metadata": trace.metadata,
         "warnings": trace.warnings,
+        "notes": trace.notes,
     }
 
 
 @click.command("info")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def command(file: Path, as_json: bool) -> None:
+def command(file: Path, as_json: bool) -> int:
     """Say what is in a recording: topics, types, rates, gaps, and what is odd about it.
 
     FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
-    read as far as it goes. Exit code 2 when FILE is not a recording.
+    read as far as it goes.
+
+    Exit code: 0 the file agrees with its checksums and counts, 1 it is damaged (what can be read
+    is shown, what is lost is named), 2 it is not a recording.
     """
     from dexkit.traces import open_trace
 
@@ -80,8 +85,9 @@ def command(file: Path, as_json: bool) -> None:
     data = summary(trace)
     if as_json:
         click.echo(json.dumps(data, indent=1))
-        return
-    _print(data)
+    else:
+        _print(data)
+    return 1 if trace.damage else 0
 
 
 def _print(data: dict[str, Any]) -> None:
@@ -93,6 +99,7 @@ def _print(data: dict[str, Any]) -> None:
     console = Console(width=max(Console().width, 120))
     start = datetime.fromtimestamp(data["start_ns"] / 1e9, timezone.utc)
     state = "[red]unfinished[/red]" if data["truncated"] else "complete"
+    state += ", [red]damaged[/red]" if data["damaged"] else ""
     console.print(f"[bold]{escape(data['file'])}[/bold]  {data['bytes']:,} bytes, {state}")
     if data["messages"]:
         console.print(
@@ -132,12 +139,14 @@ def _print(data: dict[str, Any]) -> None:
         console.print(f"\n[bold]{escape(name)}[/bold]")
         for key, value in values.items():
             console.print(f"  {escape(key)}: {escape(value)}", highlight=False, soft_wrap=True)
-    if data["warnings"]:
+    if data["warnings"] or data["notes"]:
         console.print()
         for warning in data["warnings"]:
             console.print(
                 f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False, soft_wrap=True
             )
+        for note in data["notes"]:
+            console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -83,14 +83,19 @@ def command(
     Waits until each topic is subscribed, then plays. Refuses to play while somebody else
     publishes on the same topics, and ends when somebody comes who does. The default domain is 1,
     the simulation's: --domain 0 with a robot's interface moves real hands.
+
+    Exit code: 0 all is sent (or a loop was stopped), 1 the recording is damaged (what can be read
+    of it is sent) or the topics are not free, 2 it cannot be read, 130 stopped.
     """
     from dexkit.dds import DdsNode
     from dexkit.traces import Player, open_trace
 
     trace = open_trace(file)
-    for warning in trace.warnings:
-        click.echo(f"warning: {warning}", err=True)
-    player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
+    try:
+        player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
+    finally:  # more may be found while the messages are read
+        for warning in trace.warnings:
+            click.echo(f"warning: {warning}", err=True)
     _check_types(trace, player)
     click.echo(
         f"{file}: {len(player)} messages of {', '.join(player.topics)}, {player.duration:.1f} s"
@@ -132,7 +137,9 @@ def command(
         f"{stats.error_max * 1e3:.3f} ms (max)"
     )
     # for a loop, being stopped is the ordinary end
-    return 130 if stats.stopped and not loop else 0
+    if stats.stopped and not loop:
+        return 130
+    return 1 if trace.damage else 0
 
 
 def _check_types(trace: Trace, player: Player) -> None:

@@ -103,7 +103,10 @@ def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
 
     about = result.subject
     sides = [Side(name) for name in about.get("sides", "").split(", ") if name in _SIDES]
-    view = Recording.of(open_trace(path), dialect_name=about.get("dialect"), sides=sides)
+    trace = open_trace(path)
+    view = Recording.of(trace, dialect_name=about.get("dialect"), sides=sides)
+    for text in trace.damage:
+        click.echo(f"warning: {path}: {text}", err=True)
     when = moment(view.origin_ns).isoformat(timespec="seconds")
     if not result.recorded_at or when == result.recorded_at:
         return view

@@ -45,6 +45,7 @@ class Columns:
         self._limit = max_size(kind)
         self._sequences = [f.name for f in kind.fields if f.sequence]
         self.errors: dict[int, WireError] = {}
+        self._bad: dict[str, WireError] = {}
         self._groups: dict[_Shape, _Group] = {}
         self._usual: dict[int, _Group] = {}  # by length of the samples
         self._paths: dict[str, _Steps] = {}
@@ -63,8 +64,10 @@ class Columns:
         if len(sizes) and (sizes == sizes[0]).all():
             self._append(aligned(rows_at(data, starts, int(sizes[0]))), rows, int(sizes[0]))
             return
-        for size in np.unique(sizes).tolist():
-            some = sizes == size
+        order = np.argsort(sizes, kind="stable")
+        ends = np.flatnonzero(np.diff(sizes[order])) + 1
+        for some in np.split(order, ends) if len(order) else ():
+            size = int(sizes[some[0]])
             self._append(aligned(rows_at(data, starts[some], size)), rows[some], size)
 
     def reorder(self, order: NDArray[np.intp]) -> None:
@@ -110,7 +113,9 @@ class Columns:
             big = is_big(data, self._limit, self._kind.name)
             return big, _counts(self._kind, data, big), size
         except WireError as error:
-            self.errors[row] = error.with_traceback(None)  # which holds the samples
+            # without its traceback, which holds the samples; one error for all that are alike
+            known = self._bad.setdefault(str(error), error.with_traceback(None))
+            self.errors[row] = known
             return None
 
     def _group(self, shape: _Shape, first: NDArray[np.uint32]) -> _Group:

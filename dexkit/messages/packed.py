@@ -13,7 +13,7 @@ __all__ = ["Packed", "Piece", "Words", "aligned", "pieces", "rows_at"]
 _BLOCK = 512
 """Payloads that are looked at at once: few enough to stay in the processor's cache."""
 _SEGMENT = 1 << 16
-"""Samples whose changing words are kept in one table."""
+"""Most samples whose changing words are kept in one table."""
 
 Piece: TypeAlias = "tuple[bytes | NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]"
 """A buffer, where some payloads begin in it, and how long each of them is."""
@@ -119,8 +119,10 @@ class Words:
         # changing words in the order in which they began to
         self._changing: list[int] = []
         self._place: dict[int, int] = {}
-        # a table of columns for each 65536 samples; memory that is not touched costs nothing
+        # tables of columns, each as long as all before it: no more is allocated than twice the
+        # samples take, and memory that is not touched costs nothing
         self._tables: list[NDArray[np.uint32]] = []
+        self._begins: list[int] = []  # the first sample of each table
         self._known: list[int] = []  # how many words changed when a table was full
 
     def __len__(self) -> int:
@@ -144,15 +146,17 @@ class Words:
         self._changing += new
         if self._tables and new:
             words = slice(len(self._changing) - len(new), len(self._changing))
-            self._tables[-1][words, : self._n % _SEGMENT or _SEGMENT] = self._row[new][:, None]
+            self._tables[-1][words, : self._n - self._begins[-1]] = self._row[new][:, None]
         kept = piece.take(self._changing, axis=1).T
         while kept.shape[1]:
-            at = self._n % _SEGMENT
-            if not at:
+            if not self._tables or self._n - self._begins[-1] == self._tables[-1].shape[1]:
                 if self._tables:
                     self._known.append(len(self._changing))
-                self._tables.append(np.empty((len(self._row), _SEGMENT), dtype=np.uint32))
-            some = min(kept.shape[1], _SEGMENT - at)
+                length = min(max(kept.shape[1], self._n), _SEGMENT)
+                self._tables.append(np.empty((len(self._row), length), dtype=np.uint32))
+                self._begins.append(self._n)
+            at = self._n - self._begins[-1]
+            some = min(kept.shape[1], self._tables[-1].shape[1] - at)
             self._tables[-1][: len(self._changing), at : at + some] = kept[:, :some]
             self._n += some
             kept = kept[:, some:]
@@ -172,9 +176,8 @@ class Words:
             yield slice(0, self._n), self.first(leaf, at)
             return
         step = 4 // leaf.itemsize
-        for number, table in enumerate(self._tables):
-            begin = number * _SEGMENT
-            end = min(begin + _SEGMENT, self._n)
+        for number, (begin, table) in enumerate(zip(self._begins, self._tables, strict=True)):
+            end = min(begin + table.shape[1], self._n)
             if number < len(self._known) and place >= self._known[number]:
                 yield slice(begin, end), self.first(leaf, at)  # it changed only later
             else:

@@ -1,0 +1,809 @@
+"""The container of a recording: where its chunks lie, what the file says of itself, and whether
+all of that agrees.
+
+A file is walked from record to record, without unpacking its chunks. What it says more than once
+is compared: checksums, chunk headers, message indexes, and the summary with its counts. Every
+difference is told in :attr:`Container.damage`, with its place, and what can still be read is read:
+behind a record that goes wrong the walk continues at the next place from which whole records
+follow each other. Chunks are checked when they are read (:meth:`Container.read`).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import fastcrc
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from dexkit.errors import TraceUnreadable
+from dexkit.messages.packed import rows_at
+from dexkit.traces import records
+from dexkit.traces.records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema
+from dexkit.traces.summary import Found, Summary, contradictions
+
+__all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "Segment"]
+
+MAX_CHUNK = 256 * 2**20
+"""Largest chunk that is unpacked, bytes. Writers default to 1 to 4 MiB."""
+MAX_RATIO = 300
+"""Most bytes that a file's chunks may unpack to in all, for each byte of the file. An idle body's
+states, of which little more than the times changes, reach about 130."""
+SPARE = 8 * 2**20
+"""Bytes that may be unpacked beyond that, so that a short recording is no exception."""
+
+# Largest schema, channel, metadata or index record that is believed, bytes.
+_MAX_RECORD = 64 * 2**20
+# Messages outside of chunks are read in runs of this many bytes.
+_RUN = 4 * 2**20
+# A checksum is taken over, and the next record is looked for in, this many bytes at a time.
+_BLOCK = 2**20
+_SCAN = 2**16
+# How often the walk continues behind a record that goes wrong.
+_MAX_RESUMED = 1000
+# Records in one chunk that do not belong there, before it is given up.
+_MAX_ODD = 100
+_MAX_TOLD = 50
+
+_INDEX = struct.Struct("<BQHI")
+HEADS = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "sequence", "log", "publish"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+    }
+)
+"""A message record up to its payload; ``length`` counts from ``channel`` on."""
+Heads = NDArray[np.void]
+
+_IN_SUMMARY = frozenset(
+    {
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+        Opcode.SUMMARY_OFFSET,
+        Opcode.FOOTER,
+    }
+)
+# Fits the record to follow: 1 where an opcode may begin a record outside of chunks.
+_KNOWN = np.zeros(256, dtype=np.uint64)
+for _opcode, _least in LEAST.items():
+    _KNOWN[_opcode] = _least
+_KNOWN[Opcode.HEADER] = 0  # only once, at the beginning
+
+_crc32 = fastcrc.crc32.iso_hdlc  # zlib's, several times as fast
+
+
+@dataclass
+class Segment:
+    """A chunk, or a run of messages outside of chunks.
+
+    :param at: where its record begins in the file.
+    :param offset: where its packed records begin.
+    :param total: length of its record, bytes; 0 for a run.
+    :param index: where its message index lies in the file.
+    """
+
+    at: int
+    offset: int
+    length: int
+    total: int = 0
+    compression: str = ""
+    size: int = 0
+    crc: int = 0
+    start_ns: int = 0
+    end_ns: int = 0
+    cut: bool = False
+    # channel id -> [messages, first log time, last log time]; None: not known from an index
+    counts: dict[int, list[int]] | None = None
+    index: tuple[int, int] = (0, 0)
+    index_offsets: dict[int, int] = field(default_factory=dict)
+
+
+class Container:
+    """The records of a file; see :meth:`open`.
+
+    :ivar truncated: the file ends before its end record.
+    :ivar damage: what contradicts itself, or cannot be read, in sentences with the place.
+    :ivar warnings: the same, and what else is odd.
+    :ivar notes: what is not wrong, but limits what can be checked.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.truncated = False
+        self.damage: list[str] = []
+        self.warnings: list[str] = []
+        self.notes: list[str] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.library = ""
+        self.profile = ""
+        self.segments: list[Segment] = []
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._found = Found(self.segments, self.schemas, self.channels)
+        self._summary = Summary()
+        self._bodies: dict[tuple[int, int], bytes] = {}
+        self._data_end: tuple[int, int] | None = None  # where, and its CRC
+        self._unpacked = 0
+        self._size = 0
+        self._complete_definitions = False
+
+    # -- what is odd ---------------------------------------------------------------------------
+
+    def warn(self, text: str) -> None:
+        """Tell what is odd, once."""
+        _add(self.warnings, text)
+
+    def hurt(self, text: str) -> None:
+        """Tell what is damaged, once."""
+        _add(self.damage, text)
+        _add(self.warnings, text)
+
+    # -- the walk ------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Walk over the records, reading what is small and noting where the rest lies.
+
+        :raises TraceUnreadable: it is missing, not an mcap file, or ends within its header.
+        """
+        try:
+            with self.path.open("rb") as file:
+                self._size = os.fstat(file.fileno()).st_size
+                self._walk(file, self._read_start(file))
+                sound = self._check_sums(file)
+                self._repeat(sound)
+                self._complete(file, sound)
+        except OSError as error:
+            raise TraceUnreadable(f"cannot read {self.path}: {error.strerror}") from error
+        for text in contradictions(self._summary, self._found, complete=self._complete_definitions):
+            self.hurt(text)
+
+    def _read_start(self, file: BinaryIO) -> int:
+        magic = file.read(len(MAGIC))
+        close = len(magic) == len(MAGIC) and (
+            sum(a != b for a, b in zip(magic, MAGIC, strict=True)) == 1
+        )
+        if magic != MAGIC and not close:
+            raise TraceUnreadable(f"{self.path} is not an mcap file", hint=_guess(magic))
+        at = len(MAGIC)
+        opcode, length = self._head(file, at) or (0, 0)
+        end = at + HEAD.size + length
+        if opcode == Opcode.HEADER and length <= _MAX_RECORD and end <= self._size:
+            try:
+                self.profile, self.library = records.header(file.read(length))
+                if close:
+                    self.hurt("the first 8 bytes are not quite those of an mcap file")
+                if end == self._size or self._is_record(file, end) or not self._closed(file):
+                    return end
+                problem = "the header is followed by nonsense"
+            except BadRecord as error:
+                problem = f"the header cannot be read ({error})"
+        else:
+            problem = "it ends, or goes wrong, within its header"
+        found = None if close else self._resume(file, at + 1)
+        if found is None or not self._closed(file):
+            raise TraceUnreadable(f"{self.path}: {problem}")
+        self.hurt(problem)
+        return found
+
+    def _closed(self, file: BinaryIO) -> bool:
+        """Whether the file ends as a finished one does."""
+        file.seek(max(0, self._size - len(MAGIC)))
+        return file.read() == MAGIC
+
+    def _head(self, file: BinaryIO, at: int) -> tuple[int, int] | None:
+        """Opcode and length of the record at ``at``."""
+        file.seek(at)
+        head = file.read(HEAD.size)
+        if len(head) < HEAD.size:
+            return None
+        opcode, length = HEAD.unpack(head)
+        return int(opcode), int(length)
+
+    def _walk(self, file: BinaryIO, at: int) -> None:
+        size = self._size
+        self._run: Segment | None = None
+        finished = False
+        sure = at  # from here on a record may begin that was missed
+        resumed = 0
+        while (head := self._head(file, at)) is not None:
+            opcode, length = head
+            end = at + HEAD.size + length
+            odd = not _is_possible(opcode, length)
+            if odd or end > size:
+                if not odd and opcode == Opcode.CHUNK:
+                    cut = self._add_chunk(file, at, end)
+                    if cut > at:  # its own lengths say where it ends
+                        at = sure = cut
+                        continue
+                    if cut == size or not self._closed(file):
+                        break
+                found = None
+                if resumed < _MAX_RESUMED and self._data_end is None:
+                    found = self._resume(file, max(sure, at + 1 if odd else at + HEAD.size))
+                if found is None:
+                    if odd or self._closed(file):
+                        # zeros are what a file system leaves after a power cut
+                        self.hurt(
+                            f"nonsense from byte {at}; the remaining {size - at} bytes are lost"
+                        )
+                    break
+                resumed += 1
+                self.hurt(f"nonsense at byte {at}; {found - at} bytes are lost")
+                self._run = None
+                at = sure = found
+                continue
+            if opcode == Opcode.FOOTER:
+                finished = self._read_footer(file, at, end)
+                at = end
+                break
+            at, sure = self._take(file, opcode, length, at)
+        if finished:
+            return
+        if self._closed(file):
+            self.hurt("the end of the file is damaged: it has no footer")
+            return
+        self.truncated = True
+        lost = f"; {size - at} bytes after the last whole record" if size > at else ""
+        self.warn(f"unfinished recording: read as far as it goes{lost}")
+
+    def _take(self, file: BinaryIO, opcode: int, length: int, at: int) -> tuple[int, int]:
+        """Read one record, or note where it lies.
+
+        :returns: (where the next one begins, from where on records may have been missed).
+        """
+        body = at + HEAD.size
+        end = body + length
+        if opcode == Opcode.MESSAGE:
+            if self._run is None or self._run.length > _RUN:
+                self._run = Segment(at, at, 0)
+                self.segments.append(self._run)
+            self._run.length = self._run.size = end - self._run.offset
+            return end, body + LEAST[Opcode.MESSAGE]
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._run = None
+        if opcode == Opcode.CHUNK:
+            end = self._add_chunk(file, at, end)
+            return end, end
+        if opcode >= records.PRIVATE:
+            self.warn(
+                f"a private record (kind {opcode:#x}, {length} bytes) at byte {at} is skipped"
+            )
+            return end, body
+        try:
+            if opcode == Opcode.ATTACHMENT:
+                self._read_attachment(file, at, end)
+            elif length > _MAX_RECORD:
+                raise BadRecord(f"it has {length} bytes")
+            else:
+                self._read_small(opcode, file.read(length), at, end)
+        except BadRecord as error:
+            self.hurt(f"the record at byte {at} cannot be read ({error}) and is left out")
+            return end, body
+        return end, end
+
+    def _read_small(self, opcode: int, body: bytes, at: int, end: int) -> None:
+        behind = self._data_end is not None
+        definition = opcode in (Opcode.SCHEMA, Opcode.CHANNEL)
+        if opcode == Opcode.DATA_END:
+            if behind:
+                self.hurt(f"a second end of the data section at byte {at}")
+            (crc,) = struct.unpack_from("<I", body)
+            self._data_end = (at, crc)
+            self._summary.begin = end
+        elif opcode in _IN_SUMMARY or (definition and behind):
+            self._summary.add(opcode, body, at, end)
+            if not behind:
+                self.hurt(f"a record of the summary lies in the data section, at byte {at}")
+        elif definition:
+            self.define(opcode, body, at)
+        elif opcode == Opcode.METADATA:
+            name, entries = records.metadata(body)
+            self.metadata.setdefault(name, {}).update(entries)
+            self._found.metadata.append((at, end - at, name))
+        elif opcode == Opcode.MESSAGE_INDEX:
+            self._read_message_index(body, at, end)
+        else:
+            raise BadRecord("it is a second header")
+
+    def _resume(self, file: BinaryIO, begin: int) -> int | None:
+        """The next place at which three whole records, or the file's last ones, follow each other.
+
+        Where the summary has its place, nothing is looked for: it is given up as a whole.
+        """
+        size = self._size
+        for base in range(begin, size, _SCAN):
+            file.seek(base)
+            data = np.frombuffer(file.read(_SCAN + 8), dtype=np.uint8)
+            if len(data) < HEAD.size:
+                break
+            n = len(data) - 8
+            lengths = rows_at(data, np.arange(1, n), 8).view("<u8")[:, 0] if n > 1 else None
+            if lengths is None:
+                break
+            least = _KNOWN[data[: n - 1]]
+            room = np.uint64(max(0, size - base))
+            likely = np.flatnonzero((least > 0) & (lengths >= least) & (lengths < room))
+            for place in likely.tolist():
+                if self._follows(file, base + place):
+                    return base + int(place)
+        return None
+
+    def _follows(self, file: BinaryIO, at: int) -> bool:
+        for _ in range(3):
+            head = self._head(file, at)
+            if head is None or head[0] == Opcode.HEADER or not _is_possible(*head):
+                return False
+            at += HEAD.size + head[1]
+            if at > self._size:
+                return False
+            if head[0] == Opcode.FOOTER:
+                return at + len(MAGIC) == self._size
+            if at == self._size:
+                return True
+        return True
+
+    def _add_chunk(self, file: BinaryIO, at: int, end: int) -> int:
+        """Note a chunk; returns its end as its own lengths have it, or 0 if it is cut short."""
+        size = self._size
+        body = at + HEAD.size
+        file.seek(body)
+        head = file.read(records.CHUNK_HEAD.size + 16 + 8)
+        try:
+            start_ns, end_ns, unpacked, crc, named = records.CHUNK_HEAD.unpack_from(head)
+            name_at = records.CHUNK_HEAD.size
+            if named > 16:
+                raise ValueError("the name of its compression is too long")
+            compression = head[name_at : name_at + named].decode()
+            (length,) = struct.unpack_from("<Q", head, name_at + named)
+        except (struct.error, ValueError) as error:
+            if end <= size:
+                self.hurt(f"the chunk at byte {at} has no readable header ({error}); left out")
+            return end if end <= size else 0
+        offset = body + name_at + named + 8
+        segment = Segment(
+            at, offset, length, end - at, compression, unpacked, crc, start_ns, end_ns
+        )
+        inner = offset + length
+        if inner != end:
+            # one of the two lengths is wrong, or the file ends here
+            if inner <= size and self._is_record(file, inner):
+                self.hurt(f"the chunk at byte {at} is {inner - at} bytes long, and says {end - at}")
+                segment.total = inner - at
+            elif end <= size:
+                self.hurt(f"the chunk at byte {at} has {length} bytes in a record of {end - at}")
+                segment.length = end - offset
+                inner = end
+            else:
+                inner = end
+        if inner > size:
+            segment.length, segment.cut = size - offset, True
+        most = MAX_RATIO * size + SPARE - self._unpacked
+        if max(segment.length, unpacked) > MAX_CHUNK:
+            self.hurt(
+                f"the chunk at byte {at} claims {unpacked} bytes, more than {MAX_CHUNK}; left out"
+            )
+        elif unpacked > most:
+            self.hurt(
+                f"the chunk at byte {at} claims {unpacked} bytes: the file's chunks unpack to more "
+                f"than {MAX_RATIO} times its size; left out"
+            )
+        else:
+            self._unpacked += unpacked
+            self.segments.append(segment)
+            return 0 if segment.cut else inner
+        self._found.left_out.add(at)
+        return 0 if segment.cut else inner
+
+    def _is_record(self, file: BinaryIO, at: int) -> bool:
+        """Whether a record, or the end of the file, is there."""
+        if at == self._size:
+            return True
+        head = self._head(file, at)
+        return head is not None and _is_possible(*head) and at + HEAD.size + head[1] <= self._size
+
+    def _read_message_index(self, body: bytes, at: int, end: int) -> None:
+        channel_id, length = struct.unpack_from("<HI", body)
+        if length % 16 or len(body) < 6 + length:
+            raise BadRecord("its list does not fit")
+        segment = self.segments[-1] if self.segments else None
+        if segment is not None:
+            begin, stop = segment.index
+            due = stop or segment.at + segment.total
+        if segment is None or not segment.total or at != due:
+            if not self._found.left_out:
+                self.hurt(f"the message index at byte {at} belongs to no chunk")
+            return
+        segment.index = (begin or at, end)
+        segment.index_offsets[channel_id] = at
+        if segment.counts is None:
+            segment.counts = {}
+        if length:
+            times = np.frombuffer(body, "<u8", count=length // 8, offset=6)[::2]
+            entry = [len(times), int(times.min()), int(times.max())]
+            if (known := segment.counts.get(channel_id)) is not None:
+                entry = [known[0] + entry[0], min(known[1], entry[1]), max(known[2], entry[2])]
+            segment.counts[channel_id] = entry
+
+    def _read_attachment(self, file: BinaryIO, at: int, end: int) -> None:
+        body = at + HEAD.size
+        about, begin = records.attachment(file.read(min(end - body, _BLOCK)))
+        stop = body + begin + about.size
+        if stop + 4 > end:
+            raise BadRecord("its data are longer than the record")
+        self._found.attachments.append((at, end - at, about))
+        file.seek(stop)
+        (crc,) = struct.unpack("<I", file.read(4))
+        if crc and _crc_of(file, body, stop) != crc:
+            self.hurt(
+                f"the attachment {about.name[:60]!r} at byte {at} does not match its checksum"
+            )
+
+    def _read_footer(self, file: BinaryIO, at: int, end: int) -> bool:
+        """Read the last record; False if the file ends before the 8 bytes behind it."""
+        self._summary.footer = records.footer(file.read(end - at - HEAD.size))
+        self._summary.end = at
+        if self._size < end + len(MAGIC):
+            return False
+        file.seek(end)
+        if file.read(len(MAGIC)) != MAGIC:
+            self.hurt("the last 8 bytes are not those of an mcap file")
+        if self._size > end + len(MAGIC):
+            more = self._size - end - len(MAGIC)
+            self.hurt(f"{more} bytes behind the end of the recording are not read")
+        return True
+
+    # -- what it says of itself ----------------------------------------------------------------
+
+    def _check_sums(self, file: BinaryIO) -> bool:
+        """Compare the checksums of data section and summary; True if the summary's is right."""
+        summary, footer = self._summary, self._summary.footer
+        unsure = []
+        if self._data_end is None:
+            if not self.truncated:
+                self.hurt("the data section has no end record")
+        elif not self._data_end[1]:
+            unsure.append("the data section")
+        elif _crc_of(file, 0, self._data_end[0]) != self._data_end[1]:
+            self.hurt(
+                f"the data section, bytes 0 to {self._data_end[0]}, does not match its checksum"
+            )
+        sound = False
+        if footer is not None:
+            if not footer.crc:
+                unsure.append("the summary")
+            elif _crc_of(file, summary.begin or summary.end, summary.end + HEAD.size + 16) == (
+                footer.crc
+            ):
+                sound = True
+            else:
+                self.hurt(
+                    f"the summary, bytes {summary.begin} to {summary.end}, "
+                    "does not match its checksum"
+                )
+        if bare := sum(1 for s in self.segments if s.total and not s.crc):
+            unsure.append(f"{bare} of its chunks")
+        if unsure:
+            self.notes.append(
+                f"no checksum over {', '.join(unsure)}: damage there may not be noticed"
+            )
+        if self.truncated:
+            self.notes.append("unfinished, so no checksum over what lies outside of its chunks")
+        return sound
+
+    def _repeat(self, sound: bool) -> None:
+        """Take over what the summary repeats, if it can be believed."""
+        for opcode, body, at in self._summary.definitions if sound else ():
+            self._define_if(opcode, body, at)
+
+    def _define_if(self, opcode: int, body: bytes, at: int) -> None:
+        try:
+            self.define(opcode, body, at)
+        except BadRecord as error:
+            self.hurt(f"a definition at byte {at} cannot be read ({error})")
+
+    def define(self, opcode: int, body: bytes, at: int) -> None:
+        """Take over a schema or a channel; what was defined before must be the same."""
+        key = (opcode, int.from_bytes(body[:2], "little"))
+        before = self._bodies.get(key)
+        if before is None:
+            if opcode == Opcode.SCHEMA:
+                schema = records.schema(body)
+                self.schemas[schema.id] = schema
+            else:
+                channel = records.channel(body)
+                self.channels[channel.id] = channel
+            self._bodies[key] = body
+        elif before != body:
+            if opcode == Opcode.SCHEMA:
+                if self.schemas[key[1]] != records.schema(body):
+                    self.hurt(f"schema {key[1]} is defined twice, again at byte {at}, differently")
+                return
+            known, channel = self.channels[key[1]], records.channel(body)
+            if known != channel:
+                both = f", for {known.topic[:200]} and for {channel.topic[:200]}"
+                self.hurt(
+                    f"channel {key[1]} is defined twice{both * (known.topic != channel.topic)}, "
+                    f"again at byte {at}, differently; the first is used"
+                )
+
+    def _complete(self, file: BinaryIO, sound: bool) -> None:
+        """Read into those segments that the indexes leave unknown, and into all if in doubt."""
+        known = sound and bool(self._summary.definitions)
+        doubt = bool(self.damage) or any(contradictions(self._summary, self._found, complete=known))
+        read = 0
+        for number, segment in enumerate(self.segments):
+            # the index of the last chunk of an unfinished file may itself be cut
+            last = self.truncated and number + 1 == len(self.segments)
+            counts = segment.counts
+            if doubt or last or counts is None or not (_fits(segment) and self._knows(counts)):
+                self._survey(file, segment)
+                read += 1
+        for opcode, body, at in () if sound else self._summary.definitions:
+            self._define_if(opcode, body, at)
+        self._complete_definitions = bool(self._summary.definitions) or read == len(self.segments)
+
+    def _knows(self, channel_ids: Iterable[int]) -> bool:
+        for channel_id in channel_ids:
+            channel = self.channels.get(channel_id)
+            if channel is None or (channel.schema_id and channel.schema_id not in self.schemas):
+                return False
+        return True
+
+    def _survey(self, file: BinaryIO, segment: Segment) -> None:
+        _, _, heads = self.read(file, segment)
+        segment.counts = counts = {}
+        for channel_id, some in by_channel(heads["channel"]):
+            log = heads["log"][some]
+            counts[channel_id] = [len(some), int(log.min()), int(log.max())]
+        if counts:
+            first = min(c[1] for c in counts.values())
+            last = max(c[2] for c in counts.values())
+            if (
+                segment.total
+                and not segment.cut
+                and (first, last)
+                != (
+                    segment.start_ns,
+                    segment.end_ns,
+                )
+            ):
+                self.hurt(f"the chunk at byte {segment.at} holds other times than its header says")
+            segment.start_ns, segment.end_ns = first, last
+
+    # -- chunks --------------------------------------------------------------------------------
+
+    def read(self, file: BinaryIO, segment: Segment) -> tuple[bytes, NDArray[np.int64], Heads]:
+        """The messages in a segment: its bytes, where messages begin in them, and their heads.
+
+        What is damaged is left out and told, as is what does not agree with the message index.
+        """
+        data = self._unpack(file, segment)
+        at = 0
+        index = _message_index(file, segment) if segment.index[1] else None
+        if index is not None:
+            channels, times, starts = index
+            if _are_all(data, starts):
+                at = self._scan(data, segment, [], int(starts[0]))
+                if at == starts[0]:
+                    heads = rows_at(data, starts, HEADS.itemsize).view(HEADS)[:, 0]
+                    if not (
+                        np.array_equal(heads["channel"], channels)
+                        and np.array_equal(heads["log"], times)
+                    ):
+                        self._hurt_index(segment)
+                    return data, starts, heads
+        found: list[int] = []
+        self._scan(data, segment, found, -1)
+        begins = np.array(found, dtype=np.int64)
+        heads = rows_at(data, begins, HEADS.itemsize).view(HEADS)[:, 0]
+        whole = data or not segment.size
+        if index is not None and whole and not (self.truncated and segment is self.segments[-1]):
+            order = np.lexsort((times, starts))
+            if not (
+                np.array_equal(begins, starts[order])
+                and np.array_equal(heads["channel"], channels[order])
+                and np.array_equal(heads["log"], times[order])
+            ):
+                self._hurt_index(segment)
+        return data, begins, heads
+
+    def _hurt_index(self, segment: Segment) -> None:
+        self.hurt(
+            f"the message index of the chunk at byte {segment.at} is not that of its messages"
+        )
+
+    def _unpack(self, file: BinaryIO, segment: Segment) -> bytes:
+        """The records in a segment; empty if they are damaged."""
+        file.seek(segment.offset)
+        packed = file.read(segment.length)
+        if not segment.total:
+            return packed
+        where = f"the chunk at byte {segment.at}"
+        try:
+            if segment.compression == "":
+                data, more = packed, False
+            elif segment.compression == "zstd":
+                data, more = _unzstd(packed, segment.size, segment.cut)
+            elif segment.compression == "lz4":
+                unpacker = lz4.frame.LZ4FrameDecompressor()
+                data = unpacker.decompress(packed, segment.size)
+                more = not (unpacker.eof or segment.cut)
+            else:
+                self.hurt(f"{where} is compressed with {segment.compression!r}; left out")
+                return b""
+        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+            if not segment.cut:
+                self.hurt(f"{where} is damaged and left out ({error})")
+            return b""
+        if segment.cut:
+            return data[: segment.size]
+        if more or len(data) != segment.size:
+            self.hurt(
+                f"{where} is damaged (it does not unpack to {segment.size} bytes) and left out"
+            )
+            return b""
+        if segment.crc and _crc32(data) != segment.crc:
+            self.hurt(f"{where} is damaged (its checksum does not match) and left out")
+            return b""
+        return data
+
+    def _scan(self, data: bytes, segment: Segment, found: list[int], stop: int) -> int:
+        """Go from record to record; where messages begin goes to ``found``.
+
+        :param stop: where to end, or -1.
+        :returns: where it ended.
+        """
+        at, end, odd = 0, len(data), 0
+        unpack, message = HEAD.unpack_from, int(Opcode.MESSAGE)
+        try:
+            while at < end and at != stop:
+                opcode, length = unpack(data, at)
+                after = at + 9 + length
+                if after > end:
+                    raise ValueError("a record is longer than what is left")
+                if opcode == message:
+                    if length < 22:
+                        raise ValueError("a message is shorter than its head")
+                    found.append(at)
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._define_if(opcode, data[at + 9 : after], segment.at)
+                else:
+                    odd += 1
+                    if odd > _MAX_ODD:
+                        raise ValueError("too many records that do not belong there")
+                    self.hurt(
+                        f"the chunk at byte {segment.at} holds a record of kind {opcode:#x}, which "
+                        f"does not belong there, after {at} bytes"
+                    )
+                at = after
+        except (struct.error, ValueError) as error:
+            if not segment.cut:
+                self.hurt(
+                    f"records of the chunk at byte {segment.at} go wrong after {at} bytes ({error})"
+                )
+        return at
+
+
+def by_channel(channels: NDArray[np.uint16]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Each channel that occurs, and where."""
+    if not len(channels):
+        return
+    order = np.argsort(channels, kind="stable")
+    ordered = channels[order]
+    ends = [*(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist(), len(order)]
+    begin = 0
+    for end in ends:
+        yield int(ordered[begin]), order[begin:end]
+        begin = end
+
+
+def _add(told: list[str], text: str) -> None:
+    if text in told or len(told) > _MAX_TOLD:
+        return
+    told.append(text if len(told) < _MAX_TOLD else "and more, which is not listed")
+
+
+def _fits(segment: Segment) -> bool:
+    """Whether a chunk's header has the times that its message index has."""
+    if not segment.total or not segment.counts:
+        return True
+    first = min(c[1] for c in segment.counts.values())
+    last = max(c[2] for c in segment.counts.values())
+    return (first, last) == (segment.start_ns, segment.end_ns)
+
+
+def _is_possible(opcode: int, length: int) -> bool:
+    """Whether a record of that kind can have that length, outside of chunks."""
+    return opcode >= records.PRIVATE or (opcode in LEAST and length >= LEAST[Opcode(opcode)])
+
+
+def _crc_of(file: BinaryIO, begin: int, end: int) -> int:
+    file.seek(begin)
+    crc = 0
+    while begin < end:
+        data = file.read(min(_BLOCK, end - begin))
+        if not data:
+            break
+        crc = _crc32(data, crc)
+        begin += len(data)
+    return int(crc)
+
+
+def _guess(magic: bytes) -> str:
+    """What a file that is no mcap file may be, from its first bytes."""
+    if magic.startswith(b"SQLite f"):
+        return "a ROS 2 .db3 bag: convert it to mcap ('ros2 bag convert', or 'rosbags-convert')"
+    if magic.startswith(b"#ROSBAG"):
+        return "a ROS 1 bag: convert it to mcap ('rosbags-convert')"
+    if magic.startswith(b"\x28\xb5\x2f\xfd"):
+        return "a zstd archive: unpack it first ('zstd -d')"
+    if magic.startswith(b"version "):
+        return "perhaps a Git LFS pointer: 'git lfs pull' fetches the file itself"
+    if not magic:
+        return "the file is empty"
+    return "recordings are mcap files (https://mcap.dev)"
+
+
+def _unzstd(packed: bytes, size: int, cut: bool) -> tuple[bytes, bool]:
+    """At most ``size`` bytes, whatever the frame says of itself; and whether there are more."""
+    if cut:
+        unpacker = zstandard.ZstdDecompressor().decompressobj()
+        out = bytearray()
+        try:
+            # a piece at a time: a piece that fails, or exceeds the bound, ends it
+            for at in range(0, len(packed), 4096):
+                out += unpacker.decompress(packed[at : at + 4096])
+                if len(out) > size:
+                    break
+        except zstandard.ZstdError:
+            pass
+        return bytes(out[:size]), False
+    with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
+        return reader.read(size), bool(reader.read(1))
+
+
+def _message_index(
+    file: BinaryIO, segment: Segment
+) -> tuple[NDArray[np.uint16], NDArray[np.uint64], NDArray[np.int64]]:
+    """(channels, times, offsets) of the messages, as a chunk's index has them, by offset."""
+    begin, end = segment.index
+    file.seek(begin)
+    data = file.read(end - begin)
+    channels = [np.empty(0, np.uint16)]
+    parts: list[NDArray[np.uint64]] = [np.empty(0, np.uint64)]
+    at = 0
+    while at + 15 <= len(data):
+        _, length, channel, size = _INDEX.unpack_from(data, at)
+        if at + 15 + size > len(data):
+            break  # the file has become shorter
+        part = np.frombuffer(data, "<u8", size // 8, at + 15)
+        channels.append(np.full(len(part) // 2, channel, np.uint16))
+        parts.append(part)
+        at += 9 + length
+    entries = np.concatenate(parts)
+    starts = entries[1::2].view(np.int64)
+    order = np.argsort(starts, kind="stable")
+    return np.concatenate(channels)[order], entries[::2][order], starts[order]
+
+
+def _are_all(data: bytes, starts: NDArray[np.int64]) -> bool:
+    """Whether messages begin at ``starts``, each where the last ends, up to the end of ``data``."""
+    if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - HEADS.itemsize:
+        return False
+    heads = rows_at(data, starts, HEADS.itemsize).view(HEADS)[:, 0]
+    lengths = heads["length"].astype(np.int64)
+    return bool(
+        (heads["opcode"] == Opcode.MESSAGE).all()
+        and (lengths >= 22).all()
+        and int(starts[-1] + 9 + lengths[-1]) == len(data)
+        and np.array_equal((starts + 9 + lengths)[:-1], starts[1:])
+    )

@@ -1,0 +1,271 @@
+"""The records of an mcap file (mcap.dev/spec), parsed strictly and without input or output.
+
+A record is an opcode, a length and a body. Each function here takes a body and raises
+:class:`BadRecord` where the lengths inside of it do not fit it. Bytes behind the last known field
+are allowed: the format says that later versions may add some.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, NamedTuple
+
+from mcap.opcode import Opcode
+
+__all__ = [
+    "CHUNK_HEAD",
+    "HEAD",
+    "LEAST",
+    "MAGIC",
+    "PRIVATE",
+    "Attachment",
+    "BadRecord",
+    "Channel",
+    "ChunkIndex",
+    "Footer",
+    "Opcode",
+    "Schema",
+    "Statistics",
+    "attachment",
+    "attachment_index",
+    "channel",
+    "chunk_index",
+    "footer",
+    "header",
+    "metadata",
+    "metadata_index",
+    "schema",
+    "statistics",
+    "summary_offset",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+"""Beginning and end of every file."""
+PRIVATE = 0x80
+"""From this opcode on, records belong to applications, and may be anything."""
+HEAD = struct.Struct("<BQ")
+"""Opcode and length of what follows, bytes."""
+CHUNK_HEAD = struct.Struct("<QQQII")
+"""First and last log time, bytes unpacked, their CRC, length of the compression's name."""
+LEAST = {
+    Opcode.HEADER: 8,
+    Opcode.FOOTER: 20,
+    Opcode.SCHEMA: 14,
+    Opcode.CHANNEL: 16,
+    Opcode.MESSAGE: 22,
+    Opcode.CHUNK: 40,
+    Opcode.MESSAGE_INDEX: 6,
+    Opcode.CHUNK_INDEX: 64,
+    Opcode.ATTACHMENT: 36,
+    Opcode.ATTACHMENT_INDEX: 48,
+    Opcode.STATISTICS: 46,
+    Opcode.METADATA: 8,
+    Opcode.METADATA_INDEX: 20,
+    Opcode.SUMMARY_OFFSET: 17,
+    Opcode.DATA_END: 4,
+}
+"""Shortest body of each kind of record, bytes."""
+
+_UINT16 = struct.Struct("<H")
+_UINT32 = struct.Struct("<I")
+_UINT64 = struct.Struct("<Q")
+_TWO_IDS = struct.Struct("<HH")
+_TWO = struct.Struct("<QQ")
+_FOUR = struct.Struct("<QQQQ")
+_FIVE = struct.Struct("<QQQQQ")
+_FOOTER = struct.Struct("<QQI")
+_OFFSET = struct.Struct("<BQQ")
+_STATISTICS = struct.Struct("<QHIIIIQQ")
+_ENTRY = struct.Struct("<HQ")
+
+
+class BadRecord(ValueError):
+    """A record whose lengths do not fit it, or whose text is not UTF-8."""
+
+
+class Schema(NamedTuple):
+    """A type: the text of its definition."""
+
+    id: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+class Channel(NamedTuple):
+    """A topic, of one type."""
+
+    id: int
+    schema_id: int
+    topic: str
+    message_encoding: str
+    metadata: dict[str, str]
+
+
+class ChunkIndex(NamedTuple):
+    """What the summary says of a chunk. ``offsets``: each channel's message index in the file."""
+
+    start_ns: int
+    end_ns: int
+    at: int
+    length: int
+    offsets: dict[int, int]
+    index_length: int
+    compression: str
+    packed: int
+    size: int
+
+
+class Statistics(NamedTuple):
+    """What the summary says of the whole file."""
+
+    messages: int
+    schemas: int
+    channels: int
+    attachments: int
+    metadata: int
+    chunks: int
+    start_ns: int
+    end_ns: int
+    by_channel: dict[int, int]
+
+
+class Attachment(NamedTuple):
+    """An attachment, without its data, or what the summary says of it."""
+
+    log_ns: int
+    create_ns: int
+    name: str
+    media_type: str
+    size: int
+
+
+class Footer(NamedTuple):
+    """Where the summary and its offsets begin (0: there are none), and its CRC (0: not known)."""
+
+    summary: int
+    offsets: int
+    crc: int
+
+
+class _Fields:
+    """Takes one field after the other from a body."""
+
+    def __init__(self, body: bytes) -> None:
+        self.body = body
+        self.at = 0
+
+    def take(self, form: struct.Struct) -> tuple[Any, ...]:
+        if self.at + form.size > len(self.body):
+            raise BadRecord("it ends within a field")
+        found = form.unpack_from(self.body, self.at)
+        self.at += form.size
+        return found
+
+    def data(self) -> bytes:
+        (length,) = self.take(_UINT32)
+        if self.at + length > len(self.body):
+            raise BadRecord("a field is longer than the record")
+        self.at += length
+        return self.body[self.at - length : self.at]
+
+    def text(self) -> str:
+        try:
+            return self.data().decode()
+        except UnicodeDecodeError:
+            raise BadRecord("a text is not UTF-8") from None
+
+    def texts(self) -> dict[str, str]:
+        (length,) = self.take(_UINT32)
+        end = self.at + length
+        found: dict[str, str] = {}
+        while self.at < end:
+            key = self.text()
+            found[key] = self.text()
+        if self.at != end:
+            raise BadRecord("a list is longer than it says")
+        return found
+
+    def numbers(self) -> dict[int, int]:
+        entries = self.data()
+        if len(entries) % _ENTRY.size:
+            raise BadRecord("a list ends within an entry")
+        return dict(_ENTRY.iter_unpack(entries))
+
+
+def header(body: bytes) -> tuple[str, str]:
+    """(profile, library)"""
+    fields = _Fields(body)
+    return fields.text(), fields.text()
+
+
+def schema(body: bytes) -> Schema:
+    """A Schema record."""
+    fields = _Fields(body)
+    (number,) = fields.take(_UINT16)
+    return Schema(number, fields.text(), fields.text(), fields.data())
+
+
+def channel(body: bytes) -> Channel:
+    """A Channel record."""
+    fields = _Fields(body)
+    number, of = fields.take(_TWO_IDS)
+    return Channel(number, of, fields.text(), fields.text(), fields.texts())
+
+
+def metadata(body: bytes) -> tuple[str, dict[str, str]]:
+    """(name, entries)"""
+    fields = _Fields(body)
+    return fields.text(), fields.texts()
+
+
+def attachment(body: bytes) -> tuple[Attachment, int]:
+    """An attachment from its first bytes, and where its data begin in the body."""
+    fields = _Fields(body)
+    log, created = fields.take(_TWO)
+    name, kind = fields.text(), fields.text()
+    (size,) = fields.take(_UINT64)
+    return Attachment(log, created, name, kind, size), fields.at
+
+
+def chunk_index(body: bytes) -> ChunkIndex:
+    """A Chunk Index record."""
+    fields = _Fields(body)
+    start, end, at, length = fields.take(_FOUR)
+    offsets = fields.numbers()
+    (index_length,) = fields.take(_UINT64)
+    compression = fields.text()
+    packed, size = fields.take(_TWO)
+    return ChunkIndex(start, end, at, length, offsets, index_length, compression, packed, size)
+
+
+def attachment_index(body: bytes) -> tuple[int, int, Attachment]:
+    """(offset, length, what it says of the attachment)"""
+    fields = _Fields(body)
+    at, length, log, created, size = fields.take(_FIVE)
+    return at, length, Attachment(log, created, fields.text(), fields.text(), size)
+
+
+def metadata_index(body: bytes) -> tuple[int, int, str]:
+    """(offset, length, name)"""
+    fields = _Fields(body)
+    at, length = fields.take(_TWO)
+    return at, length, fields.text()
+
+
+def statistics(body: bytes) -> Statistics:
+    """A Statistics record."""
+    fields = _Fields(body)
+    counts = fields.take(_STATISTICS)
+    return Statistics._make((*counts, fields.numbers()))
+
+
+def summary_offset(body: bytes) -> tuple[int, int, int]:
+    """(opcode of the group, its offset, its length)"""
+    opcode, at, length = _Fields(body).take(_OFFSET)
+    return opcode, at, length
+
+
+def footer(body: bytes) -> Footer:
+    """A Footer record."""
+    return Footer(*_Fields(body).take(_FOOTER))
