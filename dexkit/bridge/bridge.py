@@ -20,6 +20,7 @@ from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
+from dexkit.threads import Worker
 
 __all__ = ["Bridge", "End"]
 
@@ -77,7 +78,6 @@ class Bridge:
         self.sides = tuple(sides)
         self.states = States(gripper.dialect, client.dialect, self.sides)
         self.commands = Commands(client.dialect, gripper.dialect, self.sides, self.states)
-        self.failure: Exception | None = None  #: what ended a thread, if anything
         self._force = force
         self._clock: Clock = clock if clock is not None else RealClock()
         self._stop = threading.Event()
@@ -120,6 +120,13 @@ class Bridge:
             way.close()
 
     # -- what it says of itself ---------------------------------------------------------------
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended a thread that the bridge needs, those of its nodes included; or None."""
+        needed = [way.thread.failure for way in self._ways]
+        needed += [self.client.node.failure, self.gripper.node.failure]
+        return next((error for error in needed if error is not None), None)
 
     @property
     def clients(self) -> int:
@@ -208,7 +215,7 @@ class _Way:
             for topic in direction.inputs
         }
         self._complained = False
-        self.thread = threading.Thread(target=self._run, name="dexkit-bridge", daemon=True)
+        self.thread = Worker("bridge", self._run)
 
     @property
     def writers(self) -> list[Writer]:
@@ -223,12 +230,8 @@ class _Way:
 
     def _run(self) -> None:
         precise_timers()
-        try:
-            while not self._bridge._stop.is_set():
-                self._turn()
-        except Exception as error:  # nothing may die in silence
-            _log.exception("the bridge died")
-            self._bridge.failure = error
+        while not self._bridge._stop.is_set():
+            self._turn()
 
     def _turn(self) -> None:
         clock, direction = self._bridge._clock, self.direction
