@@ -38,8 +38,9 @@ RECEIVE_BUFFER = 16 * 2**20
 MAX_TOPICS = 256
 # Descriptions of endpoints that are kept.
 _MAX_SEEN = 1000
-# Seconds between looks at what was lost.
+# Seconds between looks at what was lost, and between records of it in the file.
 _LOOK_EVERY = 0.25
+_NOTE_EVERY = 2.0
 # Seconds between metadata records with the endpoints, at most; they change when a run starts.
 _ENDPOINTS_EVERY = 0.25
 # Seconds in which discovery may tell the type of a topic asked for by name; on one machine it takes
@@ -165,8 +166,8 @@ class DdsRecording:
             self._wake.set()
 
     def _run(self) -> None:
-        told = looked = float("-inf")
-        changed = False
+        told = looked = noted = float("-inf")
+        changed = news = False
         while True:
             self._wake.wait(_IDLE)
             self._wake.clear()
@@ -179,8 +180,10 @@ class DdsRecording:
             now = time.monotonic()
             if stopping or pause is not None or now - looked >= _LOOK_EVERY:
                 looked = now
-                if self._look(now) or pause is not None or stopping:
+                news |= self._look(now) or pause is not None
+                if stopping or (news and now - noted >= _NOTE_EVERY):
                     self.recorder.add_metadata("dexkit_recorder", self.losses.metadata())
+                    noted, news = now, False
             if changed and (stopping or now - told >= _ENDPOINTS_EVERY):
                 self.recorder.add_metadata("dds_endpoints", self._endpoint_record())
                 told, changed = now, False
