@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dexkit.clock import RealClock
 from dexkit.conformance.phases import Beats, Stall
+from dexkit.threads import Worker
 
 __all__ = ["Heartbeat"]
 
@@ -36,7 +37,7 @@ class Heartbeat:
         self._begin_ns = time.time_ns()
         self._beats: list[tuple[int, int]] = []
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._thread = Worker("heartbeat", self._beat)
 
     def _beat(self) -> None:
         clock = RealClock()

@@ -16,6 +16,10 @@ Threads: each node has one dispatcher thread that sleeps in a CycloneDDS waitset
 never calls into Python (listeners that do can deadlock on the interpreter lock), so ``on_data``
 and discovery callbacks run in the dispatcher. They must only note that something happened.
 
+What peers announce is not believed: the built-in topics are read through ctypes, as bytes,
+because CycloneDDS's Python raises at text that is not UTF-8, and then loses what other peers
+announced together with it.
+
 On loopback a node finds every other process of the machine, whether or not ``lo`` carries the
 MULTICAST flag, without changing the system (facts/unitree-dex A.6).
 
@@ -34,8 +38,9 @@ import socket
 import tempfile
 import threading
 import time
+import uuid
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
@@ -45,6 +50,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
 from dexkit.messages import MessageType, layout, message_type
+from dexkit.processes import process_id
+from dexkit.threads import Worker
 
 __all__ = [
     "DdsNode",
@@ -71,7 +78,10 @@ _ALIVE = 16  # DDS_ALIVE_INSTANCE_STATE
 _MAX_PARTICIPANT_INDEX = 60  # processes on one machine and domain; each is probed at start-up
 _TAKE_CHUNK = 64
 _EXIT_PATIENCE = 3.0  # seconds for closing at the end of the process; it takes some 20 ms
-_BUILTIN = "org::eclipse::cyclonedds::builtin::"  # types of a node's own discovery readers
+_DURABILITIES = ("volatile", "transient_local", "transient", "persistent")  # as CycloneDDS counts
+_COMPLETE = 1  # DDSI_TYPEID_KIND_COMPLETE
+_EK_COMPLETE = 0xF2  # first byte of the identifier of a struct (XTypes 7.3.4.2)
+_BUILTIN = b"org::eclipse::cyclonedds::builtin::"  # types of a node's own discovery readers
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,7 @@ class Qos:
     def __post_init__(self) -> None:
         if self.reliability not in ("reliable", "best_effort"):
             raise UsageError(f"reliability {self.reliability!r}")
-        if self.durability not in ("volatile", "transient_local", "transient", "persistent"):
+        if self.durability not in _DURABILITIES:
             raise UsageError(f"durability {self.durability!r}")
         if self.depth is not None and self.depth < 1:
             raise UsageError(f"a history keeps at least 1 sample, not {self.depth}")
@@ -199,6 +209,47 @@ class _MatchedStatus(ctypes.Structure):
     ]
 
 
+class _RejectedStatus(ctypes.Structure):
+    _fields_ = [
+        ("total_count", ctypes.c_uint32),
+        ("total_count_change", ctypes.c_int32),
+        ("last_reason", ctypes.c_int),
+        ("last_instance_handle", ctypes.c_uint64),
+    ]
+
+
+class _SampleInfo(ctypes.Structure):
+    _fields_ = [
+        ("sample_state", ctypes.c_int),
+        ("view_state", ctypes.c_int),
+        ("instance_state", ctypes.c_int),
+        ("valid_data", ctypes.c_bool),
+        ("source_timestamp", ctypes.c_int64),
+        ("instance_handle", ctypes.c_uint64),
+        ("publication_handle", ctypes.c_uint64),
+        ("disposed_generation_count", ctypes.c_uint32),
+        ("no_writers_generation_count", ctypes.c_uint32),
+        ("sample_rank", ctypes.c_uint32),
+        ("generation_rank", ctypes.c_uint32),
+        ("absolute_generation_rank", ctypes.c_uint32),
+    ]
+
+
+class _ParticipantData(ctypes.Structure):
+    _fields_ = [("key", ctypes.c_uint8 * 16), ("qos", ctypes.c_void_p)]
+
+
+class _EndpointData(ctypes.Structure):
+    _fields_ = [
+        ("key", ctypes.c_uint8 * 16),
+        ("participant_key", ctypes.c_uint8 * 16),
+        ("participant_instance_handle", ctypes.c_uint64),
+        ("topic_name", ctypes.c_char_p),
+        ("type_name", ctypes.c_char_p),
+        ("qos", ctypes.c_void_p),
+    ]
+
+
 class _Cyclone:
     """CycloneDDS, loaded on first use: the Python classes and the C functions needed here."""
 
@@ -241,6 +292,8 @@ class _Cyclone:
         entity, ssize = ctypes.c_int32, ctypes.c_ssize_t
         status = ctypes.POINTER(ctypes.c_uint32)
         matched = ctypes.POINTER(_MatchedStatus)
+        pointer, number = ctypes.c_void_p, ctypes.POINTER(ctypes.c_int32)
+        reference = ctypes.POINTER(pointer)
         for name, arguments in {
             "dds_delete": (entity,),
             "dds_create_waitset": (entity,),
@@ -252,11 +305,37 @@ class _Cyclone:
             "dds_take_status": (entity, status, ctypes.c_uint32),
             "dds_get_publication_matched_status": (entity, matched),
             "dds_get_subscription_matched_status": (entity, matched),
+            "dds_get_sample_rejected_status": (entity, ctypes.POINTER(_RejectedStatus)),
             "dds_lookup_participant": (ctypes.c_uint32, ctypes.c_void_p, ctypes.c_size_t),
+            "dds_take": (
+                entity,
+                reference,
+                ctypes.POINTER(_SampleInfo),
+                ctypes.c_size_t,
+                ctypes.c_uint32,
+            ),
+            "dds_return_loan": (entity, reference, ctypes.c_int32),
+            "dds_builtintopic_get_endpoint_type_info": (pointer, reference),
         }.items():
             # a prototype of our own: the wheel's classes set argtypes on the shared objects
             prototype = ctypes.CFUNCTYPE(ctypes.c_int32, *arguments)
             setattr(self, name, prototype((name, self.lib)))
+        for name, getter in {
+            "dds_qget_reliability": (pointer, number, ctypes.POINTER(ctypes.c_int64)),
+            "dds_qget_durability": (pointer, number),
+            "dds_qget_history": (pointer, number, number),
+            "dds_qget_prop": (pointer, ctypes.c_char_p, reference),
+            "dds_qget_userdata": (pointer, reference, ctypes.POINTER(ctypes.c_size_t)),
+        }.items():
+            setattr(self, name, ctypes.CFUNCTYPE(ctypes.c_bool, *getter)((name, self.lib)))
+        self.dds_free: Any = ctypes.CFUNCTYPE(None, pointer)(("dds_free", self.lib))
+        self.ddsi_typeinfo_typeid: Any = ctypes.CFUNCTYPE(pointer, pointer, ctypes.c_int)(
+            ("ddsi_typeinfo_typeid", self.lib)
+        )
+        self.ddsi_typeid_ser: Any = ctypes.CFUNCTYPE(
+            None, pointer, reference, ctypes.POINTER(ctypes.c_uint32)
+        )(("ddsi_typeid_ser", self.lib))
+        self.ddsi_typeid_fini: Any = ctypes.CFUNCTYPE(None, pointer)(("ddsi_typeid_fini", self.lib))
         # Nothing on stderr; what goes wrong is asked for when it is needed (_why). The sink has
         # to be a C function, since it is called by threads that hold CycloneDDS's locks, and one
         # without effect: abs() of the unused first argument.
@@ -264,6 +343,7 @@ class _Cyclone:
         self.data_available = int(core.DDSStatus.DataAvailable)
         self.publication_matched = int(core.DDSStatus.PublicationMatched)
         self.subscription_matched = int(core.DDSStatus.SubscriptionMatched)
+        self.sample_rejected = int(core.DDSStatus.SampleRejected)
 
     def __getattr__(self, name: str) -> Any:  # the C functions set above
         raise AttributeError(name)
@@ -396,9 +476,6 @@ _domains: dict[int, _Domain] = {}
 _domains_lock = threading.Lock()
 # CycloneDDS describes a type when its first topic is made, and not for two threads at once
 _types_lock = threading.RLock()
-# CycloneDDS's Python reads the policies of a discovered endpoint through variables that all threads
-# share: two nodes that discover at once would see each other's
-_policies_lock = threading.Lock()
 
 
 def _acquire_domain(number: int, interface: str) -> None:
@@ -510,11 +587,12 @@ class _Handle:
         """Wait until at least ``count`` endpoints match.
 
         :param timeout: seconds; None waits for ever.
-        :returns: False on time-out, or when it is closed meanwhile.
+        :returns: False on time-out, or when it is closed or the dispatcher dies meanwhile.
         """
         with self.node._changed:
             self.node._changed.wait_for(
-                lambda: self.closed or self.matched >= count, timeout=timeout
+                lambda: self.closed or self.node.failure or self.matched >= count,
+                timeout=timeout,
             )
         return self.matched >= count
 
@@ -608,12 +686,23 @@ class Reader(_Handle):
         on_data: Callable[[], object] | None,
     ) -> None:
         super().__init__(node, topic, kind, qos)
+        self._refused = 0
         self._on_data = on_data
         self._arrived = threading.Event()
         self._take = _cyclone().layer.ddspy_take
 
     def _matched_status(self) -> Any:
         return _cyclone().dds_get_subscription_matched_status
+
+    @property
+    def refused(self) -> int:
+        """Samples that arrived and were dropped because ``most`` were kept already."""
+        status = _RejectedStatus()
+        if self._entity is not None and (
+            _cyclone().dds_get_sample_rejected_status(self._ref, ctypes.byref(status)) == _OK
+        ):
+            self._refused = int(status.total_count)
+        return self._refused
 
     def _on_status(self) -> None:
         cyclone = _cyclone()
@@ -660,9 +749,13 @@ class Reader(_Handle):
 
 
 class Discovery:
-    """Who publishes and subscribes what. Belongs to a node: :attr:`DdsNode.discovery`."""
+    """Who publishes and subscribes what. Belongs to a node: :attr:`DdsNode.discovery`.
+
+    :ivar unreadable: announcements left out because they could not be read.
+    """
 
     def __init__(self, node: DdsNode) -> None:
+        self.unreadable = 0
         self._node = node
         self._lock = threading.Lock()
         self._endpoints: dict[str, Endpoint] = {}
@@ -688,12 +781,15 @@ class Discovery:
         :param timeout: seconds; None waits for ever.
         :returns: whether it became true.
         """
-        with self._node._changed:
+        node = self._node
+        with node._changed:
             return bool(
-                self._node._changed.wait_for(
-                    lambda: self._node.closed or predicate(self.endpoints()), timeout=timeout
+                node._changed.wait_for(
+                    lambda: node.closed or node.failure or predicate(self.endpoints()),
+                    timeout=timeout,
                 )
-                and not self._node.closed
+                and not node.closed
+                and not node.failure
             )
 
     def subscribe(self, callback: Callable[[DiscoveryEvent], object]) -> Callable[[], None]:
@@ -800,9 +896,7 @@ class DdsNode:
             cyclone.dds_waitset_attach(self._waitset, reader._ref, 0)
         # its own trigger wakes a waitset only if it is attached to itself
         cyclone.dds_waitset_attach(self._waitset, self._waitset, 0)
-        self._thread = threading.Thread(
-            target=self._dispatch, name=f"dds-{domain}-dispatch", daemon=True
-        )
+        self._thread = Worker("DDS dispatcher", self._dispatch, failed=lambda error: self._notify())
         self._thread.start()
         _nodes.add(self)
 
@@ -819,6 +913,11 @@ class DdsNode:
     def closed(self) -> bool:
         """Whether :meth:`close` has been called."""
         return self._closed
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended the dispatcher, or None: without it nothing is discovered or received."""
+        return self._thread.failure
 
     def writer(
         self,
@@ -848,26 +947,31 @@ class DdsNode:
         *,
         qos: Qos | None = None,
         depth: int | None = None,
+        most: int | None = None,
         on_data: Callable[[], object] | None = None,
     ) -> Reader:
         """A reader on ``topic``.
 
         :param qos: default :meth:`Qos.reader_default`.
-        :param depth: overrides the depth of ``qos``; a recorder wants many.
+        :param depth: overrides the depth of ``qos``.
+        :param most: keep every sample until it is taken, up to so many; later ones are dropped
+            and counted (:attr:`Reader.refused`). Without it the oldest is dropped, and nobody
+            can tell.
         :param on_data: called without arguments, in the dispatcher thread, when something has
             arrived. It must return at once: set an event, put into a queue.
         :raises DdsSetupError: the endpoint cannot be made.
         """
         kind = type_name if isinstance(type_name, MessageType) else message_type(type_name)
         chosen = qos or Qos.reader_default()
-        if depth is not None:
-            chosen = Qos(chosen.reliability, chosen.durability, depth)
+        if depth is not None or most is not None:
+            chosen = Qos(chosen.reliability, chosen.durability, depth if most is None else None)
         cyclone = _cyclone()
         reader = Reader(self, topic, kind, chosen, on_data)
         self._add(
             reader,
             cyclone.sub.DataReader,
             cyclone.data_available | cyclone.subscription_matched,
+            most,
         )
         return reader
 
@@ -911,7 +1015,7 @@ class DdsNode:
                 )
         return self._topics[key]
 
-    def _add(self, handle: _Handle, factory: Any, mask: int) -> None:
+    def _add(self, handle: _Handle, factory: Any, mask: int, most: int | None = None) -> None:
         cyclone = _cyclone()
         with self._dispatching:
             if self._closed:
@@ -919,7 +1023,7 @@ class DdsNode:
             try:
                 topic = self._topic(handle.topic, handle.type)
                 handle._entity = factory(
-                    self._participant, topic, qos=_policies(handle.qos, handle.user_data)
+                    self._participant, topic, qos=_policies(handle.qos, handle.user_data, most)
                 )
             except (cyclone.error, UnicodeError) as error:
                 raise DdsSetupError(
@@ -963,8 +1067,10 @@ class DdsNode:
         tokens = (ctypes.c_ssize_t * room)()
         while True:
             count = cyclone.dds_waitset_wait(self._waitset, tokens, room, _INFINITY)
-            if count < 0 or not self._alive():
+            if not self._alive():
                 return
+            if count < 0:
+                raise DdsError(f"waiting for samples failed: {cyclone.error(count)}")
             # more than `room` triggered entities trigger again at once
             for token in sorted(set(tokens[: min(count, room)])):
                 with self._dispatching:
@@ -986,74 +1092,160 @@ class DdsNode:
         for reader in self._builtin:
             cyclone.take_status(reader._ref, cyclone.data_available)
         # participants first, so that endpoints know their process
-        for sample in _taken(participants):
+        for data, alive in _taken(participants._ref, _ParticipantData):
             changed = True
-            key = str(sample.key)
-            if sample.sample_info.instance_state != _ALIVE:
-                self.discovery._remove_participant(key)
-            elif sample.qos is not None:
-                self.discovery._put_participant(_participant(sample, own=key == self._key))
+            with self._whatever_it_says():
+                self._read_participant(data, alive)
         for kind, reader in zip(("writer", "reader"), endpoints, strict=True):
-            for sample in _taken(reader):
+            for data, alive in _taken(reader._ref, _EndpointData):
                 changed = True
-                key = str(sample.key)
-                if sample.sample_info.instance_state != _ALIVE:
-                    self.discovery._remove(key)
-                elif sample.topic_name is not None and not sample.type_name.startswith(_BUILTIN):
-                    owner = self.discovery._participant(str(sample.participant_key))
-                    self.discovery._put(_endpoint(sample, kind, owner, self._key))
+                with self._whatever_it_says():
+                    self._read_endpoint(data, alive, kind)
         if changed:
             self._notify()
 
+    def _read_participant(self, data: Any, alive: bool) -> None:
+        key = _uuid(data.key)
+        if not alive:
+            self.discovery._remove_participant(key)
+        elif data.qos:
+            self.discovery._put_participant(_participant(data, own=key == self._key))
 
-def _taken(reader: Any) -> Iterator[Any]:
+    def _read_endpoint(self, data: Any, alive: bool, kind: str) -> None:
+        key = _uuid(data.key)
+        if not alive:
+            self.discovery._remove(key)
+        elif data.qos and not (data.type_name or b"").startswith(_BUILTIN):
+            owner = self.discovery._participant(_uuid(data.participant_key))
+            self.discovery._put(_endpoint(data, kind, owner, self._key))
+
+    @contextlib.contextmanager
+    def _whatever_it_says(self) -> Iterator[None]:
+        """One announcement that cannot be read costs itself, not those that came with it."""
+        try:
+            yield
+        except Exception:
+            self.discovery.unreadable += 1
+            if self.discovery.unreadable == 1:
+                _log.exception("an announcement of a peer cannot be read (said once)")
+
+
+def _taken(reader: int, kind: type[Any]) -> Iterator[tuple[Any, bool]]:
+    """What a built-in reader has: the sample, which lives for one turn, and whether it is alive."""
+    cyclone = _cyclone()
     while True:
-        with _policies_lock:
-            samples: Sequence[Any] = reader.take(_TAKE_CHUNK)
-        yield from samples
-        if len(samples) < _TAKE_CHUNK:
+        samples = (ctypes.c_void_p * _TAKE_CHUNK)()
+        infos = (_SampleInfo * _TAKE_CHUNK)()
+        count = cyclone.dds_take(reader, samples, infos, _TAKE_CHUNK, _TAKE_CHUNK)
+        if count < 0:
+            raise DdsError(f"discovery failed: {cyclone.error(count)}")
+        if count == 0:
             return
+        try:
+            for i in range(count):
+                yield kind.from_address(samples[i]), infos[i].instance_state == _ALIVE
+        finally:
+            cyclone.dds_return_loan(reader, samples, count)
 
 
-def _participant(sample: Any, *, own: bool) -> Participant:
-    properties = {p.key: p.value for p in sample.qos if hasattr(p, "key") and hasattr(p, "value")}
-    name, pid = properties.get("__ProcessName", ""), properties.get("__Pid", "")
+def _uuid(key: Any) -> str:
+    return str(uuid.UUID(bytes=bytes(key)))
+
+
+def _text(data: bytes | None) -> str:
+    """Text that a peer announced; what is not UTF-8 becomes U+FFFD."""
+    return (data or b"").decode("utf-8", "replace")
+
+
+def _shown(text: str) -> str:
+    """Text for people, without control characters."""
+    return "".join(c if c.isprintable() else "\ufffd" for c in text)
+
+
+def _property(qos: int, name: bytes) -> str:
+    cyclone = _cyclone()
+    value = ctypes.c_void_p()
+    if not cyclone.dds_qget_prop(qos, name, ctypes.byref(value)) or not value:
+        return ""
+    try:
+        return _text(ctypes.string_at(value.value))  # type: ignore[arg-type]
+    finally:
+        cyclone.dds_free(value)
+
+
+def _participant(data: Any, *, own: bool) -> Participant:
+    name = _shown(_property(data.qos, b"__ProcessName"))
+    pid = process_id(_property(data.qos, b"__Pid"))
     return Participant(
-        key=str(sample.key),
+        key=_uuid(data.key),
         process=f"{name} (pid {pid})" if name and pid else name,
-        pid=int(pid) if pid.isdigit() else 0,
-        host=properties.get("__Hostname", ""),
+        pid=pid,
+        host=_shown(_property(data.qos, b"__Hostname")),
         own=own,
     )
 
 
-def _endpoint(sample: Any, kind: str, owner: Participant | None, own_key: str) -> Endpoint:
-    key = str(sample.participant_key)
-    value = getattr(sample.type_id, "value", None)  # no bytes: a type that is not a struct
-    hashed = value.hex() if isinstance(value, bytes) else ""
+def _endpoint(data: Any, kind: str, owner: Participant | None, own_key: str) -> Endpoint:
+    key = _uuid(data.participant_key)
+    type_name = _text(data.type_name)
+    hashed = _announced_hash(data)
     if not hashed and owner is not None and owner.pid == os.getpid():
         # CycloneDDS does not describe the types of its own process
-        hashed = type_hash(sample.type_name) if sample.type_name in layout.STRUCTS else ""
+        hashed = type_hash(type_name) if type_name in layout.STRUCTS else ""
     return Endpoint(
-        topic=sample.topic_name,
-        type_name=sample.type_name,
+        topic=_text(data.topic_name),
+        type_name=type_name,
         kind=kind,
-        qos=_qos_of(sample.qos),
+        qos=_qos_of(data.qos, kind),
         own=key == own_key,
-        key=str(sample.key),
+        key=_uuid(data.key),
         participant=key,
         process=owner.process if owner else "",
         type_hash=hashed,
-        user_data=_user_data(sample.qos),
+        user_data=_user_data(data.qos),
     )
 
 
-def _user_data(policies: Any) -> bytes:
-    found = policies[_cyclone().qos.Policy.Userdata]  # None where there is none
-    return bytes(found.data) if found is not None else b""
+def _user_data(qos: int) -> bytes:
+    """What the owner of a discovered endpoint says of it."""
+    cyclone = _cyclone()
+    value, size = ctypes.c_void_p(), ctypes.c_size_t()
+    if not cyclone.dds_qget_userdata(qos, ctypes.byref(value), ctypes.byref(size)) or not value:
+        return b""
+    try:
+        return ctypes.string_at(value.value, size.value)  # type: ignore[arg-type]
+    finally:
+        cyclone.dds_free(value)
 
 
-def _policies(qos: Qos, user_data: bytes = b"") -> Any:
+def _announced_hash(data: Any) -> str:
+    """Hash of the complete type that an endpoint announces; empty: none, or it is no struct."""
+    cyclone = _cyclone()
+    info = ctypes.c_void_p()
+    if (
+        cyclone.dds_builtintopic_get_endpoint_type_info(ctypes.addressof(data), ctypes.byref(info))
+        or not info
+    ):
+        return ""
+    identifier = cyclone.ddsi_typeinfo_typeid(info, _COMPLETE)
+    if not identifier:
+        return ""
+    try:
+        packed, size = ctypes.c_void_p(), ctypes.c_uint32()
+        cyclone.ddsi_typeid_ser(identifier, ctypes.byref(packed), ctypes.byref(size))
+        if not packed:
+            return ""
+        try:
+            octets = ctypes.string_at(packed.value, size.value)  # type: ignore[arg-type]
+        finally:
+            cyclone.dds_free(packed)
+    finally:
+        cyclone.ddsi_typeid_fini(identifier)
+        cyclone.dds_free(identifier)
+    return octets[1:15].hex() if len(octets) >= 15 and octets[0] == _EK_COMPLETE else ""
+
+
+def _policies(qos: Qos, user_data: bytes = b"", most: int | None = None) -> Any:
     policy = _cyclone().qos.Policy
     reliability = (
         policy.Reliability.Reliable(max_blocking_time=100_000_000)  # 100 ms (F A.5)
@@ -1067,23 +1259,26 @@ def _policies(qos: Qos, user_data: bytes = b"") -> Any:
         "persistent": policy.Durability.Persistent,
     }[qos.durability]
     history = policy.History.KeepAll if qos.depth is None else policy.History.KeepLast(qos.depth)
-    more = (policy.Userdata(data=user_data),) if user_data else ()
+    more = [policy.Userdata(data=user_data)] if user_data else []
+    if most is not None:
+        more.append(policy.ResourceLimits(max_samples=most))
     return _cyclone().qos.Qos(reliability, durability, history, *more)
 
 
-def _qos_of(policies: Any) -> Qos:
+def _qos_of(qos: int, kind: str) -> Qos:
     """The policies of a discovered endpoint; what it does not announce has DDS's default."""
-    policy = _cyclone().qos.Policy
-    reliable = isinstance(policies[policy.Reliability], policy.Reliability.Reliable)
-    durability = {
-        policy.Durability.Volatile: "volatile",
-        policy.Durability.TransientLocal: "transient_local",
-        policy.Durability.Transient: "transient",
-        policy.Durability.Persistent: "persistent",
-    }.get(policies[policy.Durability], "volatile")
-    history = policies[policy.History]
-    depth = None if history == policy.History.KeepAll else getattr(history, "depth", 1)
-    return Qos("reliable" if reliable else "best_effort", durability, depth)
+    cyclone = _cyclone()
+    value, depth, duration = ctypes.c_int32(), ctypes.c_int32(), ctypes.c_int64()
+    reliable = kind == "writer"
+    if cyclone.dds_qget_reliability(qos, ctypes.byref(value), ctypes.byref(duration)):
+        reliable = value.value == 1
+    durability = 0
+    if cyclone.dds_qget_durability(qos, ctypes.byref(value)) and 0 <= value.value < 4:
+        durability = value.value
+    kept: int | None = 1
+    if cyclone.dds_qget_history(qos, ctypes.byref(value), ctypes.byref(depth)):
+        kept = None if value.value == 1 else max(depth.value, 1)
+    return Qos("reliable" if reliable else "best_effort", _DURABILITIES[durability], kept)
 
 
 @atexit.register

@@ -15,8 +15,16 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from dexkit.errors import DexkitError
+from dexkit.threads import Worker
 
-__all__ = ["END_WITH_PARENT", "READY_TIMEOUT", "STOP_TIMEOUT", "Tool", "end_with_parent"]
+__all__ = [
+    "END_WITH_PARENT",
+    "READY_TIMEOUT",
+    "STOP_TIMEOUT",
+    "Tool",
+    "end_with_parent",
+    "process_id",
+]
 
 READY_TIMEOUT = 30.0
 STOP_TIMEOUT = 5.0
@@ -24,6 +32,17 @@ _PR_SET_PDEATHSIG = 1
 
 END_WITH_PARENT = "DEXKIT_END_WITH_PARENT"
 """Environment variable: set for a command that is to end when whoever started it is killed."""
+
+
+_PID_MAX = 1 << 22  # PID_MAX_LIMIT of Linux
+
+
+def process_id(text: str) -> int:
+    """The process id that a peer announces as text; 0 when it is none."""
+    if not (text.isascii() and text.isdecimal() and len(text) <= 7):
+        return 0
+    number = int(text)
+    return number if number <= _PID_MAX else 0
 
 
 def end_with_parent() -> None:
@@ -73,7 +92,7 @@ class Tool:
             # a Ctrl-C in the terminal is the caller's to act upon: it stops its tools in order
             start_new_session=True,
         )
-        self._thread = threading.Thread(target=self._listen, name="tool", daemon=True)
+        self._thread = Worker("tool", self._listen)
         self._thread.start()
 
     def __repr__(self) -> str:

@@ -1,6 +1,7 @@
 """Ending in good order when the user or the system asks for it: Ctrl-C, SIGTERM, SIGHUP.
 
-A program that dies at once leaves a hand driven by whatever it was told last.
+A program that dies at once leaves a hand driven by whatever it was told last. A thread that died
+asks for the same: what it did is no longer done.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+from dexkit import threads
 
 __all__ = ["StopRequest", "stop_on_signals"]
 
@@ -39,7 +42,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Turn SIGINT, SIGTERM and SIGHUP into a :class:`StopRequest`.
+    """Turn SIGINT, SIGTERM, SIGHUP and the death of a thread into a :class:`StopRequest`.
 
     A second SIGINT interrupts at once. SIGHUP, which comes when the terminal or its ssh connection
     goes, is left alone where it is ignored (``nohup``).
@@ -58,7 +61,8 @@ def stop_on_signals() -> Iterator[StopRequest]:
         ending.append(signal.SIGHUP)
     previous = {s: signal.signal(s, handle) for s in ending}
     try:
-        yield request
+        with threads.listen(lambda worker: request.set()):
+            yield request
     finally:
         for signum, handler in previous.items():
             signal.signal(signum, handler)

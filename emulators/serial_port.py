@@ -23,6 +23,7 @@ from dexkit.clock import Clock, RealClock
 from dexkit.emulators.faults import Fault
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
+from dexkit.threads import Worker
 
 __all__ = ["Port", "client_baudrate"]
 
@@ -155,15 +156,11 @@ class Port:
 
     def start(self) -> None:
         """Serve in a background thread."""
-        self._thread = threading.Thread(target=self._guarded, name="dexkit-tty", daemon=True)
+        self._thread = Worker("serial line", self.run, failed=self._died)
         self._thread.start()
 
-    def _guarded(self) -> None:
-        try:
-            self.run()
-        except BaseException as error:
-            self.error = error
-            raise
+    def _died(self, error: Exception) -> None:
+        self.error = error
 
     def stop(self) -> None:
         """Ask :meth:`run` to return; may be called from a signal handler or another thread."""

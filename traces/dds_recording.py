@@ -9,22 +9,38 @@ never learns of readers that appear later (facts/unitree-dex B.7).
 from __future__ import annotations
 
 import fnmatch
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
 
 from dexkit.dds import DdsNode, Endpoint, Qos, Reader
-from dexkit.errors import UsageError
+from dexkit.errors import DdsError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS
+from dexkit.sockets import DdsSockets
+from dexkit.threads import Worker
+from dexkit.topics import HAND_TOPICS
+from dexkit.traces.losses import Losses
 from dexkit.traces.names import dds_topic
 from dexkit.traces.recorder import Recorder
 
 __all__ = ["DdsRecording", "record_topics"]
 
-#: Samples that a reader keeps until they are taken; 2 s of a 500 Hz topic.
-DEPTH = 1000
+_log = logging.getLogger(__name__)
+
+#: Samples that a reader keeps until they are taken; 40 s of a 500 Hz topic.
+MOST = 20_000
+#: Bytes that the system is asked to hold while the recorder does not run; 3 s of ten such topics.
+RECEIVE_BUFFER = 16 * 2**20
+#: Topics that are subscribed because they were seen, those of hands not counted.
+MAX_TOPICS = 256
+# Descriptions of endpoints that are kept.
+_MAX_SEEN = 1000
+# Seconds between looks at what was lost, and between records of it in the file.
+_LOOK_EVERY = 0.25
+_NOTE_EVERY = 2.0
 # Seconds between metadata records with the endpoints, at most; they change when a run starts.
 _ENDPOINTS_EVERY = 0.25
 # Seconds in which discovery may tell the type of a topic asked for by name; on one machine it takes
@@ -43,8 +59,12 @@ class DdsRecording:
     :param topics: names in any spelling, or patterns; None for every topic whose type is known.
     :param types: DDS type names by topic, for topics that must be subscribed before discovery
         tells their type.
+    :param max_topics: how many topics are subscribed because somebody announced them.
 
-    Endpoints and their QoS are stored whenever they change, so a killed recording has them too.
+    Endpoints and their QoS, and what was lost, are stored whenever they change, so a killed
+    recording has them too.
+
+    :ivar losses: what the recording lacks.
     """
 
     def __init__(
@@ -54,9 +74,14 @@ class DdsRecording:
         topics: Iterable[str] | None = None,
         *,
         types: dict[str, str] | None = None,
+        max_topics: int = MAX_TOPICS,
     ) -> None:
         self.node = node
         self.recorder = recorder
+        self.losses = Losses()
+        self._sockets = DdsSockets(node.domain)
+        self._max_topics = max_topics
+        self._described = 0
         self._patterns = None if topics is None else [dds_topic(t) for t in topics]
         self._types = {dds_topic(t): name for t, name in (types or {}).items()}
         self._readers: dict[tuple[str, str], Reader] = {}
@@ -68,8 +93,7 @@ class DdsRecording:
         self._fresh_lock = threading.Lock()
         self._wake = threading.Event()
         self._stopping = False
-        self._thread: threading.Thread | None = None
-        self._error: Exception | None = None
+        self._thread: Worker | None = None
         self._unsubscribe: Callable[[], None] | None = None
 
     @property
@@ -79,8 +103,13 @@ class DdsRecording:
 
     @property
     def unknown(self) -> dict[str, str]:
-        """Wanted topics that cannot be recorded, with the type that dexkit does not know."""
+        """Wanted topics that cannot be recorded, and why."""
         return dict(self._unknown)
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended it before it was stopped, or None."""
+        return self._thread.failure if self._thread is not None else None
 
     def start(self) -> None:
         """Subscribe and begin; waits up to half a second for the types of topics in use."""
@@ -100,11 +129,16 @@ class DdsRecording:
         self._unsubscribe = self.node.discovery.subscribe(
             lambda event: self._note(event.endpoint) if event.appeared else None
         )
-        self._thread = threading.Thread(target=self._run, name="dds-recording", daemon=True)
+        if (size := self._sockets.enlarge(RECEIVE_BUFFER)) > 0:
+            self.recorder.add_metadata("dexkit_recorder", {"receive_buffer": str(size)})
+        self._thread = Worker("recording", self._run)
         self._thread.start()
 
     def stop(self) -> None:
-        """Take what has arrived, unsubscribe. May be called twice."""
+        """Take what has arrived, unsubscribe. May be called twice.
+
+        :raises DexkitError: what ended the recording before.
+        """
         thread, self._thread = self._thread, None
         if thread is None:
             return
@@ -115,8 +149,7 @@ class DdsRecording:
         thread.join()
         for reader in self._readers.values():
             reader.close()
-        if self._error is not None:
-            raise self._error
+        thread.check()
 
     def __enter__(self) -> DdsRecording:
         self.start()
@@ -133,23 +166,36 @@ class DdsRecording:
             self._wake.set()
 
     def _run(self) -> None:
-        try:
-            told = -_ENDPOINTS_EVERY
-            changed = False
-            while True:
-                self._wake.wait(_IDLE)
-                self._wake.clear()
-                stopping = self._stopping
-                changed |= self._discover()
-                self._take()
-                now = time.monotonic()
-                if changed and (stopping or now - told >= _ENDPOINTS_EVERY):
-                    self.recorder.add_metadata("dds_endpoints", self._endpoint_record())
-                    told, changed = now, False
-                if stopping:
-                    return
-        except Exception as error:  # raised by stop(), in the caller's thread
-            self._error = error
+        told = looked = noted = float("-inf")
+        changed = news = False
+        while True:
+            self._wake.wait(_IDLE)
+            self._wake.clear()
+            stopping = self._stopping
+            pause = self.losses.turn(time.clock_gettime(time.CLOCK_BOOTTIME), time.time_ns())
+            if pause is not None:
+                _log.warning("%s", pause)
+            changed |= self._discover()
+            self._take()
+            now = time.monotonic()
+            if stopping or pause is not None or now - looked >= _LOOK_EVERY:
+                looked = now
+                news |= self._look(now) or pause is not None
+                if stopping or (news and now - noted >= _NOTE_EVERY):
+                    self.recorder.add_metadata("dexkit_recorder", self.losses.metadata())
+                    noted, news = now, False
+            if changed and (stopping or now - told >= _ENDPOINTS_EVERY):
+                self.recorder.add_metadata("dds_endpoints", self._endpoint_record())
+                told, changed = now, False
+            if stopping:
+                return
+
+    def _look(self, now: float) -> bool:
+        refused: dict[str, int] = {}
+        for (topic, _), reader in self._readers.items():
+            if count := reader.refused:
+                refused[topic] = refused.get(topic, 0) + count
+        return self.losses.look(now, self._sockets.look(), refused)
 
     def _discover(self) -> bool:
         with self._fresh_lock:
@@ -157,11 +203,12 @@ class DdsRecording:
         changed = False
         for endpoint in fresh:
             text = _describe(endpoint)
-            known = self._seen.setdefault((endpoint.topic, endpoint.kind), [])
-            if text not in known:
-                known.append(text)
+            known = self._seen.get((endpoint.topic, endpoint.kind), [])
+            if text not in known and self._described < _MAX_SEEN:
+                self._described += 1
+                self._seen[endpoint.topic, endpoint.kind] = [*known, text]
                 changed = True
-            if endpoint.kind == "writer":
+            if endpoint.kind == "writer" and len(self._reliability) < _MAX_SEEN:
                 key = (endpoint.topic, endpoint.type_name)
                 self._reliability.setdefault(key, endpoint.qos.reliability)
             if self._wants(endpoint.topic):
@@ -174,16 +221,23 @@ class DdsRecording:
         return any(topic == p or fnmatch.fnmatchcase(topic, p) for p in self._patterns)
 
     def _subscribe(self, topic: str, type_name: str) -> None:
-        if (topic, type_name) in self._readers:
+        if (topic, type_name) in self._readers or len(self._unknown) >= _MAX_SEEN:
+            return
+        named = topic in HAND_TOPICS or topic in (self._patterns or ()) or topic in self._types
+        if not named and len(self._readers) >= self._max_topics:
+            self._unknown[topic] = f"no more than {self._max_topics} topics are recorded"
             return
         try:
             kind = message_type(type_name)
         except UsageError:
-            self._unknown[topic] = type_name
+            self._unknown[topic] = f"unknown type {type_name}"
             return
-        self._readers[topic, type_name] = self.node.reader(
-            topic, kind, qos=Qos.reader_default(), depth=DEPTH, on_data=self._wake.set
-        )
+        try:
+            self._readers[topic, type_name] = self.node.reader(
+                topic, kind, qos=Qos.reader_default(), most=MOST, on_data=self._wake.set
+            )
+        except DdsError as error:  # a name that DDS does not allow, and a peer has all the same
+            self._unknown[topic] = str(error)
 
     def _take(self) -> None:
         for key, reader in self._readers.items():
@@ -197,13 +251,14 @@ class DdsRecording:
             for sample in samples:
                 # a writer may send no timestamp, which DDS gives as a negative number
                 source = max(sample.source_timestamp_ns, 0)
+                self.losses.sample(topic, sample.writer, source)
                 self.recorder.put(topic, type_name, sample.data, sample.reception_ns, source)
 
     def _channel_metadata(self, key: tuple[str, str]) -> dict[str, str]:
         metadata = {
             "dds.domain": str(self.node.domain),
             "recorder.qos.reliability": "best_effort",
-            "recorder.qos.history": f"keep_last({DEPTH})",
+            "recorder.qos.history": f"keep_all, at most {MOST} waiting",
         }
         if key in self._reliability:
             metadata["qos.reliability"] = self._reliability[key]

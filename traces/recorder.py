@@ -5,7 +5,8 @@ is slower than the samples, the queue fills up to its bound and further samples 
 counted, so recording never slows down what is recorded. Every :data:`FLUSH_INTERVAL` what has
 been received is written as a complete chunk and handed to the operating system: killing the
 process (SIGKILL included) costs the last moments, not the file, as long as the writer keeps up
-with the queue. A power cut may cost more, since nothing is forced onto the disk.
+with the queue. A power cut may cost more, since nothing is forced onto the disk. What is said to
+be written is on the disk: :mod:`~dexkit.traces.recording_file` takes whole chunks or nothing.
 
 Schemas are ``ros2msg`` and the profile is ``ros2``, because that is what PlotJuggler, Foxglove
 and the readers of ROS 2 bags open; topics keep their DDS names (``rt/...``).
@@ -18,13 +19,15 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, cast
 
 from mcap.writer import CompressionType, Writer
 
 from dexkit import __version__
 from dexkit.errors import TraceError, UsageError
 from dexkit.messages import MessageType, message_type
+from dexkit.threads import Worker
+from dexkit.traces.recording_file import ChunkIndexes, RecordingFile
 
 __all__ = ["FLUSH_INTERVAL", "Recorder"]
 
@@ -35,6 +38,8 @@ _POLL = 0.05
 _WAKE_AT = 512
 # Messages written between two looks at the clock.
 _SLICE = 4096
+# Bytes that are written at once at the latest, whatever the time.
+_COMMIT_AT = 4 * 2**20
 # mcap times are unsigned 64-bit numbers
 _TIMES = 2**64
 
@@ -76,13 +81,17 @@ class _Channel:
         self.id = 0
         self.offered = 0
         self.dropped = 0
+        self.pending = 0  # given to the writer, not yet on the disk
+        self.written = 0
 
 
 class Recorder:
     """Records samples to an mcap file; a context manager.
 
     :param path: the file to write.
-    :param overwrite: replace an existing file.
+    :param overwrite: replace an existing file, as soon as there is a message to replace it by.
+    :param keep_empty: leave a recording without messages, too; else no file is left, and an
+        existing one stays.
     :param max_messages: bound of the queue, messages.
     :param max_bytes: bound of the queue, bytes of payload.
     :param compression: ``"zstd"``, ``"lz4"`` or ``"none"``.
@@ -99,6 +108,7 @@ class Recorder:
         path: str | os.PathLike[str],
         *,
         overwrite: bool = False,
+        keep_empty: bool = True,
         max_messages: int = 200_000,
         max_bytes: int = 128 * 2**20,
         compression: str = "zstd",
@@ -110,6 +120,7 @@ class Recorder:
             raise UsageError("the recorder's queue must hold at least one message and one byte")
         self.path = Path(path)
         self._overwrite = overwrite
+        self._keep_empty = keep_empty
         self._max_messages = max_messages
         self._max_bytes = max_bytes
         self._compression = _COMPRESSION[compression]
@@ -121,8 +132,9 @@ class Recorder:
         self._channels: dict[tuple[str, str], _Channel] = {}
         self._wake = threading.Event()
         self._closing = False
-        self._thread: threading.Thread | None = None
-        self._file: BinaryIO | None = None
+        self._thread: Worker | None = None
+        self._file = RecordingFile(self.path, overwrite=overwrite)
+        self._pending_bytes = 0
         self._error: Exception | None = None
         self._written = 0
         self._bytes = 0
@@ -131,17 +143,20 @@ class Recorder:
 
     @property
     def written(self) -> int:
-        """Messages written so far."""
+        """Messages that are in the file: they can be read even if the process is killed now."""
         return self._written
 
     @property
     def written_bytes(self) -> int:
-        """Bytes of payload written so far."""
+        """Bytes of payload in the file."""
         return self._bytes
 
     @property
     def dropped(self) -> int:
-        """Messages dropped because the queue was full or the disk failed."""
+        """Messages dropped because the queue was full or the disk failed.
+
+        When all is over, what was offered and is not in the file.
+        """
         with self._lock:
             return sum(c.dropped for c in self._channels.values())
 
@@ -155,6 +170,11 @@ class Recorder:
         return dict(counts)
 
     @property
+    def displaced(self) -> str:
+        """What happened to the file's name while it was written, or empty."""
+        return self._file.displaced
+
+    @property
     def error(self) -> Exception | None:
         """Why writing has stopped, or None."""
         return self._error
@@ -164,23 +184,21 @@ class Recorder:
     def open(self) -> None:
         """Create the file and start the writer.
 
-        :raises UsageError: the file exists and must not be overwritten.
+        :raises UsageError: the file exists and must not be overwritten, or is being recorded.
         :raises TraceError: it cannot be created.
         """
         if self._thread is not None:
             raise UsageError(f"{self.path} is already being recorded")
-        try:
-            self._file = self.path.open("wb" if self._overwrite else "xb")
-        except FileExistsError:
-            raise UsageError(
-                f"{self.path} exists", hint="choose another name, or overwrite it (--force)"
-            ) from None
-        except OSError as error:
-            raise TraceError(f"cannot create {self.path}: {error.strerror}") from error
+        self._file.open()
         # with the data section's checksum, every byte of a finished recording is under one
-        self._writer = Writer(self._file, compression=self._compression, enable_data_crcs=True)
+        self._writer = Writer(
+            cast(BinaryIO, self._file), compression=self._compression, enable_data_crcs=True
+        )
+        if self._file.readable:
+            # a private name; without it the recording is the same and memory grows
+            vars(self._writer)["_Writer__chunk_indices"] = ChunkIndexes(self._file)
         self._schema_ids: dict[str, int] = {}
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread = Worker("recorder", self._run, failed=self._failed)
         self._thread.start()
 
     def close(self) -> None:
@@ -196,11 +214,13 @@ class Recorder:
         self._wake.set()
         thread.join()
         error = self._error
+        if isinstance(error, TraceError):
+            raise error
         if error is not None:
             reason = error.strerror if isinstance(error, OSError) else f"{error!r}"
+            kept = f"{self._written} messages were written and can be read; {self.dropped} were not"
             raise TraceError(
-                f"recording to {self.path} stopped: {reason or error}",
-                hint=f"{self._written} messages were written and can be read",
+                f"recording to {self.path} stopped: {reason or error}", hint=kept
             ) from error
 
     def __enter__(self) -> Recorder:
@@ -287,19 +307,26 @@ class Recorder:
     # -- the writer's thread -------------------------------------------------------------------
 
     def _run(self) -> None:
-        assert self._file is not None
+        whole = False
         try:
-            with self._file:
-                self._write_all()
-        except Exception as error:  # a full disk, a vanished mount; close() raises it
-            with self._lock:
-                self._error = error
+            self._write_all()
+            whole = True
+        finally:
+            self._file.close(keep=self._written > 0 or (whole and self._keep_empty))
+
+    def _failed(self, error: Exception) -> None:
+        """A full disk, a vanished mount: close() raises it. What is not in the file is lost."""
+        with self._lock:
+            self._error = error
+            self._queue = []
+            for channel in self._channels.values():
+                channel.dropped = channel.offered - channel.written
 
     def _write_all(self) -> None:
         writer = self._writer
         writer.start(profile="ros2", library=f"dexkit {__version__}")
         writer.add_metadata("dexkit_recorder", self._about)
-        writer.flush()  # type: ignore[no-untyped-call]
+        self._commit()
         flushed = time.monotonic()
         while True:
             self._wake.wait(_POLL)
@@ -309,10 +336,10 @@ class Recorder:
                 batch, self._queue = self._queue, []
             for start in range(0, len(batch), _SLICE):
                 self._write(batch[start : start + _SLICE])
-                flushed = self._flush_after(flushed)
+                flushed = self._commit_after(flushed)
             if closing:
                 break
-            flushed = self._flush_after(flushed)
+            flushed = self._commit_after(flushed)
         with self._lock:
             silent = [c for c in self._channels.values() if not c.id]
             dropped: Counter[str] = Counter()
@@ -320,6 +347,7 @@ class Recorder:
                 dropped[channel.topic] += channel.dropped
         for channel in silent:
             self._register(channel)
+        self._commit()
         writer.add_metadata(
             "dexkit_recorder",
             {
@@ -328,7 +356,9 @@ class Recorder:
                 **{f"dropped {topic}": str(count) for topic, count in sorted(dropped.items())},
             },
         )
+        self._commit()  # the end is made from what is in the file
         writer.finish()  # type: ignore[no-untyped-call]
+        self._commit()
 
     def _write(self, items: list[_Item | _Metadata]) -> None:
         writer = self._writer
@@ -342,21 +372,36 @@ class Recorder:
             writer.add_message(
                 item.channel.id, item.log_time_ns, item.data, item.publish_time_ns, item.sequence
             )
+            item.channel.pending += 1
             messages += 1
             size += len(item.data)
         with self._lock:
             self._queued -= messages
             self._queued_bytes -= size
-        self._written += messages
-        self._bytes += size
+        self._pending_bytes += size
 
-    def _flush_after(self, flushed: float) -> float:
+    def _commit_after(self, committed: float) -> float:
         """Complete the chunk if it is time; returns when that was last done."""
         now = time.monotonic()
-        if now - flushed < FLUSH_INTERVAL:
-            return flushed
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        if now - committed < FLUSH_INTERVAL and self._file.waiting < _COMMIT_AT:
+            return committed
+        self._commit()
         return now
+
+    def _commit(self) -> None:
+        """Complete the chunk and have it on the disk, and see that the file is still there."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._file.commit()
+        with self._lock:
+            for channel in self._channels.values():
+                channel.written += channel.pending
+                self._written += channel.pending
+                channel.pending = 0
+        self._bytes += self._pending_bytes
+        self._pending_bytes = 0
+        if self._written:
+            self._file.publish()
+        self._file.check()
 
     def _register(self, channel: _Channel) -> None:
         kind = channel.kind

@@ -8,6 +8,7 @@ import time
 from dexkit.clock import Rate
 from dexkit.conformance.virtual import Service
 from dexkit.dds import DdsNode, Qos, Reader, Writer
+from dexkit.threads import Worker
 
 __all__ = ["LiveMutant"]
 
@@ -35,7 +36,7 @@ class LiveMutant:
                     qos=Qos(endpoint.reliability, durability),
                     depth=16,
                 )
-        self._thread = threading.Thread(target=self._run, name="mutant", daemon=True)
+        self._thread = Worker("mutant", self._run)
 
     def __enter__(self) -> LiveMutant:
         self._thread.start()

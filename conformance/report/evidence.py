@@ -615,7 +615,7 @@ def _column(scene: _Scene, path: str) -> Floats | None:
     columns = scene.hand.states.columns
     assert columns is not None
     head, _, index = path.rpartition("[")
-    for name, place in ((path, 0), (head, int(index[:-1]) if index[:-1].isdigit() else 0)):
+    for name, place in ((path, 0), (head, int(index[:-1]) if index[:-1].isdecimal() else 0)):
         try:
             values = columns[name] if name else None
         except UsageError:

@@ -23,6 +23,7 @@ from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
 from dexkit.sole import LOOK, Place, SolePublisher
+from dexkit.threads import Worker
 
 __all__ = ["Bridge", "End"]
 
@@ -80,7 +81,6 @@ class Bridge:
         self.sides = tuple(sides)
         self.states = States(gripper.dialect, client.dialect, self.sides)
         self.commands = Commands(client.dialect, gripper.dialect, self.sides, self.states)
-        self.failure: Exception | None = None  #: what ended a thread, if anything
         self._force = force
         self._clock: Clock = clock if clock is not None else RealClock()
         self._stop = threading.Event()
@@ -143,6 +143,13 @@ class Bridge:
             way.wake()
 
     # -- what it says of itself ---------------------------------------------------------------
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended a thread that the bridge needs, those of its nodes included; or None."""
+        needed = [way.thread.failure for way in self._ways]
+        needed += [self.client.node.failure, self.gripper.node.failure]
+        return next((error for error in needed if error is not None), None)
 
     @property
     def clients(self) -> int:
@@ -232,7 +239,7 @@ class _Way:
         self._watch = PauseWatch(bridge._clock)
         self._watch.restart()  # from here on samples may wait to be received
         self._said: set[str] = set()
-        self.thread = threading.Thread(target=self._run, name="dexkit-bridge", daemon=True)
+        self.thread = Worker("bridge", self._run)
 
     @property
     def writers(self) -> list[Writer]:
@@ -250,14 +257,8 @@ class _Way:
 
     def _run(self) -> None:
         precise_timers()
-        try:
-            while not self._bridge._stop.is_set():
-                self._turn()
-        except TopicConflict as error:
-            self._bridge.failure = error
-        except Exception as error:  # nothing may die in silence
-            _log.exception("the bridge died")
-            self._bridge.failure = error
+        while not self._bridge._stop.is_set():
+            self._turn()
 
     def _turn(self) -> None:
         clock, direction = self._bridge._clock, self.direction

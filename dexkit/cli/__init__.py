@@ -12,7 +12,7 @@ import sys
 
 import click
 
-from dexkit import __version__
+from dexkit import __version__, threads
 from dexkit.errors import DexkitError
 
 __all__ = ["cli", "main"]
@@ -40,6 +40,12 @@ _COMMANDS: dict[str, tuple[str, str]] = {
 
 
 class _LazyGroup(click.Group):
+    def invoke(self, ctx: click.Context) -> object:
+        threads.forget()
+        result = super().invoke(ctx)
+        threads.check()  # a command that lost a thread has failed, whatever it returned
+        return result
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(_COMMANDS)
 

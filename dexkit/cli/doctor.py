@@ -32,7 +32,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     found: list[int] = []
     for part in text.split(","):
         low, dash, high = part.partition("-")
-        if not low.isdigit() or (dash and not high.isdigit()):
+        if not low.isdecimal() or (dash and not high.isdecimal()):
             raise click.BadParameter("write 0-10, or 0,1,5-7, or none")
         first, last = int(low), int(high if dash else low)
         if not 0 <= first <= last <= 230:

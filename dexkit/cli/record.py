@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit import threads
 from dexkit.cli.common import dds_options, stop_on_signals
 from dexkit.errors import TraceError, UsageError
 
@@ -37,7 +39,9 @@ __all__ = ["command"]
     metavar="S",
     help="Stop after so many seconds. Default: record until Ctrl-C.",
 )
-@click.option("--force", is_flag=True, help="Overwrite OUT.")
+@click.option(
+    "--force", is_flag=True, help="Replace OUT, as soon as there is something to replace it by."
+)
 @click.option(
     "--compression",
     type=click.Choice(["zstd", "lz4", "none"]),
@@ -60,7 +64,9 @@ def command(
     timestamp, and with ros2msg schemas, as PlotJuggler, Foxglove and readers of ROS 2 bags want
     them. Killing the recorder costs at most half a second.
 
-    Exit code 1 when nothing was received.
+    Exit codes: 0 a complete recording, as far as this machine can know; 1 nothing was received,
+    or something is missing (it is said what), or OUT was renamed meanwhile; 2 wrong usage, or OUT
+    cannot be written (any more).
     """
     from dexkit.dds import DdsNode
     from dexkit.traces import Recorder
@@ -69,8 +75,9 @@ def command(
     if out.exists() and not force:
         raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
     started = time.monotonic()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        recorder = Recorder(out, overwrite=force, compression=compression)
+        recorder = Recorder(out, overwrite=force, keep_empty=False, compression=compression)
         status = _Status(recorder, started)
         with recorder:
             what = ", ".join(topics) if topics else "every known type"
@@ -85,14 +92,32 @@ def command(
             )
         status.clear()
         if not recorder.written:
-            out.unlink()
+            threads.check()  # why nothing came is known then
             _nothing(node, recording, time.monotonic() - started)
-    for topic, type_name in recording.unknown.items():
-        click.echo(f"warning: {topic} was not recorded: unknown type {type_name}", err=True)
+    for topic, why in recording.unknown.items():
+        click.echo(f"warning: {_plain(topic)} was not recorded: {_plain(why)}", err=True)
+    for text in (*recording.losses.sentences(), recorder.displaced):
+        if text:
+            click.echo(f"warning: {text}", err=True)
     dropped = recorder.dropped
     per_topic = ", ".join(f"{topic} {count}" for topic, count in sorted(recorder.offered.items()))
-    click.echo(f"{out}: {recorder.written} messages ({per_topic}), {dropped} dropped")
-    return 0
+    click.echo(f"{out}: {recorder.written} messages ({per_topic}), {_missing(recorder, recording)}")
+    return 1 if dropped or recording.losses or recorder.displaced else 0
+
+
+def _missing(recorder: Recorder, recording: DdsRecording) -> str:
+    losses = recording.losses
+    text = f"{recorder.dropped} dropped"
+    if losses.datagrams:
+        text += f", {losses.datagrams} datagrams lost"
+    if refused := sum(losses.refused.values()):
+        text += f", {refused} refused"
+    return text
+
+
+def _plain(text: str) -> str:
+    """What a peer announced, without control characters."""
+    return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
 def _nothing(node: DdsNode, recording: DdsRecording, waited: float) -> None:
@@ -101,7 +126,7 @@ def _nothing(node: DdsNode, recording: DdsRecording, waited: float) -> None:
     :raises TraceError: always, with exit code 1.
     """
     seen = sorted({f"{e.topic} ({e.type_name})" for e in node.endpoints() if not e.own})
-    seen = [entry for entry in seen if not entry.startswith("DCPS")]
+    seen = [_plain(entry) for entry in seen if not entry.startswith("DCPS")]
     others = [p.process or p.key for p in node.discovery.participants() if not p.own]
     if not others:
         hint = "no other participant was seen there: is it another --domain or --interface?"
@@ -139,7 +164,7 @@ class _Status:
             return
         self._before, self._at, self._last_line = offered, now, now
         text = f"{now - self._started:6.1f} s  {sum(offered.values()):,} messages"
-        text += f"  {self._recorder.dropped} dropped"
+        text += f"  {_missing(self._recorder, recording)}"
         text += "".join(f"  {t.removeprefix('rt/')} {hz:.0f} Hz" for t, hz in rates.items())
         if not offered:
             text += f"  waiting for {', '.join(recording.subscribed) or 'topics'}"

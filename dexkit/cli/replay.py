@@ -15,6 +15,7 @@ import click
 from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
 from dexkit.errors import DdsError, TraceUnsupported
 from dexkit.sole import Place, SolePublisher
+from dexkit.threads import Worker
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
@@ -201,7 +202,7 @@ def _status(player: Player) -> Iterator[None]:
             text = f"{part}  {player.sent:,} messages" + (f"  pass {passes + 1}" if passes else "")
             click.echo(f"\r\033[K{text}", nl=False, err=True)
 
-    thread = threading.Thread(target=show, name="status", daemon=True)
+    thread = Worker("status", show)
     thread.start()
     try:
         yield

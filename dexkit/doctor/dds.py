@@ -21,6 +21,7 @@ from dexkit.doctor.rtps import EndpointData, Locator
 from dexkit.doctor.topics import is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
+from dexkit.processes import process_id
 
 __all__ = ["DISCOVERY_SECONDS", "look"]
 
@@ -296,8 +297,7 @@ def _view(number: int, windows: Sequence[_Window], began: float, until: float) -
 
 def _participant(data: rtps.ParticipantData, interface: str) -> Participant:
     host = data.properties.get("__Hostname", "")
-    text = data.properties.get("__Pid", "")
-    pid = int(text) if text.isdigit() else 0
+    pid = process_id(data.properties.get("__Pid", ""))
     here = bool(pid) and host == socket.gethostname()
     return Participant(
         key=data.prefix.hex(),

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from dexkit.clock import Clock, Rate, RealClock
 from dexkit.service.realtime import go_first, precise_timers
+from dexkit.threads import Worker
 
 __all__ = ["Publisher", "align"]
 
@@ -44,7 +45,9 @@ class Publisher:
         self._lock = threading.Lock()
         self._ticks: list[Callable[[int], None]] = []
         self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: Worker | None = None
+        #: what ended its thread, or None: without it nothing is published
+        self.failure: Exception | None = None
 
     def add(self, tick: Callable[[int], None]) -> None:
         """Call ``tick`` at every deadline from now on.
@@ -55,9 +58,7 @@ class Publisher:
             self._ticks.append(tick)
             if self._thread is None:
                 self._stop = threading.Event()
-                self._thread = threading.Thread(
-                    target=self._run, args=(self._stop,), name="dexkit-publish", daemon=True
-                )
+                self._thread = Worker("publish", self._run, self._stop, failed=self._died)
                 self._thread.start()
 
     def remove(self, tick: Callable[[int], None]) -> None:
@@ -70,6 +71,9 @@ class Publisher:
             thread, self._thread = self._thread, None
             self._stop.set()
         thread.join()
+
+    def _died(self, error: Exception) -> None:
+        self.failure = error
 
     def _run(self, stop: threading.Event) -> None:
         precise_timers()

@@ -46,6 +46,7 @@ from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
 from dexkit.service.publisher import Publisher, align
 from dexkit.sole import Place, SolePublisher
+from dexkit.threads import Worker
 
 __all__ = ["HandService", "Node"]
 
@@ -196,7 +197,7 @@ class HandService:
         self._said: set[str] = set()  # remarks logged, each kind only once
         self._encoded: tuple[tuple[StateView | None, ...], bytes | None] = ((), None)
         self._started = False
-        self.failure: Exception | None = None  #: what ended a thread of the service, if anything
+        self._failure: Exception | None = None
 
     # -- life -------------------------------------------------------------------------------
 
@@ -281,7 +282,7 @@ class HandService:
             self._receiving.join()
         gave_way = isinstance(self.failure, TopicConflict)
         if self._writer is not None and self._receiving is not None and not gave_way:
-            self._publish(self._compose(), low_rate=True)
+            self._publish_now(low_rate=True)
             if self.clients:
                 time.sleep(_LAST_WORDS)
         for entity in (self._reader, self._writer, self._low_rate_writer):
@@ -291,18 +292,16 @@ class HandService:
             self._node.close()
             self._node = None
 
-    def _thread(self, name: str, target: Callable[..., None], *args: object) -> threading.Thread:
-        def run() -> None:
-            try:
-                target(*args)
-            except TopicConflict as error:
-                log.error("%s; this service ends", error)
-                self.failure = error
-            except Exception as error:  # nothing may die in silence
-                log.exception("the %s thread died", name)
-                self.failure = error
+    def _thread(self, name: str, target: Callable[..., None], *args: object) -> Worker:
+        return Worker(name, target, *args, failed=self._died)
 
-        return threading.Thread(target=run, name=f"dexkit-{name}", daemon=True)
+    def _died(self, error: Exception) -> None:
+        self._failure = self._failure or error
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended a thread that the service needs, its node's and publisher's included."""
+        return self._failure or self._publisher.failure or getattr(self._node, "failure", None)
 
     # -- what it says of itself -------------------------------------------------------------
 
@@ -592,11 +591,14 @@ class HandService:
         self.counters.publish_misses += missed
         self._ticks += 1
         every = self._low_rate_every
+        self._publish_now(low_rate=every > 0 and self._ticks % every == 0)
+
+    def _publish_now(self, *, low_rate: bool) -> None:
         try:
-            self._publish(self._compose(), low_rate=every > 0 and self._ticks % every == 0)
+            self._publish(self._compose(), low_rate=low_rate)
         except Exception as error:  # nothing may die in silence
             log.exception("%s: publishing failed", self.state_topic)
-            self.failure = error
+            self._died(error)
 
     def _compose(self) -> bytes | None:
         """The sample for now; None without a state.

@@ -39,7 +39,6 @@ class EmulatedBody:
     :param force: start even if somebody else publishes the state.
 
     :ivar body: the body itself. It belongs to that thread: read it, and assign ``body.remote``.
-    :ivar failure: what ended it, if anything did.
 
     Troubles of clients are logged once each, as warnings of the logger ``dexkit.body``, and
     counted in ``body.counters``.
@@ -62,7 +61,7 @@ class EmulatedBody:
         self.interface = node.interface if node is not None else interface
         self._clock: Clock = clock or RealClock()
         self.body = Body(model, settings, now=self._clock.now(), report=log.warning)
-        self.failure: BaseException | None = None
+        self._failure: Exception | None = None
         self.missed = 0
         self._node = node
         self._own_node: DdsNode | None = None
@@ -77,6 +76,12 @@ class EmulatedBody:
         self._remote: Writer | None = None
         self._commands: Reader | None = None
         self._arm_commands: Reader | None = None
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended it, or a thread that it needs."""
+        node = self._node or self._own_node
+        return self._failure or self._publisher.failure or (node.failure if node else None)
 
     @property
     def clients(self) -> int:
@@ -186,10 +191,10 @@ class EmulatedBody:
                 self._sole.poll()
             self._live(missed)
         except TopicConflict as error:
-            self.failure = error
+            self._failure = error
             log.error("%s; this %s ends", error, self.model.name)
         except Exception as error:  # the thread may be somebody else's as well
-            self.failure = error
+            self._failure = error
             log.error("the %s died: %s: %s", self.model.name, type(error).__name__, error)
 
     def _live(self, missed: int) -> None:

@@ -38,6 +38,7 @@ from usbip.device import USBDevice
 
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
+from dexkit.threads import Worker
 
 __all__ = [
     "DEAD",
@@ -158,15 +159,11 @@ class Server:
 
     def start(self) -> None:
         """Serve in a background thread."""
-        self._thread = threading.Thread(target=self._guarded, name="dexkit-usbip", daemon=True)
+        self._thread = Worker("USB/IP", self.run, failed=self._died)
         self._thread.start()
 
-    def _guarded(self) -> None:
-        try:
-            self.run()
-        except BaseException as error:
-            self.error = error
-            raise
+    def _died(self, error: Exception) -> None:
+        self.error = error
 
     def stop(self) -> None:
         """Ask :meth:`run` to return; from any thread or a signal handler."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable
 
 import click
 
 from dexkit.cli.common import StopRequest
 from dexkit.errors import DexkitError
+from dexkit.threads import Worker
 
 __all__ = ["A_MISTAKE", "read_faults"]
 
@@ -23,7 +23,7 @@ def read_faults(inject: Callable[[str], None], request: StopRequest) -> None:
 
     :param inject: has one; what it raises is printed.
     """
-    threading.Thread(target=_read, args=(inject, request), daemon=True).start()
+    Worker("standard input", _read, inject, request).start()
 
 
 def _read(inject: Callable[[str], None], request: StopRequest) -> None:

@@ -1,0 +1,126 @@
+"""Threads whose death is heard.
+
+A thread of Python that dies of an exception leaves the rest of the program running: a recorder
+that records nothing, a service whose state stands still. There is one rule for every thread of
+dexkit: **one that dies ends the program, with a message and an error exit code.**
+
+:class:`Worker` is that rule. When its function raises, it logs why, keeps the exception as
+:attr:`Worker.failure`, tells its owner (``failed``), and tells everybody who asked by
+:func:`listen`. :func:`~dexkit.stopping.stop_on_signals` asks: its request is set, so that the
+program ends in good order, as on Ctrl-C: hands brake, recordings are finished. Last of all the
+command line asks :func:`check` and exits with 1.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterator
+
+from dexkit.errors import DexkitError
+
+__all__ = ["Worker", "check", "forget", "listen"]
+
+_log = logging.getLogger(__name__)
+
+_lock = threading.Lock()
+_listeners: list[Callable[[Worker], object]] = []
+_dead: list[Worker] = []
+_KEPT = 16  # dead workers that are remembered
+
+
+class Worker(threading.Thread):
+    """A thread that runs ``target(*args)`` once; it does not keep the process from ending.
+
+    :param name: what it does, for messages: ``"the NAME thread died"``.
+    :param failed: called in the thread with the exception that ended it, before anybody else is
+        told.
+
+    :ivar failure: what ended it, or None.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        target: Callable[..., object],
+        *args: object,
+        failed: Callable[[Exception], object] | None = None,
+    ) -> None:
+        super().__init__(name=f"dexkit-{name}", daemon=True)
+        self.what = name
+        self.failure: Exception | None = None
+        self._work = target
+        self._arguments = args
+        self._failed = failed
+
+    def run(self) -> None:
+        """What the thread does; not to be called."""
+        try:
+            self._work(*self._arguments)
+        except Exception as error:
+            self.failure = error
+            self._tell(error)
+
+    def _tell(self, error: Exception) -> None:
+        with _lock:
+            del _dead[:-_KEPT]
+            _dead.append(self)
+            listeners = list(_listeners)
+        if isinstance(error, DexkitError | OSError):  # foreseen: a full disk, a lost device
+            _log.error("the %s thread ended: %s", self.what, error)
+        else:
+            _log.error("the %s thread died", self.what, exc_info=error)
+        owner: list[Callable[[], object]] = []
+        if self._failed is not None:
+            failed = self._failed
+            owner = [lambda: failed(error)]
+        for tell in [*owner, *((lambda hear=hear: hear(self)) for hear in listeners)]:
+            try:
+                tell()
+            except Exception:
+                _log.exception("telling of a thread that died failed")
+
+    def check(self) -> None:
+        """Raise if it has died.
+
+        :raises DexkitError: with what ended it; a DexkitError is raised as it is.
+        """
+        if self.failure is None:
+            return
+        if isinstance(self.failure, DexkitError):
+            raise self.failure
+        raise DexkitError(
+            f"the {self.what} thread died: {type(self.failure).__name__}: {self.failure}",
+            hint="that is a mistake of dexkit's if it is not a full disk or the like: "
+            "please report it",
+        ) from self.failure
+
+
+@contextlib.contextmanager
+def listen(hear: Callable[[Worker], object]) -> Iterator[None]:
+    """Have ``hear`` called with every worker that dies meanwhile, in its thread."""
+    with _lock:
+        _listeners.append(hear)
+    try:
+        yield
+    finally:
+        with _lock:
+            _listeners.remove(hear)
+
+
+def check() -> None:
+    """Raise if a worker of this process has died since :func:`forget`.
+
+    :raises DexkitError: with what ended the first.
+    """
+    with _lock:
+        first = _dead[0] if _dead else None
+    if first is not None:
+        first.check()
+
+
+def forget() -> None:
+    """Begin anew: what died before is no longer told by :func:`check`."""
+    with _lock:
+        _dead.clear()

@@ -1,0 +1,292 @@
+"""What a recording lacks is counted and told: in the status line, the file and the exit code."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexkit.dds import DdsNode
+from dexkit.sockets import DdsSockets
+from dexkit.traces import Recorder, open_trace
+from dexkit.traces.dds_recording import DdsRecording
+from dexkit.traces.losses import PAUSE, Losses
+from tests.dds_helpers import free_domain, wait_until
+from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
+
+MS = 1_000_000
+
+
+# -- the arithmetic --------------------------------------------------------------------------------
+
+
+@given(
+    period=st.integers(1, 100),
+    jitter=st.lists(st.floats(-0.4, 0.4), min_size=60, max_size=60),
+    hole=st.integers(2, 30),
+)
+def test_a_hole_in_a_regular_stream_is_estimated(
+    period: int, jitter: list[float], hole: int
+) -> None:
+    losses = Losses()
+    times = [round((n + jitter[n]) * period * MS) + T0 for n in range(60)]
+    for n in (*range(30), *range(30 + hole, 60)):
+        losses.sample("rt/a", 1, times[n])
+    # nothing is claimed unless the system dropped something
+    assert not losses.look(1.0, 0, {})
+    assert losses.about == {}
+    for n in range(60, 90):
+        losses.sample("rt/a", 1, T0 + n * period * MS)
+    again = T0 + (90 + hole) * period * MS
+    losses.sample("rt/a", 1, again)
+    assert losses.look(2.0, hole, {})
+    assert losses
+    assert abs(losses.about["rt/a"] - hole) <= 1 + hole // 4
+    assert losses.about["rt/a"] <= losses.datagrams + 2
+
+
+def test_an_estimate_never_exceeds_what_was_dropped() -> None:
+    losses = Losses()
+    for topic in ("rt/a", "rt/b"):
+        for n in (*range(50), *range(150, 160)):
+            losses.sample(topic, 7, T0 + n * 2 * MS)
+    losses.look(0.0, 98, {})
+    assert losses.about == {"rt/a": 50, "rt/b": 50}
+
+
+def test_a_gap_that_shows_later_still_counts_and_much_later_does_not() -> None:
+    losses = Losses()
+    for n in range(50):
+        losses.sample("rt/a", 1, T0 + n * 2 * MS)
+    losses.look(0.0, 30, {})
+    assert losses.about == {}
+    losses.sample("rt/a", 1, T0 + 80 * 2 * MS)
+    losses.look(0.5, 0, {})
+    assert losses.about == {"rt/a": 30}
+    losses.sample("rt/a", 1, T0 + 180 * 2 * MS)
+    losses.look(5.0, 0, {})
+    assert losses.about == {"rt/a": 30}
+
+
+def test_samples_without_a_time_and_out_of_order_harm_nothing() -> None:
+    losses = Losses()
+    for source in (0, 0, 5, 3, 0, T0, T0, 0, T0 + 1, 2**62):
+        for _ in range(9):
+            losses.sample("rt/a", 1, source)
+    losses.look(0.0, 1, {})
+    assert sum(losses.about.values()) <= 2
+
+
+def test_pauses_are_told_with_their_time() -> None:
+    losses = Losses()
+    assert losses.turn(10.0, T0) is None
+    assert losses.turn(10.0 + PAUSE - 0.01, T0) is None
+    pause = losses.turn(13.5, T0)
+    assert pause is not None
+    assert "did not run for 3.0 s from 2026-11-21 08:57:05 UTC" in str(pause)
+    assert not losses  # a pause in which nothing was lost
+    for n in range(100):
+        losses.turn(20.0 + n, T0)
+    assert losses.paused == 101
+    assert len(losses.sentences()) == 21
+    assert losses.metadata()["pauses"].endswith("101 in all")
+
+
+# -- a reader that is full -------------------------------------------------------------------------
+
+
+def test_a_full_reader_counts_what_it_refuses() -> None:
+    domain = free_domain()
+    with DdsNode(domain) as hand, DdsNode(domain) as node:
+        writer = hand.writer(CMD, CMD_TYPE)
+        with node.reader(CMD, CMD_TYPE, most=10) as reader:
+            assert writer.wait_matched(10)
+            for n in range(25):
+                writer.write_raw(cmd(float(n)))
+            wait_until(lambda: reader.refused == 15)
+            assert [s.data for s in reader.take()] == [cmd(float(n)) for n in range(10)]
+            writer.write_raw(cmd(99.0))
+            wait_until(reader.take)
+            assert reader.refused == 15
+
+
+def test_what_a_reader_refused_is_in_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dexkit.traces.dds_recording.MOST", 10)
+    domain = free_domain()
+    path = tmp_path / "a.mcap"
+    with (
+        DdsNode(domain) as hand,
+        DdsNode(domain) as node,
+        Recorder(path) as recorder,
+        DdsRecording(node, recorder, [STATE], types={STATE: STATE_TYPE}) as recording,
+    ):
+        writer = hand.writer(STATE, STATE_TYPE)
+        assert writer.wait_matched(10)
+        take = recording._take
+        monkeypatch.setattr(recording, "_take", lambda: None)  # busy with something else
+        for n in range(40):
+            writer.write_raw(state(float(n)))
+        reader = recording._readers[STATE, STATE_TYPE]
+        wait_until(lambda: reader.refused >= 20)
+        monkeypatch.setattr(recording, "_take", take)
+        recording.stop()
+        lost = recording.losses.refused[STATE]
+        assert recording.losses
+    trace = open_trace(path)
+    assert trace.message_count + lost == 40
+    assert trace.metadata["dexkit_recorder"][f"refused {STATE}"] == str(lost)
+
+
+# -- the recorder as a program ---------------------------------------------------------------------
+
+# a recorder whose sockets hold little, whatever this machine allows
+CHILD = textwrap.dedent(
+    """
+    import socket, sys
+    from dexkit.cli import main
+    from dexkit.sockets import DdsSockets
+    def shrink(self, size):
+        for sock in self._sockets():
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        return 65536
+    if sys.argv.pop(1) == "small":
+        DdsSockets.enlarge = shrink
+    main(sys.argv[1:])
+    """
+)
+
+
+@contextmanager
+def recorder(buffer: str, *arguments: object, **options: object) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", CHILD, buffer, "record", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,  # type: ignore[call-overload]
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready:")
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("buffer", ["small", "default"])
+def test_a_recorder_that_was_stopped_says_what_it_lost(tmp_path: Path, buffer: str) -> None:
+    domain = free_domain()
+    out = tmp_path / "out.mcap"
+    sent = 0
+    with (
+        recorder(buffer, out, "--topic", STATE, "--domain", domain) as process,
+        DdsNode(domain) as node,
+    ):
+        writer = node.writer(STATE, STATE_TYPE)
+        assert writer.wait_matched(20)
+
+        def send(count: int) -> None:
+            nonlocal sent
+            for _ in range(count):
+                sent += 1
+                writer.write_raw(state(float(sent)), T0 + sent * 2 * MS)
+
+        send(20)
+        wait_until(lambda: open_trace(out).message_count == 20)
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+        send(600 if buffer == "small" else 100)
+        # the stop has to be long enough to be one
+        signal.sigtimedwait([], PAUSE + 0.2)
+        process.send_signal(signal.SIGCONT)
+        wait_until(lambda: open_trace(out).message_count > 20)
+        send(2)  # the first may be swallowed by CycloneDDS, as every first after a hole
+        # one by one, so that none of these finds the buffer full
+        for _ in range(2):
+            before = open_trace(out).message_count
+            send(1)
+            wait_until(lambda n=before: open_trace(out).message_count > n)  # type: ignore[misc]
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=20)
+    trace = open_trace(out)
+    lost = sent - trace.message_count
+    about = trace.metadata["dexkit_recorder"]
+    assert "the recorder did not run for" in stderr
+    assert "s until" in about["pauses"]
+    assert f"{trace.message_count} messages" in stdout
+    if buffer == "small":
+        assert process.returncode == 1
+        assert lost > 100
+        datagrams = int(about["lost_datagrams"])
+        assert lost - 1 <= datagrams <= lost
+        assert f"{datagrams} datagrams lost" in stdout
+        assert f"{datagrams} datagrams were lost because the receive buffer was full" in stderr
+        assert abs(int(about[f"lost about {STATE}"]) - lost) <= 1
+    else:
+        assert (process.returncode, lost) == (0, 0)
+        assert "0 dropped" in stdout
+        assert about["lost_datagrams"] == "0"
+
+
+def test_a_full_disk_is_told_as_it_is(tmp_path: Path) -> None:
+    """What it says was written is what can be read, and the exit code is an error."""
+    domain = free_domain()
+    out = tmp_path / "out.mcap"
+
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
+
+    options = ("--topic", STATE, "--domain", domain, "--compression", "none")
+    with (
+        recorder("default", out, *options, preexec_fn=small_files) as process,
+        DdsNode(domain) as node,
+    ):
+        writer = node.writer(STATE, STATE_TYPE)
+        assert writer.wait_matched(20)
+        while process.poll() is None:
+            writer.write_raw(state(1.0))
+            signal.sigtimedwait([], 0.002)
+        _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "stopped: File too large" in stderr
+    assert "Traceback" not in stderr
+    count = open_trace(out).message_count
+    assert count > 0
+    assert f"  {count} messages were written and can be read" in stderr
+
+
+def test_a_deleted_file_is_told(tmp_path: Path) -> None:
+    domain = free_domain()
+    out = tmp_path / "out.mcap"
+    with recorder("default", out, "--topic", STATE, "--domain", domain) as process:
+        out.unlink()
+        _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "was deleted while it was recorded" in stderr
+    assert "Traceback" not in stderr
+
+
+def test_sockets_are_found_and_count_for_their_domain_only() -> None:
+    domain, other = free_domain(), free_domain()
+    assert not DdsSockets(domain).known
+    with DdsNode(domain):
+        sockets = DdsSockets(domain)
+        assert sockets.known
+        assert sockets.enlarge(100_000) >= 100_000
+        assert sockets.look() == 0
+        assert not DdsSockets(other).known
+        assert DdsSockets(other).enlarge(100_000) == 0

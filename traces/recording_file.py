@@ -1,0 +1,339 @@
+"""The file that a recording is written to: whole chunks or nothing, and nobody else's.
+
+* What is written goes into memory until :meth:`RecordingFile.commit`, which puts it on the disk.
+  When the disk takes only a part, the file is cut back to the last commit, so what was said to
+  be written is what can be read.
+* A recording that replaces another is written beside it, under the same name with ``.part``, and
+  takes its place when it holds a message. Until then the old one is untouched.
+* The file is locked (``flock``) while it is written. A second recorder is refused; readers do
+  not look at the lock and may follow the file as it grows.
+
+What is left after kill -9: without ``overwrite`` the file itself, at any time. With it, either
+the old recording and a ``.part`` without messages, which the next recorder takes over, or the
+new one. Only in the instant between the first commit and the renaming there is a ``.part`` with
+messages; it is never overwritten.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import stat
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap.records import ChunkIndex
+
+from dexkit.errors import TraceError, UsageError
+
+__all__ = ["ChunkIndexes", "RecordingFile"]
+
+_PART = ".part"
+_CREATE = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")  # operation code, length
+_CHUNK, _MESSAGE_INDEX, _DATA_END = 0x06, 0x07, 0x0F
+_CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, size, CRC, length of a string
+_RETRIES = (0.001, 0.01, 0.05)  # seconds; a look at a lock takes microseconds
+_LEAST_CHUNK = _CHUNK_HEAD.size + 8
+
+
+class RecordingFile:
+    """A file for the mcap library's writer (``write``, ``tell``, ``flush``).
+
+    :param path: what it is called in the end. A link is followed.
+    :param overwrite: replace what is there.
+
+    :ivar displaced: what happened to the file's name while it was written, or empty.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        self.path = path
+        self.displaced = ""
+        self._target = Path(os.path.realpath(path))
+        self._part = self._target.with_name(self._target.name + _PART)
+        self._overwrite = overwrite
+        self._fd = -1
+        self._regular = True
+        self._hidden = False  # written beside, still
+        self._buffer: list[bytes] = []
+        self._buffered = 0
+        self._size = 0
+
+    # -- life ----------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Create it.
+
+        :raises UsageError: there is one already, or it is being recorded.
+        :raises TraceError: it cannot be created.
+        """
+        try:
+            self._open()
+        except FileExistsError:
+            raise UsageError(
+                f"{self.path} exists", hint="choose another name, or overwrite it (--force)"
+            ) from None
+        except OSError as error:
+            raise TraceError(f"cannot create {self.path}: {error.strerror}") from error
+
+    def _open(self) -> None:
+        existing = _status(self._target)
+        if existing is not None and not self._overwrite:
+            raise FileExistsError
+        if existing is not None and not stat.S_ISREG(existing.st_mode):
+            if stat.S_ISDIR(existing.st_mode):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            self._regular = False  # a device or a pipe: nothing to keep, cut back or lock
+            self._fd = os.open(self._target, os.O_WRONLY | os.O_CLOEXEC)
+            return
+        self._refuse_company(self._part)
+        if existing is None:
+            self._fd = os.open(
+                self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
+            )
+            self._lock(self._fd, fcntl.LOCK_EX)
+            return
+        self._refuse_company(self._target)
+        fd = os.open(self._part, _CREATE, 0o666)
+        try:
+            self._lock(fd, fcntl.LOCK_EX)
+            # the lock may be that of a file which has got its name meanwhile
+            now = _status(self._part)
+            if now is None or now.st_ino != os.fstat(fd).st_ino:
+                raise self._busy()
+            self._refuse_company(self._target)
+            if _holds_messages(fd):
+                raise UsageError(
+                    f"{self._part} holds messages of a recorder that was killed",
+                    hint="rename it (dexkit info tells what is in it) or delete it",
+                )
+            os.ftruncate(fd, 0)
+            with contextlib.suppress(OSError):
+                os.fchmod(fd, stat.S_IMODE(existing.st_mode))
+        except BaseException:
+            os.close(fd)
+            raise
+        self._fd, self._hidden = fd, True
+
+    def _lock(self, fd: int, how: int) -> None:
+        for pause in (*_RETRIES, None):
+            try:
+                fcntl.flock(fd, how | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if pause is None:
+                    raise self._busy() from None
+                time.sleep(pause)  # somebody may only be looking
+            except OSError:
+                return  # a file system without locks
+            else:
+                return
+
+    def _refuse_company(self, path: Path) -> None:
+        """Raise if another recorder writes to ``path``."""
+        with contextlib.suppress(FileNotFoundError, PermissionError):
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+            try:
+                self._lock(fd, fcntl.LOCK_SH)
+            finally:
+                os.close(fd)  # and with it the lock
+
+    def _busy(self) -> UsageError:
+        return UsageError(
+            f"{self.path} is being recorded by another program",
+            hint="choose another name, or stop that one",
+        )
+
+    def close(self, *, keep: bool) -> None:
+        """Close it; what was not committed is lost.
+
+        :param keep: leave it under its name; else remove it, and leave what it was to replace.
+        :raises TraceError: it cannot get its name.
+        """
+        fd, self._fd = self._fd, -1
+        if fd < 0:
+            return
+        try:
+            if not self._regular:
+                return
+            if keep:
+                self.publish(fd)
+                return
+            place = self._part if self._hidden else self._target
+            if self._is_at(place, fd):
+                place.unlink()
+        finally:
+            os.close(fd)
+
+    def publish(self, fd: int | None = None) -> None:
+        """Give it its name, if it has not got it yet.
+
+        :raises TraceError: another recorder has begun to write there, or it cannot be renamed.
+        """
+        if not self._hidden:
+            return
+        fd = self._fd if fd is None else fd
+        try:
+            self._refuse_company(self._target)
+            if not self._is_at(self._part, fd):
+                raise TraceError(f"{self._part} was deleted while it was recorded")
+            os.replace(self._part, self._target)
+        except UsageError as error:
+            raise TraceError(error.message, hint=f"this recording is {self._part}") from None
+        except OSError as error:
+            raise TraceError(
+                f"cannot replace {self.path}: {error.strerror}",
+                hint=f"this recording is {self._part}",
+            ) from error
+        self._hidden = False
+
+    # -- for the writer ------------------------------------------------------------------------
+
+    def write(self, data: bytes) -> int:
+        """Take bytes; they are on the disk after :meth:`commit`."""
+        if data:
+            self._buffer.append(bytes(data))
+            self._buffered += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Bytes written so far, committed or not."""
+        return self._size + self._buffered
+
+    def flush(self) -> None:
+        """Nothing; it is :meth:`commit` that writes."""
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that are not committed."""
+        return self._buffered
+
+    def commit(self) -> None:
+        """Hand what was written to the operating system, all of it or nothing.
+
+        :raises OSError: the disk is full, for example.
+        """
+        data, self._buffer, self._buffered = b"".join(self._buffer), [], 0
+        view = memoryview(data)
+        done = 0
+        try:
+            while done < len(view):
+                done += os.write(self._fd, view[done:])
+        except OSError:
+            if self._regular and done:
+                with contextlib.suppress(OSError):
+                    os.ftruncate(self._fd, self._size)
+            raise
+        self._size += len(view)
+
+    def check(self) -> None:
+        """See whether it is still there.
+
+        :raises TraceError: it was deleted: what is written goes nowhere.
+        """
+        if not self._regular:
+            return
+        if os.fstat(self._fd).st_nlink == 0:
+            raise TraceError(
+                f"{self._part if self._hidden else self.path} was deleted while it was recorded",
+                hint="what was recorded is lost",
+            )
+        if not self._hidden and not self.displaced and not self._is_at(self._target, self._fd):
+            self.displaced = (
+                f"{self.path} was renamed or replaced while it was recorded; "
+                "the recording has another name now"
+            )
+
+    def _is_at(self, path: Path, fd: int) -> bool:
+        there, here = _status(path), os.fstat(fd)
+        return there is not None and (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
+
+    # -- what was written ------------------------------------------------------------------------
+
+    @property
+    def readable(self) -> bool:
+        """Whether what was committed can be read back."""
+        return self._regular
+
+    def chunk_indexes(self) -> Iterator[ChunkIndex]:
+        """The index of each chunk committed, made from the file itself."""
+        at, size = len(_MAGIC), self._size
+        index: ChunkIndex | None = None
+        while at + _RECORD.size <= size:
+            operation, length = _RECORD.unpack(os.pread(self._fd, _RECORD.size, at))
+            end = at + _RECORD.size + length
+            if operation == _MESSAGE_INDEX and index is not None:
+                (channel,) = struct.unpack("<H", os.pread(self._fd, 2, at + _RECORD.size))
+                index.message_index_offsets[channel] = at
+                index.message_index_length += end - at
+            elif index is not None:
+                yield index
+                index = None
+            if operation == _CHUNK:
+                index = self._chunk_index(at, end)
+            elif operation == _DATA_END:
+                return
+            at = end
+        if index is not None:
+            yield index
+
+    def _chunk_index(self, at: int, end: int) -> ChunkIndex:
+        head = os.pread(self._fd, _LEAST_CHUNK + 16, at + _RECORD.size)
+        first, last, size, _, name_length = _CHUNK_HEAD.unpack_from(head)
+        name = head[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length]
+        (packed,) = struct.unpack_from("<Q", head, _CHUNK_HEAD.size + name_length)
+        return ChunkIndex(
+            chunk_length=end - at,
+            chunk_start_offset=at,
+            compression=name.decode(),
+            compressed_size=packed,
+            message_end_time=last,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=first,
+            uncompressed_size=size,
+        )
+
+
+class ChunkIndexes:
+    """In place of the list in which the mcap library collects the index of every chunk.
+
+    With five chunks a second that list grows by 18 MB an hour; the file holds the same.
+    """
+
+    def __init__(self, file: RecordingFile) -> None:
+        self._file = file
+
+    def append(self, index: ChunkIndex) -> None:
+        """Forget it."""
+
+    def __iter__(self) -> Iterator[ChunkIndex]:
+        """From the file; everything must have been committed."""
+        return self._file.chunk_indexes()
+
+
+def _status(path: Path) -> os.stat_result | None:
+    try:
+        return path.stat()
+    except FileNotFoundError:
+        return None
+
+
+def _holds_messages(fd: int) -> bool:
+    """Whether an unfinished recording has a chunk, or is something else altogether."""
+    size = os.fstat(fd).st_size
+    if size < len(_MAGIC):
+        return False
+    if os.pread(fd, len(_MAGIC), 0) != _MAGIC:
+        return True
+    at = len(_MAGIC)
+    while at + _RECORD.size <= size:
+        operation, length = _RECORD.unpack(os.pread(fd, _RECORD.size, at))
+        if operation == _CHUNK:
+            return True
+        at += _RECORD.size + length
+    return False
