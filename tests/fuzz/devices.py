@@ -224,7 +224,7 @@ def mx64_line(seed: int, count: int) -> int:
         now += case.random.choice((0.0, 1e-4, 1e-3, 2e-3, 5e-3, 0.02))
         case.run(data, lambda bus=bus, data=data, now=now: _talk(case, bus, data, now))  # type: ignore[misc]
         if (i + 1) % _BLOCK == 0:
-            now += 60.0  # 4 KiB at 9600 baud take 4 s
+            now += bus.behind(now) + 2.0  # 4 KiB at 9600 baud take 4 s
             case.run(b"", lambda bus=bus, now=now: _still_there(bus, now))  # type: ignore[misc]
     return count
 
