@@ -74,7 +74,7 @@ def test_a_gap_that_shows_later_still_counts_and_much_later_does_not() -> None:
     losses.look(0.5, 0, {})
     assert losses.about == {"rt/a": 30}
     losses.sample("rt/a", 1, T0 + 180 * 2 * MS)
-    losses.look(5.0, 0, {})
+    losses.look(50.0, 0, {})
     assert losses.about == {"rt/a": 30}
 
 

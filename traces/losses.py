@@ -31,7 +31,7 @@ _KNOWN = 8
 # Share of a new interval in the running period.
 _SHARE = 1 / 16
 # Seconds after a drop was seen in which its gap may show: the next sample has to come first.
-_SHOWS = 1.0
+_SHOWS = 5.0
 _TOLD = 20  # pauses that are kept
 
 
