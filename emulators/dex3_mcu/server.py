@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import select
 import socket
 import struct
@@ -22,10 +23,13 @@ from typing import Any, Protocol
 from usbip import protocol
 from usbip.device import USBDevice
 
+from dexkit import ingress
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
 
 __all__ = ["Plug", "Server"]
+
+_log = logging.getLogger(__name__)
 
 _REQUEST = 8  # bytes: version, code, status
 _BUSID = 32
@@ -388,11 +392,22 @@ class _Connection:
         )
 
 
+def _keep_networks_out(listener: socket.socket) -> None:
+    """With route_localnet set, the kernel takes packets for 127.0.0.1 from networks, too."""
+    try:
+        ingress.restrict(listener, "lo")
+    except OSError as error:
+        # the address alone keeps them out unless the kernel was told otherwise
+        _log.warning("packets from networks are not kept from 127.0.0.1: %s", error.strerror)
+
+
 def _listen(host: str, port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        if listener.getsockname()[0].startswith("127."):
+            _keep_networks_out(listener)
         listener.listen(16)
     except OSError as error:
         listener.close()
