@@ -23,6 +23,10 @@ announced together with it.
 On loopback a node finds every other process of the machine, whether or not ``lo`` carries the
 MULTICAST flag, without changing the system (facts/unitree-dex A.6).
 
+Only what comes in by the node's interface, or from this machine, is seen (:mod:`dexkit.ingress`);
+CycloneDDS by itself would listen to every interface of the machine. Where the system has no
+filter for that, a node is refused, unless ``DEXKIT_ALL_INTERFACES=1`` says that it is meant.
+
 ``DEXKIT_DDS_LOG=PATH`` appends CycloneDDS's own log to a file; otherwise its warnings only become
 part of a :class:`~dexkit.errors.DdsSetupError`.
 """
@@ -48,6 +52,8 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
+from dexkit import ingress
+from dexkit.dds_sockets import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
 from dexkit.messages import MessageType, layout, message_type
 from dexkit.processes import process_id
@@ -75,6 +81,7 @@ _OK = 0
 _TIMEOUT = -10
 _PRECONDITION_NOT_MET = -4
 _ALIVE = 16  # DDS_ALIVE_INSTANCE_STATE
+_LOOK_EVERY_NS = 500_000_000  # whether the interface is still the one that is let in
 _MAX_PARTICIPANT_INDEX = 60  # processes on one machine and domain; each is probed at start-up
 _TAKE_CHUNK = 64
 _EXIT_PATIENCE = 3.0  # seconds for closing at the end of the process; it takes some 20 ms
@@ -295,6 +302,7 @@ class _Cyclone:
         pointer, number = ctypes.c_void_p, ctypes.POINTER(ctypes.c_int32)
         reference = ctypes.POINTER(pointer)
         for name, arguments in {
+            "dds_domain_set_deafmute": (entity, ctypes.c_bool, ctypes.c_bool, ctypes.c_int64),
             "dds_delete": (entity,),
             "dds_create_waitset": (entity,),
             "dds_waitset_attach": (entity, entity, ssize),
@@ -429,13 +437,6 @@ def interfaces() -> list[str]:
     return [name for _, name in socket.if_nameindex()]
 
 
-def _is_loopback(interface: str) -> bool:
-    try:
-        return bool(int(Path(f"/sys/class/net/{interface}/flags").read_text(), 16) & 0x8)
-    except (OSError, ValueError):
-        return interface.startswith("lo")
-
-
 def _trace(verbosity: str, path: str) -> str:
     return (
         f"<Tracing><Verbosity>{verbosity}</Verbosity><AppendToFile>true</AppendToFile>"
@@ -443,14 +444,18 @@ def _trace(verbosity: str, path: str) -> str:
     )
 
 
-def _config(interface: str, tracing: str = "") -> str:
+# until the filter is there; dds_domain_set_deafmute() ends it
+_DEAF = "<Internal><ControlTopic><Deaf>true</Deaf></ControlTopic></Internal>"
+
+
+def _config(interface: str, more: str = "") -> str:
     """CycloneDDS configuration of a domain (facts/unitree-dex A.6).
 
     On loopback peers are called on 127.0.0.1 by port, since multicast may be off there;
     ``multicast="default"`` keeps listening to it where it is on, because an SDK process then
     listens to nothing else.
     """
-    peers = '<Peers><Peer address="127.0.0.1"/></Peers>' if _is_loopback(interface) else ""
+    peers = '<Peers><Peer address="127.0.0.1"/></Peers>' if ingress.is_loopback(interface) else ""
     return (
         "<CycloneDDS><Domain>"
         "<General><Interfaces>"
@@ -458,7 +463,7 @@ def _config(interface: str, tracing: str = "") -> str:
         "</Interfaces></General>"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANT_INDEX}</MaxAutoParticipantIndex>"
-        f"{peers}</Discovery>{tracing}"
+        f"{peers}</Discovery>{more}"
         "</Domain></CycloneDDS>"
     )
 
@@ -470,6 +475,7 @@ class _Domain:
     interface: str
     entity: Any  # None when somebody else in this process configured the domain
     nodes: int = 0
+    sockets: DomainSockets | None = None  # None when nothing is kept out
 
 
 _domains: dict[int, _Domain] = {}
@@ -497,8 +503,10 @@ def _acquire_domain(number: int, interface: str) -> None:
         )
     path = os.environ.get("DEXKIT_DDS_LOG")
     tracing = _trace("config", path) if path else ""
+    before = open_sockets()
+    sockets = None
     try:
-        entity = cyclone.domain.Domain(number, _config(interface, tracing))
+        entity = cyclone.domain.Domain(number, _config(interface, _DEAF + tracing))
     except cyclone.error as error:
         if error.code != _PRECONDITION_NOT_MET:
             raise DdsSetupError(
@@ -508,12 +516,46 @@ def _acquire_domain(number: int, interface: str) -> None:
                 f"{_MAX_PARTICIPANT_INDEX} processes share a domain",
             ) from error
         _log.warning(
-            "domain %d was configured by other code in this process; its interface is used, not %s",
+            "domain %d was configured by other code in this process; its interface is used, not "
+            "%s, and whoever reaches any network of this machine can take part",
             number,
             interface,
         )
         entity = None
-    _domains[number] = _Domain(interface, entity, 1)
+    else:
+        try:
+            sockets = _shut_out_others(number, interface, before)
+            code = cyclone.dds_domain_set_deafmute(entity._ref, False, False, _INFINITY)
+            if code != _OK:
+                raise DdsSetupError(f"domain {number} stays deaf (CycloneDDS says {code})")
+        except BaseException:
+            cyclone.delete(entity)
+            raise
+    _domains[number] = _Domain(interface, entity, 1, sockets)
+
+
+def _shut_out_others(number: int, interface: str, before: dict[int, int]) -> DomainSockets | None:
+    """Let in what comes by ``interface`` only. The domain is deaf when this is called.
+
+    :returns: None when the user allows all interfaces.
+    :raises DdsSetupError: the system has no such filter.
+    """
+    try:
+        return DomainSockets(number, interface, before)
+    except OSError as error:
+        if ingress.all_interfaces_allowed():
+            _log.warning(
+                "domain %d is open to every network of this machine, not only to %s (%s=1)",
+                number,
+                interface,
+                ingress.ALL_INTERFACES,
+            )
+            return None
+        raise DdsSetupError(
+            f"other networks than {interface} cannot be kept out of domain {number}: "
+            f"{error.strerror or error}",
+            hint=ingress.HINT,
+        ) from error
 
 
 def _why(number: int, interface: str) -> str:
@@ -522,7 +564,7 @@ def _why(number: int, interface: str) -> str:
     with tempfile.TemporaryDirectory(prefix="dexkit-") as folder:
         path = Path(folder) / "dds.log"
         try:
-            config = _config(interface, _trace("warning", str(path)))
+            config = _config(interface, _DEAF + _trace("warning", str(path)))
             cyclone.delete(cyclone.domain.Domain(number, config))
         except cyclone.error:
             pass
@@ -542,7 +584,8 @@ def _release_domain(number: int) -> None:
         return  # other code made participants on it: they would vanish with the domain
     del _domains[number]
     if domain.entity is not None:
-        cyclone.delete(domain.entity)
+        with domain.sockets.ending() if domain.sockets else contextlib.nullcontext():
+            cyclone.delete(domain.entity)
 
 
 class _Handle:
@@ -876,6 +919,7 @@ class DdsNode:
         self._next_token = 1
         with _domains_lock:
             _acquire_domain(domain, interface)
+            self._sockets = _domains[domain].sockets
             try:
                 self._participant = cyclone.domain.DomainParticipant(domain)
                 self._waitset = cyclone.dds_create_waitset(self._participant._ref)
@@ -1065,12 +1109,18 @@ class DdsNode:
         cyclone = _cyclone()
         room = 64
         tokens = (ctypes.c_ssize_t * room)()
+        sockets = self._sockets if self._sockets and not self._sockets.fixed else None
+        patience = _LOOK_EVERY_NS if sockets else _INFINITY
+        look_at = time.monotonic()
         while True:
-            count = cyclone.dds_waitset_wait(self._waitset, tokens, room, _INFINITY)
+            count = cyclone.dds_waitset_wait(self._waitset, tokens, room, patience)
             if not self._alive():
                 return
             if count < 0:
                 raise DdsError(f"waiting for samples failed: {cyclone.error(count)}")
+            if sockets and time.monotonic() >= look_at:
+                look_at = time.monotonic() + _LOOK_EVERY_NS * 1e-9
+                sockets.follow()
             # more than `room` triggered entities trigger again at once
             for token in sorted(set(tokens[: min(count, room)])):
                 with self._dispatching:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
+from dexkit import ingress
 from dexkit.doctor import rtps
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
@@ -122,6 +123,7 @@ class _Window:
         try:
             with contextlib.suppress(OSError):
                 self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+            self._restrict()
             self.socket.bind((self.address, 0))
             self.socket.setblocking(False)
             packed = socket.inet_aton(self.address)
@@ -129,6 +131,9 @@ class _Window:
             # no further than the next network, and to the other processes of this machine
             self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
             self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        except DdsSetupError:
+            self.socket.close()
+            raise
         except OSError as error:
             self.socket.close()
             raise DdsSetupError(f"cannot look at {interface}: {error.strerror}") from error
@@ -145,6 +150,17 @@ class _Window:
             wanted=is_hand_topic,
             on_sample=self.sample,
         )
+
+    def _restrict(self) -> None:
+        """See what comes by this interface only: an address is reached by the others, too."""
+        try:
+            ingress.restrict(self.socket, self.interface)
+        except OSError as error:
+            if not ingress.all_interfaces_allowed():
+                raise DdsSetupError(
+                    f"other networks than {self.interface} cannot be kept out: {error.strerror}",
+                    hint=ingress.HINT,
+                ) from error
 
     def sample(self, writer: EndpointData, sequence: int, data: bytes, now: float) -> None:
         watch = self.watches.get(writer.guid)

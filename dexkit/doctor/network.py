@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import re
 import socket
-import struct
 from pathlib import Path
 
 from dexkit.doctor.observations import DdsSocket, Interface
 from dexkit.doctor.processes import command_line, open_sockets
 from dexkit.errors import DdsSetupError
+from dexkit.ingress import interface_address, interface_flags
 
 __all__ = ["ROBOT_NETWORK", "address_of", "dds_sockets", "interfaces"]
 
 ROBOT_NETWORK = "192.168.123."
 """Where Unitree's robots are (facts/unitree-dex A.6)."""
 
-_SIOCGIFADDR, _SIOCGIFFLAGS = 0x8915, 0x8913
 _IFF_UP, _IFF_LOOPBACK, _IFF_MULTICAST = 0x1, 0x8, 0x1000
 _GROUP = "0100FFEF"  # 239.255.0.1 as /proc/net/igmp writes it on little-endian machines
 
@@ -54,36 +52,18 @@ def interfaces(proc: Path = Path("/proc")) -> tuple[Interface, ...]:
     joined = _joined(proc)
     found = []
     for _, name in socket.if_nameindex():
-        flags = _flags(name)
+        flags, address = interface_flags(name), interface_address(name)
         found.append(
             Interface(
                 name=name,
                 up=bool(flags & _IFF_UP),
                 loopback=bool(flags & _IFF_LOOPBACK),
                 multicast=bool(flags & _IFF_MULTICAST),
-                addresses=_addresses(name),
+                addresses=(address,) if address else (),
                 discovery=name in joined,
             )
         )
     return tuple(found)
-
-
-def _ioctl(request: int, name: str) -> bytes:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as handle:
-        return fcntl.ioctl(handle.fileno(), request, struct.pack("256s", name.encode()[:15]))
-
-
-def _addresses(name: str) -> tuple[str, ...]:
-    with contextlib.suppress(OSError):
-        return (socket.inet_ntoa(_ioctl(_SIOCGIFADDR, name)[20:24]),)
-    return ()
-
-
-def _flags(name: str) -> int:
-    # not from /sys, which may be another network namespace's
-    with contextlib.suppress(OSError):
-        return int(struct.unpack_from("H", _ioctl(_SIOCGIFFLAGS, name), 16)[0])
-    return 0
 
 
 def _joined(proc: Path) -> set[str]:

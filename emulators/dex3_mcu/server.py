@@ -36,6 +36,7 @@ from typing import Any, Protocol
 from usbip import protocol
 from usbip.device import USBDevice
 
+from dexkit import ingress
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
 from dexkit.threads import Worker
@@ -490,11 +491,22 @@ class _Connection:
         self.outbox += _RETURN.pack(command, urb.seqnum, urb.devid, urb.direction, urb.ep, status)
 
 
+def _keep_networks_out(listener: socket.socket) -> None:
+    """With route_localnet set, the kernel takes packets for 127.0.0.1 from networks, too."""
+    try:
+        ingress.restrict(listener, "lo")
+    except OSError as error:
+        # the address alone keeps them out unless the kernel was told otherwise
+        log.warning("packets from networks are not kept from 127.0.0.1: %s", error.strerror)
+
+
 def _listen(host: str, port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        if listener.getsockname()[0].startswith("127."):
+            _keep_networks_out(listener)
         listener.listen(MOST_CONNECTIONS)
     except OSError as error:
         listener.close()

@@ -1,0 +1,514 @@
+"""What comes in by a network that was not chosen is never seen, and who was chosen is obeyed.
+
+A robot has two networks, net0 with a friend and net1 with a stranger, each a network namespace.
+The robot is set up as badly as can be: it routes packets for 127.0.0.1 from net1, believes any
+sender's address, and something on it has joined the group of discovery on net1.
+"""
+
+from __future__ import annotations
+
+import ast
+import ctypes
+import errno
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dexkit import ingress
+from dexkit.cli import main
+from dexkit.dds import DdsNode
+from dexkit.errors import DdsSetupError
+from tests.dds_helpers import free_domain
+from tests.namespaces import Host, Link, connect, network, unavailable
+
+ROOT = Path(__file__).parent.parent
+NET0 = Link("robot", "net0", "10.9.0.1", "friend", "port0", "10.9.0.2")
+NET1 = Link("robot", "net1", "10.9.1.1", "stranger", "port1", "10.9.1.2")
+_LOOPBACK_INDEX = 1  # always, on Linux
+_PIDFD_GETFD = 438  # the number of the system call, on every processor
+
+_ROBOT = """
+for name in all net1; do
+    echo 1 > /proc/sys/net/ipv4/conf/$name/route_localnet
+    echo 0 > /proc/sys/net/ipv4/conf/$name/rp_filter
+    echo 1 > /proc/sys/net/ipv4/conf/$name/accept_local
+done
+ip address add 239.255.0.1/32 dev net1 autojoin
+"""
+_STRANGER = """
+echo 1 > /proc/sys/net/ipv4/conf/port1/route_localnet
+ip address delete 127.0.0.1/8 dev lo
+ip route add 127.0.0.1 via 10.9.1.1 dev port1
+ip route add 10.9.0.0/24 via 10.9.1.1
+ip route add 239.0.0.0/8 dev port1
+"""
+_TOPICS = ("rt/dex1/left/cmd", "rt/unitree_actuator/cmd")
+_WAYS = (
+    "10.9.1.1",
+    "10.9.0.1",  # the address of the other interface
+    "127.0.0.1",
+    "239.255.0.1",  # a group that somebody on the robot has joined there
+    "10.9.1.255",
+    "10.9.1.1@127.0.0.1",  # as if sent by the robot itself
+    "10.9.0.1@10.9.0.2",  # as if sent by the friend
+)
+
+
+@pytest.fixture(scope="module")
+def hosts() -> Iterator[dict[str, Host]]:
+    if why := unavailable():
+        pytest.skip(why)
+    with network(NET0, NET1) as found:
+        found["robot"].sh(_ROBOT)
+        found["stranger"].sh(_STRANGER)
+        yield found
+
+
+class Program:
+    """A ``dexkit`` command, or another of Python, on a host; what it prints is kept."""
+
+    def __init__(
+        self, host: Host, *arguments: object, module: tuple[str, ...] = ("-m", "dexkit")
+    ) -> None:
+        self.arguments = arguments
+        self.process = host.popen(sys.executable, *module, *arguments, stdin=subprocess.DEVNULL)
+        self.lines: list[str] = []
+        self._news = threading.Condition()
+        self._threads = [
+            threading.Thread(target=self._read, args=(stream,), daemon=True)
+            for stream in (self.process.stdout, self.process.stderr)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _read(self, stream: Any) -> None:
+        for line in stream:
+            with self._news:
+                self.lines.append(line.strip())
+                self._news.notify_all()
+
+    def wait_line(self, pattern: str, after: int = 0, timeout: float = 120.0) -> str:
+        """The first line that matches, of those after the first ``after``."""
+
+        def found() -> list[str]:
+            return [line for line in self.lines[after:] if re.search(pattern, line)]
+
+        with self._news:
+            assert self._news.wait_for(found, timeout), (pattern, self.arguments, self.lines)
+            return found()[0]
+
+    def counters(self) -> dict[str, Any]:
+        """Its counters now."""
+        seen = len(self.lines)
+        self.process.send_signal(signal.SIGUSR1)
+        line = self.wait_line(r"counters \{", seen)
+        counted: dict[str, Any] = json.loads(line[line.index("{") :])
+        return counted
+
+    def end(self) -> int:
+        """Ask it to end: its exit code."""
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            return self.process.wait(30)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            raise
+        finally:
+            for thread in self._threads:
+                thread.join(10)
+
+
+@contextmanager
+def programs(host: Host, *commands: tuple[object, ...]) -> Iterator[list[Program]]:
+    """Commands that run at once and are ready, stopped at the end."""
+    with ExitStack() as stack:
+        started = []
+        for command in commands:
+            program = Program(host, *command)
+            started.append(program)
+            stack.callback(lambda p=program: p.process.poll() is None and p.end())
+        for program in started:
+            program.wait_line("^ready: ")
+        yield started
+
+
+def attack(host: Host, *ways: str, domains: Iterable[int], seconds: float = 1.0) -> None:
+    """Attack these domains in all these ways, to the end."""
+    words = [word for domain in domains for word in ("--domain", str(domain))]
+    words += [word for topic in _TOPICS for word in ("--topic", topic)]
+    words += [word for way in ways for word in ("--to", way)]
+    out = host.run(sys.executable, "-m", "tests.lan_attack", *words, "--seconds", seconds)
+    assert int(out.split()[-1]) > 100, out
+
+
+def command(host: Host, domain: int, interface: str, q: float) -> None:
+    """A genuine client on this host: fails unless the hand obeys it."""
+    client = ("-m", "tests.lan_client", "--domain", domain, "--interface", interface, "--q", q)
+    host.run(sys.executable, *client)
+
+
+def received(program: Program) -> int:
+    counters = program.counters()
+    assert counters["received"] >= counters["hands"]["left"]["accepted"]
+    return int(counters["received"])
+
+
+GRIPPER = ("serve", "sim-dex1", "--side", "left")
+
+
+def test_a_stranger_moves_nothing_and_users_are_obeyed(hosts: dict[str, Host]) -> None:
+    robot, friend, stranger = hosts["robot"], hosts["friend"], hosts["stranger"]
+    on_lo = (*GRIPPER, "--domain", 104)
+    on_net0 = (*GRIPPER, "--domain", 105, "--interface", "net0")
+    with programs(robot, on_lo, on_net0) as (local, named):
+        attack(stranger, *_WAYS, domains=(104, 105))
+        assert (received(local), received(named)) == (0, 0)
+        # the same packets do move a hand where they are let in: DDS has no authentication
+        attack(friend, "10.9.0.1", domains=(104, 105), seconds=0.5)
+        assert received(named) > 0
+        assert received(local) == 0
+        command(robot, 104, "lo", 2.0)
+        command(friend, 105, "port0", 3.0)
+        _hears_this_machine_only("service", local)
+        assert (local.end(), named.end()) == (0, 0)
+
+
+_ECHO = """
+import socket
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+    sock.bind(("127.0.0.1", 9000))
+    sock.settimeout(20)
+    print("ready", flush=True)
+    print(sock.recvfrom(100)[1][0])
+"""
+
+
+def test_the_robot_is_set_up_badly_enough(hosts: dict[str, Host]) -> None:
+    """A socket on 127.0.0.1 without a filter hears the stranger: the tests here mean something."""
+    with hosts["robot"].popen(sys.executable, "-c", _ECHO) as echo:
+        assert echo.stdout is not None
+        assert echo.stdout.readline() == "ready\n"
+        hosts["stranger"].run(
+            sys.executable,
+            "-c",
+            "import socket; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); "
+            "s.sendto(b'x', ('127.0.0.1', 9000))",
+        )
+        assert echo.stdout.readline().startswith("10.9.1.2")
+
+
+_NODES = """
+import sys
+from dexkit.dds import DdsNode
+CMDS = "unitree_go::msg::dds_::MotorCmds_"
+strangers = 0
+for _ in range(6):
+    with DdsNode(106) as node:
+        reader, writer = node.reader("rt/dex1/left/cmd", CMDS), node.writer("rt/x", CMDS)
+        with DdsNode(106) as other:  # discovery has come round when they have met
+            assert other.reader("rt/x", CMDS).wait_matched(20)
+        strangers += sum(not p.own and not p.pid for p in node.discovery.participants())
+        strangers += len(reader.take())
+print(strangers)
+"""
+
+
+def test_nothing_gets_in_while_a_node_starts(hosts: dict[str, Host]) -> None:
+    """CycloneDDS's sockets are open before they have their filter."""
+    flood = ("--domain", "106", "--to", "10.9.1.1", "--seconds", "60", "--pause", "0")
+    with hosts["stranger"].popen(sys.executable, "-m", "tests.lan_attack", *flood) as flooding:
+        try:
+            assert flooding.stdout is not None
+            assert flooding.stdout.readline() == "attacking\n"
+            assert hosts["robot"].run(sys.executable, "-c", _NODES) == "0\n"
+        finally:
+            flooding.terminate()
+
+
+def test_an_interface_that_comes_back_is_heard_again(hosts: dict[str, Host]) -> None:
+    robot, friend = hosts["robot"], hosts["friend"]
+    with programs(robot, (*GRIPPER, "--domain", 107, "--interface", "net0")) as (service,):
+        command(friend, 107, "port0", 3.0)
+        robot.sh("ip link delete net0")
+        service.wait_line("net0 is gone")
+        connect(hosts, NET0)  # with another index
+        service.wait_line("net0 is back")
+        command(friend, 107, "port0", 1.0)
+        index = int(robot.sh("ip -o link show net0").split(":")[0])
+        assert _any_address(service, index) == {True}
+        robot.sh("ip address flush dev net0; ip address add 10.9.0.9/24 dev net0")
+        service.wait_line("address of net0 was 10.9.0.1 and is 10.9.0.9")
+        robot.sh("ip link delete net0")
+        assert service.end() == 0
+    connect(hosts, NET0)
+
+
+def _sockets(pid: int) -> dict[str, int]:
+    """Inodes and file descriptors of a process's sockets."""
+    found = {}
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = os.readlink(entry)
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            found[target[8:-1]] = int(entry.name)
+    return found
+
+
+def _family(pid: int) -> list[int]:
+    """A process and those that it has started."""
+    found = [pid]
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in (task / "children").read_text().split():
+            found += _family(int(child))
+    return found
+
+
+def _filter_of(sock: socket.socket) -> bytes:
+    code = ctypes.create_string_buffer(4096 * 8)
+    count = ctypes.c_uint32(4096)
+    libc = ctypes.CDLL(None, use_errno=True)
+    # SO_GET_FILTER; the length is in instructions
+    result = libc.getsockopt(sock.fileno(), socket.SOL_SOCKET, 26, code, ctypes.byref(count))
+    return code.raw[: count.value * 8] if result == 0 else b""
+
+
+def _filter_in(pid: int, descriptor: int) -> bytes:
+    """The filter of a socket of another process."""
+    pidfd = os.pidfd_open(pid)
+    try:
+        copy = ctypes.CDLL(None, use_errno=True).syscall(_PIDFD_GETFD, pidfd, descriptor, 0)
+    finally:
+        os.close(pidfd)
+    if copy < 0:
+        pytest.skip(f"sockets of a child cannot be looked at: {os.strerror(ctypes.get_errno())}")
+    with closing(socket.socket(fileno=copy)) as sock:
+        return _filter_of(sock)
+
+
+def _listening(program: Program, indices: Sequence[int]) -> list[tuple[str, str, bool]]:
+    """What a program takes packets on: protocol, local address, and if only by these interfaces."""
+    wanted = ingress.program(indices)
+    found = []
+    for pid in _family(program.process.pid):
+        own = _sockets(pid)
+        for protocol in ("udp", "udp6", "tcp", "tcp6"):
+            for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
+                fields = line.split()
+                if fields[9] in own and (protocol[:3] == "udp" or fields[3] == "0A"):
+                    filtered = _filter_in(pid, own[fields[9]]) == wanted
+                    found.append((protocol, fields[1].split(":")[0], filtered))
+    return found
+
+
+_ANY, _LOCAL = "00000000", "0100007F"  # addresses as /proc/net has them on little-endian machines
+
+
+def _any_address(program: Program, index: int) -> set[bool]:
+    """Whether what is bound to all addresses lets in loopback and that interface alone."""
+    seen = _listening(program, [_LOOPBACK_INDEX, index])
+    return {filtered for _, address, filtered in seen if address == _ANY}
+
+
+def _hears_this_machine_only(name: str, program: Program) -> None:
+    # some listen before they say anything, the doctor only while it looks
+    deadline = time.monotonic() + 60
+    while not (seen := _listening(program, [_LOOPBACK_INDEX])):
+        assert time.monotonic() < deadline, (name, program.lines)
+        time.sleep(0.02)
+    for protocol, address, filtered in seen:
+        if protocol == "udp" and address == _ANY:
+            assert filtered, (name, seen)
+        else:  # the doctor's, what CycloneDDS sends from, the USB/IP server's
+            assert address == _LOCAL, (name, seen)
+    assert any(filtered for _, _, filtered in seen), (name, seen)
+
+
+def test_every_program_hears_this_machine_only(hosts: dict[str, Host], tmp_path: Path) -> None:
+    """Of those that listen; the service is above."""
+    recording = tmp_path / "a.mcap"
+    ends = ("--from", "unitree_actuator", "--to", "unitree_go")
+    commands: dict[str, tuple[object, ...]] = {
+        "bridge": ("bridge", *ends, "--domain", 111, "--to-domain", 112),
+        "body": ("emulate", "h1", "--domain", 113),
+        "recorder": ("record", recording, "--domain", 114),
+        "USB device": ("emulate", "dex3-usb", "--port", 0),
+        "doctor": ("doctor", "--watch", "--domain", 115),
+    }
+    with ExitStack() as stack:
+        started = {name: Program(hosts["robot"], *words) for name, words in commands.items()}
+        for program in started.values():
+            stack.callback(lambda p=program: p.process.poll() is None and p.end())
+        for name, program in started.items():
+            if name != "doctor":
+                program.wait_line("^ready: ")
+        attack(hosts["stranger"], *_WAYS, domains=range(111, 116), seconds=0.3)
+        for name, program in started.items():
+            _hears_this_machine_only(name, program)
+        bridge = started["bridge"]
+        assert bridge.end() == 0
+        counters = bridge.wait_line("counters {")
+        assert '"received": 0' in counters
+        assert not re.search('"received": [1-9]', counters), counters
+        assert "the two fight" not in " ".join(bridge.lines)
+        # nothing to record, and nobody seen either
+        assert started["recorder"].end() == 1
+        assert "no other participant was seen" in " ".join(started["recorder"].lines)
+        assert not recording.exists()
+
+
+@pytest.mark.soak
+def test_clients_and_whole_robots_hear_this_machine_only(hosts: dict[str, Host]) -> None:
+    sample = ROOT / "traces" / "samples" / "dex1_pick_place.mcap"
+    kit = ("-m", "pytest", "conformance", "--backend", "sim-dex1", "-q", "-p", "no:cacheprovider")
+    dexkit = ("-m", "dexkit")
+    with ExitStack() as stack:
+        for name, words in {
+            "replay": (*dexkit, "replay", sample, "--domain", 116, "--wait", 60),
+            "teleoperation": (*dexkit, "teleop", "full-stroke", "--domain", 117),
+            "whole robot": (*dexkit, "emulate", "all", "--domain", 118),
+            "conformance": (*kit, "--domain", 119),
+        }.items():
+            program = Program(hosts["robot"], *words, module=())
+            stack.callback(lambda p=program: p.process.poll() is None and p.end())
+            if name == "whole robot":
+                program.wait_line("^ready: ")
+            _hears_this_machine_only(name, program)
+
+
+def test_the_usb_server_is_not_reached_from_a_network(hosts: dict[str, Host]) -> None:
+    script = """
+import socket, sys
+for host in "127.0.0.1", "10.9.1.1":
+    try:
+        socket.create_connection((host, int(sys.argv[1])), timeout=float(sys.argv[2])).close()
+        print("reached", host)
+    except OSError as error:
+        print("not", host)
+"""
+    with programs(hosts["robot"], ("emulate", "dex3-usb", "--port", 0)) as (server,):
+        port = server.wait_line("ready: ").split()[1].rsplit(":", 1)[1]
+        robot = hosts["robot"].run(sys.executable, "-c", script, port, 20)
+        stranger = hosts["stranger"].run(sys.executable, "-c", script, port, 0.3)
+    assert robot == "reached 127.0.0.1\nnot 10.9.1.1\n"
+    assert stranger == "not 127.0.0.1\nnot 10.9.1.1\n"
+
+
+# --- without networks
+
+
+def test_the_filter_goes_by_the_interface_alone() -> None:
+    with (
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender,
+    ):
+        sock.bind(("127.0.0.1", 0))
+        sock.setblocking(False)
+        for indices, expected in (
+            ([_LOOPBACK_INDEX], True),
+            ([_LOOPBACK_INDEX + 1], False),
+            ([7, _LOOPBACK_INDEX, 9], True),
+            ([7, 8, 9], False),
+            ([], False),
+            (ingress.accepted_indices("lo"), True),
+            (ingress.accepted_indices("nowhere0"), True),  # this machine is always heard
+        ):
+            ingress.accept_only(sock, indices)
+            assert _filter_of(sock) == ingress.program(indices)
+            sender.sendto(b"x", sock.getsockname())
+            try:
+                heard = sock.recv(10) == b"x"
+            except BlockingIOError:
+                heard = False
+            assert heard == expected, indices
+
+
+def _refuse(sock: socket.socket, indices: object) -> None:
+    raise OSError(errno.ENOPROTOOPT, "Protocol not available")
+
+
+@pytest.mark.parametrize("arguments", [("record", "x.mcap"), ("doctor",)])
+def test_without_a_filter_nothing_starts(
+    arguments: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ingress, "accept_only", _refuse)
+    monkeypatch.delenv(ingress.ALL_INTERFACES, raising=False)
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--domain", str(free_domain())])
+    assert ended.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "other networks than lo cannot be kept out" in said
+    assert ingress.ALL_INTERFACES in said
+
+
+def test_without_free_file_descriptors_nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even with some of the sockets found, and the others open to all."""
+    calls = iter(range(100))
+    duplicate = os.dup
+
+    def full(descriptor: int) -> int:
+        if next(calls) >= 1:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return duplicate(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "dup", full)
+        with pytest.raises(DdsSetupError, match="Too many open files"):
+            DdsNode(free_domain())
+    DdsNode(free_domain()).close()
+
+
+def test_a_user_may_go_on_without_a_filter_and_is_warned(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(ingress, "accept_only", _refuse)
+    monkeypatch.setenv(ingress.ALL_INTERFACES, "1")
+    domain = free_domain()
+    with DdsNode(domain) as node, DdsNode(domain) as other:
+        reader = node.reader("rt/x", "unitree_go::msg::dds_::MotorCmds_")
+        assert other.writer("rt/x", "unitree_go::msg::dds_::MotorCmds_").wait_matched(20)
+        assert reader.matched == 1
+    assert f"domain {domain} is open to every network of this machine" in caplog.text
+
+
+_OPENING = {"bind", "listen", "create_server", "start_server", "Domain", "DomainParticipant"}
+_SERVERS = re.compile(r"(TCP|UDP|HTTP)Server$")
+# where something listens, each tested above
+_KNOWN = {
+    "dexkit/dds.py": {"Domain", "DomainParticipant"},
+    "dexkit/doctor/dds.py": {"bind"},
+    "emulators/dex3_mcu/server.py": {"bind", "listen"},
+}
+
+
+def test_whatever_listens_is_known_here() -> None:
+    """Something new that listens belongs into this file, with a filter or an address."""
+    found: dict[str, set[str]] = {}
+    for folder in ("dexkit", "drivers", "emulators", "conformance", "traces"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            name = str(path.relative_to(ROOT))
+            if path.parts[len(ROOT.parts) + 1] in ("drivers", "emulators", "conformance", "traces"):
+                continue  # the links of the package
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Call):
+                    called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                    if called in _OPENING or _SERVERS.search(called):
+                        found.setdefault(name, set()).add(called)
+    assert found == _KNOWN
