@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import dds_options, stop_on_signals
+from dexkit.cli.common import Number, dds_options, stop_on_signals
 from dexkit.errors import TraceError, UsageError
+from dexkit.untrusted import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
@@ -33,7 +34,7 @@ __all__ = ["command"]
 @dds_options(default_domain=1)
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="Stop after so many seconds. Default: record until Ctrl-C.",
 )
@@ -88,9 +89,12 @@ def command(
             out.unlink()
             _nothing(node, recording, time.monotonic() - started)
     for topic, type_name in recording.unknown.items():
-        click.echo(f"warning: {topic} was not recorded: unknown type {type_name}", err=True)
+        text = f"warning: {topic} was not recorded: unknown type {type_name}"
+        click.echo(one_line(text, REMARK), err=True)
     dropped = recorder.dropped
-    per_topic = ", ".join(f"{topic} {count}" for topic, count in sorted(recorder.offered.items()))
+    per_topic = ", ".join(
+        f"{one_line(topic)} {count}" for topic, count in sorted(recorder.offered.items())
+    )
     click.echo(f"{out}: {recorder.written} messages ({per_topic}), {dropped} dropped")
     return 0
 
@@ -140,7 +144,9 @@ class _Status:
         self._before, self._at, self._last_line = offered, now, now
         text = f"{now - self._started:6.1f} s  {sum(offered.values()):,} messages"
         text += f"  {self._recorder.dropped} dropped"
-        text += "".join(f"  {t.removeprefix('rt/')} {hz:.0f} Hz" for t, hz in rates.items())
+        text += "".join(
+            f"  {one_line(t.removeprefix('rt/'))} {hz:.0f} Hz" for t, hz in rates.items()
+        )
         if not offered:
             text += f"  waiting for {', '.join(recording.subscribed) or 'topics'}"
         if self._tty:

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.cli.common import Number, StopRequest, dds_options, stop_on_signals
 from dexkit.errors import DdsError, TopicConflict, TraceUnsupported
+from dexkit.untrusted import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
@@ -35,7 +36,7 @@ _LINGER = 0.1
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
     "--speed",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(1e-3, 1e3),
     default=1.0,
     show_default=True,
     help="2 plays in half the time.",
@@ -51,14 +52,14 @@ _LINGER = 0.1
 )
 @click.option(
     "--max-gap",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="Shorten longer pauses to this. Default: keep them.",
 )
 @dds_options(default_domain=1)
 @click.option(
     "--wait",
-    type=click.FloatRange(min=0),
+    type=Number(min=0),
     default=10.0,
     show_default=True,
     metavar="S",
@@ -91,12 +92,12 @@ def command(
 
     trace = open_trace(file)
     for warning in trace.warnings:
-        click.echo(f"warning: {warning}", err=True)
+        click.echo(one_line(f"warning: {warning}", REMARK), err=True)
     player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
     _check_types(trace, player)
     click.echo(
-        f"{file}: {len(player)} messages of {', '.join(player.topics)}, {player.duration:.1f} s"
-        + (", looped" if loop else "")
+        f"{file}: {len(player)} messages of {', '.join(map(one_line, player.topics))}, "
+        f"{player.duration:.1f} s" + (", looped" if loop else "")
     )
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
         if not force:
@@ -164,7 +165,8 @@ def _wait_for_readers(
     end = time.monotonic() + patience
     missing = [t for t, w in writers.items() if not w.matched]
     if missing:
-        click.echo(f"waiting for somebody to subscribe {', '.join(missing)} ...", err=True)
+        names = ", ".join(map(one_line, missing))
+        click.echo(f"waiting for somebody to subscribe {names} ...", err=True)
     while missing and not stop and time.monotonic() < end:
         writers[missing[0]].wait_matched(timeout=0.1)
         missing = [t for t, w in writers.items() if not w.matched]
