@@ -24,6 +24,7 @@ from typing import Any
 
 import platformdirs
 
+from dexkit import files
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.errors import UsageError
 from dexkit.wire import mx64
@@ -75,20 +76,9 @@ class Store:
         self.path = path if path is not None else default_path()
 
     def _load(self) -> dict[str, Any]:
-        try:
-            text = self.path.read_text(encoding="utf-8")
-        except FileNotFoundError:
+        if not os.path.lexists(self.path):
             return {}
-        except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"cannot read {self.path}: {error}") from error
-        try:
-            # NaN and Infinity are no JSON, and no calibration either
-            content = json.loads(text, parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
-            raise UsageError(
-                f"{self.path} is not valid JSON: {error}",
-                hint="correct it, or remove it and calibrate again",
-            ) from error
+        content = files.read_json(self.path, hint="correct it, or remove it and calibrate again")
         if not isinstance(content, dict):
             raise UsageError(f"{self.path} must hold a JSON object")
         return content
@@ -189,7 +179,3 @@ class Store:
                     raise
         except OSError as error:
             raise UsageError(f"cannot write {self.path}: {error}") from error
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number")
