@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import StopRequest, dds_options, log_to_stderr, stop_on_signals
+from dexkit.cli.common import Number, StopRequest, dds_options, log_to_stderr, stop_on_signals
 from dexkit.errors import DexkitError, TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, dialect
@@ -54,7 +54,7 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
 )
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="End after so many seconds.  [default: at Ctrl-C]",
 )

@@ -24,6 +24,7 @@ from usbip.device import USBDevice
 
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
+from dexkit.untrusted import one_line
 
 __all__ = ["Plug", "Server"]
 
@@ -394,9 +395,12 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         listener.bind((host, port))
         listener.listen(16)
-    except OSError as error:
+    except (OSError, TypeError, ValueError) as error:  # the latter two: no host has such a name
         listener.close()
         hint = "--host takes an address of this machine"
+        if not isinstance(error, OSError):
+            what = f"cannot serve USB/IP on {one_line(host, 80)!r}: no such host"
+            raise EmulatorError(what, hint=hint) from error
         if error.errno == errno.EADDRINUSE:
             hint = "another USB/IP server has it; choose another with --port, or --port 0"
         elif error.errno == errno.EACCES:
