@@ -102,6 +102,13 @@ _TYPES: Mapping[str, type] = {
     "repeat": int,
 }
 """Types of values that are not texts."""
+_TYPE_NAMES: Mapping[type, str] = {
+    str: "a text",
+    list: "a list of texts",
+    dict: "a table",
+    bool: "true or false",
+    int: "a whole number",
+}
 
 
 class Level(str, Enum):
@@ -248,8 +255,8 @@ def _look_at_types(entry: Any, origin: str) -> None:
         kind = _TYPES.get(key, str)
         texts = kind is not list or (isinstance(value, list) and all(type(v) is str for v in value))
         if type(value) is not kind or not texts:
-            name = {str: "text", list: "list of texts", dict: "table"}.get(kind, kind.__name__)
-            raise UsageError(f"{origin}: {entry.get('id', 'a requirement')}: {key} is a {name}")
+            name = _TYPE_NAMES[kind]
+            raise UsageError(f"{origin}: {entry.get('id', 'a requirement')}: {key} is {name}")
 
 
 def _filled(text: str, tolerances: Mapping[str, float], where: str) -> str:
