@@ -122,13 +122,13 @@ def test_what_is_valid_renders_and_the_rest_is_refused_by_its_place(tmp_path: Pa
     rng = random.Random(3)
     for place in places:
         # each kind at each place costs too long here; the soak does it
-        for value in rng.sample(values, 2):
+        for value in rng.sample(values, 1):
             path.write_text(json.dumps(hostile.replaced(good, place, value)))
             if not refused(read_json, path, str(place)):
                 rendered += 1
                 hostile.render_all(path, tmp_path)
     assert len(places) > 70
-    assert rendered > 20
+    assert rendered > 8
 
 
 @pytest.mark.soak

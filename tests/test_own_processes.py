@@ -45,8 +45,6 @@ def hostile_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_nothing_in_the_working_folder_is_imported(hostile_folder: Path) -> None:
     commands = (
-        ("--version",),
-        ("backends",),
         ("check", "--list", "--dialect", "dex3"),
         ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.2"),
     )
