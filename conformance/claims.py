@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from dexkit import files
+from dexkit import documents
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement
 from dexkit.errors import UsageError
 from dexkit.models import model
@@ -52,7 +52,7 @@ class Claims:
         :raises UsageError: it is no TOML, or holds what is not known: a misspelt claim must not
             silently be none.
         """
-        return cls._of(files.parse_toml(text, origin), origin)
+        return cls._of(documents.parse_toml(text, origin), origin)
 
     @classmethod
     def _of(cls, document: Mapping[str, Any], origin: str) -> Claims:
@@ -90,7 +90,7 @@ class Claims:
         """
         if path is None:
             return cls()
-        claims = cls._of(files.read_toml(path), path.name)
+        claims = cls._of(documents.read_toml(path), path.name)
         about = claims.hand.get("model")
         if about and model_name and about != model_name:
             raise UsageError(

@@ -13,8 +13,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
-from dexkit.files import parse_json
 from dexkit.hand import Floats, Side
 
 __all__ = [

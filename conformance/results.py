@@ -25,7 +25,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dexkit import __version__, files
+from dexkit import __version__, documents
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.requirements.sources import told
 from dexkit.errors import UsageError
@@ -320,7 +320,7 @@ class RunResult:
 
     def write_json(self, path: Path) -> None:
         """Write the result file."""
-        files.write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
+        documents.write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
 
 
 def _result_dict(result: Result) -> dict[str, Any]:
@@ -348,7 +348,7 @@ def read_json(path: Path) -> RunResult:
     :raises UsageError: it is not one, of a version that this dexkit does not know, or something
         in it is not as ``result.schema.json`` says: the error names the place.
     """
-    data = files.read_json(path)
+    data = documents.read_json(path)
     about = data if isinstance(data, dict) else {}
     if about.get("format") != FORMAT:
         raise UsageError(

@@ -29,8 +29,8 @@ from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording, sides_of
+from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.files import write_file
 from dexkit.hand import Side
 from dexkit.limits import room_for_files
 from dexkit.models import DEX1_1, Dialect, dialect, model

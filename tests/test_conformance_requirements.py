@@ -16,8 +16,8 @@ from dexkit.conformance.selection import quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.conformance.stimuli.script import default_objects
+from dexkit.documents import parse_toml
 from dexkit.errors import DexkitError, UsageError
-from dexkit.files import parse_toml
 from dexkit.hand import Side
 from dexkit.models import model
 from tests import hostile

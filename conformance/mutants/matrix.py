@@ -21,7 +21,7 @@ from dexkit.conformance.mutants import body, shared
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.conformance.usb import mutants as usb
 from dexkit.console import Console
-from dexkit.files import write_file
+from dexkit.documents import write_file
 from dexkit.models import DEX1_1, DEX3_1
 
 __all__ = ["Outcome", "Score", "Trial", "chosen", "essential", "trials", "try_one"]

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.bodies import BodyModel, body
+from dexkit.documents import parse_toml, read_toml
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.files import parse_toml, read_toml
 from dexkit.models import DIALECTS, HandModel, model
 
 __all__ = [

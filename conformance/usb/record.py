@@ -16,8 +16,8 @@ from typing import Any
 
 from dexkit.conformance.phases import Beats, Stall, stalls_of, time_of
 from dexkit.conformance.usb import RECORD
+from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
-from dexkit.files import parse_json
 from dexkit.hand import Side
 
 __all__ = [

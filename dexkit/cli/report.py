@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.documents import write_file
 from dexkit.errors import UsageError
-from dexkit.files import write_file
 
 if TYPE_CHECKING:
     from dexkit.conformance.results import RunResult

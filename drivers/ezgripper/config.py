@@ -24,7 +24,7 @@ from typing import Any
 
 import platformdirs
 
-from dexkit import files
+from dexkit import documents
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.errors import UsageError
 from dexkit.wire import mx64
@@ -78,7 +78,9 @@ class Store:
     def _load(self) -> dict[str, Any]:
         if not os.path.lexists(self.path):
             return {}
-        content = files.read_json(self.path, hint="correct it, or remove it and calibrate again")
+        content = documents.read_json(
+            self.path, hint="correct it, or remove it and calibrate again"
+        )
         if not isinstance(content, dict):
             raise UsageError(f"{self.path} must hold a JSON object")
         return content

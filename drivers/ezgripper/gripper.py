@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from dexkit import files
+from dexkit import documents
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.drivers.ezgripper import calibration, settings
@@ -548,7 +548,7 @@ def _or_auto(text: str) -> int | None:
 def _table(text: str) -> ForceTable:
     if text == "default":
         return DEFAULT_FORCE_TABLE
-    content = files.read_json(Path(text))
+    content = documents.read_json(Path(text))
     if not isinstance(content, dict):
         raise ValueError("the file must hold a JSON object")
     return ForceTable.from_mapping(content)

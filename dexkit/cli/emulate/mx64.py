@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from dexkit import files
+from dexkit import documents
 from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import read_faults
 from dexkit.clock import RealClock
@@ -176,7 +176,7 @@ class _EepromFile:
             )
         if os.path.lexists(path):
             hint = "it is to hold the servos' EEPROM; remove it to start with factory values"
-            data = files.read_json(path, error=EmulatorError, hint=hint)
+            data = documents.read_json(path, error=EmulatorError, hint=hint)
             try:
                 if data["device"] != "mx64":
                     raise ValueError(f"it is for a {data['device']}")
@@ -193,4 +193,4 @@ class _EepromFile:
     def save(self, contents: list[bytes]) -> None:
         """Replace the file atomically."""
         text = json.dumps({"device": "mx64", "eeprom": [c.hex() for c in contents]}, indent=1)
-        files.write_file(self.path, text + "\n")
+        documents.write_file(self.path, text + "\n")

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from dexkit import files
+from dexkit import documents
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
 from dexkit.conformance.claims import Claims
@@ -28,7 +28,7 @@ from tests.conformance_helpers import short_run
 from tests.report_helpers import result_of_every_kind
 
 JSON = (
-    files.read_json,
+    documents.read_json,
     read_json,
     _EepromFile,
     lambda path: Store(path).read("key"),
@@ -36,7 +36,7 @@ JSON = (
         BackendOptions(Side.LEFT, "/dev/null", {"force_table": str(path)})
     ),
 )
-TOML = (files.read_toml, lambda path: Claims.load(path, None))
+TOML = (documents.read_toml, lambda path: Claims.load(path, None))
 
 
 def refused(read: Callable[[Path], Any], path: Path, what: str) -> bool:
@@ -72,25 +72,25 @@ def test_what_is_no_ordinary_file_is_refused_at_once(tmp_path: Path) -> None:
             assert refused(read, tmp_path / name, name), name
     for name in ("/dev/zero", "/dev/full", "/proc/self/mem", "/proc/self", "a\0b", "x" * 5000):
         with pytest.raises(UsageError):
-            files.read_text(Path(name))
+            documents.read_text(Path(name))
     with pytest.raises(UsageError, match="No such file"):
-        files.read_text(tmp_path / "none")
+        documents.read_text(tmp_path / "none")
 
 
 def test_a_file_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "large"
     with path.open("wb") as file:
-        file.truncate(files.LARGEST + 1)
+        file.truncate(documents.LARGEST + 1)
     with pytest.raises(UsageError, match="larger than 64 MB"):
-        files.read_text(path)
+        documents.read_text(path)
 
 
 def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b'\xef\xbb\xbf{"a": 1}')
-    assert files.read_json(path) == {"a": 1}
+    assert documents.read_json(path) == {"a": 1}
     path.write_bytes(b"\xef\xbb\xbfa = 1")
-    assert files.read_toml(path) == {"a": 1}
+    assert documents.read_toml(path) == {"a": 1}
 
 
 def test_a_key_twice_and_a_number_that_is_none_are_refused() -> None:
@@ -102,11 +102,11 @@ def test_a_key_twice_and_a_number_that_is_none_are_refused() -> None:
         ("[" * 33 + "]" * 33, "nested more than 32 levels"),
     ):
         with pytest.raises(UsageError, match=why):
-            files.parse_json(text, "it")
-    files.parse_json("[" * 32 + "]" * 32, "it")
+            documents.parse_json(text, "it")
+    documents.parse_json("[" * 32 + "]" * 32, "it")
     for text in ("a = nan", "a = 1e400", f"a = {'9' * 40}", f"a = 0x{'f' * 40}"):
         with pytest.raises(UsageError, match="it is not valid TOML"):
-            files.parse_toml(text, "it")
+            documents.parse_toml(text, "it")
 
 
 def test_what_is_valid_renders_and_the_rest_is_refused_by_its_place(tmp_path: Path) -> None:
@@ -191,14 +191,14 @@ def left_behind(folder: Path) -> list[str]:
 def test_a_file_is_written_with_the_usual_rights_and_keeps_those_it_has(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
-        files.write_file(tmp_path / "new", "手\n")
+        documents.write_file(tmp_path / "new", "手\n")
     finally:
         os.umask(before)
     assert (tmp_path / "new").read_text(encoding="utf-8") == "手\n"
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o640
     (tmp_path / "new").chmod(0o604)
     (tmp_path / "link").symlink_to("new")
-    files.write_file(tmp_path / "link", b"other")
+    documents.write_file(tmp_path / "link", b"other")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "new").read_bytes() == b"other"
     assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o604
@@ -218,7 +218,7 @@ def test_what_cannot_be_written_leaves_what_was_there(
         patch.setattr(os, where, full)
         for target in (path, tmp_path / "new"):
             with pytest.raises(OutputError, match=f"cannot write .*{target.name}: No space left"):
-                files.write_file(target, "bad" * 1000)
+                documents.write_file(target, "bad" * 1000)
     assert path.read_text() == "good"
     assert [p.name for p in tmp_path.iterdir()] == ["report"]
 
@@ -234,7 +234,7 @@ def test_places_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
         (str(tmp_path / ("x" * 300)), "too long"),
     ):
         with pytest.raises(OutputError, match=why) as caught:
-            files.write_file(Path(name), "text")
+            documents.write_file(Path(name), "text")
         assert caught.value.exit_code == 2
     assert not left_behind(tmp_path)
-    files.write_file(Path("/dev/null"), "text")
+    documents.write_file(Path("/dev/null"), "text")
