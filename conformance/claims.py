@@ -19,19 +19,15 @@ as not claimed. Without a file every unit is judged at the catalogue's level.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+from dexkit import documents
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement
 from dexkit.errors import UsageError
 from dexkit.models import model
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 __all__ = ["Claims"]
 
@@ -56,10 +52,10 @@ class Claims:
         :raises UsageError: it is no TOML, or holds what is not known: a misspelt claim must not
             silently be none.
         """
-        try:
-            document = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise UsageError(f"{origin}: {error}") from error
+        return cls._of(documents.parse_toml(text, origin), origin)
+
+    @classmethod
+    def _of(cls, document: Mapping[str, Any], origin: str) -> Claims:
         hand, units = document.get("hand", {}), document.get("claims", {})
         unknown = sorted(set(document) - {"hand", "claims"})
         if unknown or not isinstance(hand, dict) or not isinstance(units, dict):
@@ -94,10 +90,7 @@ class Claims:
         """
         if path is None:
             return cls()
-        try:
-            claims = cls.parse(path.read_text(encoding="utf-8"), path.name)
-        except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"cannot read {path}: {error}") from error
+        claims = cls._of(documents.read_toml(path), path.name)
         about = claims.hand.get("model")
         if about and model_name and about != model_name:
             raise UsageError(

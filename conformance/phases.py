@@ -13,10 +13,24 @@ from typing import Any, cast
 
 import numpy as np
 
+from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Floats, Side
 
-__all__ = ["BODY", "IDLE", "RECORD", "Beats", "Lost", "Phase", "Stall", "Stimulus"]
+__all__ = [
+    "BODY",
+    "IDLE",
+    "RECORD",
+    "Beats",
+    "Lost",
+    "Phase",
+    "Stall",
+    "Stimulus",
+    "stalls_of",
+    "time_of",
+]
+
+_LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
@@ -83,6 +97,18 @@ class Beats:
     begin_ns: int = 0
     t_us: list[int] = field(default_factory=list)
     late_us: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, text: str) -> Beats:
+        """Read the record's content.
+
+        :raises TypeError, ValueError, TraceUnsupported: it is damaged.
+        """
+        found = cls(**_json(text))
+        t, late = [time_of(t) for t in found.t_us], [time_of(t) for t in found.late_us]
+        if len(t) != len(late):
+            raise ValueError("a heartbeat without a lateness")
+        return cls(time_of(found.begin_ns), t, late)
 
     def lateness(self, begin_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Median and 99th percentile of it in [begin, end], seconds; None if it is not known."""
@@ -161,25 +187,28 @@ class Stimulus:
                 hint="judge it with the dexkit that recorded it, or a newer one",
             )
         try:
-            phases: list[dict[str, Any]] = json.loads(record["phases"])
+            phases: list[dict[str, Any]] = _json(record["phases"])
             return cls(
                 phases=[
                     Phase(
                         name=p["name"],
                         sides=tuple(_side(s) for s in p["sides"]),
-                        begin_ns=int(p["begin_ns"]),
-                        end_ns=int(p["end_ns"]),
+                        begin_ns=time_of(p["begin_ns"]),
+                        end_ns=time_of(p["end_ns"]),
                         targets={_side(s): _joints(q) for s, q in p["targets"].items()},
                         params=dict(p["params"]),
                         observed=dict(p["observed"]),
                     )
                     for p in phases
                 ],
-                objects={_side(s): q for s, q in json.loads(record["objects"]).items()},
-                stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])],
-                beats=Beats(**json.loads(record.get("beats", "{}"))),
+                objects={
+                    _side(s): None if q is None else float(q)
+                    for s, q in _json(record["objects"]).items()
+                },
+                stalls=stalls_of(record["stalls"]),
+                beats=Beats.of(record.get("beats", "{}")),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
 
 
@@ -192,3 +221,23 @@ def _joints(value: Any) -> dict[int, float]:
     if isinstance(value, dict):
         return {int(i): float(q) for i, q in value.items()}
     return {0: float(value)}
+
+
+def stalls_of(text: str) -> list[Stall]:
+    """Read the stalls of a record.
+
+    :raises TypeError, ValueError, TraceUnsupported: it is damaged.
+    """
+    return [Stall(time_of(a), time_of(b)) for a, b in _json(text)]
+
+
+def time_of(value: Any) -> int:
+    """A time or a duration, nanoseconds or microseconds."""
+    if isinstance(value, bool) or not isinstance(value, int) or not -_LATEST <= value <= _LATEST:
+        raise ValueError(f"{value!r} is not a time")
+    return value
+
+
+def _json(text: str) -> Any:
+    # what was measured may be NaN
+    return parse_json(text, "the stimulus record", error=TraceUnsupported, finite=False)

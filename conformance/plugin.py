@@ -244,9 +244,8 @@ def pytest_terminal_summary(
             )
         terminalreporter.write_line(text, yellow=True)
         return
-    from rich.console import Console
-
     from dexkit.conformance.report.terminal import print_result
+    from dexkit.console import Console
 
     width = max(terminalreporter._tw.fullwidth, 80)
     console = Console(

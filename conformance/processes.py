@@ -6,7 +6,6 @@ The kit reaches backends only as a user would; nothing of them runs in its own p
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +17,7 @@ from dexkit.bodies import BODIES
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
+from dexkit.scratch import Scratch
 
 __all__ = [
     "BODY_EMULATORS",
@@ -174,7 +174,7 @@ class Rig:
         options = self.options
         if not options.emulated:
             return
-        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="dexkit-")))
+        folder = self._stack.enter_context(Scratch("hands"))
         emulation = EMULATED[options.backend]
         emulators = {}
         for s in options.sides:

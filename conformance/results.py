@@ -21,13 +21,15 @@ import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dexkit import __version__
+from dexkit import __version__, documents
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.requirements.sources import told
 from dexkit.errors import UsageError
+from dexkit.untrusted import REMARK, one_line
 
 __all__ = [
     "BUSY",
@@ -165,22 +167,26 @@ class Result:
 
     def explain(self) -> str:
         """Everything a person needs to act on it, in lines."""
+
+        def say(name: str, text: str) -> None:
+            lines.append(f"  {name + ':':<9} {one_line(text, REMARK)}")
+
         lines = [f"{self.requirement.id} ({self.requirement.level}) {self.side}: {self.verdict}"]
-        lines.append(f"  required: {self.requirement.sentence}")
+        say("required", self.requirement.sentence)
         if self.expected != self.requirement.sentence:
-            lines.append(f"  expected: {self.expected}")
+            say("expected", self.expected)
         if self.observed:
-            lines.append(f"  observed: {self.observed}")
+            say("observed", self.observed)
         if self.reason:
-            lines.append(f"  reason:   {self.reason}")
+            say("reason", self.reason)
         for place in self.evidence:
             until = f" .. {place.end_s:.3f} s" if place.end_s is not None else ""
-            lines.append(f"  where:    {place.topic} at {place.time_s:.3f} s{until}")
+            say("where", f"{one_line(place.topic)} at {place.time_s:.3f} s{until}")
         if self.verdict in (Verdict.FAIL, Verdict.WARN):
             if self.cause:
-                lines.append(f"  cause:    {self.cause}")
-            lines.append(f"  try:      {self.requirement.advice}")
-            lines.append(f"  source:   {told(self.requirement.source)}")
+                say("cause", self.cause)
+            say("try", self.requirement.advice)
+            say("source", told(self.requirement.source))
         return "\n".join(lines)
 
 
@@ -314,7 +320,7 @@ class RunResult:
 
     def write_json(self, path: Path) -> None:
         """Write the result file."""
-        path.write_text(json.dumps(self.as_dict(), indent=2) + "\n", encoding="utf-8")
+        documents.write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
 
 
 def _result_dict(result: Result) -> dict[str, Any]:
@@ -339,28 +345,105 @@ def _result_dict(result: Result) -> dict[str, Any]:
 def read_json(path: Path) -> RunResult:
     """Read a result file back.
 
-    :raises UsageError: it is not one, or of a version that this dexkit does not know.
+    :raises UsageError: it is not one, of a version that this dexkit does not know, or something
+        in it is not as ``result.schema.json`` says: the error names the place.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data["format"] != FORMAT or data["version"] != VERSION:
-            raise UsageError(f"{path} is version {data['version']} of {data['format']}")
-        return RunResult(
-            subject=data["subject"],
-            stage={side: Stage(stage) for side, stage in data["stage"].items()},
-            duration_s=data["duration_s"],
-            notes=data["notes"],
-            environment=data["environment"],
-            harness=data["harness"],
-            claims=data["claims"],
-            catalogue=data["catalogue"],
-            recorded_at=data["recorded_at"],
-            results=[_result_of(entry) for entry in data["results"]],
+    data = documents.read_json(path)
+    about = data if isinstance(data, dict) else {}
+    if about.get("format") != FORMAT:
+        raise UsageError(
+            f"{path} is not a result file of dexkit",
+            hint="'dexkit check --json FILE' and the suite's '--json FILE' write them",
         )
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        if isinstance(error, UsageError):
-            raise
-        raise UsageError(f"{path} is not a result file of dexkit ({error})") from error
+    if about.get("version") != VERSION:
+        raise UsageError(f"{path} is version {one_line(about.get('version'), 40)} of {FORMAT}")
+    _validate(data, path)
+    return RunResult(
+        subject=data["subject"],
+        stage={side: Stage(stage) for side, stage in data["stage"].items()},
+        duration_s=data["duration_s"],
+        notes=data["notes"],
+        environment=data["environment"],
+        harness=data["harness"],
+        claims=data["claims"],
+        catalogue=data["catalogue"],
+        recorded_at=data["recorded_at"],
+        results=[_result_of(entry) for entry in data["results"]],
+    )
+
+
+@cache
+def _validator() -> Any:
+    import jsonschema
+
+    text = Path(__file__).with_name("report").joinpath("result.schema.json").read_text("utf-8")
+    return jsonschema.Draft202012Validator(json.loads(text))
+
+
+def _validate(data: Any, path: Path) -> None:
+    """Hold a document to the schema that is published with dexkit.
+
+    :raises UsageError: naming the first place that is not as it says.
+    """
+    from jsonschema.exceptions import relevance
+
+    error = min(_validator().iter_errors(data), key=relevance, default=None)
+    if error is None:
+        return
+    while error.context:  # of several alternatives: what is wrong with the nearest
+        error = min(error.context, key=relevance)
+    where = one_line(error.json_path.removeprefix("$").removeprefix(".") or "the document")
+    raise UsageError(
+        f"{path}: {where} {_expected(error.validator, error.validator_value, error.instance)}",
+        hint="the file is damaged, or was written by another program; docs/reports.md says what is "
+        "in a result file",
+    )
+
+
+_KINDS = {
+    dict: "an object",
+    list: "a list",
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    type(None): "null",
+}
+_NAMES = {
+    "object": "an object",
+    "array": "a list",
+    "string": "a text",
+    "boolean": "true or false",
+    "integer": "a whole number",
+    "number": "a number",
+    "null": "null",
+}
+
+
+def _expected(rule: str, value: Any, found: Any) -> str:
+    """What a rule of the schema wants, and what is there instead."""
+    is_there = _KINDS[type(found)]
+    if isinstance(found, str | int | float | bool):
+        is_there = one_line(json.dumps(found), 60)
+    if rule == "type":
+        kinds = [value] if isinstance(value, str) else value
+        return f"must be {' or '.join(_NAMES[kind] for kind in kinds)}, not {is_there}"
+    if rule == "required":
+        missing = [name for name in value if name not in found]
+        return f"has no {', '.join(missing)}"
+    if rule == "enum":
+        return f"must be one of {', '.join(json.dumps(v) for v in value)}, not {is_there}"
+    if rule == "const":
+        return f"must be {json.dumps(value)}, not {is_there}"
+    if rule in ("minimum", "maximum"):
+        return f"must be {'at least' if rule == 'minimum' else 'at most'} {value:g}, not {is_there}"
+    if rule == "additionalProperties":
+        return "holds something that is not known"
+    if rule in ("maxLength", "maxItems", "maxProperties", "minLength"):
+        return f"is too {'short' if rule == 'minLength' else 'long'} ({rule} {value})"
+    if rule == "pattern":
+        return f"is not of the form {value}: {is_there}"
+    return f"is not as it should be ({rule})"
 
 
 def _result_of(entry: dict[str, Any]) -> Result:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,9 +29,12 @@ from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording, sides_of
+from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
+from dexkit.limits import room_for_files
 from dexkit.models import DEX1_1, Dialect, dialect, model
+from dexkit.scratch import Scratch
 
 if TYPE_CHECKING:
     import pytest
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "selection"]
 
 T = TypeVar("T")
+_FILES = 48  # descriptors of a run: DDS, recording, the pipes of its processes
 
 
 @dataclass(frozen=True)
@@ -351,6 +354,7 @@ def run_suite(
     from dexkit.conformance.live import free_domain, record_run
     from dexkit.traces import open_trace
 
+    room_for_files(_FILES, "a conformance run")
     result: RunResult | None = None
     while result is None or (result.disturbed and attempts > 0):
         if result is not None:
@@ -358,8 +362,8 @@ def run_suite(
         attempts -= 1
         given = options.domain
         domain = given if given is not None else free_domain(options.interface)
-        with tempfile.TemporaryDirectory(prefix="dexkit-") as folder:
-            path = options.recording or Path(folder) / "run.mcap"
+        with Scratch() as folder:
+            path = options.recording or folder / "run.mcap"
             if not record_run(live_options(options, domain), path, say=say, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")
             say("judging the recording")
@@ -389,5 +393,5 @@ def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
     if options.markdown:
         from dexkit.conformance.report.markdown import render_markdown
 
-        options.markdown.write_text(render_markdown(result), encoding="utf-8")
+        write_file(options.markdown, render_markdown(result))
     return result

@@ -5,7 +5,15 @@ import os
 from dexkit.cli import main
 from dexkit.processes import END_WITH_PARENT, end_with_parent
 
-if __name__ == "__main__":
+__all__ = ["start"]
+
+
+def start() -> None:
+    """Run the command line; ends with whoever started it, if that was asked for."""
     if os.environ.get(END_WITH_PARENT):
         end_with_parent()
     main()
+
+
+if __name__ == "__main__":
+    start()

@@ -55,6 +55,7 @@ from xml.sax.saxutils import escape, quoteattr
 from dexkit import ingress
 from dexkit.dds_sockets import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
+from dexkit.limits import room_for_files
 from dexkit.messages import MessageType, layout, message_type
 from dexkit.processes import process_id
 from dexkit.threads import Worker
@@ -479,6 +480,7 @@ class _Domain:
 
 
 _domains: dict[int, _Domain] = {}
+_FILES = 16  # descriptors of a participant; short of them, CycloneDDS dies
 _domains_lock = threading.Lock()
 # CycloneDDS describes a type when its first topic is made, and not for two threads at once
 _types_lock = threading.RLock()
@@ -905,6 +907,7 @@ class DdsNode:
     def __init__(self, domain: int = 1, interface: str = "lo") -> None:
         if not 0 <= domain <= 230:
             raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
+        room_for_files(_FILES, "DDS")
         cyclone = _cyclone()
         self.domain = domain
         self.interface = interface

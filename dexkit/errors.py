@@ -29,6 +29,7 @@
     │   └── BackendBroken                   the plug-in cannot be imported or is not a backend
     ├── EmulatorError                   an emulated device cannot be set up as asked
     ├── ConformanceError                the kit itself cannot judge (not a verdict on the hand)
+    ├── OutputError (OSError)           a file or stream cannot be written: disk full, pipe closed
     └── UsageError (ValueError)         arguments or configuration that make no sense
 
 Errors that are also a built-in (in brackets) are caught by an ordinary ``except`` of that
@@ -58,6 +59,7 @@ __all__ = [
     "HandNotFound",
     "HandRefused",
     "HandTimeout",
+    "OutputError",
     "OversizeError",
     "TopicConflict",
     "TraceError",
@@ -205,6 +207,12 @@ class EmulatorError(DexkitError):
 
 class ConformanceError(DexkitError):
     """The kit itself cannot judge; says nothing about the hand."""
+
+    exit_code = 2
+
+
+class OutputError(DexkitError, OSError):
+    """A file or a stream cannot be written."""
 
     exit_code = 2
 

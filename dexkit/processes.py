@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
@@ -11,7 +10,8 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar
 
 from dexkit.errors import DexkitError
@@ -22,16 +22,26 @@ __all__ = [
     "READY_TIMEOUT",
     "STOP_TIMEOUT",
     "Tool",
+    "command_line",
     "end_with_parent",
     "process_id",
 ]
 
 READY_TIMEOUT = 30.0
 STOP_TIMEOUT = 5.0
-_PR_SET_PDEATHSIG = 1
+_START = Path(__file__).resolve().with_name("_start") / "dexkit"
 
 END_WITH_PARENT = "DEXKIT_END_WITH_PARENT"
-"""Environment variable: set for a command that is to end when whoever started it is killed."""
+"""Environment variable: set for a command that is to end when whoever started it is killed. It is
+the number of a pipe's descriptor that nobody writes and whose other end only the parent has: when
+that is closed, however it came to it, the parent is gone."""
+
+
+def command_line(*arguments: str) -> list[str]:
+    """What starts ``dexkit ARGUMENTS`` with this interpreter, and imports nothing from the working
+    folder, as ``python -P`` does where there is one.
+    """
+    return [sys.executable, str(_START), *arguments]
 
 
 _PID_MAX = 1 << 22  # PID_MAX_LIMIT of Linux
@@ -46,9 +56,22 @@ def process_id(text: str) -> int:
 
 
 def end_with_parent() -> None:
-    """Have SIGTERM sent to this process when its parent dies, where the system can (Linux)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    """End this process by SIGTERM when its parent does; by SIGKILL if that does not help."""
+    try:
+        pipe = int(os.environ[END_WITH_PARENT])
+        os.set_inheritable(pipe, False)
+    except (ValueError, OSError):
+        return
+    threading.Thread(target=_await_end, args=(pipe,), name="parent", daemon=True).start()
+
+
+def _await_end(pipe: int) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(pipe, 64):
+            pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(2 * STOP_TIMEOUT)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Tool:
@@ -76,8 +99,24 @@ class Tool:
         """The first word after ``ready:``."""
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=40)
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "dexkit", *arguments],
+        # closed when this process ends, even by SIGKILL
+        theirs, self._alive = os.pipe2(os.O_CLOEXEC)
+        try:
+            self._process = self._popen(arguments, theirs, environment or {})
+        except BaseException:
+            os.close(self._alive)
+            raise
+        finally:
+            os.close(theirs)
+        self._thread = Worker("tool", self._listen)
+        self._thread.start()
+
+    @staticmethod
+    def _popen(
+        arguments: Sequence[str], pipe: int, environment: Mapping[str, str]
+    ) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            command_line(*arguments),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -86,14 +125,13 @@ class Tool:
             env={
                 **os.environ,
                 "PYTHONUNBUFFERED": "1",
-                END_WITH_PARENT: "1",
-                **(environment or {}),
+                END_WITH_PARENT: str(pipe),
+                **environment,
             },
+            pass_fds=(pipe,),
             # a Ctrl-C in the terminal is the caller's to act upon: it stops its tools in order
             start_new_session=True,
         )
-        self._thread = Worker("tool", self._listen)
-        self._thread.start()
 
     def __repr__(self) -> str:
         return f"dexkit {' '.join(self.arguments)}"
@@ -151,6 +189,9 @@ class Tool:
             self._process.kill()
             self._process.wait()
         self._thread.join(STOP_TIMEOUT)
+        if self._alive >= 0:
+            os.close(self._alive)
+            self._alive = -1
         if self._process.stdout is not None:
             self._process.stdout.close()
         return polite

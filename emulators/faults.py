@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 
 from dexkit.errors import UsageError
 from dexkit.hand import Side
+from dexkit.untrusted import one_line
 
 __all__ = [
     "DEX3_FAULTS",
@@ -159,7 +160,9 @@ FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kin
 """The kinds of the MX-64 by name."""
 
 _SPEC = re.compile(r"(?P<kind>[a-z-]+)(?:@(?P<time>[^:]+))?(?::(?P<args>.*))?", re.DOTALL)
-_DURATION = re.compile(r"(\d+(?:\.\d*)?|\.\d+)(ms|s)?")
+_DURATION = re.compile(r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)(ms|s)?")
+_LONGEST = 1e6
+"""Seconds, eleven days: no emulator runs longer with a fault that is planned."""
 
 
 def grammar(family: FaultFamily = MX64_FAULTS) -> str:
@@ -203,8 +206,11 @@ class Fault:
 def _duration(value: str) -> float:
     match = _DURATION.fullmatch(value.strip())
     if match is None:
-        raise _Bad(f"{value!r} is not a time")
-    return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)
+        raise _Bad(f"{one_line(value, 40)!r} is not a time")
+    seconds = float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)
+    if seconds > _LONGEST:
+        raise _Bad(f"{one_line(value, 40)} is longer than {_LONGEST:g} s")
+    return seconds
 
 
 def parse_fault(text: str, family: FaultFamily = MX64_FAULTS) -> Fault:
@@ -216,7 +222,7 @@ def parse_fault(text: str, family: FaultFamily = MX64_FAULTS) -> Fault:
     try:
         return _parse(text, family)
     except _Bad as error:
-        raise UsageError(f"fault {text!r}: {error}", hint=grammar(family)) from None
+        raise UsageError(f"fault {one_line(text, 80)!r}: {error}", hint=grammar(family)) from None
 
 
 class _Bad(Exception):
@@ -242,8 +248,9 @@ def _parse(text: str, family: FaultFamily) -> Fault:
         if key == "for" and kind.lasting:
             duration = _duration(value)
         elif key == "id" and kind.targets_device:
-            if not value.isdecimal() or len(value) > 9 or int(value) > family.max_id:
-                raise _Bad(f"{value[:20]!r} is not an id (0 to {family.max_id})")
+            # of other scripts' digits, and of thousands of them, int() does not want to know
+            if not re.fullmatch("[0-9]{1,3}", value) or int(value) > family.max_id:
+                raise _Bad(f"{one_line(value, 40)!r} is not an id (0 to {family.max_id})")
             device = int(value)
         elif key == "side" and family.sided:
             try:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import select
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from typing import IO
 
 from dexkit.emulators.faults import FaultFamily, parse_fault
 from dexkit.errors import EmulatorError
+from dexkit.processes import command_line
 
 __all__ = ["EmulatorProcess"]
 
@@ -40,7 +40,7 @@ class EmulatorProcess:
         self._faults = faults
         self.output = self.errors = ""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "dexkit", "emulate", device, "--faults-from-stdin", *arguments],
+            command_line("emulate", device, "--faults-from-stdin", *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

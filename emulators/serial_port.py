@@ -13,7 +13,6 @@ import errno
 import fcntl
 import os
 import select
-import tempfile
 import threading
 import time
 import tty
@@ -23,6 +22,7 @@ from dexkit.clock import Clock, RealClock
 from dexkit.emulators.faults import Fault
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
+from dexkit.scratch import Scratch
 from dexkit.threads import Worker
 
 __all__ = ["Port", "client_baudrate"]
@@ -79,10 +79,10 @@ class Port:
         self.error: BaseException | None = None
         self._clock: Clock = clock or RealClock()
         self._check_baudrate = check_baudrate
-        self._directory: str | None = None
+        self._directory: Scratch | None = None
         if link is None:
-            self._directory = tempfile.mkdtemp(prefix="dexkit-tty-")
-            self.path = os.path.join(self._directory, "tty")
+            self._directory = Scratch("tty")
+            self.path = str(self._directory.path / "tty")
         else:
             self.path = os.path.abspath(os.fspath(link))
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -258,8 +258,7 @@ class Port:
         os.close(self._wake_read)
         os.close(self._wake_write)
         if self._directory is not None:
-            with contextlib.suppress(OSError):
-                os.rmdir(self._directory)
+            self._directory.close()
 
     def __enter__(self) -> Port:
         return self

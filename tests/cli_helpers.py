@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
 
+from dexkit.processes import command_line
 from tests.patience import PATIENCE
 
 __all__ = ["Process", "running"]
@@ -20,7 +20,7 @@ class Process:
 
     def __init__(self, *arguments: object) -> None:
         self._popen = subprocess.Popen(
-            [sys.executable, "-m", "dexkit", *map(str, arguments)],
+            command_line(*map(str, arguments)),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

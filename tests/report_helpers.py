@@ -53,5 +53,6 @@ def run_named(name: str, when: str, **verdicts: Verdict) -> RunResult:
         for k, v in verdicts.items()
     ]
     base = result_of_every_kind()
-    subject = {"model": "dex1-1", "dialect": "unitree_go", "hand": name, "backend": "x"}
+    about = {"hand": name, "backend": "x", "sides": "left"}
+    subject = {"model": "dex1-1", "dialect": "unitree_go", **about}
     return replace(base, subject=subject, results=results, recorded_at=when)

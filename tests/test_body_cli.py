@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 
@@ -18,6 +17,7 @@ from dexkit.dds import DdsNode, Sample
 from dexkit.emulators.body import EmulatedBody, run_body
 from dexkit.errors import EmulatorError, TopicConflict
 from dexkit.messages import encode
+from dexkit.processes import command_line
 from dexkit.wire.low_level import encode_with_crc, verify_payload
 from tests.body_helpers import low_cmd
 from tests.dds_helpers import free_domain, take_until, wait_until
@@ -34,7 +34,7 @@ def test_process(node: DdsNode) -> None:
     """Ready, state, commands good and bad, the remote, JSON, a clean end."""
     process = subprocess.Popen(
         [
-            *(sys.executable, "-m", "dexkit", "emulate", "g1", "--no-real-time"),
+            *command_line("emulate", "g1", "--no-real-time"),
             *("--domain", str(node.domain), "--remote-from-stdin", "--json"),
         ],
         stdin=subprocess.PIPE,

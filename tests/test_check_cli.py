@@ -126,7 +126,7 @@ def test_verbose_says_what_was_not_judged(capsys: pytest.CaptureFixture[str]) ->
 def test_a_result_file_that_cannot_be_written_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     name = "/no/such/directory/r.json"
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--json", name) == 2
-    assert f"error: {name}: No such file or directory" in capsys.readouterr().err
+    assert f"error: cannot write {name}: No such file or directory" in capsys.readouterr().err
 
 
 _UNUSED = (

@@ -35,7 +35,7 @@ VELOCITY = next(r for r in catalogue("dex1-1") if r.id == "DEX1-FIELD-04")
         ("[hand]\ncolour = 'red'", "colour is not understood"),
         ("[hand]\nname = 1", "name is not understood"),
         ("[hand]\nmodel = 'dex9'", "no hand model 'dex9'"),
-        ("[claims", "capabilities.toml: "),
+        ("[claims", "capabilities.toml is not valid TOML: "),
     ],
 )
 def test_a_file_that_is_not_understood_is_an_error(text: str, says: str) -> None:

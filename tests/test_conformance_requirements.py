@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import pytest
 
+from dexkit.conformance import requirements
 from dexkit.conformance.checks import all_checks
 from dexkit.conformance.mutants import MUTANTS
 from dexkit.conformance.requirements import LAYERS, Level, catalogue, models, parse, select
@@ -14,9 +16,11 @@ from dexkit.conformance.selection import quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.conformance.stimuli.script import default_objects
-from dexkit.errors import UsageError
+from dexkit.documents import parse_toml
+from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import model
+from tests import hostile
 
 DOCS = Path(__file__).parent.parent / "docs" / "conformance.md"
 
@@ -181,3 +185,22 @@ def test_what_cannot_be_written_is_told_before_the_run(
     monkeypatch.setattr("os.access", lambda path, mode: False)
     with pytest.raises(UsageError, match="its directory is read-only"):
         SuiteOptions.make(backend="sim-dex1", json=tmp_path / "r.json")
+
+
+def test_what_is_no_catalogue_is_refused_by_name() -> None:
+    rng = random.Random(1)
+    document = parse_toml(GOOD, "good")
+    good = 0
+    for _ in range(500):
+        changed = hostile.mutated(document, rng)
+        if not isinstance(changed, dict):
+            continue
+        try:
+            requirements._parse(changed, "it", {})
+        except DexkitError:
+            continue
+        good += 1
+    assert good
+    for text in ("[" * 5000, "a = nan", "model = 1", 'requirement = "x"', "retired = 1"):
+        with pytest.raises(UsageError):
+            parse(text)

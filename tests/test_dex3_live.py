@@ -6,7 +6,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from dexkit.emulators.dex3_mcu import emulated_dex3
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
+from dexkit.processes import command_line
 from dexkit.service import real_time
 from tests.dds_helpers import dds_domain, dds_node
 from tests.test_service_cli import serving
@@ -148,7 +148,7 @@ def test_an_emulator_with_the_priority_of_a_service() -> None:
         pass
     arguments = ["emulate", "dex3-usb", "--port", "0", "--real-time"]
     with subprocess.Popen(
-        [sys.executable, "-m", "dexkit", *arguments],
+        command_line(*arguments),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

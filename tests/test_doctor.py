@@ -30,6 +30,7 @@ from dexkit.doctor.rtps import parse_message, unicast_port
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.models import DIALECTS
+from dexkit.processes import command_line
 from tests import doctor_packets as packets
 from tests.dds_helpers import free_domain
 
@@ -320,7 +321,7 @@ def service() -> Iterator[int]:
     domain = free_domain()
     with subprocess.Popen(
         [
-            *(sys.executable, "-m", "dexkit", "serve", "sim-dex1", "--side", "both"),
+            *command_line("serve", "sim-dex1", "--side", "both"),
             *("--domain", str(domain), "--quiet"),
         ],
         stdout=subprocess.PIPE,
@@ -351,7 +352,7 @@ def test_the_command_line(service: int) -> None:
 
 def test_what_cannot_be_looked_at_is_no_verdict() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "dexkit", "doctor", "--scan", "5", "--interface", "nosuch0"],
+        command_line("doctor", "--scan", "5", "--interface", "nosuch0"),
         capture_output=True,
         text=True,
         check=False,

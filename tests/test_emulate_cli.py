@@ -10,7 +10,6 @@ import select
 import signal
 import socket
 import subprocess
-import sys
 import termios
 import time
 import tty
@@ -35,6 +34,7 @@ from dexkit.emulators.mx64 import (
 )
 from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
+from dexkit.processes import command_line
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
 from tests.patience import PATIENCE
@@ -101,7 +101,7 @@ def is_cut_off(opened: Client) -> bool:
 
 def emulate(*arguments: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-m", "dexkit", "emulate", "mx64", *arguments],
+        command_line("emulate", "mx64", *arguments),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
@@ -415,7 +415,7 @@ def test_port_in_the_callers_thread_can_be_stopped() -> None:
 
 def emulate_dex3(*arguments: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-m", "dexkit", "emulate", "dex3-usb", "--port", "0", *arguments],
+        command_line("emulate", "dex3-usb", "--port", "0", *arguments),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from dexkit import files
+from dexkit import documents
+from dexkit.documents import update_file
 from dexkit.drivers.ezgripper.config import GripperRecord, Store
 from dexkit.errors import UsageError
-from dexkit.files import update_file
 
 
 def _store_many(path: str, name: str, count: int, begin: object) -> None:
@@ -126,7 +126,7 @@ def test_what_cannot_be_locked_or_read_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "f.json"
-    monkeypatch.setattr(files, "LOCK_PATIENCE", 0.0)
+    monkeypatch.setattr(documents, "LOCK_PATIENCE", 0.0)
     with open(tmp_path / ".f.json.lock", "w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(UsageError, match="locked by another program") as caught:

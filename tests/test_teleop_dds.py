@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,19 +19,20 @@ from dexkit.dds import DdsNode
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
+from dexkit.processes import command_line
 from dexkit.teleop import profile
 from dexkit.traces import open_trace
 from tests.dds_helpers import free_domain, take_until
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
-TELEOP = [sys.executable, "-m", "dexkit", "teleop"]
+TELEOP = command_line("teleop")
 
 
 @contextmanager
 def served(backend: str, side: str) -> Iterator[int]:
     """A domain on which ``dexkit serve`` serves a simulated hand."""
     domain = free_domain()
-    arguments = [sys.executable, "-m", "dexkit", "serve", backend, "--side", side, "--quiet"]
+    arguments = command_line("serve", backend, "--side", side, "--quiet")
     with subprocess.Popen(
         [*arguments, "--domain", str(domain)],
         stdout=subprocess.PIPE,

@@ -13,7 +13,6 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -21,6 +20,8 @@ from dexkit.conformance import mutants as dds
 from dexkit.conformance.mutants import body, shared
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.conformance.usb import mutants as usb
+from dexkit.console import Console
+from dexkit.documents import write_file
 from dexkit.models import DEX1_1, DEX3_1
 
 __all__ = ["Outcome", "Score", "Trial", "chosen", "essential", "trials", "try_one"]
@@ -209,7 +210,7 @@ class Score:
 
     def write_json(self, path: Path) -> None:
         """Write it to a file."""
-        path.write_text(json.dumps(self.as_dict(), indent=2) + "\n", encoding="utf-8")
+        write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
 
     def print(self, console: Console, *, verbose: bool = False) -> None:
         """The score by area, and whatever is not as it should be."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
 
 from dexkit.conformance.report.html import document
-from dexkit.conformance.report.markdown import plain, table
+from dexkit.conformance.report.markdown import code, plain, table
 from dexkit.conformance.report.wording import (
     ANSWERS,
     VERDICTS,
@@ -20,6 +19,7 @@ from dexkit.conformance.report.wording import (
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.errors import UsageError
+from dexkit.untrusted import html as escape
 
 __all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
 
@@ -272,7 +272,7 @@ def render_comparison_markdown(comparison: Comparison) -> str:
         if changes:
             lines += [f"### {title}", ""]
             lines += [
-                f"- `{c.requirement.id}` {plain(_change_text(comparison, c))}" for c in changes
+                f"- {code(c.requirement.id)} {plain(_change_text(comparison, c))}" for c in changes
             ]
             lines.append("")
     lines += [f"### Where they differ ({len(comparison.differing)})", ""]
@@ -290,7 +290,7 @@ def _markdown_matrix(rows: Sequence[Row], names: Sequence[str]) -> list[str]:
         return f"{word.mark} {plain(_figure(group) or word.text)}"
 
     lines = [
-        [f"`{row.requirement.id}`", plain(row.requirement.title), *(cell(g) for g in row.found)]
+        [code(row.requirement.id), plain(row.requirement.title), *(cell(g) for g in row.found)]
         for row in rows
     ]
     return table(["requirement", "what", *(plain(n) for n in names)], lines) if rows else []

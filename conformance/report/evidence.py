@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.view import Recording, SideView
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, JointSpec, Side
+from dexkit.untrusted import html as escape
 
 __all__ = ["PHASES", "command_and_state", "evidence", "operated", "phase_bands"]
 

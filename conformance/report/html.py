@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from datetime import datetime
-from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
@@ -43,6 +42,8 @@ from dexkit.conformance.results import (
 )
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording
+from dexkit.documents import write_file
+from dexkit.untrusted import html as escape
 
 __all__ = ["document", "render", "write_html"]
 
@@ -72,7 +73,7 @@ def write_html(
     link = result.subject.get("recording", "")
     if recording is not None:
         link = Path(os.path.relpath(recording.absolute(), path.absolute().parent)).as_posix()
-    path.write_text(render(result, view, link=link), encoding="utf-8")
+    write_file(path, render(result, view, link=link))
 
 
 def document(title: str, body: str) -> str:

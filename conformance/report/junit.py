@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import re
+import io
 from pathlib import Path
 from xml.etree import ElementTree
 
 from dexkit.conformance.report.wording import hand_name
 from dexkit.conformance.results import RunResult, Verdict
+from dexkit.documents import write_file
+from dexkit.untrusted import visible
 
 __all__ = ["write_junit"]
 
-_FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that XML 1.0 has no way to write (section 2.2)."""
 _SKIPPED = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
 
 
@@ -58,12 +58,10 @@ def write_junit(result: RunResult, path: Path) -> None:
             out = ElementTree.SubElement(case, "system-out")
             out.text = entry.explain()
     for element in suite.iter():
-        element.attrib = {name: _clean(value) for name, value in element.attrib.items()}
-        element.text = _clean(element.text or "") or None
+        element.attrib = {name: visible(value) for name, value in element.attrib.items()}
+        element.text = visible(element.text or "") or None
     tree = ElementTree.ElementTree(suite)
     ElementTree.indent(tree)
-    tree.write(path, encoding="utf-8", xml_declaration=True)
-
-
-def _clean(text: str) -> str:
-    return _FORBIDDEN.sub("\ufffd", text)
+    content = io.BytesIO()
+    tree.write(content, encoding="utf-8", xml_declaration=True)
+    write_file(path, content.getvalue())

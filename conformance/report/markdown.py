@@ -24,26 +24,28 @@ from dexkit.conformance.report.wording import (
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
+from dexkit.untrusted import REMARK, one_line
 
-__all__ = ["plain", "render_markdown", "table"]
+__all__ = ["code", "plain", "render_markdown", "table"]
 
 MOST_CARDS = 25
 """Failures told at length: a comment on GitHub holds 65536 characters."""
 _SPECIAL = re.compile(r"([\\`*_\[\]|~#])")
+_NOTHING = "&#8203;"
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN)
 
 
 def plain(text: str) -> str:
     """``text`` as Markdown that shows just that, in one line."""
-    text = " ".join(text.split())
+    text = one_line(" ".join(text.split()), REMARK)
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    # a space of no width keeps a name behind @ from being called
-    return _SPECIAL.sub(r"\\\1", text).replace("@", "@\u200b").replace("://", ":\u200b//")
+    # a space of no width keeps a name behind @ from being called, and an address from being a link
+    return _SPECIAL.sub(r"\\\1", text).replace("@", f"@{_NOTHING}").replace("://", f":{_NOTHING}//")
 
 
-def _code(text: str) -> str:
+def code(text: str) -> str:
     """``text`` as code; a grave accent in it would end it."""
-    return f"`{' '.join(text.split()).replace('`', chr(39)).replace('|', '/')}`"
+    return f"`{one_line(' '.join(text.split())).replace('`', chr(39)).replace('|', '/')}`"
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -111,7 +113,7 @@ def _troubles(result: RunResult) -> list[str]:
         if entry.verdict is Verdict.BLOCKED:
             blocked.setdefault(entry.reason, {})[entry.requirement.id] = None
     for reason, names in blocked.items():
-        told = ", ".join(_code(name) for name in names)
+        told = ", ".join(code(name) for name in names)
         lines += [f"{VERDICTS[Verdict.BLOCKED].mark} {plain(reason)}: {told}", ""]
     return lines
 
@@ -120,7 +122,7 @@ def _card(need: Requirement, group: Sequence[Result]) -> list[str]:
     word = VERDICTS[worst(r.verdict for r in group)]
     sides = " and ".join(r.side for r in group)
     lines = [
-        f"### {word.mark} {_code(need.id)} {plain(need.title)} ({plain(sides)})",
+        f"### {word.mark} {code(need.id)} {plain(need.title)} ({plain(sides)})",
         "",
         f"- required: {plain(need.sentence)} ({need.level})",
     ]
@@ -133,7 +135,7 @@ def _card(need: Requirement, group: Sequence[Result]) -> list[str]:
         for place in entry.evidence[:1]:
             until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
             lines.append(
-                f"- where: {_code(place.topic)} at {place.time_s:.3f} s{until}, log time "
+                f"- where: {code(place.topic)} at {place.time_s:.3f} s{until}, log time "
                 f"`{place.log_time_ns}`"
             )
     lines += [f"- likely cause: {plain(cause)}" for _, cause in causes(list(group))]
@@ -154,7 +156,7 @@ def _every(result: RunResult) -> list[str]:
             for r in group
         }
         rows.append(
-            [_code(need.id), str(need.level), plain(need.title), *(cells.get(s, "") for s in sides)]
+            [code(need.id), str(need.level), plain(need.title), *(cells.get(s, "") for s in sides)]
         )
     return table(["requirement", "level", "what", *(plain(s) for s in sides)], rows)
 

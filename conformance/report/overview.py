@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import numpy as np
 
 from dexkit.conformance.report.evidence import command_and_state, operated, phase_bands
@@ -13,6 +11,7 @@ from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import JointSpec
+from dexkit.untrusted import html as escape
 
 __all__ = ["overview"]
 

@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
 
 import numpy as np
 
 from dexkit.hand import Floats
+from dexkit.untrusted import html as escape
 
 __all__ = [
     "Band",

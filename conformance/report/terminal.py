@@ -5,14 +5,16 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 
-from rich.console import Console
-from rich.markup import escape
+import rich.markup
 from rich.table import Table
 from rich.text import Text
 
 from dexkit.conformance.report.wording import about_harness, causes
 from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
+from dexkit.console import Console
+from dexkit.console import markup as escape
+from dexkit.untrusted import REMARK, one_line
 
 __all__ = ["MARKS", "print_result"]
 
@@ -55,9 +57,9 @@ def print_result(
         cells = {r.side: _cell(r) for r in group}
         table.add_row(
             # texts, for rich would read a string as markup each time that it measures it
-            Text(requirement.id),
+            Text(one_line(requirement.id)),
             Text(str(requirement.level)),
-            Text(requirement.title),
+            Text(one_line(requirement.title)),
             Text(mark, style),
             *(cells.get(side, Text()) for side in sides),
         )
@@ -84,7 +86,7 @@ def print_result(
             console.print("\n[dim]not judged:[/dim]")
         for (id_, reason), on in reasons.items():
             text = _hung(console, f"  {id_} {' and '.join(on)}: ", reason)
-            console.print(f"[dim]{escape(text)}[/dim]", highlight=False, soft_wrap=True)
+            console.print(f"[dim]{text}[/dim]", soft_wrap=True)
     stages = ", ".join(f"{side} {stage}" for side, stage in result.stage.items())
     if stages:
         console.print(f"[dim]stage reached: {escape(stages)}[/dim]", highlight=False)
@@ -106,14 +108,13 @@ def _print_trouble(group: Sequence[Result], console: Console) -> None:
     need = group[0].requirement
     sides = " and ".join(r.side for r in group)
     console.print(
-        f"[bold]{need.id}[/] ({need.level}) {sides}: {worst(r.verdict for r in group)}",
+        f"[bold]{escape(need.id)}[/] ({need.level}) {escape(sides)}: "
+        f"{worst(r.verdict for r in group)}",
         highlight=False,
     )
     for name, text in _lines(group):
         label = f"{name}:" if name else ""
-        console.print(
-            escape(_hung(console, f"  {label:<9} ", text)), highlight=False, soft_wrap=True
-        )
+        console.print(_hung(console, f"  {label:<9} ", text), soft_wrap=True)
 
 
 def _lines(group: Sequence[Result]) -> Iterator[tuple[str, str]]:
@@ -140,15 +141,16 @@ def _lines(group: Sequence[Result]) -> Iterator[tuple[str, str]]:
 
 
 def _hung(console: Console, head: str, text: str) -> str:
-    """``text`` after ``head``, its further lines below its first one."""
-    return textwrap.fill(
-        text,
+    """``text`` after ``head``, its further lines below its first one, as markup."""
+    filled = textwrap.fill(
+        one_line(" ".join(text.split()), REMARK),
         console.width,
         initial_indent=head,
-        subsequent_indent=" " * min(len(head), 12),
+        subsequent_indent=" " * max(2, min(len(head), 12)),
         break_long_words=False,
         break_on_hyphens=False,
     )
+    return rich.markup.escape(filled)
 
 
 def _print_blocked(result: RunResult, console: Console) -> None:
@@ -160,10 +162,10 @@ def _print_blocked(result: RunResult, console: Console) -> None:
     if groups:
         console.print()
     for reason, names in groups.items():
-        text = escape(_hung(console, "", f"{reason}: {', '.join(names)}"))
+        text = _hung(console, "", f"{reason}: {', '.join(names)}")
         console.print(f"[magenta]{text}[/]", highlight=False, soft_wrap=True)
 
 
 def _cell(result: Result) -> Text:
     mark, style = MARKS[result.verdict]
-    return Text(result.figure or mark, style)
+    return Text(one_line(result.figure or mark), style)

@@ -13,7 +13,6 @@ selection, reports and the catalogue in docs/conformance.md.
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -22,13 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.bodies import BodyModel, body
+from dexkit.documents import parse_toml, read_toml
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS, HandModel, model
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 __all__ = [
     "CAPABILITIES",
@@ -96,6 +91,23 @@ _OPTIONAL = {
     "cause",
     "expected",
     "repeat",
+}
+
+
+_TYPES: Mapping[str, type] = {
+    "after": list,
+    "dialects": list,
+    "tolerances": dict,
+    "realtime": bool,
+    "repeat": int,
+}
+"""Types of values that are not texts."""
+_TYPE_NAMES: Mapping[type, str] = {
+    str: "a text",
+    list: "a list of texts",
+    dict: "a table",
+    bool: "true or false",
+    int: "a whole number",
 }
 
 
@@ -205,8 +217,12 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
     :param others: entries of other documents, by id.
     """
     prefix = str(document.get("prefix", ""))
+    entries = document.get("requirement", [])
+    if not isinstance(entries, list):
+        raise UsageError(f"{origin}: requirements are [[requirement]] tables")
     found = []
-    for entry in document.get("requirement", []):
+    for entry in entries:
+        _look_at_types(entry, origin)
         if "like" not in entry:
             found.append(entry)
             continue
@@ -228,6 +244,32 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
     return found
 
 
+def _look_at_types(entry: Any, origin: str) -> None:
+    """Whether each value is what its key stands for.
+
+    :raises UsageError: naming the one that is not.
+    """
+    if not isinstance(entry, dict):
+        raise UsageError(f"{origin}: requirements are [[requirement]] tables")
+    for key, value in entry.items():
+        kind = _TYPES.get(key, str)
+        texts = kind is not list or (isinstance(value, list) and all(type(v) is str for v in value))
+        if type(value) is not kind or not texts:
+            name = _TYPE_NAMES[kind]
+            raise UsageError(f"{origin}: {entry.get('id', 'a requirement')}: {key} is {name}")
+
+
+def _filled(text: str, tolerances: Mapping[str, float], where: str) -> str:
+    """``text`` with the tolerances that it names.
+
+    :raises UsageError: it names others, or has a brace too many.
+    """
+    try:
+        return text.format(**tolerances)
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
+        raise UsageError(f"{where}: {text!r} cannot be filled in: {error}") from error
+
+
 def parse(
     text: str, origin: str = "requirements", others: Mapping[str, Any] | None = None
 ) -> tuple[Requirement, ...]:
@@ -238,7 +280,7 @@ def parse(
         occurs twice or is retired, ``after`` names what does not come before, or ``like`` what
         there is not.
     """
-    return _parse(tomllib.loads(text), origin, others or {})
+    return _parse(parse_toml(text, origin), origin, others or {})
 
 
 def _parse(
@@ -247,7 +289,9 @@ def _parse(
     unknown = set(document) - {"model", "prefix", "layer", "retired", "requirement"}
     if unknown:
         raise UsageError(f"{origin}: unknown keys {sorted(unknown)}")
-    retired = set(document.get("retired", ()))
+    retired = document.get("retired", [])
+    if not isinstance(retired, list):
+        raise UsageError(f"{origin}: retired is a list of ids")
     hand = _model_of(document)
     layer = str(document.get("layer", "dds"))
     if layer not in LAYERS:
@@ -292,7 +336,7 @@ def _parse(
             area=entry["area"],
             level=Level[entry["level"]],
             title=entry["title"],
-            sentence=entry["sentence"].format(**tolerances),
+            sentence=_filled(entry["sentence"], tolerances, where),
             rationale=entry["rationale"],
             source=entry["source"],
             confidence=entry["confidence"],
@@ -304,7 +348,7 @@ def _parse(
             realtime=bool(entry.get("realtime", False)),
             layer=layer,
             cause=entry.get("cause", ""),
-            expected=entry.get("expected", entry["sentence"]).format(**tolerances),
+            expected=_filled(entry.get("expected", entry["sentence"]), tolerances, where),
             capability=entry.get("capability", ""),
             repeat=entry.get("repeat", 1),
             like=entry.get("like", ""),
@@ -317,14 +361,14 @@ def _files() -> dict[str, tuple[str, str]]:
     """Model and layer of each file that ships, by its name."""
     found = {}
     for path in sorted(Path(__file__).parent.glob("*.toml")):
-        head = tomllib.loads(path.read_text(encoding="utf-8").partition("[[")[0])
+        head = parse_toml(path.read_text(encoding="utf-8").partition("[[")[0], path.name)
         found[path.name] = _model_of(head).name, str(head.get("layer", "dds"))
     return found
 
 
 @cache
 def _document(name: str) -> Mapping[str, Any]:
-    return tomllib.loads((Path(__file__).parent / name).read_text(encoding="utf-8"))
+    return read_toml(Path(__file__).parent / name)
 
 
 @cache

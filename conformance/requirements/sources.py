@@ -98,12 +98,13 @@ def told(source: str) -> str:
     def section(match: re.Match[str]) -> str:
         before = source[: match.start()]
         code = match.group(1)
-        if before.count("(") > before.count(")"):  # in brackets, behind what it is about
+        # in brackets, behind what it is about; of a result file, perhaps one that is not known here
+        if before.count("(") > before.count(")") or code not in SECTIONS:
             return f"{PAGE} {code}"
         return f"{SECTIONS[code].names}, {PAGE} {code}"
 
     text = _CITED.sub(section, source)
-    return _SEED.sub(lambda m: DOCUMENTS[m.group(1)], text)
+    return _SEED.sub(lambda m: DOCUMENTS.get(m.group(1), m.group()), text)
 
 
 def cited(source: str) -> tuple[str, ...]:
@@ -113,7 +114,12 @@ def cited(source: str) -> tuple[str, ...]:
 
 def linked(text: str, link: Callable[[str, Section], str]) -> str:
     """What :func:`told` says, with every code replaced by ``link(code, section)``."""
-    return _CODE.sub(lambda m: link(m.group(), SECTIONS[m.group()]), text)
+
+    def one(match: re.Match[str]) -> str:
+        code = match.group()
+        return link(code, SECTIONS[code]) if code in SECTIONS else code
+
+    return _CODE.sub(one, text)
 
 
 def anchor(code: str) -> str:

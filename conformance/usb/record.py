@@ -14,8 +14,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from dexkit.conformance.phases import Beats, Stall
+from dexkit.conformance.phases import Beats, Stall, stalls_of, time_of
 from dexkit.conformance.usb import RECORD
+from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
 
@@ -175,13 +176,13 @@ class UsbRecord:
             )
         try:
             found = cls(
-                stalls=[Stall(int(a), int(b)) for a, b in json.loads(record["stalls"])],
-                beats=Beats(**json.loads(record.get("beats", "{}"))),
+                stalls=stalls_of(record["stalls"]),
+                beats=Beats.of(record.get("beats", "{}")),
             )
             for side in Side:
                 if str(side) in record:
-                    found.sides[side] = _side(json.loads(record[str(side)]))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+                    found.sides[side] = _side(_json(record[str(side)]))
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the USB record is damaged ({error})") from error
         return found
 
@@ -197,8 +198,15 @@ def _side(plain: dict[str, Any]) -> SideRecord:
         ),
         buses=[(int(bus), int(number)) for bus, number in plain["buses"]],
         phases=[
-            UsbPhase(p["name"], int(p["begin_ns"]), int(p["end_ns"]), dict(p["params"]))
+            UsbPhase(
+                str(p["name"]), time_of(p["begin_ns"]), time_of(p["end_ns"]), dict(p["params"])
+            )
             for p in plain["phases"]
         ],
         trouble=plain["trouble"],
     )
+
+
+def _json(text: str) -> Any:
+    # what was measured may be NaN
+    return parse_json(text, "the USB record", error=TraceUnsupported, finite=False)

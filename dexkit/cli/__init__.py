@@ -6,14 +6,18 @@ rooms (drivers, emulators, traces, conformance).
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import errno
 import importlib
+import os
 import sys
 
 import click
 
 from dexkit import __version__, threads
-from dexkit.errors import DexkitError
+from dexkit.errors import DexkitError, OutputError
+from dexkit.untrusted import REMARK, guarded, one_line
 
 __all__ = ["cli", "main"]
 
@@ -36,6 +40,14 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("dexkit.cli.report", "Write the reports of a result again."),
     "serve": ("dexkit.cli.serve", "Put a hand on Unitree's topics."),
     "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
+}
+
+
+_NO_READER = 141
+_HINTS = {
+    errno.EMFILE: "too many open files: raise the limit (ulimit -n)",
+    errno.ENFILE: "too many open files on this machine",
+    errno.EADDRINUSE: "another program has that address; choose another one, or end it",
 }
 
 
@@ -84,29 +96,50 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns (through ``sys.exit``) the exit code.
 
     0 success, 1 a negative result or a failed operation, 2 wrong usage or something unusable,
-    130 interrupted.
+    130 interrupted, 141 nobody reads the output any more.
     """
     try:
-        result = cli.main(args=argv, standalone_mode=False)
-        sys.exit(result if isinstance(result, int) else 0)
+        with guarded():
+            code = _run(argv)
+    except OutputError as error:
+        if error.exit_code != _NO_READER:
+            with contextlib.suppress(OutputError), guarded():
+                _tell(error)
+        code = error.exit_code
+    sys.exit(code)
+
+
+def _run(argv: list[str] | None) -> int:
+    try:
+        result = cli.main(args=argv, prog_name="dexkit", standalone_mode=False)
+        return result if isinstance(result, int) else 0
     except click.exceptions.Abort:
         click.echo("interrupted", err=True)
-        sys.exit(130)
+        return 130
     except click.ClickException as error:
         error.show()
-        sys.exit(error.exit_code)
+        return error.exit_code
+    except OutputError:
+        raise
     except DexkitError as error:
-        click.echo(f"error: {error.message}", err=True)
-        if error.hint:
-            click.echo(f"  {error.hint}", err=True)
-        sys.exit(error.exit_code)
+        _tell(error)
+        return error.exit_code
     except KeyboardInterrupt:
         click.echo("interrupted", err=True)
-        sys.exit(130)
-    except BrokenPipeError:
-        sys.exit(141)
+        return 130
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno is None:
             raise
-        click.echo(f"error: {error.filename}: {error.strerror}", err=True)
-        sys.exit(2)
+        where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        hint = _HINTS.get(error.errno or 0, "")
+        _tell(DexkitError(where + (error.strerror or str(error)), hint=hint))
+        return 2
+
+
+def _tell(error: DexkitError) -> None:
+    """Print an error: one line, then what to do, indented, so that no part of it looks like
+    something else that dexkit prints.
+    """
+    click.echo(f"error: {one_line(error.message, REMARK)}", err=True)
+    for line in error.hint.splitlines():
+        click.echo(f"  {one_line(line, REMARK)}", err=True)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import shutil
 
 import click
+from rich.text import Text
 
 from dexkit.backends import BackendInfo, list_backends
+from dexkit.console import Console
+from dexkit.untrusted import one_line
 
 _WIDEST = 100  # columns; longer lines are hard to read
 
@@ -15,14 +18,16 @@ _WIDEST = 100  # columns; longer lines are hard to read
 def command() -> None:
     """List the hands that can be served: name, model, origin, what each needs, its settings."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
+    console = Console()
     for row in list_backends():
-        click.echo(_describe(row, width))
+        name, _, rest = _describe(row, width).partition(" ")
+        console.print(Text(one_line(name), "bold"), Text(rest), soft_wrap=True)
     click.echo("Your own: dexkit serve package.module:Object (docs/backends.md).")
 
 
 def _describe(row: BackendInfo, width: int) -> str:
     model = f", {row.backend.model}" if row.backend is not None and row.backend.model else ""
-    text = f"{click.style(row.name, bold=True)} ({row.origin}{model})\n"
+    text = f"{row.name} ({row.origin}{model})\n"
 
     def paragraph(content: str, first: str = "", indent: str = "  ") -> None:
         nonlocal text

@@ -13,6 +13,7 @@ import click
 
 from dexkit.cli.common import (
     MOST_REMARKS,
+    Number,
     StopRequest,
     dds_options,
     log_to_stderr,
@@ -60,7 +61,7 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
 )
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="End after so many seconds.  [default: at Ctrl-C]",
 )

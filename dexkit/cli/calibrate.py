@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import click
-from rich.console import Console
 from rich.table import Table
 
-from dexkit.cli.common import StopRequest, stop_on_signals
+from dexkit.cli.common import Number, StopRequest, stop_on_signals
+from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.config import GripperRecord, Store
@@ -19,6 +20,7 @@ from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.scaling import amperes
 from dexkit.drivers.ezgripper.servo import Servo
 from dexkit.errors import UsageError
+from dexkit.untrusted import one_line
 from dexkit.wire import mx64
 
 __all__ = ["command"]
@@ -27,18 +29,24 @@ _FORCE_EFFORTS = (10.0, 15.0, 20.0, 30.0, 40.0)
 """Percent; more would heat the motor while the gauge is read."""
 
 
-class _IdOrAuto(click.ParamType):  # type: ignore[type-arg]
+class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
     name = "N|auto"
+
+    def __init__(self, most: int) -> None:
+        self._most = most
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> object:
         if value == "auto" or isinstance(value, int):
             return value
-        try:
+        if re.fullmatch("[0-9]{1,9}", str(value)) and int(str(value)) <= self._most:
             return int(str(value))
-        except ValueError:
-            self.fail(f"{value!r} is neither a number nor 'auto'", param, ctx)
+        self.fail(
+            f"{one_line(value, 40)!r} is neither a number from 0 to {self._most} nor 'auto'",
+            param,
+            ctx,
+        )
 
 
 @click.command()
@@ -50,18 +58,23 @@ class _IdOrAuto(click.ParamType):  # type: ignore[type-arg]
     help="Whose motor; only for dex1-serial, and needed there.",
 )
 @click.option(
-    "--id", "servo_id", type=_IdOrAuto(), default=1, show_default=True, help="Servo id, or auto."
+    "--id",
+    "servo_id",
+    type=_NumberOrAuto(252),
+    default=1,
+    show_default=True,
+    help="Servo id, or auto.",
 )
 @click.option(
     "--baudrate",
-    type=_IdOrAuto(),
+    type=_NumberOrAuto(12_000_000),
     default=1_000_000,
     show_default=True,
     help="Bits a second, or auto to try those known.",
 )
 @click.option(
     "--effort",
-    type=click.FloatRange(5, 60),
+    type=Number(5, 60),
     default=calibration.EFFORT,
     show_default=True,
     help="Percent of force while looking for the closed position.",
@@ -227,7 +240,7 @@ class _Question:
 
     def _ask(self) -> None:
         try:
-            self.answer = click.prompt("force that the gauge shows", type=click.FloatRange(0))
+            self.answer = click.prompt("force that the gauge shows", type=Number(0))
         except BaseException as error:  # end of input, for example: belongs to the main thread
             self._failed = error
 

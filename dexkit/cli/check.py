@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import click
-from rich.console import Console
 
 from dexkit.bodies import BODIES
+from dexkit.console import Console
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS
 
@@ -119,7 +119,7 @@ def command(
     result = judge(
         view, requirements=requirements, claims=claims, subject={"recording": recording.name}
     )
-    console = Console(highlight=False, emoji=False)
+    console = Console()
     print_result(result, console, verbose=verbose, more="-v says why")
     if also:
         console.print(also)

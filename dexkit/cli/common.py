@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -11,12 +12,15 @@ from typing import Any, TypeVar
 import click
 
 from dexkit.stopping import StopRequest, stop_on_signals
+from dexkit.untrusted import REMARK, one_line
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 __all__ = [
     "MOST_REMARKS",
+    "SEED",
     "STATUS_LINES",
+    "Number",
     "StatusLine",
     "StopRequest",
     "dds_options",
@@ -28,6 +32,29 @@ MOST_REMARKS = 100
 """Different warnings about peers in one run: what they announce is theirs to make up."""
 STATUS_LINES = "DEXKIT_STATUS_LINES"
 """Environment variable: set by a command that starts others and shows what they are doing."""
+
+
+class Number(click.FloatRange):
+    """A finite number. ``click.FloatRange`` lets NaN pass, which is neither too small nor too
+    large, and numbers that no clock or timer can count.
+    """
+
+    _LARGEST = 1e9  # seconds: 30 years
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number."""
+        found: float = super().convert(value, param, ctx)
+        if not math.isfinite(found):
+            self.fail(f"{one_line(value, 40)} is not a finite number.", param, ctx)
+        if abs(found) > self._LARGEST:
+            self.fail(f"{one_line(value, 40)} is larger than {self._LARGEST:g}.", param, ctx)
+        return found
+
+
+SEED = click.IntRange(0, 2**32 - 1)
+"""Where a chance begins that can be repeated."""
 
 
 def dds_options(*, default_domain: int | None) -> Callable[[F], F]:
@@ -53,6 +80,14 @@ def dds_options(*, default_domain: int | None) -> Callable[[F], F]:
     return decorate
 
 
+class _OneLine(logging.Formatter):
+    """Each message in a line of its own, whatever names are in it."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        record.message = one_line(record.message, REMARK)
+        return super().formatMessage(record)
+
+
 def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
     """Log to stderr for as long as the command runs.
 
@@ -62,7 +97,9 @@ def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
     """
     clear = "\r\x1b[K" if status else ""
     level = logging.WARNING if quiet else logging.INFO
-    logging.basicConfig(level=level, format=f"{clear}%(levelname)s %(message)s", force=True)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_OneLine(f"{clear}%(levelname)s %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
     logging.getLogger(always).setLevel(logging.INFO)
 
 

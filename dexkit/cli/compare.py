@@ -49,7 +49,7 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
 
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
     if html_path:
-        html_path.write_text(render_comparison(comparison), encoding="utf-8")
+        write_text(html_path, render_comparison(comparison))
         click.echo(f"report: {html_path}", err=True)
     if markdown_path or not html_path:
         write_text(markdown_path or Path("-"), render_comparison_markdown(comparison))

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 import click
-from rich.console import Console
 
 from dexkit.cli.common import stop_on_signals
+from dexkit.console import Console
 from dexkit.errors import ConformanceError
 
 __all__ = ["command"]
@@ -50,7 +50,7 @@ def command(out: Path, backend: str, domain: int | None) -> None:
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.session import SuiteOptions, run_suite
 
-    console = Console(highlight=False)
+    console = Console()
     out.mkdir(parents=True, exist_ok=True)
     options = SuiteOptions.make(
         backend=backend,

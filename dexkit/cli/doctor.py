@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -11,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import StopRequest, stop_on_signals
+from dexkit.cli.common import Number, StopRequest, stop_on_signals
 from dexkit.errors import UsageError
+from dexkit.limits import room_for_files
 from dexkit.models import DIALECTS, MODELS, Dialect
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 _REFRESH = 1.0  # seconds between looks
+_FILES = 16  # descriptors beside one a domain and interface
 _MODEL_NAMES = {name.partition("-")[0]: name for name in MODELS}
 
 
@@ -32,7 +35,8 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     found: list[int] = []
     for part in text.split(","):
         low, dash, high = part.partition("-")
-        if not low.isdecimal() or (dash and not high.isdecimal()):
+        # int() knows fewer digits than isdigit()
+        if not all(re.fullmatch("[0-9]{1,3}", end) for end in (low, *([high] if dash else []))):
             raise click.BadParameter("write 0-10, or 0,1,5-7, or none")
         first, last = int(low), int(high if dash else low)
         if not 0 <= first <= last <= 230:
@@ -77,7 +81,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 @click.option("--watch", is_flag=True, help="Look again and again until Ctrl-C.")
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.2, 600),
+    type=Number(0.2, 600),
     default=2.0,
     show_default=True,
     help="How long samples are watched.",
@@ -109,6 +113,8 @@ def command(
     if domain is None and not scan:
         raise UsageError("no domain to look at", hint="give --domain or --scan")
     wish = Wish(domain, _dialects(model, dialect), bool(devices) and domain is None)
+    windows = len({*scan, *([] if domain is None else [domain])}) * len({"lo", *interfaces})
+    room_for_files(windows + _FILES, f"a look at {windows} domain(s)")
     with stop_on_signals() as stop, ThreadPoolExecutor(1) as beside:
         env = beside.submit(environment)  # it starts processes, which takes a second
         last: int | None = None
@@ -208,8 +214,7 @@ def _print(
     watch: bool,
     first: bool,
 ) -> None:
-    from rich.console import Console
-
+    from dexkit.console import Console
     from dexkit.doctor.report import print_report
 
     console = Console(soft_wrap=True)

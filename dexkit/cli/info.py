@@ -91,9 +91,11 @@ def command(file: Path, as_json: bool) -> int:
 
 
 def _print(data: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+
+    from dexkit.console import Console
+    from dexkit.console import markup as escape
+    from dexkit.untrusted import LONGEST
 
     # wide enough for the table: in a pipe rich would cut topics to 80 columns
     console = Console(width=max(Console().width, 120))
@@ -123,22 +125,24 @@ def _print(data: dict[str, Any]) -> None:
         for row in data["topics"]:
             gaps = row.get("gap_ms", {})
             table.add_row(
-                escape(row["topic"]),
+                escape(row["topic"], LONGEST),
                 f"{row['messages']:,}",
                 _number(row.get("mean_hz"), 1),
                 _number(gaps.get("p50"), 2),
                 _number(gaps.get("p99"), 2),
                 _number(gaps.get("max"), 1),
                 _number(row.get("first_s"), 2),
-                escape(row["type"].replace("::msg::dds_::", " ") or "?"),
-                escape(row["schema_encoding"] or "none"),
+                escape(row["type"].replace("::msg::dds_::", " ") or "?", LONGEST),
+                escape(row["schema_encoding"] or "none", LONGEST),
             )
         console.print()
         console.print(table)
     for name, values in data["metadata"].items():
         console.print(f"\n[bold]{escape(name)}[/bold]")
         for key, value in values.items():
-            console.print(f"  {escape(key)}: {escape(value)}", highlight=False, soft_wrap=True)
+            console.print(
+                f"  {escape(key, LONGEST)}: {escape(value)}", highlight=False, soft_wrap=True
+            )
     if data["warnings"] or data["notes"]:
         console.print()
         for warning in data["warnings"]:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
+
+    from dexkit.console import Console
 
 __all__ = ["command"]
 
@@ -29,8 +30,7 @@ def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     Without a NAME, an overview. docs/models.md has the same with drawings; the shape of the
     JSON is in dexkit/family/facts.py: one object with a list "models".
     """
-    from rich.console import Console
-
+    from dexkit.console import Console
     from dexkit.family.facts import describe
     from dexkit.family.facts import names as all_names
 
@@ -39,7 +39,7 @@ def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
         click.echo(json.dumps({"models": models}, indent=1))
         return
     width = min(shutil.get_terminal_size().columns, _WIDEST)
-    console = Console(width=width, highlight=False)
+    console = Console(width=width)
     if not (names or every):
         _overview(console, models)
         return

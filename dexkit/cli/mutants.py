@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
 import click
-from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from dexkit.bodies import BODIES
 from dexkit.cli.common import stop_on_signals
+from dexkit.console import Console
 from dexkit.models import MODELS
 
 
@@ -29,7 +30,7 @@ from dexkit.models import MODELS
 @click.option(
     "--json", "json_path", type=click.Path(path_type=Path), help="Write the score as JSON."
 )
-@click.option("--jobs", type=click.IntRange(1), help="Processes. Default: one a processor.")
+@click.option("--jobs", type=click.IntRange(1, 1024), help="Processes. Default: one a processor.")
 @click.option("-v", "--verbose", is_flag=True, help="Say what every wrong hand does wrong.")
 def command(
     model: str | None,
@@ -49,6 +50,10 @@ def command(
     """
     from dexkit.conformance.mutants.matrix import Score, chosen
 
+    if json_path:
+        json_path = json_path.absolute()
+    # Python's worker processes begin with the working folder in front of their import path
+    os.chdir("/")
     console = Console()
     requirements, trials = chosen(model, require)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit import threads
-from dexkit.cli.common import dds_options, stop_on_signals
+from dexkit.cli.common import Number, dds_options, stop_on_signals
 from dexkit.errors import TraceError, UsageError
+from dexkit.untrusted import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
@@ -35,7 +36,7 @@ __all__ = ["command"]
 @dds_options(default_domain=1)
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="Stop after so many seconds. Default: record until Ctrl-C.",
 )
@@ -95,12 +96,14 @@ def command(
             threads.check()  # why nothing came is known then
             _nothing(node, recording, time.monotonic() - started)
     for topic, why in recording.unknown.items():
-        click.echo(f"warning: {_plain(topic)} was not recorded: {_plain(why)}", err=True)
+        click.echo(one_line(f"warning: {topic} was not recorded: {why}", REMARK), err=True)
     for text in (*recording.losses.sentences(), recorder.displaced):
         if text:
-            click.echo(f"warning: {text}", err=True)
+            click.echo(one_line(f"warning: {text}", REMARK), err=True)
     dropped = recorder.dropped
-    per_topic = ", ".join(f"{topic} {count}" for topic, count in sorted(recorder.offered.items()))
+    per_topic = ", ".join(
+        f"{one_line(topic)} {count}" for topic, count in sorted(recorder.offered.items())
+    )
     click.echo(f"{out}: {recorder.written} messages ({per_topic}), {_missing(recorder, recording)}")
     return 1 if dropped or recording.losses or recorder.displaced else 0
 
@@ -115,18 +118,13 @@ def _missing(recorder: Recorder, recording: DdsRecording) -> str:
     return text
 
 
-def _plain(text: str) -> str:
-    """What a peer announced, without control characters."""
-    return "".join(c if c.isprintable() else "\ufffd" for c in text)
-
-
 def _nothing(node: DdsNode, recording: DdsRecording, waited: float) -> None:
     """Say what was there instead.
 
     :raises TraceError: always, with exit code 1.
     """
     seen = sorted({f"{e.topic} ({e.type_name})" for e in node.endpoints() if not e.own})
-    seen = [_plain(entry) for entry in seen if not entry.startswith("DCPS")]
+    seen = [one_line(entry) for entry in seen if not entry.startswith("DCPS")]
     others = [p.process or p.key for p in node.discovery.participants() if not p.own]
     if not others:
         hint = "no other participant was seen there: is it another --domain or --interface?"
@@ -165,7 +163,9 @@ class _Status:
         self._before, self._at, self._last_line = offered, now, now
         text = f"{now - self._started:6.1f} s  {sum(offered.values()):,} messages"
         text += f"  {_missing(self._recorder, recording)}"
-        text += "".join(f"  {t.removeprefix('rt/')} {hz:.0f} Hz" for t, hz in rates.items())
+        text += "".join(
+            f"  {one_line(t.removeprefix('rt/'))} {hz:.0f} Hz" for t, hz in rates.items()
+        )
         if not offered:
             text += f"  waiting for {', '.join(recording.subscribed) or 'topics'}"
         if self._tty:

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import StopRequest, dds_options, stop_on_signals
+from dexkit.cli.common import Number, StopRequest, dds_options, stop_on_signals
 from dexkit.errors import DdsError, TraceUnsupported
 from dexkit.sole import Place, SolePublisher
 from dexkit.threads import Worker
+from dexkit.untrusted import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
@@ -34,7 +35,7 @@ _LINGER = 0.1
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
     "--speed",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(1e-3, 1e3),
     default=1.0,
     show_default=True,
     help="2 plays in half the time.",
@@ -50,14 +51,14 @@ _LINGER = 0.1
 )
 @click.option(
     "--max-gap",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="Shorten longer pauses to this. Default: keep them.",
 )
 @dds_options(default_domain=1)
 @click.option(
     "--wait",
-    type=click.FloatRange(min=0),
+    type=Number(min=0),
     default=10.0,
     show_default=True,
     metavar="S",
@@ -96,11 +97,11 @@ def command(
         player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
     finally:  # more may be found while the messages are read
         for warning in trace.warnings:
-            click.echo(f"warning: {warning}", err=True)
+            click.echo(one_line(f"warning: {warning}", REMARK), err=True)
     _check_types(trace, player)
     click.echo(
-        f"{file}: {len(player)} messages of {', '.join(player.topics)}, {player.duration:.1f} s"
-        + (", looped" if loop else "")
+        f"{file}: {len(player)} messages of {', '.join(map(one_line, player.topics))}, "
+        f"{player.duration:.1f} s" + (", looped" if loop else "")
     )
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
         # two sources of commands fight over the hand: a recording gives way to whoever comes
@@ -163,7 +164,8 @@ def _wait_for_readers(
     end = time.monotonic() + patience
     missing = [t for t, w in writers.items() if not w.matched]
     if missing:
-        click.echo(f"waiting for somebody to subscribe {', '.join(missing)} ...", err=True)
+        names = ", ".join(map(one_line, missing))
+        click.echo(f"waiting for somebody to subscribe {names} ...", err=True)
     while missing and not stop and time.monotonic() < end:
         writers[missing[0]].wait_matched(timeout=0.1)
         missing = [t for t, w in writers.items() if not w.matched]

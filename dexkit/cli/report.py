@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 
+from dexkit.documents import write_file
 from dexkit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def write_text(path: Path, text: str) -> None:
     if str(path) == "-":
         click.echo(text, nl=False)
     else:
-        path.write_text(text, encoding="utf-8")
+        write_file(path, text)
 
 
 @click.command("report")
@@ -64,6 +64,7 @@ def command(
     from dexkit.conformance.report.markdown import render_markdown
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.results import read_json
+    from dexkit.console import Console
 
     found = read_json(result)
     if html_path:

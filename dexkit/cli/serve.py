@@ -15,6 +15,7 @@ import click
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.common import (
     MOST_REMARKS,
+    Number,
     StatusLine,
     StopRequest,
     dds_options,
@@ -84,7 +85,7 @@ _LONELY = 10.0  # seconds without a client before a hint
 @dds_options(default_domain=None)
 @click.option(
     "--state-rate",
-    type=click.FloatRange(1, 1000),
+    type=Number(1, 1000),
     metavar="HZ",
     help="States published a second.  [default: the model's, "
     + ", ".join(f"{m.state_rate:g} for a {m.name}" for m in MODELS.values())

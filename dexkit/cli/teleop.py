@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dexkit.cli.common import dds_options, stop_on_signals
+from dexkit.cli.common import Number, dds_options, stop_on_signals
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
@@ -64,14 +64,14 @@ _MS = 1e3
 )
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0.5),
+    type=Number(min=0.5),
     metavar="S",
     help="Go on for so long; the profile repeats.  [default: once]",
 )
 @click.option(
     "--wait",
     "patience",
-    type=click.FloatRange(min=0),
+    type=Number(min=0),
     metavar="S",
     help="Give up waiting for state after so long.  [default: never, as the genuine client]",
 )

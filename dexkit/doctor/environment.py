@@ -47,9 +47,11 @@ def _version(name: str) -> str:
 def _import_problem(module: str) -> str:
     """Why a module does not import, or empty. A crash of it is not ours."""
     code = f"import {module}"
+    # -c has the working folder in front of the path; installed programs have not
+    start = f"import sys; sys.path[:] = [p for p in sys.path if p]; {code}"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code],
+            [sys.executable, "-c", start],
             capture_output=True,
             text=True,
             timeout=_PATIENCE,

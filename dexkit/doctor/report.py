@@ -6,16 +6,17 @@ import dataclasses
 import math
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Column, Table
 
 from dexkit.bodies import BODIES
+from dexkit.console import Console
+from dexkit.console import markup as escape
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
 from dexkit.doctor.rules import Readiness, Verdict
 from dexkit.doctor.topics import short
 from dexkit.topics import roles
+from dexkit.untrusted import LONGEST
 
 __all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
 
@@ -96,10 +97,12 @@ def print_report(
     )
     for view in seen.domains:
         for endpoint in view.endpoints:
-            table.add_row(*(escape(cell) for cell in _row(view, endpoint)))
+            table.add_row(*(escape(cell, LONGEST) for cell in _row(view, endpoint)))
         if view.participants and not view.endpoints:
             for participant in view.participants:
-                table.add_row(str(view.number), "-", "-", "-", "", escape(participant.name))
+                table.add_row(
+                    str(view.number), "-", "-", "-", "", escape(participant.name, LONGEST)
+                )
     if table.row_count:
         console.print()
         console.print(table)

@@ -23,10 +23,12 @@ from typing import Any
 
 import platformdirs
 
+from dexkit import documents
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.errors import UsageError
-from dexkit.files import update_file
 from dexkit.wire import mx64
+
+_HINT = "correct it, or remove it and calibrate again"
 
 __all__ = ["ENVIRONMENT", "GripperRecord", "Store", "default_path", "record_key"]
 
@@ -75,23 +77,12 @@ class Store:
         self.path = path if path is not None else default_path()
 
     def _load(self) -> dict[str, Any]:
-        try:
-            text = self.path.read_text(encoding="utf-8")
-        except FileNotFoundError:
+        if not os.path.lexists(self.path):
             return {}
-        except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"cannot read {self.path}: {error}") from error
-        return self._parse(text)
+        return self._parse(documents.read_text(self.path, hint=_HINT))
 
     def _parse(self, text: str) -> dict[str, Any]:
-        try:
-            # NaN and Infinity are no JSON, and no calibration either
-            content = json.loads(text, parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
-            raise UsageError(
-                f"{self.path} is not valid JSON: {error}",
-                hint="correct it, or remove it and calibrate again",
-            ) from error
+        content = documents.parse_json(text, self.path, hint=_HINT)
         if not isinstance(content, dict):
             raise UsageError(f"{self.path} must hold a JSON object")
         return content
@@ -156,7 +147,7 @@ class Store:
     def write(self, key: str, record: GripperRecord) -> None:
         """Store what ``record`` knows; what it does not know stays as it is in the file.
 
-        What other programs store at the same time is kept (:func:`dexkit.files.update_file`).
+        What other programs store at the same time is kept (:func:`dexkit.documents.update_file`).
 
         :raises UsageError: the file cannot be read or written.
         """
@@ -166,7 +157,7 @@ class Store:
             self._enter(content, key, record)
             return json.dumps(content, indent=2, sort_keys=True) + "\n"
 
-        update_file(self.path, change)
+        documents.update_file(self.path, change)
 
     def _enter(self, content: dict[str, Any], key: str, record: GripperRecord) -> None:
         if record.zero is not None:
@@ -184,7 +175,3 @@ class Store:
             content[_FORCE] = self._section(content, _FORCE) | {
                 key: record.force_table.to_mapping()
             }
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -12,6 +11,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from dexkit import documents
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.drivers.ezgripper import calibration, settings
@@ -577,7 +577,7 @@ def _or_auto(text: str) -> int | None:
 def _table(text: str) -> ForceTable:
     if text == "default":
         return DEFAULT_FORCE_TABLE
-    content = json.loads(Path(text).read_text(encoding="utf-8"))
+    content = documents.read_json(Path(text))
     if not isinstance(content, dict):
         raise ValueError("the file must hold a JSON object")
     return ForceTable.from_mapping(content)

@@ -40,6 +40,7 @@ from dexkit import ingress
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
 from dexkit.threads import Worker
+from dexkit.untrusted import one_line
 
 __all__ = [
     "DEAD",
@@ -508,9 +509,12 @@ def _listen(host: str, port: int) -> socket.socket:
         if listener.getsockname()[0].startswith("127."):
             _keep_networks_out(listener)
         listener.listen(MOST_CONNECTIONS)
-    except OSError as error:
+    except (OSError, TypeError, ValueError) as error:  # the latter two: no host has such a name
         listener.close()
         hint = "--host takes an address of this machine"
+        if not isinstance(error, OSError):
+            what = f"cannot serve USB/IP on {one_line(host, 80)!r}: no such host"
+            raise EmulatorError(what, hint=hint) from error
         if error.errno == errno.EADDRINUSE:
             hint = "another USB/IP server has it; choose another with --port, or --port 0"
         elif error.errno == errno.EACCES:

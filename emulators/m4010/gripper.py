@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 
 from dexkit.clock import RealClock
@@ -18,6 +17,7 @@ from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
+from dexkit.scratch import Scratch
 
 __all__ = ["Dex1Motors", "Dex1Process", "emulated_dex1"]
 
@@ -180,10 +180,10 @@ class Dex1Process(EmulatorProcess):
         *,
         timeout: float = 20.0,
     ) -> None:
-        self._directory: tempfile.TemporaryDirectory[str] | None = None
+        self._directory: Scratch | None = None
         if link is None:
-            self._directory = tempfile.TemporaryDirectory(prefix="dexkit-dex1-")
-            link = os.path.join(self._directory.name, "tty")
+            self._directory = Scratch("dex1")
+            link = self._directory.path / "tty"
         self.path = os.path.abspath(os.fspath(link))
         try:
             super().__init__(
@@ -200,7 +200,7 @@ class Dex1Process(EmulatorProcess):
 
     def _cleanup(self) -> None:
         if self._directory is not None:
-            self._directory.cleanup()
+            self._directory.close()
             self._directory = None
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import tempfile
 from collections.abc import Iterator, Sequence
 
 from dexkit.clock import RealClock
@@ -16,6 +15,7 @@ from dexkit.emulators.mx64.settings import Firmware, Physics
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
+from dexkit.scratch import Scratch
 
 __all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
 
@@ -72,10 +72,10 @@ class EmulatedProcess(EmulatorProcess):
         *,
         timeout: float = 20.0,
     ) -> None:
-        self._directory: tempfile.TemporaryDirectory[str] | None = None
+        self._directory: Scratch | None = None
         if link is None:
-            self._directory = tempfile.TemporaryDirectory(prefix="dexkit-mx64-")
-            link = os.path.join(self._directory.name, "tty")
+            self._directory = Scratch("mx64")
+            link = self._directory.path / "tty"
         self.path = os.path.abspath(os.fspath(link))
         super().__init__("mx64", ["--link", self.path, *arguments], MX64_FAULTS, timeout=timeout)
 
@@ -83,7 +83,7 @@ class EmulatedProcess(EmulatorProcess):
         """Stop it; ``output`` and ``errors`` then hold what it printed behind the ready line."""
         super().close()
         if self._directory is not None:
-            self._directory.cleanup()
+            self._directory.close()
             self._directory = None
 
 

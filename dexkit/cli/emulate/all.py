@@ -14,7 +14,14 @@ from concurrent.futures import ThreadPoolExecutor
 import click
 
 from dexkit.bodies import BODIES
-from dexkit.cli.common import STATUS_LINES, StatusLine, StopRequest, dds_options, stop_on_signals
+from dexkit.cli.common import (
+    STATUS_LINES,
+    Number,
+    StatusLine,
+    StopRequest,
+    dds_options,
+    stop_on_signals,
+)
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1
 from dexkit.processes import READY_TIMEOUT, Tool
@@ -48,7 +55,7 @@ _POLL = 0.05  # seconds between looks whether all parts live
 @dds_options(default_domain=1)
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0, min_open=True),
+    type=Number(min=0, min_open=True),
     metavar="S",
     help="End after so many seconds.  [default: at Ctrl-C]",
 )

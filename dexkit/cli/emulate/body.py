@@ -15,6 +15,8 @@ import click
 from dexkit.bodies import G1, H1, BodyModel
 from dexkit.cli.common import (
     MOST_REMARKS,
+    SEED,
+    Number,
     StatusLine,
     StopRequest,
     dds_options,
@@ -123,7 +125,7 @@ def _command(model: BodyModel) -> click.Command:
 
 
 _OPTIONS = [
-    click.option("--duration", type=click.FloatRange(0), metavar="S", help="Stop after S seconds."),
+    click.option("--duration", type=Number(0), metavar="S", help="Stop after S seconds."),
     click.option(
         "--remote",
         default="",
@@ -142,13 +144,13 @@ _OPTIONS = [
     ),
     click.option(
         "--noise",
-        type=click.FloatRange(0),
+        type=Number(0, 1000),
         default=0.0,
         show_default=True,
         metavar="X",
         help="Noise of the IMU; 1 is that of a plain one.",
     ),
-    click.option("--seed", type=int, default=0, show_default=True, help="Of the noise."),
+    click.option("--seed", type=SEED, default=0, show_default=True, help="Of the noise."),
     click.option("--force", is_flag=True, help="Even if another process publishes the state."),
     click.option(
         "--real-time/--no-real-time",

@@ -6,7 +6,7 @@ import sys
 
 import click
 
-from dexkit.cli.common import stop_on_signals
+from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import Side
@@ -34,16 +34,14 @@ __all__ = ["emulate_dex1_motor"]
 @click.option(
     "--object",
     "object_pct",
-    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    type=Number(0, 100, min_open=True, max_open=True),
     metavar="PCT",
     help="Percent of opening at which the jaws touch an object.  [default: no object]",
 )
-@click.option(
-    "--start", type=click.FloatRange(0, 100), default=20.0, metavar="PCT", help="Opening at first."
-)
+@click.option("--start", type=Number(0, 100), default=20.0, metavar="PCT", help="Opening at first.")
 @click.option(
     "--zero-error",
-    type=click.FloatRange(-6, 6),
+    type=Number(-6, 6),
     default=0.0,
     metavar="RAD",
     help="Report the position too large by this, until it is calibrated.",
@@ -58,14 +56,14 @@ __all__ = ["emulate_dex1_motor"]
 @click.option("--line-time/--no-line-time", default=True, help="Bytes take their time.")
 @click.option(
     "--answer-time",
-    type=click.FloatRange(0, 1000),
+    type=Number(0, 1000),
     default=0.0,
     metavar="MS",
     help="From a command to its answer; what the real motor needs is not known.",
 )
 @click.option(
     "--latency-timer",
-    type=click.FloatRange(0, 255),
+    type=Number(0, 255),
     default=0.0,
     metavar="MS",
     help="Of the USB-serial adapter, where it has one.",
@@ -82,7 +80,7 @@ __all__ = ["emulate_dex1_motor"]
     is_flag=True,
     help="Also take faults as lines of input, and stop at its end.",
 )
-@click.option("--seed", type=int, default=0, help="Of the faults' chance.")
+@click.option("--seed", type=SEED, default=0, help="Of the faults' chance.")
 @click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
 def emulate_dex1_motor(
     side: str,

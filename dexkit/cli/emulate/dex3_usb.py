@@ -8,19 +8,25 @@ from contextlib import nullcontext
 
 import click
 
-from dexkit.cli.common import stop_on_signals
+from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.errors import EmulatorError
 from dexkit.hand import Side
+from dexkit.untrusted import one_line
 
 __all__ = ["emulate_dex3_usb"]
 
 
 def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     try:
-        return int(value, 0)
+        found = int(value, 0)
     except ValueError:
-        raise click.BadParameter(f"{value!r} is not an endpoint address such as 0x81") from None
+        found = -1
+    # USB 2.0, 9.6.6: the direction in bit 7, the number in bits 0 to 3; 0 is the control endpoint
+    if found & ~0x8F or not found & 0x0F:
+        shown = one_line(value, 40)
+        raise click.BadParameter(f"{shown!r} is not an endpoint address such as 0x81")
+    return found
 
 
 @click.command("dex3-usb", context_settings={"show_default": True})
@@ -46,13 +52,13 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
 @click.option(
     "--object",
     "object_pct",
-    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    type=Number(0, 100, min_open=True, max_open=True),
     metavar="PCT",
     help="How far the fingers close until they touch an object.  [default: no object]",
 )
 @click.option(
     "--start",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     metavar="PCT",
     help="How far they are closed at first.  [default: at rest, about 20]",
 )
@@ -74,7 +80,7 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     is_flag=True,
     help="Also take faults as lines of input, and stop at its end.",
 )
-@click.option("--seed", type=int, default=0, help="Of the faults' chance.")
+@click.option("--seed", type=SEED, default=0, help="Of the faults' chance.")
 @click.option(
     "--real-time",
     is_flag=True,

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.common import stop_on_signals
+from dexkit import documents
+from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.clock import RealClock
 from dexkit.errors import EmulatorError, UsageError
-from dexkit.files import update_file
 from dexkit.wire import mx64
 
 __all__ = ["emulate_mx64"]
@@ -40,13 +40,11 @@ __all__ = ["emulate_mx64"]
 @click.option(
     "--object",
     "object_pct",
-    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    type=Number(0, 100, min_open=True, max_open=True),
     metavar="PCT",
     help="Percent of opening at which the fingers touch an object.  [default: no object]",
 )
-@click.option(
-    "--start", type=click.FloatRange(0, 100), default=50.0, metavar="PCT", help="Opening at first."
-)
+@click.option("--start", type=Number(0, 100), default=50.0, metavar="PCT", help="Opening at first.")
 @click.option(
     "--closed-at",
     type=click.IntRange(0, mx64.TICKS_PER_TURN - 1),
@@ -57,7 +55,7 @@ __all__ = ["emulate_mx64"]
 @click.option("--line-time/--no-line-time", default=True, help="Bytes take their time.")
 @click.option(
     "--latency-timer",
-    type=click.FloatRange(0, 255),
+    type=Number(0, 255),
     default=1.0,
     metavar="MS",
     help="Of the USB-serial adapter; an untuned one has 16, a ttyACM device 0.",
@@ -74,7 +72,7 @@ __all__ = ["emulate_mx64"]
     is_flag=True,
     help="Also take faults as lines of input, and stop at its end.",
 )
-@click.option("--seed", type=int, default=0, help="Of the faults' chance and of noise.")
+@click.option("--seed", type=SEED, default=0, help="Of the faults' chance and of noise.")
 @click.option(
     "--eeprom",
     type=click.Path(dir_okay=False, path_type=Path),
@@ -178,16 +176,16 @@ class _EepromFile:
                 f"cannot keep the EEPROM in {path}",
                 hint="its directory must exist and be writable",
             )
-        if path.exists():
+        if os.path.lexists(path):
+            hint = "it is to hold the servos' EEPROM; remove it to start with factory values"
+            data = documents.read_json(path, error=EmulatorError, hint=hint)
             try:
-                data = json.loads(path.read_text(encoding="utf-8"))
                 if data["device"] != "mx64":
                     raise ValueError(f"it is for a {data['device']}")
                 self._contents = [bytes.fromhex(text) for text in data["eeprom"]]
-            except (OSError, ValueError, KeyError, TypeError) as error:
+            except (ValueError, KeyError, TypeError) as error:
                 raise EmulatorError(
-                    f"{path} is not an EEPROM file of this emulator: {error}",
-                    hint="remove it to start with factory values",
+                    f"{path} is not an EEPROM file of this emulator: {error}", hint=hint
                 ) from error
 
     def load(self, index: int) -> bytes | None:
@@ -198,6 +196,6 @@ class _EepromFile:
         """Replace the file; a disk that is full does not stop the emulator."""
         text = json.dumps({"device": "mx64", "eeprom": [c.hex() for c in contents]}, indent=1)
         try:
-            update_file(self.path, lambda _: text + "\n")
+            documents.update_file(self.path, lambda _: text + "\n")
         except UsageError as error:
             click.echo(f"warning: the EEPROM is not kept: {error.message}", err=True)

@@ -1,0 +1,319 @@
+"""Files that a user gives, and files that dexkit writes.
+
+Reading raises one typed error that names the file, whatever is wrong with it: not there, a folder,
+a device, a pipe, too large, no UTF-8, no JSON or TOML, nested without end, a key twice, a number
+that is none. Writing replaces a file in one step: what was there stays until the new one is whole.
+A file that several programs change has one writer at a time (:func:`update_file`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import math
+import os
+import secrets
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from dexkit.errors import DexkitError, UsageError
+from dexkit.untrusted import one_line, output_error
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = [
+    "DEEPEST",
+    "LARGEST",
+    "LOCK_PATIENCE",
+    "parse_json",
+    "parse_toml",
+    "read_json",
+    "read_text",
+    "read_toml",
+    "update_file",
+    "write_file",
+]
+
+LARGEST = 64 * 1024 * 1024
+"""Bytes of a file that is read; a result of the largest run has less than one million."""
+DEEPEST = 32
+"""Levels of a document; dexkit's own have less than ten."""
+_DIGITS = 20
+"""Digits of a whole number: 64 bits."""
+
+
+LOCK_PATIENCE = 10.0
+"""Seconds to wait for another writer, which needs some milliseconds."""
+_LOOK = 0.01  # seconds between attempts
+_NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS})
+
+
+def read_text(path: Path, *, error: type[DexkitError] = UsageError, hint: str = "") -> str:
+    """The text of a UTF-8 file, with or without a byte order mark.
+
+    :param error: what is raised when it cannot be read.
+    :param hint: what to do then.
+    """
+    try:
+        # a pipe without a writer would be waited for
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError) as why:  # ValueError: a null character in the name
+        reason = why.strerror if isinstance(why, OSError) else str(why)
+        raise error(f"cannot read {path}: {reason}", hint=hint) from why
+    try:
+        with os.fdopen(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
+            data = file.read(LARGEST + 1)
+    except OSError as why:
+        raise error(f"cannot read {path}: {why.strerror}", hint=hint) from why
+    if len(data) > LARGEST:
+        raise error(f"cannot read {path}: it is larger than {LARGEST >> 20} MB", hint=hint)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as why:
+        raise error(f"{path} is not UTF-8 text (at byte {why.start})", hint=hint) from why
+
+
+def read_json(path: Path, *, error: type[DexkitError] = UsageError, hint: str = "") -> Any:
+    """The document in a JSON file; raises as :func:`read_text` and :func:`parse_json`."""
+    return parse_json(read_text(path, error=error, hint=hint), path, error=error, hint=hint)
+
+
+def read_toml(
+    path: Path, *, error: type[DexkitError] = UsageError, hint: str = ""
+) -> dict[str, Any]:
+    """The document in a TOML file; raises as :func:`read_text` and :func:`parse_toml`."""
+    return parse_toml(read_text(path, error=error, hint=hint), path, error=error, hint=hint)
+
+
+def parse_json(
+    text: str,
+    origin: object,
+    *,
+    error: type[DexkitError] = UsageError,
+    hint: str = "",
+    finite: bool = True,
+) -> Any:
+    """The document in a JSON text.
+
+    :param origin: what to call it.
+    :param finite: refuse NaN and infinity, which are no JSON, but which Python writes.
+    :raises DexkitError: it is no JSON, holds a key twice, a number that is not finite or has more
+        than 64 bits, or is nested more than :data:`DEEPEST` levels.
+    """
+    try:
+        document = json.loads(
+            text,
+            parse_constant=_no_number if finite else None,
+            parse_float=_finite if finite else None,
+            parse_int=_whole,
+            object_pairs_hook=_once,
+        )
+        _shallow(document)
+    except RecursionError:
+        raise error(f"{origin} is not valid JSON: {_TOO_DEEP}", hint=hint) from None
+    except ValueError as why:
+        raise error(f"{origin} is not valid JSON: {one_line(why)}", hint=hint) from why
+    return document
+
+
+def parse_toml(
+    text: str, origin: object, *, error: type[DexkitError] = UsageError, hint: str = ""
+) -> dict[str, Any]:
+    """The document in a TOML text.
+
+    :param origin: what to call it.
+    :raises DexkitError: it is no TOML, holds a number that is not finite or has more than 64 bits,
+        or is nested more than :data:`DEEPEST` levels.
+    """
+    try:
+        document = tomllib.loads(text, parse_float=_finite)
+        _shallow(document)
+    except RecursionError:
+        raise error(f"{origin} is not valid TOML: {_TOO_DEEP}", hint=hint) from None
+    except ValueError as why:
+        raise error(f"{origin} is not valid TOML: {one_line(why)}", hint=hint) from why
+    return document
+
+
+_TOO_DEEP = f"nested more than {DEEPEST} levels"
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is not a number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{one_line(text, 40)} is not a finite number")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) > _DIGITS:
+        raise ValueError(f"{one_line(text, 40)} has more than {_DIGITS} digits")
+    return int(text)
+
+
+def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"the key {one_line(key, 40)!r} is there twice")
+        found[key] = value
+    return found
+
+
+def _shallow(document: Any) -> None:
+    """Refuse what is nested too deeply, or has huge numbers (TOML's parser leaves them).
+
+    :raises ValueError: it is.
+    """
+    level, depth = [document], 0
+    while level:
+        below: list[Any] = []
+        for value in level:
+            if isinstance(value, dict | list):
+                if depth == DEEPEST:
+                    raise ValueError(_TOO_DEEP)
+                below += value.values() if isinstance(value, dict) else value
+            elif isinstance(value, int) and abs(value) >= 10**_DIGITS:
+                raise ValueError(f"a number has more than {_DIGITS} digits")
+        level, depth = below, depth + 1
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file in one step: until it is whole, and on any error, what was there stays.
+
+    A device or a pipe is written as it is, and a link keeps leading to the file.
+
+    :raises OutputError: it cannot be written.
+    """
+    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+    try:
+        target = Path(os.path.realpath(path))
+        mode = target.stat().st_mode if target.exists() else None
+        if mode is not None and stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if mode is not None and not stat.S_ISREG(mode):
+            with target.open("wb", buffering=0) as file:
+                _write_all(file.fileno(), data)
+            return
+        if mode is not None and not os.access(target, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        _replace(target, data)
+    except (OSError, ValueError) as why:
+        found = why if isinstance(why, OSError) else OSError(errno.EINVAL, str(why))
+        raise output_error(path, found) from why
+
+
+def _replace(target: Path, data: bytes) -> None:
+    """Write beside a file, flush to the disk and rename; permissions and, as far as permitted, the
+    owner stay.
+    """
+    temporary = target.with_name(f".dexkit-{secrets.token_hex(8)}")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    descriptor = os.open(temporary, flags, 0o666)  # less the mask, as of any new file
+    try:
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                known = target.stat()
+                with contextlib.suppress(PermissionError):
+                    os.fchown(descriptor, known.st_uid, known.st_gid)
+                os.fchmod(descriptor, stat.S_IMODE(known.st_mode))
+            _write_all(descriptor, data)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(temporary, target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+    with contextlib.suppress(OSError):  # some file systems have no fsync of folders
+        folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(descriptor, view) :]
+
+
+def update_file(path: Path, change: Callable[[str | None], str]) -> None:
+    """Replace a text file by what ``change`` makes of its content, alone among all writers.
+
+    :param change: gets the content, None where there is no file, and returns the new one. What it
+        raises leaves the file as it was.
+    :raises UsageError: the file or its folder cannot be read, locked or written.
+
+    Reading and writing happen under an exclusive lock on ``.NAME.lock`` beside the file, which
+    stays there. The new content is written beside the file, flushed to the disk and renamed over
+    it: whenever the program is killed, the file is the old or the new one. A symbolic link stays
+    one, and the file keeps its permissions and, as far as permitted, its owner.
+    """
+    try:
+        target = path.resolve()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(target):
+            try:
+                before: str | None = target.read_text(encoding="utf-8")
+            except FileNotFoundError:
+                before = None
+            after = change(before)
+            if after != before:
+                _replace(target, after.encode())
+    except UnicodeDecodeError as error:
+        raise UsageError(f"cannot read {path}: it is not UTF-8 text") from error
+    except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links (Python 3.10)
+        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise UsageError(
+            f"cannot write {path}: {why}", hint="its folder must be writable and have room"
+        ) from error
+
+
+@contextlib.contextmanager
+def _locked(target: Path) -> Iterator[None]:
+    lock = target.with_name(f".{target.name}.lock")
+    try:
+        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except PermissionError:  # another user's: reading is enough for a lock on a local disk
+        descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        end = time.monotonic() + LOCK_PATIENCE
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() >= end:
+                    raise UsageError(
+                        f"{target} has been locked by another program for {LOCK_PATIENCE:g} s",
+                        hint=f"which one? See: fuser -v {lock}",
+                    ) from error
+                time.sleep(_LOOK)
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                raise UsageError(
+                    f"{target} cannot be locked: {error.strerror}",
+                    hint="its file system (NFS?) has no locks; keep the file on another one",
+                ) from error
+        yield
+    finally:
+        os.close(descriptor)  # which unlocks

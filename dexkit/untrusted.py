@@ -1,0 +1,198 @@
+r"""Text from outside (topic and participant names, notes, result files) on its way to people.
+
+A name can hold escape sequences that move a terminal's cursor or write its title, characters that
+turn the direction of what follows (U+202E), lines of its own, or markup. Nothing of that is to
+reach a terminal or a page raw. It is done where text leaves the program:
+
+- the standard streams are :class:`Guard`\ ed as long as a command runs: control characters are
+  shown as escapes such as ``\x1b``;
+- tables are printed by :class:`dexkit.console.Console`: its own colours pass, those in texts not;
+- pages are written through :func:`html`, Markdown through ``plain``, XML through :func:`visible`.
+
+A line break is no control character there, so names in a line go through :func:`one_line`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from html import escape
+from typing import IO, Any, NoReturn, TextIO, cast
+
+from dexkit.errors import OutputError
+
+__all__ = ["LONGEST", "REMARK", "Guard", "guarded", "html", "one_line", "output_error", "visible"]
+
+LONGEST = 300
+"""Characters of a name that are shown; the rest is an ellipsis."""
+REMARK = 2000
+"""Characters of a remark or an error that are shown."""
+
+# C0 but tab and line feed, DEL, C1; invisible and direction-changing format characters (category
+# Cf), separators of lines and paragraphs, surrogates, and U+FFFE and U+FFFF, which XML forbids
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e"
+    "\u200b-\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff\ufeff\ufff9-\ufffb\ufffe\uffff"
+    "\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
+    "\U000e0000-\U000e0fff]"
+)
+_BREAK = re.compile("[\t\n]")
+# What a runner of GitHub Actions takes for a command: "::NAME" where a line begins, which is where
+# any part of a text may come to be when it is folded, and "##[" anywhere. Other words behind "::"
+# are names of DDS types.
+_COMMAND = re.compile(
+    r"::(?=add-|debug|echo|endgroup|error|group|internal-|notice|remove-|save-|set-|stop-|warning)"
+    r"|##\[",
+    re.IGNORECASE,
+)
+_CLEAR_LINE = "\r\x1b[K"
+"""How a status line begins: it goes over the one before."""
+
+
+def _escaped(match: re.Match[str]) -> str:
+    code = ord(match.group())
+    if code < 0x100:
+        return {9: "\\t", 10: "\\n", 13: "\\r"}.get(code, f"\\x{code:02x}")
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def visible(text: str) -> str:
+    """``text`` with control characters as escapes; tabs and line feeds stay."""
+    return text if text.isprintable() else _CONTROL.sub(_escaped, text)
+
+
+def one_line(text: object, longest: int = LONGEST) -> str:
+    """A name or a remark in one line: tabs and line feeds as escapes, too, no longer than
+    ``longest`` characters, and no command to a runner of GitHub Actions (``::error::``).
+    """
+    shown = str(text)
+    if len(shown) > longest:
+        shown = f"{shown[: longest - 1]}…"
+    shown = shown if shown.isprintable() else _BREAK.sub(_escaped, visible(shown))
+    return _COMMAND.sub(lambda found: f"\\x{ord(found[0][0]):x}{found[0][1:]}", shown)
+
+
+def html(text: object, quote: bool = True) -> str:
+    """``text`` as HTML or XML that shows just that."""
+    return escape(visible(str(text)), quote)
+
+
+class Guard:
+    """A text stream on which control characters are shown, and errors are dexkit's own.
+
+    A write may begin with carriage return and "clear line", as status lines do. What has been
+    cleaned otherwise is written to :attr:`trusted`.
+
+    :raises OutputError: by each of its writes: disk full, pipe closed, ...
+    """
+
+    def __init__(self, stream: IO[str], name: str) -> None:
+        self._stream = stream
+        self._name = name
+        self._error: OSError | None = None
+        self.trusted = _Trusted(self)
+
+    # click takes ``buffer``, where there is one, and would write past this
+    def __getattr__(self, name: str) -> Any:
+        if name == "buffer":
+            raise AttributeError(name)
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write ``text``, cleaned."""
+        if not isinstance(text, str):
+            raise TypeError(f"text is written here, not {type(text).__name__}")
+        begin = _CLEAR_LINE if text.startswith(_CLEAR_LINE) and self.isatty() else ""
+        self.write_trusted(begin + visible(text.removeprefix(begin)))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write each of ``lines``."""
+        for line in lines:
+            self.write(line)
+
+    def write_trusted(self, text: str) -> None:
+        """Write ``text`` as it is, but for what the stream's encoding lacks."""
+        self._check()
+        if not text:
+            return  # /dev/full takes not even that, and click tries it
+        encoding = getattr(self._stream, "encoding", None) or "utf-8"
+        try:
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:
+                plain = text.encode(encoding, "backslashreplace").decode(encoding)
+                self._stream.write(plain)
+        except OSError as error:
+            self._lost(error)
+
+    def flush(self) -> None:
+        """Flush it."""
+        self._check()
+        try:
+            self._stream.flush()
+        except OSError as error:
+            self._lost(error)
+
+    def _check(self) -> None:
+        """Who swallowed the first error gets it again."""
+        if self._error is not None:
+            raise output_error(self._name, self._error) from self._error
+
+    def _lost(self, error: OSError) -> NoReturn:
+        self._error = error
+        # what is left in its buffer must not be tried again when the interpreter ends
+        with contextlib.suppress(OSError, ValueError):
+            sink = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(sink, self._stream.fileno())
+            os.close(sink)
+        raise output_error(self._name, error) from error
+
+
+class _Trusted:
+    """A guarded stream for who cleans by himself."""
+
+    def __init__(self, guard: Guard) -> None:
+        self._guard = guard
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._guard, name)
+
+    def write(self, text: str) -> int:
+        self._guard.write_trusted(text)
+        return len(text)
+
+
+def output_error(what: object, error: OSError) -> OutputError:
+    """What to raise when a file or stream cannot be written."""
+    found = OutputError(f"cannot write {what}: {error.strerror or error}")
+    if error.errno == errno.EPIPE:
+        found.exit_code = 141  # as of a program that dies of SIGPIPE
+    return found
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Guard the standard output and error stream; flushes them at the end.
+
+    :raises OutputError: the output cannot be written.
+    """
+    before = sys.stdout, sys.stderr
+    # None where the descriptor was closed by whoever started this: what a program opens next would
+    # get its number
+    out, err = (stream or open(os.devnull, "w") for stream in before)  # noqa: SIM115
+    sys.stdout = cast(TextIO, Guard(out, "standard output"))
+    sys.stderr = cast(TextIO, Guard(err, "standard error"))
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    finally:
+        with contextlib.suppress(OutputError):
+            sys.stderr.flush()
+        sys.stdout, sys.stderr = before

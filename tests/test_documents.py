@@ -1,0 +1,240 @@
+"""Every file that a user gives is read or refused with its name; what is written is whole."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import random
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dexkit import documents
+from dexkit.backends import BackendOptions, backend
+from dexkit.cli.emulate.mx64 import _EepromFile
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.phases import RECORD, Stimulus
+from dexkit.conformance.results import read_json
+from dexkit.conformance.usb.record import UsbRecord
+from dexkit.drivers.ezgripper.config import Store
+from dexkit.errors import DexkitError, OutputError, UsageError
+from dexkit.hand import Side
+from tests import hostile
+from tests.conformance_helpers import short_run
+from tests.report_helpers import result_of_every_kind
+
+JSON = (
+    documents.read_json,
+    read_json,
+    _EepromFile,
+    lambda path: Store(path).read("key"),
+    lambda path: backend("ezgripper").create(
+        BackendOptions(Side.LEFT, "/dev/null", {"force_table": str(path)})
+    ),
+)
+TOML = (documents.read_toml, lambda path: Claims.load(path, None))
+
+
+def refused(read: Callable[[Path], Any], path: Path, what: str) -> bool:
+    """Whether it is refused, by an error that names the file."""
+    try:
+        read(path)
+    except DexkitError as error:
+        told = str(error)
+    else:
+        return False
+    assert path.name in told or "force table" in told, f"{what}: {told}"
+    assert len(told) < 1000
+    assert not hostile.raw(told)
+    return True
+
+
+def test_whatever_a_file_holds_is_read_or_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "given.file"
+    count = 0
+    for what, content in hostile.broken_files():
+        path.write_bytes(content)
+        for read in (*JSON, *TOML):
+            count += refused(read, path, what)
+    assert count > 200
+
+
+def test_what_is_no_ordinary_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "around").symlink_to("around")
+    for name in ("pipe", "folder", "around"):
+        for read in (*JSON, *TOML):
+            assert refused(read, tmp_path / name, name), name
+    for name in ("/dev/zero", "/dev/full", "/proc/self/mem", "/proc/self", "a\0b", "x" * 5000):
+        with pytest.raises(UsageError):
+            documents.read_text(Path(name))
+    with pytest.raises(UsageError, match="No such file"):
+        documents.read_text(tmp_path / "none")
+
+
+def test_a_file_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    with path.open("wb") as file:
+        file.truncate(documents.LARGEST + 1)
+    with pytest.raises(UsageError, match="larger than 64 MB"):
+        documents.read_text(path)
+
+
+def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b'\xef\xbb\xbf{"a": 1}')
+    assert documents.read_json(path) == {"a": 1}
+    path.write_bytes(b"\xef\xbb\xbfa = 1")
+    assert documents.read_toml(path) == {"a": 1}
+
+
+def test_a_key_twice_and_a_number_that_is_none_are_refused() -> None:
+    for text, why in (
+        ('{"a": 1, "a": 2}', "the key 'a' is there twice"),
+        ('{"a": NaN}', "NaN is not a number"),
+        ('{"a": -1e400}', "-1e400 is not a finite number"),
+        ('{"a": ' + "9" * 40 + "}", "has more than 20 digits"),
+        ("[" * 33 + "]" * 33, "nested more than 32 levels"),
+    ):
+        with pytest.raises(UsageError, match=why):
+            documents.parse_json(text, "it")
+    documents.parse_json("[" * 32 + "]" * 32, "it")
+    for text in ("a = nan", "a = 1e400", f"a = {'9' * 40}", f"a = 0x{'f' * 40}"):
+        with pytest.raises(UsageError, match="it is not valid TOML"):
+            documents.parse_toml(text, "it")
+
+
+def test_what_is_valid_renders_and_the_rest_is_refused_by_its_place(tmp_path: Path) -> None:
+    """Every node of a result replaced by every kind of value; a fuzzer's part of it."""
+    result = result_of_every_kind()
+    result.write_json(tmp_path / "good.json")
+    good = json.loads((tmp_path / "good.json").read_text())
+    good["results"] = good["results"][2:3]  # one that failed
+    path = tmp_path / "given.json"
+    rendered = 0
+    places = list(hostile.nodes(good))
+    values = (hostile.MISSING, None, True, -1, 1.5, 10**18, "text", "<script>\x1b", [], {}, [[]])
+    rng = random.Random(3)
+    for place in places:
+        # each kind at each place costs too long here; the soak does it
+        for value in rng.sample(values, 1):
+            path.write_text(json.dumps(hostile.replaced(good, place, value)))
+            if not refused(read_json, path, str(place)):
+                rendered += 1
+                hostile.render_all(path, tmp_path)
+    assert len(places) > 70
+    assert rendered > 8
+
+
+@pytest.mark.soak
+def test_every_kind_of_value_at_every_place_of_a_result(tmp_path: Path) -> None:
+    result = result_of_every_kind()
+    result.write_json(tmp_path / "good.json")
+    good = json.loads((tmp_path / "good.json").read_text())
+    good["results"] = good["results"][:3]
+    path = tmp_path / "given.json"
+    for place in hostile.nodes(good):
+        for value in (hostile.MISSING, *hostile.VALUES):
+            path.write_text(json.dumps(hostile.replaced(good, place, value)))
+            if not refused(read_json, path, str(place)):
+                hostile.render_all(path, tmp_path)
+
+
+def test_an_error_says_where_and_what_was_expected(tmp_path: Path) -> None:
+    result = result_of_every_kind()
+    result.write_json(tmp_path / "r.json")
+    good = json.loads((tmp_path / "r.json").read_text())
+    for place, value, told in (
+        (("results", 2, "evidence", 0, "time_s"), "soon", 'time_s must be a number, not "soon"'),
+        (("results", 2, "verdict"), "good", "results[2].verdict must be one of"),
+        (("results", 2, "side"), hostile.MISSING, "results[2] has no side"),
+        (("duration_s",), -1, "duration_s must be at least 0, not -1"),
+        (("claims",), [], "claims must be"),
+        (("notes",), {}, "notes must be a list, not an object"),
+        (("format",), "other", "is not a result file of dexkit"),
+        (("version",), 3, "is version 3 of dexkit-conformance-result"),
+        ((), [], "is not a result file of dexkit"),
+    ):  # fmt: skip
+        (tmp_path / "r.json").write_text(json.dumps(hostile.replaced(good, place, value)))
+        with pytest.raises(UsageError) as caught:
+            read_json(tmp_path / "r.json")
+        assert told in str(caught.value)
+
+
+def test_records_in_a_recording_are_read_or_refused() -> None:
+    rng = random.Random(2)
+    stimulus = dict(short_run().metadata[RECORD])
+    usb = UsbRecord().to_metadata()
+    for _ in range(120):
+        for record, read in ((stimulus, Stimulus.from_metadata), (usb, UsbRecord.from_metadata)):
+            key = rng.choice(list(record))
+            text = json.dumps(hostile.mutated(json.loads(record[key]), rng))
+            for value in (text, text[: rng.randint(0, len(text))], "[" * 5000):
+                try:
+                    read({**record, key: value})
+                except DexkitError:
+                    pass
+
+
+# ---------------------------------------------------------------------------------- writing
+
+
+def left_behind(folder: Path) -> list[str]:
+    return [p.name for p in folder.iterdir() if p.name.startswith(".dexkit-")]
+
+
+def test_a_file_is_written_with_the_usual_rights_and_keeps_those_it_has(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        documents.write_file(tmp_path / "new", "手\n")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "new").read_text(encoding="utf-8") == "手\n"
+    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o640
+    (tmp_path / "new").chmod(0o604)
+    (tmp_path / "link").symlink_to("new")
+    documents.write_file(tmp_path / "link", b"other")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "new").read_bytes() == b"other"
+    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o604
+
+
+@pytest.mark.parametrize("where", ["write", "fsync", "replace"])
+def test_what_cannot_be_written_leaves_what_was_there(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "report"
+    path.write_text("good")
+
+    def full(*arguments: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, where, full)
+        for target in (path, tmp_path / "new"):
+            with pytest.raises(OutputError, match=f"cannot write .*{target.name}: No space left"):
+                documents.write_file(target, "bad" * 1000)
+    assert path.read_text() == "good"
+    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+
+
+def test_places_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    for name, why in (
+        ("/dev/full", "No space left"),
+        (str(tmp_path / "folder"), "Is a directory"),
+        (str(tmp_path / "none" / "x"), "No such file"),
+        ("/proc/x", "No such file|denied|Permission"),
+        ("a\0b", "null"),
+        (str(tmp_path / ("x" * 300)), "too long"),
+    ):
+        with pytest.raises(OutputError, match=why) as caught:
+            documents.write_file(Path(name), "text")
+        assert caught.value.exit_code == 2
+    assert not left_behind(tmp_path)
+    documents.write_file(Path("/dev/null"), "text")

@@ -1,0 +1,155 @@
+"""Whatever cannot be written is told with an exit code, and what was there before stays."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from dexkit.cli import main
+from dexkit.processes import command_line
+from tests import hostile
+
+_SAMPLE = "<sample>"
+_WRITERS: dict[tuple[str, ...], list[str]] = {
+    ("badge",): ["<result>"],
+    ("check",): [_SAMPLE, "--require", "DEX1-RATE-03"],
+    ("compare",): ["<result>", "<result>"],
+    ("report",): ["<result>"],
+    ("mutants",): [],
+}
+"""Commands that write files by options, with what they need for it."""
+_INPUTS = {"--capabilities", "--recording", "--eeprom", "--config"}
+_ELSEWHERE = {
+    ("demo", "--out"),  # a folder, made before anything starts
+    ("teleop", "--record"),  # as 'record' writes
+}
+
+
+def _outputs() -> Iterator[tuple[tuple[str, ...], str]]:
+    for name, command in hostile.commands():
+        for parameter in command.params:
+            option = parameter.opts[0]
+            if (
+                isinstance(parameter, click.Option)
+                and isinstance(parameter.type, click.Path)
+                and option not in _INPUTS
+                and (name[0], option) not in _ELSEWHERE
+            ):
+                yield name, next(o for o in parameter.opts if o.startswith("--"))
+
+
+def test_every_option_that_names_a_file_to_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, recording = hostile.judged_result(tmp_path)
+    given = {"<result>": str(tmp_path / "good.json"), _SAMPLE: str(recording)}
+    (tmp_path / "out").mkdir()
+    there = tmp_path / "out" / "there"
+    there.write_text("good")
+
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    seen = 0
+    for name, option in _outputs():
+        assert name in _WRITERS, f"dexkit {' '.join(name)} {option} is not in the table"
+        if name == ("mutants",):
+            continue  # it starts processes; it writes as the others do
+        seen += 1
+        fixed = [given.get(a, a) for a in _WRITERS[name]]
+        for place, why in (
+            ("/dev/full", "No space left on device"),
+            (str(there), "No space left on device"),
+            (str(tmp_path / "out"), "Is a directory"),
+            (str(tmp_path / "none" / "x"), "No such file or directory"),
+        )[: 2 if name == ("check",) else 4]:  # which judges each time
+            with monkeypatch.context() as patch:
+                if place == str(there):
+                    patch.setattr(os, "replace", full)
+                code, _, err = hostile.run_command([*name, *fixed, option, place])
+            assert code == 2, f"{name} {option} {place}: {code}\n{err}"
+            assert f"cannot write {place}: {why}" in err, err
+            assert [p.name for p in (tmp_path / "out").iterdir()] == ["there"]
+            assert there.read_text() == "good"
+    assert seen >= 9
+
+
+def test_standard_output_that_is_full_or_read_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, recording = hostile.judged_result(tmp_path)
+    result = str(tmp_path / "good.json")
+    no_reader, pipe = os.pipe()
+    os.close(no_reader)
+    full = os.open("/dev/full", os.O_WRONLY)
+    for arguments in (
+        ["--help"],
+        ["backends"],
+        ["badge", result, "-o", "-"],
+        ["info", str(recording)],
+        ["models", "--json"],
+        ["models"],
+        ["report", result],
+        ["report", result, "--markdown", "-"],
+        ["compare", result, result],
+        ["check", "--list", "--dialect", "dex3"],
+        ["teleop", "--list"],
+    ):
+        for place, code in ((full, 2), (pipe, 141)):
+            # as the interpreter opens it, with buffer and without
+            for buffered in (True, False) if arguments == ["--help"] else (True,):
+                stream = os.fdopen(os.dup(place), "w", encoding="utf-8")
+                stream.reconfigure(write_through=not buffered)
+                err = io.StringIO()
+                with monkeypatch.context() as patch:
+                    patch.setattr(sys, "stdout", stream)
+                    patch.setattr(sys, "stderr", err)
+                    with pytest.raises(SystemExit) as ended:
+                        main(arguments)
+                assert ended.value.code == code, (arguments, err.getvalue())
+                told = "error: cannot write standard output: No space left on device\n"
+                assert err.getvalue() == (told if code == 2 else "")
+                stream.close()  # what is left in it raises nothing
+    os.close(pipe)
+    os.close(full)
+
+
+def test_the_interpreter_says_no_more_about_it_at_its_end() -> None:
+    no_reader, pipe = os.pipe()
+    os.close(no_reader)
+    for place, code in ((os.open("/dev/full", os.O_WRONLY), 2), (pipe, 141)):
+        done = subprocess.run(
+            command_line("models", "--json"),
+            stdout=place,
+            stderr=subprocess.PIPE,
+            check=False,
+            timeout=60,
+        )
+        os.close(place)
+        assert done.returncode == code
+        assert done.stderr.count(b"\n") == (1 if code == 2 else 0), done.stderr
+
+
+def test_without_standard_streams_nothing_is_written_into_what_is_opened_next(
+    tmp_path: Path,
+) -> None:
+    _, recording = hostile.judged_result(tmp_path)
+    out = tmp_path / "result.json"
+    done = subprocess.run(
+        [
+            *("sh", "-c", 'exec "$@" >&- 2>&-', "sh"),
+            *command_line("check", str(recording), "--json", str(out), "--require", "DEX1-RATE"),
+        ],
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode in (0, 1)
+    assert out.read_text().startswith("{")

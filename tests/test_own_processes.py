@@ -1,0 +1,264 @@
+"""The processes that dexkit starts: what they import, when they end, and what they leave."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import resource
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+import pytest
+
+from dexkit.emulators.mx64 import EmulatedProcess
+from dexkit.errors import DexkitError
+from dexkit.limits import room_for_files
+from dexkit.processes import END_WITH_PARENT, Tool, command_line
+from dexkit.scratch import PREFIX, Scratch, sweep
+
+_HOSTILE = """
+import os
+open(os.path.join(os.path.dirname(os.path.abspath(__file__)), "was-run"), "w").close()
+raise SystemExit(99)
+"""
+
+
+@pytest.fixture
+def hostile_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with modules that must not be imported."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    for name in ("click", "json", "dexkit", "rich", "cyclonedds", "socket", "typing", "pickle"):
+        (folder / f"{name}.py").write_text(_HOSTILE)
+    for name in ("numpy", "multiprocessing", "logging"):
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text(_HOSTILE.replace("was-run", "../was-run"))
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    return folder
+
+
+def test_nothing_in_the_working_folder_is_imported(hostile_folder: Path) -> None:
+    commands = (
+        ("check", "--list", "--dialect", "dex3"),
+        ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.2"),
+    )
+    started = [
+        subprocess.Popen(command_line(*c), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        for c in commands
+    ]
+    for command, process in zip(commands, started, strict=True):
+        out = process.communicate(timeout=60)[0].decode()
+        # 1: the doctor finds fault with an empty domain
+        assert process.returncode in (0, 1), (command, out)
+    with Tool("emulate", "mx64", "--link", str(hostile_folder / "link")) as tool:
+        tool.wait_ready(threading.Event())
+    emulator = EmulatedProcess([])
+    emulator.close()
+    assert not (hostile_folder / "was-run").exists()
+
+
+@pytest.mark.soak
+def test_workers_import_nothing_from_it_either(hostile_folder: Path) -> None:
+    command = command_line("mutants", "--require", "DEX1-RATE-03", "--jobs", "1", "--json", "out")
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode in (0, 1), done.stderr
+    assert (hostile_folder / "out").exists()
+    assert not (hostile_folder / "was-run").exists()
+
+
+def test_a_checkout_that_is_not_installed_is_found(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [command_line()[0], "-S", "-c", "import sys; print(sys.path)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "site-packages" not in done.stdout
+    # -S: no site-packages, so only dexkit itself is found, and its dependencies are not
+    done = subprocess.run(
+        [sys.executable, "-S", *command_line("--version")[1:]],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert "No module named 'click'" in done.stderr
+
+
+def _ended(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+_PARENT = """
+import os, sys, threading
+from dexkit.processes import Tool
+tool = Tool("emulate", "mx64", "--link", sys.argv[1])
+if sys.argv[2] == "ready":
+    tool.wait_ready(threading.Event())
+print(tool._process.pid, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("when", ["ready", "at once"])
+def test_a_process_ends_with_its_parent_however_that_ends(when: str, tmp_path: Path) -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", _PARENT, str(tmp_path / "link"), when],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    child = os.pidfd_open(pid)
+    parent.kill()
+    parent.wait(10)
+    parent.communicate()
+    poll = select.poll()
+    poll.register(child)
+    assert poll.poll(20_000), "it still runs"
+    os.close(child)
+    assert not os.path.lexists(tmp_path / "link")
+
+
+def test_a_process_that_does_not_end_when_told_is_killed(tmp_path: Path) -> None:
+    code = (
+        "import signal, time, dexkit.processes as p\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "p.STOP_TIMEOUT = 0.05\n"
+        "p.end_with_parent()\n"
+        "print('up', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    theirs, ours = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        pass_fds=(theirs,),
+        env={**os.environ, END_WITH_PARENT: str(theirs)},
+        stdout=subprocess.PIPE,
+    )
+    os.close(theirs)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"up\n"
+    os.close(ours)
+    assert process.wait(20) == -signal.SIGKILL
+    process.stdout.close()
+
+
+# -------------------------------------------------------------------------- temporary folders
+
+_RUN = """
+import sys
+from dexkit.scratch import Scratch
+folder = Scratch("run")
+(folder.path / "run.mcap").write_bytes(bytes(1000))
+print(folder.path, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    return tmp_path
+
+
+def test_folders_of_killed_programs_are_removed_and_those_of_others_stay(temporary: Path) -> None:
+    def start() -> tuple[subprocess.Popen[str], Path]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", _RUN], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        return process, Path(process.stdout.readline().strip())
+
+    killed, left = start()
+    killed.kill()
+    killed.communicate()
+    assert (left / "run.mcap").exists()
+    living, kept = start()  # which sweeps, too
+    try:
+        assert not left.exists()
+        (temporary / f"{PREFIX}somebody").mkdir()
+        (temporary / f"{PREFIX}link").symlink_to(kept)
+        (temporary / f"{PREFIX}file").write_text("x")
+        with Scratch() as own:
+            assert sweep() == []
+            assert own.exists()
+            assert own.stat().st_mode & 0o077 == 0
+        assert not own.exists()
+        assert (kept / "run.mcap").exists()
+        assert (temporary / f"{PREFIX}somebody").exists()
+    finally:
+        living.communicate("")
+
+
+def test_a_folder_is_never_seen_without_its_lock(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    genuine = fcntl.flock
+
+    def sweeping(descriptor: int, how: int) -> None:
+        if how == fcntl.LOCK_EX:  # of the new folder: somebody sweeps before and after
+            monkeypatch.setattr(fcntl, "flock", genuine)
+            assert sweep() == []
+            genuine(descriptor, how)
+            assert sweep() == []
+            return
+        genuine(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", sweeping)
+    with Scratch() as folder:
+        assert folder.exists()
+        assert sweep() == []
+
+
+# ------------------------------------------------------------------------------- descriptors
+
+
+def test_without_room_for_files_nothing_begins() -> None:
+    commands = {
+        ("doctor", "--seconds", "0.2"): "a look at 11 domain(s) needs",
+        ("serve", "sim-dex1", "--side", "left", "--domain", "1"): "DDS needs 16 more",
+    }
+
+    def few() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))
+
+    started = [
+        subprocess.Popen(
+            command_line(*arguments),
+            preexec_fn=few,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for arguments in commands
+    ]
+    for process, (arguments, told) in zip(started, commands.items(), strict=True):
+        err = process.communicate(timeout=60)[1]
+        assert process.returncode == 2, (arguments, process.returncode, err)
+        assert told in err
+        assert "ulimit -n" in err
+
+
+def test_a_limit_that_may_be_raised_is_raised() -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    used = len(os.listdir("/proc/self/fd"))
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (used + 5, before[1]))
+        room_for_files(20, "a test")
+        assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > used + 5
+        with pytest.raises(DexkitError, match="a test needs 100000000 more open files"):
+            room_for_files(10**8, "a test")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
