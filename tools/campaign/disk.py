@@ -1,0 +1,5 @@
+from tools.campaign.case import Case
+
+
+def cases() -> list[Case]:
+    return []
