@@ -32,7 +32,7 @@ from dexkit.service.core import HandCore
 from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.rig import LocalNode, NotYet, open_files, until
 
-__all__ = ["cases"]
+__all__ = ["Bench", "bench_of", "cases"]
 
 SIDE = Side.LEFT
 _PAUSES = (0.02, 0.06, 0.15, 0.4, 0.9)
@@ -139,6 +139,30 @@ class _Dex3(Bench):
             mode = number | 1 << 4
             motors.append(unitree_hg.MotorCmd_(mode=mode, q=goal, kp=1.5, kd=0.2))
         return encode(unitree_hg.HandCmd_(motor_cmd=motors))
+
+
+class _Dex5(Bench):
+    """Without a device: only what a client says."""
+
+    dialect_name = "dex5"
+    low, high = 0.2, 0.8
+
+    def message(self, q: float) -> bytes:
+        from dexkit.models import DEX5_1
+
+        motors = [
+            unitree_hg.MotorCmd_(mode=1, q=joint.q_min + q * joint.stroke, kp=1.5, kd=0.2)
+            for joint in DEX5_1.joints[SIDE]
+        ]
+        return encode(unitree_hg.HandCmd_(motor_cmd=motors))
+
+
+_BENCHES: dict[str, type[Bench]] = {"mx64": _Mx64, "m4010": _M4010, "dex3": _Dex3, "dex5": _Dex5}
+
+
+def bench_of(name: str) -> type[Bench]:
+    """What knows the device called ``name``."""
+    return _BENCHES[name]
 
 
 class DeviceCase(Case):
@@ -286,7 +310,8 @@ class DeviceCase(Case):
 def cases() -> list[Case]:
     """Every device, unplugged and restarted."""
     found: list[Case] = []
-    for name, bench in (("mx64", _Mx64), ("m4010", _M4010), ("dex3", _Dex3)):
+    for name in ("mx64", "m4010", "dex3"):
+        bench = bench_of(name)
         found.append(DeviceCase(name, bench, restart=False, aim=270))
         found.append(DeviceCase(name, bench, restart=True, aim=70))
     return found

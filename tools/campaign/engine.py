@@ -105,7 +105,7 @@ class Engine:
     """A campaign.
 
     :param cases: to run.
-    :param jobs: fuzzers at once; twice as many other batches, which mostly wait, run beside them.
+    :param jobs: fuzzers at once; three times as many other batches, which mostly wait, run beside them.
     :param seconds: how long.
     :param sample: each case once, in miniature.
     :param tell: is given a line of progress now and then.
@@ -175,7 +175,7 @@ class Engine:
 
     def _open_workers(self) -> None:
         lanes = {lane: [c for c in self.cases if c.lane is lane] for lane in Lane}
-        live = 2 * self._jobs
+        live = 3 * self._jobs
         counts = {Lane.COMPUTE: self._jobs, Lane.LIVE: live, Lane.LONG: len(lanes[Lane.LONG])}
         for lane, count in counts.items():
             if self._sample and lane is not Lane.LONG:

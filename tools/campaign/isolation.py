@@ -20,7 +20,7 @@ from dataclasses import dataclass
 __all__ = ["Isolation", "die_with_parent", "inside", "new_network", "subreaper"]
 
 _NEWNS, _NEWUSER, _NEWPID, _NEWNET = 0x00020000, 0x10000000, 0x20000000, 0x40000000
-_MS_REC_PRIVATE = 0x4000 | 0x40000
+_MS_REC_PRIVATE, _MS_BIND = 0x4000 | 0x40000, 0x1000
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 1
 
@@ -56,10 +56,15 @@ def subreaper() -> None:
 
 
 def new_network() -> bool:
-    """A network of this process's own with loopback up; False where that is not permitted."""
-    if _libc.unshare(_NEWNET):
+    """A network of this process's own with loopback up, and pseudo-terminals of its own; False
+    where that is not permitted.
+    """
+    if _libc.unshare(_NEWNET | _NEWNS):
         return False
     _loopback_up()
+    _libc.mount(b"none", b"/", None, _MS_REC_PRIVATE, None)
+    if not _libc.mount(b"devpts", b"/dev/pts", b"devpts", 0, b"newinstance,ptmxmode=0666"):
+        _libc.mount(b"/dev/pts/ptmx", b"/dev/ptmx", None, _MS_BIND, None)
     return True
 
 
