@@ -276,7 +276,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; the exit code."""
     os.chdir(ROOT)
     try:
-        result = command.main(args=argv, standalone_mode=False, prog_name="python -m tools.campaign")
+        result = command.main(
+            args=argv, standalone_mode=False, prog_name="python -m tools.campaign"
+        )
         return int(result or 0)
     except click.ClickException as error:
         error.show()

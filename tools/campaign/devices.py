@@ -183,7 +183,7 @@ class DeviceCase(Case):
         self.aim = aim
         self._bench, self._restart = bench, restart
 
-    def run(self, batch: Batch) -> None:  # noqa: D102
+    def run(self, batch: Batch) -> None:
         logging.disable()
         bench = self._bench(batch.scratch)
         files, threads = 0, 0
@@ -211,9 +211,7 @@ class DeviceCase(Case):
         topic = spoken.topics(SIDE)[0]
         with contextlib.ExitStack() as power:
             device = power.enter_context(bench.device())
-            service = HandService(
-                bench.hand(), node=node, state_rate=100.0, soft_start=False
-            )
+            service = HandService(bench.hand(), node=node, state_rate=100.0, soft_start=False)
             with service:
                 for _ in range(count):
                     device = self._round(batch, bench, service, node, topic, device, power)
@@ -237,7 +235,9 @@ class DeviceCase(Case):
         goals = [bench.low, bench.high]
         rng.shuffle(goals)
         start = bench.position(device)
-        self._drive(bench, node, topic, goals[0], lambda: abs(bench.position(device) - start) > bench.still)
+        self._drive(
+            bench, node, topic, goals[0], lambda: abs(bench.position(device) - start) > bench.still
+        )
         time.sleep(rng.uniform(0.0, 0.2))
         # the client goes on for some time after the device went, or stops before it
         after = rng.choice((0.0, 0.0, 0.05, 0.3))
@@ -268,7 +268,9 @@ class DeviceCase(Case):
                 f"after it went",
             )
         here = bench.position(device)
-        self._drive(bench, node, topic, goals[1], lambda: abs(bench.position(device) - here) > bench.still)
+        self._drive(
+            bench, node, topic, goals[1], lambda: abs(bench.position(device) - here) > bench.still
+        )
         return device
 
     @staticmethod

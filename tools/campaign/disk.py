@@ -8,6 +8,7 @@ is not 0; a traceback is a finding, and so is a claim that does not hold.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 import os
@@ -53,7 +54,7 @@ class WriteCase(Case):
         self.what = f"{name}, on disks that do not take it"
         self._command = command
 
-    def run(self, batch: Batch) -> None:  # noqa: D102
+    def run(self, batch: Batch) -> None:
         logging.disable()
         result = batch.scratch / "result.json"
         sample = _sample()
@@ -73,9 +74,7 @@ class WriteCase(Case):
                 batch.found("traceback", told[0], f"{way}: {told[1]}\n{program!r}")
             elif code is None or code < 0:
                 batch.found("exit code", f"{self.name} {way}", f"{code}: {program.output[-1000:]}")
-            elif code == 0 and way != "small":
-                batch.found("said to be done", f"{self.name} {way}", program.output[-1000:])
-            elif code == 0 and not Path(place).stat().st_size:
+            elif (code == 0 and way != "small") or (code == 0 and not Path(place).stat().st_size):
                 batch.found("said to be done", f"{self.name} {way}", program.output[-1000:])
             program.end()
             if way == "small":
@@ -108,7 +107,7 @@ class RecordCase(Case):
     name = "disk:record"
     what = "record, while its disk fills up, its file goes, and two of them"
 
-    def run(self, batch: Batch) -> None:  # noqa: D102
+    def run(self, batch: Batch) -> None:
         logging.disable()
         ways = ("limit", "small", "deleted", "full", "force")
         scene = Scene(batch)
@@ -123,7 +122,8 @@ class RecordCase(Case):
                         _release(batch.scratch / "small")
 
     def _one(self, batch: Batch, scene: Scene, way: str) -> None:
-        path, limits = batch.scratch / f"{way}.mcap", []
+        path = batch.scratch / f"{way}.mcap"
+        limits: list[tuple[int, int]] = []
         if way == "limit":
             limits = [(resource.RLIMIT_FSIZE, 30_000)]
         elif way == "small":
@@ -144,14 +144,11 @@ class RecordCase(Case):
                 until(lambda: path.exists() and path.stat().st_size > 5000, "something recorded")
                 path.unlink()
                 time.sleep(1.0)
-            elif program.running:
+            else:
                 # it ends by itself when it cannot write, or goes on and says so at the end
-                for _ in range(100):
-                    if not program.running:
-                        break
-                    time.sleep(0.05)
-            if program.running:
-                program.signal(signal.SIGTERM)
+                with contextlib.suppress(NotYet):
+                    until(lambda: not program.running, "its end", 5.0)
+            program.signal(signal.SIGTERM)
             code = program.wait()
             batch.units += 1
             told = traceback_in(program.output)

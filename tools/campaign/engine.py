@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
@@ -105,7 +106,8 @@ class Engine:
     """A campaign.
 
     :param cases: to run.
-    :param jobs: fuzzers at once; three times as many other batches, which mostly wait, run beside them.
+    :param jobs: fuzzers at once; three times as many other batches run beside them, for they
+        mostly wait.
     :param seconds: how long.
     :param sample: each case once, in miniature.
     :param tell: is given a line of progress now and then.
@@ -138,7 +140,7 @@ class Engine:
         self._began = time.monotonic()
         self._first = {name: p.units for name, p in state.cases.items()}
         state.folder.mkdir(parents=True, exist_ok=True)
-        self._log: IO[bytes] = open(state.folder / "workers.log", "ab")
+        self._log: IO[bytes] = (state.folder / "workers.log").open("ab")
         self._home = Path(tempfile.mkdtemp(prefix="dexkit-campaign-home-"))
 
     # --- running
@@ -186,10 +188,7 @@ class Engine:
     def _open(self, lane: Lane) -> Worker:
         used = {w.number for w in self._workers}
         number = next(n for n in range(len(used) + 1) if n not in used)
-        own = self._own_network and lane is not Lane.COMPUTE
-        worker = Worker(
-            number, lane, self._log, self._home, own_network=own or self._own_network
-        )
+        worker = Worker(number, lane, self._log, self._home, own_network=self._own_network)
         self._workers.append(worker)
         self._selector.register(worker.out, selectors.EVENT_READ, worker)
         return worker
@@ -210,7 +209,7 @@ class Engine:
         """The case that is furthest behind; none when too little time is left."""
         if not self._sample and self._left < min(GRACE, self._seconds / 4):
             return None
-        candidates = []
+        candidates: list[tuple[float, int, Case]] = []
         for chosen in self.cases:
             if chosen.lane is not lane or self._tries.get(chosen.name, 0) >= _TRIES:
                 continue
@@ -344,8 +343,6 @@ class Engine:
         self._log.close()
         self.state.wall += time.monotonic() - self._began
         self._save()
-        import shutil
-
         shutil.rmtree(self._home, ignore_errors=True)
 
     def _save(self) -> None:

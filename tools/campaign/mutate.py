@@ -121,6 +121,7 @@ class TextMutator:
         self._rng = rng
 
     def __call__(self) -> str:
+        """Another one."""
         rng = self._rng
         text = rng.choice(self._corpus)
         for _ in range(1 + (rng.getrandbits(8) & 3)):

@@ -22,8 +22,8 @@ from dexkit.models import dialect
 from tools.campaign.case import Batch, Case
 from tools.campaign.fuzz.messages import announcements, filled
 from tools.campaign.mutate import mutator
-from tools.campaign.programs import SIDE, Client, Scene, Spec, bodies_and_hands
 from tools.campaign.process import Program, traceback_in
+from tools.campaign.programs import SIDE, Client, Scene, Spec, bodies_and_hands
 from tools.campaign.rig import NotYet, until
 
 __all__ = ["cases"]
@@ -64,7 +64,9 @@ class Stranger:
         place = Locator("127.0.0.1", 40_000 + rng.randrange(1000))
         key = rng.choice(("__Pid", "__ProcessName", "__Hostname", "x"))
         value = rng.choice(("\u00b2", "\u0661\u0662", "9" * 60, "-1", "", "\x1b[2J", "MARK"))
-        data = rtps.build_participant(prefix, place, lease=3, properties={key: value, "__Pid": "\u00b2"})
+        data = rtps.build_participant(
+            prefix, place, lease=3, properties={key: value, "__Pid": "\u00b2"}
+        )
         if value == "MARK":
             data = data.replace(b"MARK", rng.choice((b"\xff\xfe\xfd\xfc", b"\xc3\x28\xa0\xa1")))
         self.send(rtps.message(prefix, rtps.build_data(rtps.SPDP_WRITER, 1, data)))
@@ -130,7 +132,7 @@ class PeerCase(Case):
         self.aim = 100_000
         self._spec, self._spoken = spec, spoken
 
-    def run(self, batch: Batch) -> None:  # noqa: D102
+    def run(self, batch: Batch) -> None:
         logging.disable()
         scene = Scene(batch)
         with self._spec.stage(scene):
@@ -214,7 +216,4 @@ def cases() -> list[Case]:
     """Those that listen to the network."""
     spoken = {"serve-sim-dex1": "unitree_go", "serve-sim-dex3": "dex3", "serve-sim-dex5": "dex5"}
     _ = Client
-    return [
-        PeerCase(spec, spoken.get(spec.name, ""))
-        for spec in bodies_and_hands()
-    ]
+    return [PeerCase(spec, spoken.get(spec.name, "")) for spec in bodies_and_hands()]

@@ -133,8 +133,8 @@ class Spec:
     stage: Stage
     ready: str = "ready:"
     codes: tuple[int, ...] = (0,)
-    works: Callable[[Scene, Program], None] = lambda scene, program: None  # noqa: E731
-    after: Callable[[Scene, bool], None] = lambda scene, killed: None  # noqa: E731
+    works: Callable[[Scene, Program], None] = lambda scene, program: None
+    after: Callable[[Scene, bool], None] = lambda scene, killed: None
 
 
 # --- stages
@@ -452,7 +452,7 @@ class _Runs(Case):
     def __init__(self, spec: Spec) -> None:
         self.spec = spec
 
-    def run(self, batch: Batch) -> None:  # noqa: D102
+    def run(self, batch: Batch) -> None:
         logging.disable()
         scene = Scene(batch)
         with self.spec.stage(scene):
@@ -521,7 +521,7 @@ class KillCase(_Runs):
         self.what = f"{spec.name}, ended by SIGKILL, SIGTERM and SIGINT"
         self.aim = 200
 
-    def runs(self, batch: Batch, scene: Scene) -> None:  # noqa: D102
+    def runs(self, batch: Batch, scene: Scene) -> None:
         endings = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
         batch.random.shuffle(endings)
         if batch.sample:
@@ -549,9 +549,7 @@ class KillCase(_Runs):
         try:
             _wait_still(scene, 5.0)
         except NotYet:
-            batch.found(
-                "moves afterwards", f"{self.name} {signal.Signals(number).name}", "for 5 s"
-            )
+            batch.found("moves afterwards", f"{self.name} {signal.Signals(number).name}", "for 5 s")
 
 
 class StopCase(_Runs):
@@ -565,7 +563,7 @@ class StopCase(_Runs):
         self.what = f"{spec.name}, stopped for half a second to three"
         self.aim = 200
 
-    def runs(self, batch: Batch, scene: Scene) -> None:  # noqa: D102
+    def runs(self, batch: Batch, scene: Scene) -> None:
         program = self.start(batch, scene)
         try:
             for _ in range(1 if batch.sample else 6):
@@ -670,6 +668,12 @@ def cases() -> list[Case]:
 
 def bodies_and_hands() -> list[Spec]:
     """The programs that listen to whoever is on a domain."""
-    names = ("serve-sim-dex1", "serve-sim-dex3", "serve-sim-dex5", "bridge", "record")
+    names: tuple[str, ...] = (
+        "serve-sim-dex1",
+        "serve-sim-dex3",
+        "serve-sim-dex5",
+        "bridge",
+        "record",
+    )
     names += ("emulate-h1", "emulate-g1", "doctor-watch")
     return [spec for spec in specs() if spec.name in names]

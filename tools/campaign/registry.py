@@ -24,13 +24,10 @@ def all_cases() -> tuple[Case, ...]:
 
 
 def case(name: str) -> Case:
-    """The case called ``name``; ``module:attribute`` is one that is not in the list.
+    """The case called ``name``; ``module::attribute`` is one that is not in the list.
 
     :raises UsageError: there is none.
     """
-    for known in all_cases():
-        if known.name == name:
-            return known
     module, _, attribute = name.partition("::")
     if attribute:
         import importlib
@@ -40,6 +37,9 @@ def case(name: str) -> Case:
         assert isinstance(made, Case)
         made.name = name
         return made
+    for known in all_cases():
+        if known.name == name:
+            return known
     raise UsageError(f"there is no case {name!r}", hint="python -m tools.campaign --list")
 
 
@@ -52,6 +52,9 @@ def select(only: Sequence[str]) -> list[Case]:
         return list(all_cases())
     chosen: dict[str, Case] = {}
     for wanted in only:
-        found = [c for c in all_cases() if c.name.startswith(wanted)] or [case(wanted)]
+        found: list[Case] = []
+        if "::" not in wanted:
+            found = [c for c in all_cases() if c.name.startswith(wanted)]
+        found = found or [case(wanted)]
         chosen |= {c.name: c for c in found}
     return list(chosen.values())

@@ -70,8 +70,8 @@ class Watched:
                 ("memory grows", f"{hourly:.1f} MiB an hour, {memory[0]:.1f} to {memory[-1]:.1f}")
             )
         for what, values in (("descriptors", self.files), ("threads", self.threads)):
-            half = len(values) // 2
-            if min(values[half:]) > max(values[first : half + 1]):
+            half = (first + len(values)) // 2
+            if min(values[half:]) > max(values[first:half]):
                 found.append((f"{what} grow", f"{values[first]} to {values[-1]}"))
         return found
 
@@ -94,7 +94,7 @@ class SoakCase(Case):
     lane = Lane.LONG
     limit = 300.0
 
-    def run(self, batch: Batch) -> None:  # noqa: D102
+    def run(self, batch: Batch) -> None:
         logging.disable()
         domain, beside = str(batch.domain), str(batch.domain + 1)
         commands = {

@@ -112,7 +112,9 @@ class State:
                 content["wall"],
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UsageError(f"{path} cannot be read: {error}", hint="--fresh begins anew") from error
+            raise UsageError(
+                f"{path} cannot be read: {error}", hint="--fresh begins anew"
+            ) from error
         if seed is not None and seed != state.seed:
             raise UsageError(
                 f"the campaign in {folder} has seed {state.seed}, not {seed}",

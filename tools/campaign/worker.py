@@ -71,7 +71,7 @@ def run_task(task: dict[str, Any]) -> dict[str, Any]:
     finally:
         left = sweep()
         shutil.rmtree(scratch, ignore_errors=True)
-    if left and outcome == "ok":
+    if left and outcome == "ok" and not batch.findings:
         batch.found("left behind", "process", "\n".join(left))
     return {
         "outcome": outcome,

@@ -19,8 +19,10 @@ from tools.campaign.case import Batch, Case, Lane
 
 __all__ = ["Difference", "FuzzCase", "Hang", "Target"]
 
-HANG = 2
+HANG = 2.0
 """Seconds of processor time that one input may take; wall time would blame a busy machine."""
+_HANGS = 3
+"""Inputs of a batch that may take too long before it is given up."""
 MEMORY = 2 << 30
 """Bytes of address space that a fuzzer may have on top of what it had before."""
 
@@ -45,7 +47,7 @@ class Target:
     make: Callable[[], Any]
     run: Callable[[Any], object]
     allowed: tuple[type[BaseException], ...] = (DexkitError,)
-    close: Callable[[], object] = lambda: None  # noqa: E731
+    close: Callable[[], object] = lambda: None
 
 
 Prepare = Callable[[random.Random, Path], Target]
@@ -56,6 +58,7 @@ class FuzzCase(Case):
 
     :param prepare: makes the target, given the source of chance and a scratch folder.
     :param size: inputs in a batch; some half a second of them.
+    :param hang: seconds of processor time that one input may take.
     """
 
     unit = "inputs"
@@ -71,8 +74,10 @@ class FuzzCase(Case):
         size: int,
         aim: int,
         weight: float = 1.0,
+        hang: float = HANG,
     ) -> None:
         self.name = f"fuzz:{name}"
+        self.hang = hang
         self.what = what
         self.size = size
         self.aim = aim
@@ -83,7 +88,7 @@ class FuzzCase(Case):
         logging.disable()
         target = self._prepare(batch.random, batch.scratch)
         size = max(1, self.size // 20) if batch.sample else self.size
-        with _limited() as watch:
+        with _limited(self.hang) as watch:
             try:
                 self._feed(batch, target, size, watch)
             finally:
@@ -92,7 +97,7 @@ class FuzzCase(Case):
     def _feed(self, batch: Batch, target: Target, size: int, watch: _Watch) -> None:
         make, run, allowed = target.make, target.run, target.allowed
         mark = None if batch.trace is None else os.open(batch.trace, os.O_WRONLY | os.O_CREAT)
-        done = -1
+        done, hangs = -1, 0
         while done + 1 < size:
             data: Any = b""
             try:
@@ -111,6 +116,9 @@ class FuzzCase(Case):
             except (Exception, Hang) as error:
                 watch.index = -1
                 batch.failed(error, index=done, data=as_bytes(data))
+                hangs += isinstance(error, Hang)
+                if hangs == _HANGS:
+                    break
             if done == batch.only:
                 break
         watch.index = -1
@@ -125,7 +133,7 @@ class FuzzCase(Case):
         given: Any = data
         if isinstance(target.make(), str):
             given = data.decode(errors="surrogatepass")
-        with _limited() as watch:
+        with _limited(self.hang) as watch:
             try:
                 watch.index = 0
                 target.run(given)
@@ -150,33 +158,34 @@ def as_bytes(data: Any) -> bytes:
 
 
 class _Watch:
-    """Interrupts an input that takes :data:`HANG` seconds of processor time."""
+    """Interrupts an input that takes ``limit`` seconds of processor time."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: float) -> None:
         self.index = -1
+        self._limit = limit
         self._last = (-1, 0)
 
     def tick(self, signum: int, frame: FrameType | None) -> None:
-        """A second of processor time has passed."""
+        """Half of that time has passed."""
         index, ticks = self._last
         if self.index < 0 or self.index != index:
             self._last = (self.index, 0)
             return
         self._last = (index, ticks + 1)
-        if ticks + 1 >= HANG:
+        if ticks + 1 >= 2:
             self._last = (-1, 0)
-            raise Hang(f"more than {HANG} s of processor time for one input")
+            raise Hang(f"more than {self._limit:g} s of processor time for one input")
 
 
 @contextlib.contextmanager
-def _limited() -> Iterator[_Watch]:
-    watch = _Watch()
+def _limited(hang: float) -> Iterator[_Watch]:
+    watch = _Watch(hang)
     before = signal.signal(signal.SIGPROF, watch.tick)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, hard))
-    signal.setitimer(signal.ITIMER_PROF, 1.0, 1.0)
+    signal.setitimer(signal.ITIMER_PROF, hang / 2, hang / 2)
     try:
         yield watch
     finally:

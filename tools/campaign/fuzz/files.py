@@ -75,8 +75,10 @@ def _foreign(compression: CompressionType, chunked: bool, rng: random.Random) ->
         for number in range(6):
             stamp = _TIME + number * 10_000_000 + at
             writer.add_message(channel, stamp, kind.encode(filled(name, rng)), stamp, number)
-    writer.add_metadata("dds_endpoints", {"rt/dex1/left/cmd writer": "Reliable, Durability.Volatile"})
-    writer.finish()
+    writer.add_metadata(
+        "dds_endpoints", {"rt/dex1/left/cmd writer": "Reliable, Durability.Volatile"}
+    )
+    writer.finish()  # type: ignore[no-untyped-call]
     return out.getvalue()
 
 
@@ -112,9 +114,7 @@ def _hostile(rng: random.Random) -> list[bytes]:
     found = []
     for size, count in ((1 << 20, 1), (1 << 24, 4), (1 << 28, 1), (1 << 28, 6)):
         packed = _zeros(size)
-        chunk = (
-            struct.pack("<QQQI", 0, 1, size, 0) + _text("zstd") + struct.pack("<Q", len(packed))
-        )
+        chunk = struct.pack("<QQQI", 0, 1, size, 0) + _text("zstd") + struct.pack("<Q", len(packed))
         found.append(header + _record(6, chunk + packed) * count)
     for body in ("\n" * 200_000, " " * 200_000 + "x", "#" * 100_000, "float32 a\n" * 2_000):
         schema = struct.pack("<H", 1) + _text("a/msg/B") + _text("ros2msg") + _text(body)
@@ -134,7 +134,9 @@ def _zeros(size: int) -> bytes:
 def _content(path: Path) -> tuple[Any, bool]:
     """Everything that is read from a recording, and whether something odd was told."""
     trace = open_trace(path)
-    rows = [(m.topic, m.type_name, m.log_time_ns, m.publish_time_ns, m.data) for m in trace.messages()]
+    rows = [
+        (m.topic, m.type_name, m.log_time_ns, m.publish_time_ns, m.data) for m in trace.messages()
+    ]
     columns = trace.load()
     sizes = {topic: len(array.log_time_ns) for topic, array in columns.items()}
     told = bool(trace.warnings) or trace.truncated or any(c.problem for c in trace.channels)
@@ -249,7 +251,9 @@ def damaged_json(content: Any, rng: random.Random) -> str:
     """JSON text of ``content`` with one to three places of another type, absent or too deep."""
     copy = json.loads(json.dumps(content))
     for _ in range(1 + rng.getrandbits(1)):
-        place, parent, key = copy, None, None
+        place: Any = copy
+        parent: Any = None
+        key: Any = None
         while isinstance(place, dict | list) and place and (parent is None or rng.random() < 0.8):
             parent = place
             key = rng.choice(list(place)) if isinstance(place, dict) else rng.randrange(len(place))
@@ -363,7 +367,7 @@ def _store(rng: random.Random, scratch: Path) -> Target:
 
     def run(text: str) -> None:
         path.write_text(text, encoding="utf-8", errors="surrogatepass")
-        for key in store.keys():
+        for key in store.keys():  # noqa: SIM118  # a file, not a dict
             try:
                 store.read(key)
             except DexkitError:
@@ -395,8 +399,8 @@ def _claims(rng: random.Random, scratch: Path) -> Target:
             "[claims]\n",
             "",
         ],
-        ["[hand]", "[claims]", "= true", "= [", "= {", '"""', "[[a]]", "[" * 5000, "a = " + "[" * 5000,
-         "a." * 3000 + "b = 1", "1979-05-27", "\\u0000", "nan", "model = 'x'", "x = 1"],
+        ["[hand]", "[claims]", "= true", "= [", "= {", '"""', "[[a]]", "[" * 5000, "nan",
+         "a = " + "[" * 5000, "a." * 3000 + "b = 1", "1979-05-27", "\\u0000", "model = 'x'"],
         rng,
     )  # fmt: skip
     return Target(text, Claims.parse)
@@ -461,7 +465,17 @@ def _settings(rng: random.Random, scratch: Path) -> Target:
 def _uri(rng: random.Random, scratch: Path) -> Target:
     text = TextMutator(
         ["<CycloneDDS><Domain/></CycloneDDS>", "file:///dev/null", "<?xml version='1.0'?><a/>"],
-        ["<", ">", "<!DOCTYPE a [<!ENTITY b 'c'>]>", "&b;", "file://", "%00", "/proc", ",", "\udc80"],
+        [
+            "<",
+            ">",
+            "<!DOCTYPE a [<!ENTITY b 'c'>]>",
+            "&b;",
+            "file://",
+            "%00",
+            "/proc",
+            ",",
+            "\udc80",
+        ],
         rng,
     )
     # the environment holds no NUL

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -223,9 +224,11 @@ def announcements(rng: random.Random) -> list[bytes]:
         properties = {
             "__ProcessName": rng.choice(texts),
             "__Pid": rng.choice((*texts, "4711")),
-            "__Hostname": rng.choice((*texts, doctor_dds.socket.gethostname())),
+            "__Hostname": rng.choice((*texts, socket.gethostname())),
         }
-        found.append(rtps.build_participant(rng.randbytes(12), place, lease=10, properties=properties))
+        found.append(
+            rtps.build_participant(rng.randbytes(12), place, lease=10, properties=properties)
+        )
     found += [
         rtps.build_endpoint(rng.randbytes(16), topic, "unitree_go::msg::dds_::MotorCmds_")
         for topic in ("rt/dex1/left/cmd", "", "rt/\u00e9", "x" * 200)
@@ -244,9 +247,7 @@ def _rtps_packet(rng: random.Random, scratch: Path) -> Target:
     packets.append(
         rtps.message(rng.randbytes(12), rtps.build_heartbeat(rtps.SEDP_PUBLICATIONS, 1, 5, 1))
     )
-    packets.append(
-        rtps.message(rng.randbytes(12), acknack)
-    )
+    packets.append(rtps.message(rng.randbytes(12), acknack))
 
     def run(data: bytes) -> None:
         _, items = rtps.parse_message(data)
@@ -276,9 +277,11 @@ def _rtps_announcement(rng: random.Random, scratch: Path) -> Target:
 
 def _observer(rng: random.Random, scratch: Path) -> Target:
     me = bytes(range(12))
-    fresh = lambda: Observer(  # noqa: E731
-        me, Locator("127.0.0.1", 4711), wanted=lambda topic, kind: len(topic) % 2 == 0
-    )
+
+    def fresh() -> Observer:
+        place = Locator("127.0.0.1", 4711)
+        return Observer(me, place, wanted=lambda topic, kind: len(topic) % 2 == 0)
+
     state: list[Any] = [fresh(), 0]
     whose = [rng.randbytes(12) for _ in range(4)]
     packets = []

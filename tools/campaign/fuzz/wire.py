@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 import socket
 import struct
@@ -188,9 +189,7 @@ def _stream(make: Callable[[], Any], most: int) -> Callable[[random.Random, byte
     return run
 
 
-def _streams(
-    corpus: Sequence[bytes], fix: Fix, make: Callable[[], Any], most: int
-) -> Prepare:
+def _streams(corpus: Sequence[bytes], fix: Fix, make: Callable[[], Any], most: int) -> Prepare:
     def prepare(rng: random.Random, scratch: Path) -> Target:
         damaged = mutator(corpus, rng, fix)
         feed = _stream(make, most)
@@ -257,7 +256,7 @@ def _m4010_data(data: bytes) -> None:
 def _scan(data: bytes) -> None:
     kinds = packets.FROM_HAND if data[-1:] > b"\x7f" else packets.TO_HAND
     found, lost = packets.scan_bus(data, kinds)
-    for (at, kind), (then, _) in zip(found, found[1:], strict=False):
+    for (at, kind), (then, _) in itertools.pairwise(found):
         _same(at + kind.size <= then, True, "packets overlap")
     for problem in lost:
         str(problem)
@@ -361,14 +360,13 @@ def _servo(fast: bool) -> Prepare:
         def bus() -> Bus:
             return Bus([Servo(1, firmware=firmware), Servo(2, firmware=firmware)], line_time=False)
 
-        state = [bus(), 0.0, 0]
+        state: list[Any] = [bus(), 0.0, 0]
 
         def run(data: bytes) -> None:
             line, now, used = state
             if used >= 200:  # a servo that was told to be silent is no test of anything
                 line, used = bus(), 0
             state[:] = line, now + 1e-4, used + 1
-            assert isinstance(line, Bus)
             line.advance_to(now)
             line.receive(data, now)
             line.due(now + 1.0)
@@ -394,11 +392,10 @@ def _protocol_1(rng: random.Random, scratch: Path) -> Target:
 
 
 def _dex1_motor(rng: random.Random, scratch: Path) -> Target:
-    state = [DexBus([Motor(0), Motor(1)], line_time=False), 0.0]
+    state: list[Any] = [DexBus([Motor(0), Motor(1)], line_time=False), 0.0]
 
     def run(data: bytes) -> None:
         line, now = state
-        assert isinstance(line, DexBus)
         line.advance_to(now)
         line.receive(data, now)
         line.due(now + 1.0)
@@ -449,7 +446,7 @@ def _usbip_server(rng: random.Random, scratch: Path) -> Target:
     from dexkit.emulators.dex3_mcu import emulated_dex3
 
     context = emulated_dex3(port=0)
-    hands = context.__enter__()
+    hands: Any = context.__enter__()
     place = ("127.0.0.1", hands.port)
     enter = struct.pack(">HHI", 0x0111, 0x8003, 0) + b"1-1".ljust(32, b"\0")
     listing = struct.pack(">HHI", 0x0111, 0x8005, 0)
@@ -491,78 +488,166 @@ def cases() -> list[FuzzCase]:
     data = (_motor_data(), fix_words(0, m4010.DATA.head))
     serial = [
         FuzzCase(
-            "dynamixel.decode", "a Dynamixel packet", _bytes(both, fix_dynamixel, _decode_dynamixel),
-            size=200_000, aim=fast, weight=3,
+            "dynamixel.decode",
+            "a Dynamixel packet",
+            _bytes(both, fix_dynamixel, _decode_dynamixel),
+            size=200_000,
+            aim=fast,
+            weight=3,
         ),
         FuzzCase(
-            "dynamixel.parser", "a stream of Dynamixel packets, cut anywhere",
+            "dynamixel.parser",
+            "a stream of Dynamixel packets, cut anywhere",
             _streams(both, fix_dynamixel, lambda: dynamixel.PacketParser(keep_bad=True), 1024),
-            size=120_000, aim=fast, weight=3,
+            size=120_000,
+            aim=fast,
+            weight=3,
         ),
         FuzzCase(
-            "dynamixel.status", "fields of a status packet",
-            _bytes(statuses, fix_dynamixel, _status_fields), size=200_000, aim=fast, weight=2,
+            "dynamixel.status",
+            "fields of a status packet",
+            _bytes(statuses, fix_dynamixel, _status_fields),
+            size=200_000,
+            aim=fast,
+            weight=2,
         ),
         FuzzCase(
-            "dynamixel.fast", "a combined status", _bytes(statuses, None, _split),
-            size=200_000, aim=fast, weight=2,
+            "dynamixel.fast",
+            "a combined status",
+            _bytes(statuses, None, _split),
+            size=200_000,
+            aim=fast,
+            weight=2,
         ),
         FuzzCase(
-            "dynamixel.stuffing", "byte stuffing there and back", _bytes(both, None, _stuffing),
-            size=320_000, aim=fast, weight=3,
+            "dynamixel.stuffing",
+            "byte stuffing there and back",
+            _bytes(both, None, _stuffing),
+            size=320_000,
+            aim=fast,
+            weight=3,
         ),
-        FuzzCase("mx64.table", "items of the control table", _bytes(both, None, _table),
-                 size=200_000, aim=fast, weight=2),
-        FuzzCase("m4010.command", "a command frame of the M4010", _bytes(*motor, _m4010_motor),
-                 size=200_000, aim=fast, weight=3),
-        FuzzCase("m4010.data", "a data frame of the M4010", _bytes(*data, _m4010_data),
-                 size=200_000, aim=fast, weight=3),
         FuzzCase(
-            "m4010.parser", "a stream of M4010 frames, cut anywhere",
-            _streams(motor[0] + data[0], motor[1],
-                     lambda: m4010.FrameParser((m4010.COMMAND, m4010.DATA)), 26),
-            size=120_000, aim=fast, weight=2,
+            "mx64.table",
+            "items of the control table",
+            _bytes(both, None, _table),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase(
+            "m4010.command",
+            "a command frame of the M4010",
+            _bytes(*motor, _m4010_motor),
+            size=200_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "m4010.data",
+            "a data frame of the M4010",
+            _bytes(*data, _m4010_data),
+            size=200_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "m4010.parser",
+            "a stream of M4010 frames, cut anywhere",
+            _streams(
+                motor[0] + data[0],
+                motor[1],
+                lambda: m4010.FrameParser((m4010.COMMAND, m4010.DATA)),
+                26,
+            ),
+            size=120_000,
+            aim=fast,
+            weight=2,
         ),
         FuzzCase("ris.scale", "counts of a quantity", _scale, size=200_000, aim=fast, weight=2),
-        FuzzCase("crc32", "the word CRC", _bytes([*motor[0], *_dex3_states()], None, _crc),
-                 size=200_000, aim=fast, weight=2),
+        FuzzCase(
+            "crc32",
+            "the word CRC",
+            _bytes([*motor[0], *_dex3_states()], None, _crc),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        ),
     ]
     motor_packet = fix_words(0, dex3_usb.MOTOR_CMD.head)
     dex3 = [
         FuzzCase(
-            f"dex3.{kind.__name__}", f"a {kind.__name__} packet of the Dex3-1",
+            f"dex3.{kind.__name__}",
+            f"a {kind.__name__} packet of the Dex3-1",
             _bytes(corpus, fix_words(0, structure.head), _pack_again(kind)),
-            size=200_000, aim=fast, weight=2,
+            size=200_000,
+            aim=fast,
+            weight=2,
         )
         for kind, structure, corpus in (
-            (packets.MotorCmd, dex3_usb.MOTOR_CMD,
-             [packets.MotorCmd(1, 1, True, 5, -6, 7, 8, 9).pack()]),
-            (packets.MotorState, dex3_usb.MOTOR_STATE,
-             [packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()]),
-            (packets.SensorState, dex3_usb.SENSOR_STATE,
-             [packets.SensorState(1, 0, tuple(range(12)), tuple(range(12))).pack()]),
+            (
+                packets.MotorCmd,
+                dex3_usb.MOTOR_CMD,
+                [packets.MotorCmd(1, 1, True, 5, -6, 7, 8, 9).pack()],
+            ),
+            (
+                packets.MotorState,
+                dex3_usb.MOTOR_STATE,
+                [packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()],
+            ),
+            (
+                packets.SensorState,
+                dex3_usb.SENSOR_STATE,
+                [packets.SensorState(1, 0, tuple(range(12)), tuple(range(12))).pack()],
+            ),
         )
     ]
-    buses = [
-        packets.MotorCmd(i, 1, True, 0, 0, 0, 0, 0).pack() * 2 for i in range(2)
-    ] + [packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()
-         + packets.SensorState(1, 0, (0,) * 12, (0,) * 12).pack()]
+    buses = [packets.MotorCmd(i, 1, True, 0, 0, 0, 0, 0).pack() * 2 for i in range(2)] + [
+        packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()
+        + packets.SensorState(1, 0, (0,) * 12, (0,) * 12).pack()
+    ]
     dex3 += [
-        FuzzCase("dex3.bus", "a bus buffer of the Dex3-1", _bytes(buses, motor_packet, _scan),
-                 size=120_000, aim=fast, weight=2),
-        FuzzCase("dex3.command-frame", "a frame to the Dex3-1",
-                 _bytes(_dex3_commands(), _fix_command, _parsed_command), size=25_000, aim=slow),
-        FuzzCase("dex3.state-frame", "a frame from the Dex3-1",
-                 _bytes(_dex3_states(), _fix_frame(dex3_usb.STATE), _parsed_state),
-                 size=20_000, aim=slow),
-        FuzzCase("dex3.codec", "the driver's reading of a state frame", _dex3_codec,
-                 size=15_000, aim=slow),
-        FuzzCase("dex3.codec-command", "the hand's reading of a command frame",
-                 _dex3_decode_command, size=15_000, aim=slow),
+        FuzzCase(
+            "dex3.bus",
+            "a bus buffer of the Dex3-1",
+            _bytes(buses, motor_packet, _scan),
+            size=120_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase(
+            "dex3.command-frame",
+            "a frame to the Dex3-1",
+            _bytes(_dex3_commands(), _fix_command, _parsed_command),
+            size=25_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "dex3.state-frame",
+            "a frame from the Dex3-1",
+            _bytes(_dex3_states(), _fix_frame(dex3_usb.STATE), _parsed_state),
+            size=20_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "dex3.codec",
+            "the driver's reading of a state frame",
+            _dex3_codec,
+            size=15_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "dex3.codec-command",
+            "the hand's reading of a command frame",
+            _dex3_decode_command,
+            size=15_000,
+            aim=slow,
+        ),
     ]
     low = [
-        FuzzCase(f"low_level.{name}", f"image and CRC of {name}", _low(name), size=50_000,
-                 aim=1_000_000)
+        FuzzCase(
+            f"low_level.{name}", f"image and CRC of {name}", _low(name), size=50_000, aim=1_000_000
+        )
         for name in (
             "unitree_go::msg::dds_::LowCmd_",
             "unitree_hg::msg::dds_::LowCmd_",
@@ -570,18 +655,28 @@ def cases() -> list[FuzzCase]:
         )
     ]
     devices = [
-        FuzzCase("device.mx64", "the emulated MX-64, on its line", _servo(False),
-                 size=15_000, aim=slow),
-        FuzzCase("device.mx64-fast", "the same with fast reads and backup", _servo(True),
-                 size=15_000, aim=slow),
-        FuzzCase("device.protocol-1", "the old firmware of it", _protocol_1,
-                 size=120_000, aim=fast),
-        FuzzCase("device.m4010", "the emulated M4010, on its line", _dex1_motor,
-                 size=25_000, aim=slow),
+        FuzzCase(
+            "device.mx64", "the emulated MX-64, on its line", _servo(False), size=15_000, aim=slow
+        ),
+        FuzzCase(
+            "device.mx64-fast",
+            "the same with fast reads and backup",
+            _servo(True),
+            size=15_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "device.protocol-1", "the old firmware of it", _protocol_1, size=120_000, aim=fast
+        ),
+        FuzzCase(
+            "device.m4010", "the emulated M4010, on its line", _dex1_motor, size=25_000, aim=slow
+        ),
         FuzzCase("device.dex3", "the emulated Dex3-1, behind USB", _mcu, size=10_000, aim=slow),
-        FuzzCase("usbip.client", "what a USB/IP server answers", _usbip_client,
-                 size=15_000, aim=slow),
-        FuzzCase("usbip.server", "what a USB/IP client sends", _usbip_server,
-                 size=2_000, aim=slow // 3),
+        FuzzCase(
+            "usbip.client", "what a USB/IP server answers", _usbip_client, size=15_000, aim=slow
+        ),
+        FuzzCase(
+            "usbip.server", "what a USB/IP client sends", _usbip_server, size=2_000, aim=slow // 3
+        ),
     ]
     return serial + dex3 + low + devices
