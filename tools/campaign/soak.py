@@ -70,8 +70,8 @@ class Watched:
                 ("memory grows", f"{hourly:.1f} MiB an hour, {memory[0]:.1f} to {memory[-1]:.1f}")
             )
         for what, values in (("descriptors", self.files), ("threads", self.threads)):
-            half = (first + len(values)) // 2
-            if min(values[half:]) > max(values[first:half]):
+            third = (len(values) - first) // 3
+            if min(values[-third:]) > max(values[first : first + third]):
                 found.append((f"{what} grow", f"{values[first]} to {values[-1]}"))
         return found
 

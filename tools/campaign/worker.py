@@ -43,11 +43,10 @@ def scratch_root() -> str | None:
 
 def run_task(task: dict[str, Any]) -> dict[str, Any]:
     """Run one batch: ``outcome`` is ok, skipped or failed."""
-    chosen = case(task["case"])
     scratch = Path(tempfile.mkdtemp(prefix="dexkit-campaign-", dir=scratch_root()))
     only = task.get("only")
     batch = Batch(
-        chosen.name,
+        task["case"],
         task["seed"],
         task["batch"],
         scratch,
@@ -60,6 +59,7 @@ def run_task(task: dict[str, Any]) -> dict[str, Any]:
     outcome, text = "ok", ""
     began = time.monotonic()
     try:
+        chosen = case(task["case"])
         if task.get("data") is not None:
             chosen.repeat(batch, bytes.fromhex(task["data"]))
         else:

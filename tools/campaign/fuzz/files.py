@@ -335,8 +335,8 @@ def _faults(rng: random.Random, scratch: Path) -> Target:
                 fault = parse_fault(given, family)
             except DexkitError:
                 continue
-            if not (math.isfinite(fault.at) and fault.at < 1e9):
-                raise Difference(f"a fault at {fault.at} s")
+            if not (fault.at >= 0.0 and all(map(math.isfinite, fault.params.values()))):
+                raise Difference(f"a fault that cannot be: {fault}")
 
     return Target(text, run)
 

@@ -646,7 +646,11 @@ def cases() -> list[FuzzCase]:
     ]
     low = [
         FuzzCase(
-            f"low_level.{name}", f"image and CRC of {name}", _low(name), size=50_000, aim=1_000_000
+            "low_level." + name.replace("::msg::dds_::", "."),
+            f"image and CRC of {name}",
+            _low(name),
+            size=50_000,
+            aim=1_000_000,
         )
         for name in (
             "unitree_go::msg::dds_::LowCmd_",
