@@ -1,4 +1,4 @@
-"""Processes below this one: found, waited for, ended."""
+"""What a batch has below it: processes, found, waited for and ended; scratch folders."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import time
 
-__all__ = ["command_of", "descendants", "reap", "sweep", "wait_gone"]
+__all__ = ["command_of", "descendants", "reap", "scratch_root", "sweep", "wait_gone"]
 
 
 def _parents() -> dict[int, int]:
@@ -78,3 +78,8 @@ def sweep() -> list[str]:
         if not left:
             break
     return names
+
+
+def scratch_root() -> str | None:
+    """Where scratch folders go: memory where there is some, for fuzzers write many small files."""
+    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None

@@ -106,8 +106,8 @@ class Engine:
     """A campaign.
 
     :param cases: to run.
-    :param jobs: fuzzers at once; three times as many other batches run beside them, for they
-        mostly wait.
+    :param jobs: fuzzers at once; twice as many other batches run beside them, for they mostly
+        wait.
     :param seconds: how long.
     :param sample: each case once, in miniature.
     :param tell: is given a line of progress now and then.
@@ -141,7 +141,9 @@ class Engine:
         self._first = {name: p.units for name, p in state.cases.items()}
         state.folder.mkdir(parents=True, exist_ok=True)
         self._log: IO[bytes] = (state.folder / "workers.log").open("ab")
-        self._home = Path(tempfile.mkdtemp(prefix="dexkit-campaign-home-"))
+        self._home = Path(
+            tempfile.mkdtemp(prefix="dexkit-campaign-home-", dir=children.scratch_root())
+        )
 
     # --- running
 
@@ -177,7 +179,7 @@ class Engine:
 
     def _open_workers(self) -> None:
         lanes = {lane: [c for c in self.cases if c.lane is lane] for lane in Lane}
-        live = 3 * self._jobs
+        live = 2 * self._jobs
         counts = {Lane.COMPUTE: self._jobs, Lane.LIVE: live, Lane.LONG: len(lanes[Lane.LONG])}
         for lane, count in counts.items():
             if self._sample and lane is not Lane.LONG:
@@ -218,7 +220,19 @@ class Engine:
             if progress.skipped or (given and (self._sample or lane is Lane.LONG)):
                 continue
             candidates.append((self._behind(chosen, progress), len(candidates), chosen))
-        return min(candidates)[2] if candidates else None
+        if not candidates or (lane is Lane.LIVE and not self._sample and self._enough()):
+            return None
+        return min(candidates)[2]
+
+    def _enough(self) -> bool:
+        """Every live case has reached its aim, and the fuzzers have not: they get the cores."""
+
+        def short(chosen: Case) -> bool:
+            progress = self.state.of(chosen.name)
+            return not progress.skipped and progress.units < chosen.aim
+
+        live = any(short(c) for c in self.cases if c.lane is Lane.LIVE)
+        return not live and any(short(c) for c in self.cases if c.lane is Lane.COMPUTE)
 
     def _behind(self, chosen: Case, progress: Progress) -> float:
         under_way = sum(w.case is chosen for w in self._workers)

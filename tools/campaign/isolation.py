@@ -91,6 +91,8 @@ def inside(run: Callable[[Isolation], int]) -> int:
         try:
             _loopback_up()
             _libc.mount(b"none", b"/", None, _MS_REC_PRIVATE, None)
+            # scratch folders that go with the namespace, however it ends
+            _libc.mount(b"tmpfs", b"/dev/shm", b"tmpfs", 0, b"mode=1777")
             # dexkit and the campaign read /proc, which must show the new process numbers
             own = _libc.mount(b"proc", b"/proc", b"proc", 0, None) == 0
             code = run(Isolation(True, True, own, "" if own else "no /proc of its own"))

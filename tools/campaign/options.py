@@ -94,7 +94,7 @@ class OptionsCase(Case):
     name = "options"
     what = "odd values for every option of every command"
     unit = "command lines"
-    aim = 1500
+    aim = 800
     limit = 300.0
 
     def run(self, batch: Batch) -> None:

@@ -129,7 +129,7 @@ class PeerCase(Case):
     def __init__(self, spec: Spec, spoken: str) -> None:
         self.name = f"peers:{spec.name}"
         self.what = f"{spec.name}, among hostile peers"
-        self.aim = 100_000
+        self.aim = 40_000
         self._spec, self._spoken = spec, spoken
 
     def run(self, batch: Batch) -> None:
