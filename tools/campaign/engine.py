@@ -57,7 +57,13 @@ class Worker:
             stderr=log,
             cwd=ROOT,
             start_new_session=True,
-            env={**environment, "HOME": str(home), "PYTHONUNBUFFERED": "1"},
+            env={
+                **environment,
+                "HOME": str(home),
+                "PYTHONUNBUFFERED": "1",
+                # this checkout, wherever a program works and whatever is installed
+                "PYTHONPATH": str(ROOT),
+            },
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None

@@ -99,13 +99,14 @@ class FuzzCase(Case):
         mark = None if batch.trace is None else os.open(batch.trace, os.O_WRONLY | os.O_CREAT)
         done, hangs = -1, 0
         while done + 1 < size:
-            data: Any = b""
+            data: Any = None
             try:
                 # the loop is inside the try: entering one for each input would cost a tenth
                 for watch.index in range(done + 1, size):
                     done = watch.index
                     if mark is not None:
                         os.pwrite(mark, b"%20d" % done, 0)
+                    data = None
                     data = make()
                     try:
                         run(data)
@@ -115,6 +116,8 @@ class FuzzCase(Case):
                         break
             except (Exception, Hang) as error:
                 watch.index = -1
+                if data is None:
+                    raise  # there is no input yet: it is the campaign that is wrong
                 batch.failed(error, index=done, data=as_bytes(data))
                 hangs += isinstance(error, Hang)
                 if hangs == _HANGS:

@@ -9,6 +9,7 @@ import random
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -263,7 +264,7 @@ def damaged_json(content: Any, rng: random.Random) -> str:
         if rng.random() < 0.15:
             del parent[key]
         else:
-            parent[key] = rng.choice(_ODD)
+            parent[key] = deepcopy(rng.choice(_ODD))
     text = json.dumps(copy)
     if rng.random() < 0.01:
         deep = rng.choice((900, 20_000))
