@@ -307,34 +307,6 @@ def _observer(rng: random.Random, scratch: Path) -> Target:
     return Target(mutator(packets, rng), run, ())
 
 
-class _Property:
-    def __init__(self, key: str, value: str) -> None:
-        self.key, self.value = key, value
-
-
-class _Sample:
-    def __init__(self, qos: list[_Property]) -> None:
-        self.key, self.qos = "k", qos
-
-
-def _discovery(rng: random.Random, scratch: Path) -> Target:
-    """Properties of a participant as CycloneDDS hands them to the recorder and the service."""
-    from dexkit import dds
-
-    text = TextMutator(
-        ["python", "4711", "host", "0"], ["\u00b2", "\u0664", "\u2460", "1_0", "+1"], rng
-    )
-
-    def make() -> str:
-        return text()
-
-    def run(value: str) -> None:
-        qos = [_Property(k, value) for k in ("__ProcessName", "__Pid", "__Hostname")]
-        dds._participant(_Sample(qos), own=False)
-
-    return Target(make, run, ())
-
-
 # --- schemas and names
 
 _MSG_WORDS = (
@@ -412,8 +384,6 @@ def cases() -> list[FuzzCase]:
         FuzzCase("rtps.announcement", "an announcement, and who it says it is",
                  _rtps_announcement, size=15_000, aim=1_000_000),
         FuzzCase("rtps.observer", "the doctor's observer", _observer, size=15_000, aim=1_000_000),
-        FuzzCase("discovery", "properties of a participant", _discovery, size=60_000,
-                 aim=1_000_000),
         FuzzCase("schema.ros2msg", "schemas of recordings", _schema("ros2msg"), size=1_500,
                  aim=slow),
         FuzzCase("schema.omgidl", "schemas of recordings", _schema("omgidl"), size=1_500,
