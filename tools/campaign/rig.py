@@ -82,12 +82,17 @@ class LocalNode:
         self.readers: dict[int, tuple[str, _Reader, Callable[[], object] | None]] = {}
         self._lock = threading.Lock()
 
-    def writer(self, topic: str, type_name: str) -> Any:
-        """A writer that keeps the newest message."""
+    def writer(self, topic: str, type_name: str, **more: object) -> Any:
+        """A writer that keeps the newest message; what is only for other processes is ignored."""
         return _Writer(self, topic)
 
     def reader(
-        self, topic: str, type_name: str, *, on_data: Callable[[], object] | None = None
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        on_data: Callable[[], object] | None = None,
+        **more: object,
     ) -> Any:
         """A reader that :meth:`send` fills."""
         reader = _Reader(self, type_name)
