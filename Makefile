@@ -24,10 +24,10 @@ $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
 	@$(UV) sync --frozen --quiet
 	@touch $@
 
-.PHONY: help setup demo test soak lint format bench lock clean
+.PHONY: help setup demo test soak campaign campaign-sample lint format bench lock clean
 
 help: ## this list
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
 
 setup: $(STAMP) ## create the environment
 
@@ -39,6 +39,13 @@ test: $(STAMP) ## the tests, on all cores (ARGS="-k name" is passed on)
 
 soak: $(STAMP) ## the long tests
 	$(RUN) pytest -m soak $(ARGS)
+
+campaign: $(STAMP) ## tries to break it: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record FRESH=1 (docs/campaign.md)
+	$(RUN) python -m tools.campaign $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED)) \
+		$(if $(JOBS),--jobs $(JOBS)) $(if $(ONLY),--only $(ONLY)) $(if $(FRESH),--fresh) $(ARGS)
+
+campaign-sample: $(STAMP) ## two minutes of it, all cases in miniature
+	$(RUN) python -m tools.campaign --sample $(if $(JOBS),--jobs $(JOBS)) $(ARGS)
 
 lint: $(STAMP) ## ruff and mypy strict
 	$(RUN) ruff check .
@@ -56,5 +63,5 @@ lock: | $(UV) ## resolve the dependencies again
 	$(UV) lock --upgrade
 
 clean: ## remove everything that make created
-	rm -rf $(TOOLS) .venv build dist demo-out benchmarks/results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(TOOLS) .venv build dist demo-out campaign-out benchmarks/results .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

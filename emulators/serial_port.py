@@ -123,7 +123,8 @@ class Port:
             raise EmulatorError(
                 f"{path} exists and is not a link", hint="choose another path, or remove it"
             )
-        if path.exists():
+        # a link to the terminal that is ours now was left by an emulator that was killed
+        if path.exists() and os.readlink(path) != self._terminal:
             raise EmulatorError(
                 f"{path} is a link to {os.readlink(path)}, which exists",
                 hint="another emulator may serve it; choose another path, or remove it",

@@ -175,6 +175,9 @@ def test_a_configuration_that_can_be_read(tmp_path: Path) -> None:
     assert "not XML" in uri_problem("<CycloneDDS>")
     file.write_bytes(b"\xff\xfe\x00")
     assert "not text" in uri_problem(str(file))
+    # a name with a NUL, a host that is none, bytes of the environment that are no text
+    for odd in ("file://%00", "file://[::1", "/x\udc80", "<a\udc80/>"):
+        assert "cannot be read" in uri_problem(odd) or "not XML" in uri_problem(odd), odd
 
 
 def test_this_python(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -534,3 +534,22 @@ def test_settings_that_cannot_be() -> None:
         pass
     with pytest.raises(EmulatorError):
         Dex1Process(["--side=up"])
+
+
+def test_a_link_left_by_a_killed_emulator_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the next emulator mostly gets the same terminal again: the link names its own
+    ours, other = os.openpty(), os.openpty()
+    link = tmp_path / "tty"
+    link.symlink_to(os.ttyname(ours[1]))
+    monkeypatch.setattr(os, "openpty", lambda: ours)
+    with Dex1Motors(links={Side.LEFT: link}) as motors:
+        assert motors.path == str(link)
+    link.unlink(missing_ok=True)
+    link.symlink_to(os.ttyname(other[1]))
+    monkeypatch.undo()
+    with pytest.raises(EmulatorError, match="which exists"), Dex1Motors(links={Side.LEFT: link}):
+        pass
+    for fd in other:
+        os.close(fd)

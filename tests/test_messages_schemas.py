@@ -162,6 +162,7 @@ HEAD, TAIL = "module a { module msg { module dds_ { ", " }; }; };"
         ),
         ("@final struct X { uint8 a }", "expected ;"),
         ("@final struct X { uint8 $; };", "cannot read"),
+        ("@final struct X { uint8 a[x]; };", "no length"),
         ("@final struct X { uint8 a; }", "expected ;"),
     ],
 )

@@ -74,16 +74,20 @@ def uri_problem(uri: str) -> str:
     for part in _parts(uri):
         text = part
         if not part.startswith("<"):
-            path = Path(unquote(urlsplit(part).path) if part.startswith("file:") else part)
             try:
+                path = Path(unquote(urlsplit(part).path) if part.startswith("file:") else part)
                 text = path.read_text(encoding="utf-8")
-            except (OSError, UnicodeDecodeError) as error:
-                reason = getattr(error, "strerror", None) or "it is not text"
-                return f"{path} cannot be read: {reason}"
+            except (OSError, ValueError) as error:  # ValueError: no text, or no name of a file
+                reason = getattr(error, "strerror", None) or (
+                    "it is not text"
+                    if isinstance(error, UnicodeDecodeError)
+                    else "that is no name of a file"
+                )
+                return f"{part} cannot be read: {reason}"
         try:
             # a configuration may be several elements in a row
             root = ElementTree.fromstring(f"<all>{_without_declaration(text)}</all>")
-        except ElementTree.ParseError as error:
+        except (ElementTree.ParseError, UnicodeEncodeError) as error:
             return f"it is not XML: {error}"
         if not len(root):
             return "it holds no configuration"

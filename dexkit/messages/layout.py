@@ -269,7 +269,10 @@ class _Parser:
         array = None
         if self._peek() == "[":
             self._next()
-            array = int(self._next())
+            length = self._next()
+            if not length.isdecimal() or len(length) > 9:
+                raise IdlError(f"IDL line {line}: {length!r} is no length of an array")
+            array = int(length)
             self._next("]")
         self._next(";")
         if sequence and (array is not None or not isinstance(kind, Struct)):

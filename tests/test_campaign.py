@@ -1,0 +1,192 @@
+"""The campaign itself: it finds what is planted, keeps it, repeats it, ends when it is told to."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
+
+from dexkit.errors import UsageError
+from tools.campaign.case import ROOT, Finding
+from tools.campaign.mutate import mutator
+from tools.campaign.process import traceback_in
+from tools.campaign.soak import Watched, slope
+from tools.campaign.state import State
+
+PLANTED = {
+    "BROKEN": "ValueError",
+    "DIFFERS": "Difference",
+    "FOR_EVER": "Hang",
+    "GREEDY": "MemoryError",
+    "CRASH": "died: SIGSEGV",
+    "LeavesChild": "child left behind",
+    "LeavesUnseen": "left behind",
+    "DiesLoudly": "traceback",
+    "Leaks": "memory grows",
+    "Hangs": "hang",
+}
+
+
+def start(out: Path, cases: Sequence[str], *options: str) -> subprocess.Popen[str]:
+    only = ",".join(f"tests.campaign_cases::{name}" for name in cases)
+    return subprocess.Popen(
+        [sys.executable, "-m", "tools.campaign", "--out", str(out), "--only", only, *options],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def run(out: Path, cases: Sequence[str], *options: str) -> tuple[int, str, str]:
+    process = start(out, cases, *options)
+    output, errors = process.communicate(timeout=120)
+    return process.returncode, output, errors
+
+
+def result(out: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((out / "result.json").read_text())
+    return content
+
+
+def test_it_finds_what_is_planted_and_repeats_it(tmp_path: Path) -> None:
+    code, output, errors = run(tmp_path, [*PLANTED, "CLEAN", "Skipped"], "--sample", "--jobs", "2")
+    assert code == 1, errors
+    out = tmp_path / "sample"
+    found = {(f["case"].rpartition("::")[2], f["kind"]): f for f in result(out)["findings"]}
+    assert set(found) == set(PLANTED.items()), output
+    done = {c["name"].rpartition("::")[2]: c for c in result(out)["cases"]}
+    assert done["CLEAN"]["units"] > 0
+    assert done["Skipped"]["skipped"] == "not on this machine"
+    assert found["CRASH", "died: SIGSEGV"]["index"] >= 0
+    for finding in found.values():
+        assert finding["id"] in output
+    # one by its kept input, one by doing the batch again up to it
+    for name in ("BROKEN", "CRASH"):
+        command = found[name, PLANTED[name]]["repeat"].split()
+        again = subprocess.run(
+            [sys.executable, *command[1:]], cwd=ROOT, capture_output=True, text=True, timeout=60
+        )
+        assert again.returncode == 1, again.stderr
+        assert "again" in again.stdout
+
+
+def test_it_goes_on_where_it_ended_and_fails_by_itself_with_another_code(tmp_path: Path) -> None:
+    time_limit = ("--minutes", "0.02", "--jobs", "1")
+    code, _, errors = run(tmp_path, ["CLEAN"], *time_limit, "--seed", "7")
+    assert code == 0, errors
+    (first,) = result(tmp_path)["cases"]
+    code, output, _ = run(tmp_path, ["CLEAN", "Fails"], *time_limit)
+    assert code == 2
+    assert "the campaign is wrong here" in json.dumps(result(tmp_path)["cases"])
+    assert "seed 7" in output
+    second = result(tmp_path)["cases"][0]
+    assert second["batches"] > first["batches"]
+    assert second["units"] > first["units"]
+    code, _, errors = run(tmp_path, ["CLEAN"], *time_limit, "--seed", "8")
+    assert code == 2
+    assert "--fresh" in errors
+
+
+def test_ctrl_c_prints_the_table_and_leaves_nothing(tmp_path: Path) -> None:
+    process = start(tmp_path, ["Slow"], "--minutes", "5", "--jobs", "1")
+    try:
+        log = tmp_path / "workers.log"
+        while not (log.exists() and "scratch " in log.read_text()):
+            assert process.poll() is None
+        scratch = log.read_text().split("scratch ")[1].split()[0]
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    assert "the table so far" in output
+    assert not Path(scratch).exists()
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            try:
+                command = Path(f"/proc/{name}/cmdline").read_bytes()
+            except OSError:
+                continue
+            assert str(tmp_path).encode() not in command
+            assert b"campaign_programs" not in command or int(name) == os.getpid()
+
+
+def test_a_finding_is_kept_once_with_its_input(tmp_path: Path) -> None:
+    state = State(tmp_path, "5")
+    one = Finding("fuzz:x", "ValueError", "a.py:f", "first", "5", 3, 4, "00ff")
+    assert state.add(one)
+    assert not state.add(Finding("fuzz:x", "ValueError", "a.py:f", "second", "5", 9, 9, "11"))
+    assert state.add(Finding("fuzz:x", "ValueError", "a.py:g"))
+    assert (tmp_path / "findings" / f"{one.id}.bin").read_bytes() == b"\x00\xff"
+    state.of("fuzz:x").units = 12
+    state.save()
+    again = State.load(tmp_path, None, fresh=False)
+    assert (again.seed, again.of("fuzz:x").units) == ("5", 12)
+    assert again.findings == state.findings
+    assert again.times[one.id] == 2
+    assert not State.load(tmp_path, "6", fresh=True).findings
+    state.path.write_text("{")
+    with pytest.raises(UsageError, match="cannot be read"):
+        State.load(tmp_path, None, fresh=False)
+
+
+def test_a_seed_gives_the_same_inputs_again() -> None:
+    corpus = [bytes(range(40)), b"head" * 5]
+    both = [[mutator(corpus, random.Random("s 3"))() for _ in range(500)] for _ in range(2)]
+    assert both[0] == both[1]
+    assert len(set(both[0])) > 0
+
+
+def test_a_traceback_is_seen_in_a_log_and_a_message_is_not() -> None:
+    text = 'INFO ok\nERROR it died\nTraceback (most recent call last):\n  File "/x/y.py", line 3, '
+    assert traceback_in(text + "in run\n    f()\nValueError: bad\n") == (
+        "y.py:run",
+        "ValueError: bad",
+    )
+    assert traceback_in("error: no such file\n  give another\n") is None
+
+
+def test_what_grows_is_told_from_what_does_not() -> None:
+    steady, leaky, files = (Watched(name, 0) for name in ("steady", "leaky", "files"))
+    for number in range(360):
+        for one, memory, descriptors in (
+            (steady, 45.0 + number % 3 * 0.1, 9 + number % 2),
+            (leaky, 45.0 + number * 18 / 360, 9),
+            (files, 45.0, 9 + number // 60),
+        ):
+            one.times.append(10.0 * number)
+            one.memory.append(memory)
+            one.files.append(descriptors)
+            one.threads.append(3)
+    assert steady.problems() == []
+    assert [kind for kind, _ in leaky.problems()] == ["memory grows"]
+    assert [kind for kind, _ in files.problems()] == ["descriptors grow"]
+    assert slope([0.0, 1.0, 2.0], [1.0, 3.0, 5.0]) == pytest.approx(2.0)
+
+
+def test_every_message_type_program_and_option_has_its_case() -> None:
+    from dexkit.messages import message_types
+    from tools.campaign.options import _BASE, command_lines
+    from tools.campaign.registry import all_cases
+
+    names = [case.name for case in all_cases()]
+    assert len(set(names)) == len(names)
+    for kind in message_types():
+        package, _, rest = kind.name.partition("::")
+        assert f"fuzz:cdr.{package}.{rest.rpartition('::')[2]}" in names
+    for program in ("serve-ezgripper", "bridge", "record", "replay", "emulate-all", "conformance"):
+        assert {f"kill:{program}", f"stop:{program}"} <= set(names)
+    assert set(command_lines()) == set(_BASE)

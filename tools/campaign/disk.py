@@ -1,0 +1,224 @@
+"""Disks that are full, read-only or taken away, under everything that writes.
+
+``record``, ``check``, ``report``, ``badge`` and ``compare`` write to ``/dev/full``, to a file
+system of 64 KiB, under a limit of the file's size, to a folder that is read-only or missing, and
+to a file that is deleted meanwhile. What could not be written is said and gives an exit code that
+is not 0; a traceback is a finding, and so is a claim that does not hold.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import os
+import re
+import resource
+import signal
+from pathlib import Path
+
+from dexkit.errors import DexkitError
+from tools.campaign.case import Batch, Case, Skip
+from tools.campaign.process import Program, traceback_in
+from tools.campaign.programs import Scene, _talk
+from tools.campaign.rig import NotYet, until
+
+__all__ = ["cases"]
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def _small(folder: Path) -> None:
+    """A file system of 64 KiB.
+
+    :raises Skip: mounting is not permitted.
+    """
+    folder.mkdir()
+    if _libc.mount(b"tmpfs", str(folder).encode(), b"tmpfs", 0, b"size=64k"):
+        raise Skip("small file systems cannot be mounted here")
+
+
+def _release(folder: Path) -> None:
+    _libc.umount2(str(folder).encode(), 2)
+
+
+class WriteCase(Case):
+    """A command that writes one file."""
+
+    unit = "disks"
+    aim = 40
+
+    def __init__(self, name: str, command: list[str]) -> None:
+        self.name = f"disk:{name}"
+        self.what = f"{name}, on disks that do not take it"
+        self._command = command
+
+    def run(self, batch: Batch) -> None:
+        logging.disable()
+        result = batch.scratch / "result.json"
+        sample = _sample()
+        made = Program(batch, ["dexkit", "check", sample, "--json", str(result)])
+        if made.wait() not in (0, 1):
+            raise RuntimeError(made.output)
+        for way in ("full", "limit", "read-only", "missing", "folder", "small"):
+            if batch.sample and way != batch.random.choice(("full", "full")):
+                continue
+            place, limits = self._place(batch, way)
+            words = [w.format(out=place, result=result, sample=sample) for w in self._command]
+            program = Program(batch, ["dexkit", *words], limits=limits)
+            code = program.wait(120.0)
+            batch.units += 1
+            told = traceback_in(program.output)
+            if told is not None:
+                batch.found("traceback", told[0], f"{way}: {told[1]}\n{program!r}")
+            elif code is None or code < 0:
+                batch.found("exit code", f"{self.name} {way}", f"{code}: {program.output[-1000:]}")
+            elif (code == 0 and way != "small") or (code == 0 and not Path(place).stat().st_size):
+                batch.found("said to be done", f"{self.name} {way}", program.output[-1000:])
+            program.end()
+            if way == "small":
+                _release(batch.scratch / "small")
+
+    @staticmethod
+    def _place(batch: Batch, way: str) -> tuple[str, list[tuple[int, int]]]:
+        folder = batch.scratch
+        if way == "full":
+            return "/dev/full", []
+        if way == "limit":
+            return str(folder / "limited"), [(resource.RLIMIT_FSIZE, 100)]
+        if way == "read-only":
+            # root writes where it may not; /proc takes nothing from anybody
+            return "/proc/dexkit-campaign", []
+        if way == "missing":
+            return str(folder / "no" / "such" / "file"), []
+        if way == "folder":
+            return str(folder), []
+        _small(folder / "small")
+        (folder / "small" / "filler").write_bytes(bytes(60_000))
+        return str(folder / "small" / "file"), []
+
+
+class RecordCase(Case):
+    """The recorder, whose disk fills up or whose file goes away."""
+
+    unit = "disks"
+    aim = 40
+    name = "disk:record"
+    what = "record, while its disk fills up, its file goes, and two of them"
+
+    def run(self, batch: Batch) -> None:
+        logging.disable()
+        ways = ("limit", "small", "deleted", "full", "force")
+        scene = Scene(batch)
+        with _talk(scene):
+            for way in ways[:1] if batch.sample else ways:
+                try:
+                    self._one(batch, scene, way)
+                except NotYet as error:
+                    batch.found("not ready", f"{self.name} {way}", str(error))
+                finally:
+                    if way == "small":
+                        _release(batch.scratch / "small")
+
+    def _one(self, batch: Batch, scene: Scene, way: str) -> None:
+        path = batch.scratch / f"{way}.mcap"
+        limits: list[tuple[int, int]] = []
+        if way == "limit":
+            limits = [(resource.RLIMIT_FSIZE, 30_000)]
+        elif way == "small":
+            _small(batch.scratch / "small")
+            path = batch.scratch / "small" / "x.mcap"
+        elif way == "full":
+            path = Path("/dev/full")
+        elif way == "force":
+            self._force(batch, scene, path)
+            return
+        words = ["dexkit", "record", str(path), "--domain", scene.domain, "--force"]
+        if way in ("limit", "small"):
+            words += ["--compression", "none"]
+        program = Program(batch, words, limits=limits)
+        try:
+            until(lambda: "ready:" in program.output or not program.running, "the recorder")
+            if way == "deleted" and program.running:
+                until(lambda: path.exists() and path.stat().st_size > 5000, "something recorded")
+                path.unlink()
+            # it ends by itself when it cannot write, or goes on and says so at the end
+            with contextlib.suppress(NotYet):
+                until(lambda: not program.running, "its end", 5.0)
+            program.signal(signal.SIGTERM)
+            code = program.wait()
+            batch.units += 1
+            told = traceback_in(program.output)
+            if told is not None:
+                batch.found("traceback", told[0], f"{way}: {told[1]}\n{program.output[-2000:]}")
+            elif code in (0, None) or (code < 0 and "error:" not in program.output):
+                batch.found(
+                    "said to be done", f"{self.name} {way}", f"{code}: {program.output[-2000:]}"
+                )
+            if way != "deleted" or code == 0:
+                self._claims(batch, way, path, program.output)
+        finally:
+            program.end()
+
+    def _claims(self, batch: Batch, way: str, path: Path, output: str) -> None:
+        """It does not say that more was recorded than can be read."""
+        from dexkit.traces import open_trace
+
+        claimed = re.search(r"([\d,]+) messages", output)
+        if claimed is None or path == Path("/dev/full"):
+            return
+        readable = 0
+        if path.exists():
+            try:
+                readable = len(list(open_trace(path).messages()))
+            except DexkitError:
+                readable = 0
+        said = int(claimed[1].replace(",", ""))
+        if said > readable:
+            batch.found(
+                "claims too much", f"{self.name} {way}", f"{said} said, {readable} readable"
+            )
+
+    def _force(self, batch: Batch, scene: Scene, path: Path) -> None:
+        """``--force`` on a file that is being recorded: the first one keeps what it has."""
+        words = ["dexkit", "record", str(path), "--domain", scene.domain]
+        first = Program(batch, words)
+        second: Program | None = None
+        try:
+            until(lambda: path.exists() and path.stat().st_size > 3000, "something recorded")
+            second = Program(batch, [*words, "--force", "--duration", "1"])
+            second.wait()
+            first.signal(signal.SIGTERM)
+            code = first.wait()
+            batch.units += 1
+            for program in (first, second):
+                told = traceback_in(program.output)
+                if told is not None:
+                    batch.found("traceback", told[0], f"{told[1]}\n{program.output[-2000:]}")
+            if code == 0:
+                self._claims(batch, "force", path, first.output)
+        finally:
+            first.end()
+            if second is not None:
+                second.end()
+
+
+def _sample() -> str:
+    from dexkit.traces import sample_path
+
+    return os.fspath(sample_path("dex1_hand_dropout"))
+
+
+def cases() -> list[Case]:
+    """Everything that writes."""
+    return [
+        RecordCase(),
+        WriteCase("check-json", ["check", "{sample}", "--json", "{out}"]),
+        WriteCase("check-junit", ["check", "{sample}", "--junit", "{out}"]),
+        WriteCase("check-report", ["check", "{sample}", "--report", "{out}"]),
+        WriteCase("report", ["report", "{result}", "--report", "{out}"]),
+        WriteCase("report-markdown", ["report", "{result}", "--markdown", "{out}"]),
+        WriteCase("report-junit", ["report", "{result}", "--junit", "{out}"]),
+        WriteCase("badge", ["badge", "{result}", "--output", "{out}"]),
+        WriteCase("compare", ["compare", "{result}", "{result}", "--report", "{out}"]),
+    ]

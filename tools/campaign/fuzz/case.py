@@ -1,0 +1,197 @@
+"""How a parser is fuzzed: the loop, its watchdog, and the memory limit."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import random
+import resource
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from dexkit.errors import DexkitError
+from tools.campaign.case import Batch, Case, Lane
+
+__all__ = ["Difference", "FuzzCase", "Hang", "Target"]
+
+HANG = 2.0
+"""Seconds of processor time that one input may take; wall time would blame a busy machine."""
+_HANGS = 3
+"""Inputs of a batch that may take too long before it is given up."""
+MEMORY = 2 << 30
+"""Bytes of address space that a fuzzer may have on top of what it had before."""
+
+
+class Difference(Exception):
+    """Two readings of one input do not agree."""
+
+
+class Hang(BaseException):
+    """An input takes too long; not an Exception, so that nothing takes it for one of its own."""
+
+
+@dataclass
+class Target:
+    """One parser, ready to be fed.
+
+    :param make: the next input.
+    :param run: parses one; raises what is a finding, or one of ``allowed``.
+    :param allowed: errors that say that the input is not what it should be.
+    """
+
+    make: Callable[[], Any]
+    run: Callable[[Any], object]
+    allowed: tuple[type[BaseException], ...] = (DexkitError,)
+    close: Callable[[], object] = lambda: None
+
+
+Prepare = Callable[[random.Random, Path], Target]
+
+
+class FuzzCase(Case):
+    """A parser.
+
+    :param prepare: makes the target, given the source of chance and a scratch folder.
+    :param size: inputs in a batch; some half a second of them.
+    :param hang: seconds of processor time that one input may take.
+    """
+
+    unit = "inputs"
+    lane = Lane.COMPUTE
+    limit = 120.0
+
+    def __init__(
+        self,
+        name: str,
+        what: str,
+        prepare: Prepare,
+        *,
+        size: int,
+        aim: int,
+        weight: float = 1.0,
+        hang: float = HANG,
+    ) -> None:
+        self.name = f"fuzz:{name}"
+        self.hang = hang
+        self.what = what
+        self.size = size
+        self.aim = aim
+        self.weight = weight
+        self._prepare = prepare
+
+    def run(self, batch: Batch) -> None:  # noqa: D102
+        logging.disable()
+        target = self._prepare(batch.random, batch.scratch)
+        size = max(1, self.size // 20) if batch.sample else self.size
+        with _limited(self.hang) as watch:
+            try:
+                self._feed(batch, target, size, watch)
+            finally:
+                target.close()
+
+    def _feed(self, batch: Batch, target: Target, size: int, watch: _Watch) -> None:
+        make, run, allowed = target.make, target.run, target.allowed
+        mark = None if batch.trace is None else os.open(batch.trace, os.O_WRONLY | os.O_CREAT)
+        done, hangs = -1, 0
+        while done + 1 < size:
+            data: Any = None
+            try:
+                # the loop is inside the try: entering one for each input would cost a tenth
+                for watch.index in range(done + 1, size):
+                    done = watch.index
+                    if mark is not None:
+                        os.pwrite(mark, b"%20d" % done, 0)
+                    data = None
+                    data = make()
+                    try:
+                        run(data)
+                    except allowed:
+                        pass
+                    if done == batch.only:
+                        break
+            except (Exception, Hang) as error:
+                watch.index = -1
+                if data is None:
+                    raise  # there is no input yet: it is the campaign that is wrong
+                batch.failed(error, index=done, data=as_bytes(data))
+                hangs += isinstance(error, Hang)
+                if hangs == _HANGS:
+                    break
+            if done == batch.only:
+                break
+        watch.index = -1
+        batch.units += done + 1
+        if mark is not None:
+            os.close(mark)
+
+    def repeat(self, batch: Batch, data: bytes) -> None:
+        """Try one input; text targets take UTF-8."""
+        logging.disable()
+        target = self._prepare(batch.random, batch.scratch)
+        given: Any = data
+        if isinstance(target.make(), str):
+            given = data.decode(errors="surrogatepass")
+        with _limited(self.hang) as watch:
+            try:
+                watch.index = 0
+                target.run(given)
+            except target.allowed:
+                pass
+            except (Exception, Hang) as error:
+                watch.index = -1
+                batch.failed(error, data=data)
+            finally:
+                watch.index = -1
+                target.close()
+        batch.units += 1
+
+
+def as_bytes(data: Any) -> bytes:
+    """An input as it is kept."""
+    if isinstance(data, str):
+        return data.encode(errors="surrogatepass")
+    if isinstance(data, bytes | bytearray):
+        return bytes(data)
+    return b"".join(data) if isinstance(data, list) else repr(data).encode()
+
+
+class _Watch:
+    """Interrupts an input that takes ``limit`` seconds of processor time."""
+
+    def __init__(self, limit: float) -> None:
+        self.index = -1
+        self._limit = limit
+        self._last = (-1, 0)
+
+    def tick(self, signum: int, frame: FrameType | None) -> None:
+        """Half of that time has passed."""
+        index, ticks = self._last
+        if self.index < 0 or self.index != index:
+            self._last = (self.index, 0)
+            return
+        self._last = (index, ticks + 1)
+        if ticks + 1 >= 2:
+            self._last = (-1, 0)
+            raise Hang(f"more than {self._limit:g} s of processor time for one input")
+
+
+@contextlib.contextmanager
+def _limited(hang: float) -> Iterator[_Watch]:
+    watch = _Watch(hang)
+    before = signal.signal(signal.SIGPROF, watch.tick)
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    with open("/proc/self/statm") as file:
+        now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, hard))
+    signal.setitimer(signal.ITIMER_PROF, hang / 2, hang / 2)
+    try:
+        yield watch
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

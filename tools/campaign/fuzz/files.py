@@ -1,0 +1,508 @@
+"""Files and texts of users: recordings, results, calibrations, claims, faults, settings."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import random
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import zstandard
+from mcap.writer import CompressionType, Writer
+from rich.console import Console
+
+from dexkit.backends import BackendOptions
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.phases import Stimulus
+from dexkit.conformance.report.badge import render_badge
+from dexkit.conformance.report.compare import (
+    Comparison,
+    render_comparison,
+    render_comparison_markdown,
+)
+from dexkit.conformance.report.html import render
+from dexkit.conformance.report.junit import write_junit
+from dexkit.conformance.report.markdown import render_markdown
+from dexkit.conformance.report.terminal import print_result
+from dexkit.conformance.results import read_json
+from dexkit.conformance.usb.record import UsbRecord
+from dexkit.conformance.view import Recording
+from dexkit.doctor.environment import uri_problem
+from dexkit.drivers.dex1_serial import settings as dex1_settings
+from dexkit.drivers.dex3_usb import discovery as dex3_discovery
+from dexkit.drivers.dex3_usb import settings as dex3_settings
+from dexkit.drivers.ezgripper import settings as ezgripper_settings
+from dexkit.drivers.ezgripper.config import Store
+from dexkit.emulators.faults import DEX3_FAULTS, M4010_FAULTS, MX64_FAULTS, parse_fault
+from dexkit.errors import DexkitError
+from dexkit.hand import Side
+from dexkit.messages import message_type
+from dexkit.traces import open_trace
+from dexkit.traces.recorder import Recorder
+from tools.campaign.fuzz.case import Difference, FuzzCase, Target
+from tools.campaign.fuzz.messages import filled
+from tools.campaign.mutate import TextMutator, mutator
+
+__all__ = ["cases", "damaged_json"]
+
+_TIME = 1_795_251_429_000_000_000
+_TYPES = {
+    "rt/dex1/left/cmd": "unitree_go::msg::dds_::MotorCmds_",
+    "rt/dex1/left/state": "unitree_go::msg::dds_::MotorStates_",
+    "rt/dex3/left/state": "unitree_hg::msg::dds_::HandState_",
+}
+
+
+# --- recordings
+
+
+def _foreign(compression: CompressionType, chunked: bool, rng: random.Random) -> bytes:
+    """A recording by the mcap library, with our topics and schemas."""
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=400, compression=compression, use_chunking=chunked)
+    writer.start(profile="ros2", library="campaign")
+    for at, (topic, name) in enumerate(_TYPES.items()):
+        kind = message_type(name)
+        schema = writer.register_schema(kind.layout.ros_name, "ros2msg", kind.ros2msg.encode())
+        channel = writer.register_channel(topic.removeprefix("rt"), "cdr", schema, {"a": "b"})
+        for number in range(6):
+            stamp = _TIME + number * 10_000_000 + at
+            writer.add_message(channel, stamp, kind.encode(filled(name, rng)), stamp, number)
+    writer.add_metadata(
+        "dds_endpoints", {"rt/dex1/left/cmd writer": "Reliable, Durability.Volatile"}
+    )
+    writer.finish()  # type: ignore[no-untyped-call]
+    return out.getvalue()
+
+
+def _own(path: Path, compression: str, rng: random.Random) -> bytes:
+    """A recording by dexkit's recorder."""
+    with Recorder(path, compression=compression) as recorder:
+        for number in range(12):
+            for topic, name in _TYPES.items():
+                data = message_type(name).encode(filled(name, rng))
+                stamp = _TIME + number * 10_000_000
+                recorder.put(topic, name, data, stamp, stamp)
+        recorder.add_metadata("campaign", {"key": "value"})
+    data = path.read_bytes()
+    path.unlink()
+    return data
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return bytes((opcode,)) + struct.pack("<Q", len(content)) + content
+
+
+_MAGIC = b"\x89MCAP0\r\n"
+
+
+def _text(value: str) -> bytes:
+    data = value.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _hostile(rng: random.Random) -> list[bytes]:
+    """Recordings that are small and want much: chunks that unpack to a lot, schemas of nothing."""
+    header = _MAGIC + _record(1, _text("") + _text("x"))
+    found = []
+    for size, count in ((1 << 20, 1), (1 << 24, 4), (1 << 28, 1), (1 << 28, 6)):
+        packed = _zeros(size)
+        chunk = struct.pack("<QQQI", 0, 1, size, 0) + _text("zstd") + struct.pack("<Q", len(packed))
+        found.append(header + _record(6, chunk + packed) * count)
+    for body in ("\n" * 200_000, " " * 200_000 + "x", "#" * 100_000, "float32 a\n" * 2_000):
+        schema = struct.pack("<H", 1) + _text("a/msg/B") + _text("ros2msg") + _text(body)
+        plain = _record(3, schema)
+        packed = zstandard.compress(plain)
+        chunk = struct.pack("<QQQI", 0, 1, len(plain), zlib.crc32(plain)) + _text("zstd")
+        found.append(header + _record(6, chunk + struct.pack("<Q", len(packed)) + packed))
+        found.append(header + plain)
+    return found
+
+
+@cache
+def _zeros(size: int) -> bytes:
+    return zstandard.compress(bytes(size))
+
+
+def _content(path: Path) -> tuple[Any, bool]:
+    """Everything that is read from a recording, and whether something odd was told."""
+    trace = open_trace(path)
+    rows = [
+        (m.topic, m.type_name, m.log_time_ns, m.publish_time_ns, m.data) for m in trace.messages()
+    ]
+    columns = trace.load()
+    sizes = {topic: len(array.log_time_ns) for topic, array in columns.items()}
+    told = bool(trace.warnings) or trace.truncated or any(c.problem for c in trace.channels)
+    kept = [(c.topic, c.type_name, c.message_count, c.metadata) for c in trace.channels]
+    about = {k: v for k, v in trace.metadata.items() if k != "dexkit_recorder"}
+    return (rows, sizes, kept, about, trace.endpoints), told
+
+
+def _recording(rng: random.Random, scratch: Path) -> Target:
+    """Open it, read it, say what is in it."""
+    corpus = [
+        _foreign(CompressionType.NONE, True, rng),
+        _foreign(CompressionType.ZSTD, True, rng),
+        _foreign(CompressionType.LZ4, True, rng),
+        _foreign(CompressionType.NONE, False, rng),
+        _own(scratch / "own.mcap", "none", rng),
+        _own(scratch / "zstd.mcap", "zstd", rng),
+    ]
+    damaged = mutator(corpus, rng)
+    path = scratch / "x.mcap"
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        trace = open_trace(path)
+        list(trace.messages())
+        for samples in trace.load(decode=True).values():
+            len(samples.columns().ok)
+        str((trace.warnings, trace.channels, trace.endpoints))
+
+    return Target(damaged, run)
+
+
+def _greedy(rng: random.Random, scratch: Path) -> Target:
+    """Small recordings that ask for much memory or time."""
+    hostile = _hostile(rng)
+    order = [rng.randrange(len(hostile)) for _ in range(64)]
+    path = scratch / "x.mcap"
+
+    def make() -> bytes:
+        return hostile[order.pop() if order else 0]
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        trace = open_trace(path)
+        list(trace.messages())
+        trace.load()
+
+    return Target(make, run)
+
+
+def _flips(rng: random.Random, scratch: Path) -> Target:
+    """One byte of a recording of dexkit's own changed: read as it was, or told."""
+    kind = rng.choice(("none", "zstd"))
+    good = _own(scratch / "own.mcap", kind, rng)
+    path = scratch / "x.mcap"
+    path.write_bytes(good)
+    wanted, odd = _content(path)
+    assert not odd
+
+    def make() -> bytes:
+        data = bytearray(good)
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        return bytes(data)
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        found, told = _content(path)
+        if found != wanted and not told:
+            at = next(i for i, (a, b) in enumerate(zip(data, good, strict=True)) if a != b)
+            raise Difference(f"byte {at} of {len(good)} ({kind}) changes what is read, untold")
+
+    return Target(make, run)
+
+
+def _judged(rng: random.Random, scratch: Path) -> Target:
+    """A recording of odd content, judged."""
+    path = scratch / "x.mcap"
+
+    def make() -> bytes:
+        topic, name = rng.choice(list(_TYPES.items()))
+        kind = message_type(name)
+        with Recorder(path, overwrite=True) as recorder:
+            stamp = _TIME
+            for _ in range(rng.choice((1, 2, 3, 40))):
+                message = filled(name, rng)
+                if rng.random() < 0.3:
+                    member = next(f for f in kind.layout.fields if f.sequence)
+                    element = getattr(filled(name, rng), member.name)[:1]
+                    setattr(message, member.name, element * rng.choice((64, 1000, 1024)))
+                recorder.put(topic, name, kind.encode(message), stamp, stamp)
+                stamp += rng.choice((0, 1, 2_000_000, 10**9, 10**12))
+        return path.read_bytes()
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        result = judge(Recording.of(open_trace(path)))
+        render(result)
+
+    return Target(make, run)
+
+
+# --- results
+
+
+_ODD: tuple[Any, ...] = (
+    None, True, 0, -1, 1.5, 10**30, 1e308, math.inf, "", "x", "\x1b[31m\x00", [], {}, [[]],
+    [None], {"a": 1}, "left", ["left"],
+)  # fmt: skip
+
+
+def damaged_json(content: Any, rng: random.Random) -> str:
+    """JSON text of ``content`` with one to three places of another type, absent or too deep."""
+    copy = json.loads(json.dumps(content))
+    for _ in range(1 + rng.getrandbits(1)):
+        place: Any = copy
+        parent: Any = None
+        key: Any = None
+        while isinstance(place, dict | list) and place and (parent is None or rng.random() < 0.8):
+            parent = place
+            key = rng.choice(list(place)) if isinstance(place, dict) else rng.randrange(len(place))
+            place = place[key]
+        if parent is None:
+            continue
+        if rng.random() < 0.15:
+            del parent[key]
+        else:
+            parent[key] = deepcopy(rng.choice(_ODD))
+    text = json.dumps(copy)
+    if rng.random() < 0.01:
+        deep = rng.choice((900, 20_000))
+        return text[: rng.randrange(len(text))] + "[" * deep + "]" * deep
+    if rng.random() < 0.02:
+        return text[: rng.randrange(len(text))]
+    return text
+
+
+@cache
+def _result() -> dict[str, Any]:
+    from dexkit.traces import sample_path
+
+    result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
+    return dict(result.as_dict())
+
+
+def _results(rng: random.Random, scratch: Path) -> Target:
+    """A result file with wrong types, and all reports of it."""
+    content = _result()
+    small = {**content, "results": content["results"][:4]}
+    path = scratch / "result.json"
+    ways: list[Callable[[Any], object]] = [
+        render,
+        render_markdown,
+        render_badge,
+        lambda found: write_junit(found, scratch / "x.xml"),
+        lambda found: print_result(found, Console(file=io.StringIO()), verbose=True, more=""),
+        lambda found: render_comparison(Comparison([found, found], ["a", "b"])),
+        lambda found: render_comparison_markdown(Comparison([found, found], ["a", "b"])),
+    ]
+    turn = [0]
+
+    def run(text: str) -> None:
+        path.write_text(text, encoding="utf-8", errors="surrogatepass")
+        found = read_json(path)
+        turn[0] += 1
+        ways[turn[0] % len(ways)](found)
+
+    return Target(lambda: damaged_json(small, rng), run)
+
+
+# --- settings of users
+
+_NUMBERS = ("0", "1", "-1", "1.5", "nan", "inf", "1e400", "9" * 5000, "0x10", "\u00b2", "1_0", "")
+
+
+def _faults(rng: random.Random, scratch: Path) -> Target:
+    words = ["@", "3s", "500ms", ":", "for=", "p=", "id=", "side=left", "ms=", ",", "c=", "volts="]
+    words += [*_NUMBERS, "1" * 400 + "s", ".5", "e"]
+    text = TextMutator(
+        [
+            "overload@3s",
+            "drop:p=0.05",
+            "unplug@5s:for=2s",
+            "brown-out:volts=9,for=1s,id=1",
+            "silent:id=3",
+            "stray:before=1,after=2",
+            "unplug:side=left,for=300ms",
+        ],
+        words,
+        rng,
+    )
+    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS)
+
+    def run(given: str) -> None:
+        for family in families:
+            try:
+                fault = parse_fault(given, family)
+            except DexkitError:
+                continue
+            if not (fault.at >= 0.0 and all(map(math.isfinite, fault.params.values()))):
+                raise Difference(f"a fault that cannot be: {fault}")
+
+    return Target(text, run)
+
+
+def _stdin(rng: random.Random, scratch: Path) -> Target:
+    """Faults as lines of standard input, as bytes that need not be text."""
+    lines = [b"overload@3s", b"drop:p=0.05", b"unplug@5s:for=2s", b"\xff\xfe", b""]
+    damaged = mutator(lines, rng)
+
+    def run(data: bytes) -> None:
+        parse_fault(data.decode(errors="replace"))
+
+    return Target(damaged, run)
+
+
+def _store(rng: random.Random, scratch: Path) -> Target:
+    path = scratch / "ezgripper.json"
+    store = Store(path)
+    content = {
+        "zero_positions": {"a:1": 100, "b:2": -5},
+        "speeds": {"a:1": {"opening": 90.0, "closing": 80.0}},
+        "force_tables": {"a:1": {"0": 0.0, "100": 0.5}},
+    }
+    from dexkit.drivers.ezgripper import config as ezgripper_config
+
+    names = [ezgripper_config._ZERO, ezgripper_config._SPEED, ezgripper_config._FORCE]
+    plain = dict(zip(names, content.values(), strict=True))
+
+    def run(text: str) -> None:
+        path.write_text(text, encoding="utf-8", errors="surrogatepass")
+        for key in store.keys():  # noqa: SIM118  # a file, not a dict
+            try:
+                store.read(key)
+            except DexkitError:
+                pass
+
+    return Target(lambda: damaged_json(plain, rng), run)
+
+
+def _eeprom(rng: random.Random, scratch: Path) -> Target:
+    from dexkit.cli.emulate.mx64 import _EepromFile
+    from dexkit.emulators.mx64 import Servo
+
+    path = scratch / "eeprom.json"
+    content = {"device": "mx64", "eeprom": [Servo(1).eeprom.hex(), Servo(2).eeprom.hex()]}
+
+    def run(text: str) -> None:
+        path.write_text(text, encoding="utf-8", errors="surrogatepass")
+        kept = _EepromFile(path)
+        for index in range(2):
+            Servo(1, eeprom=kept.load(index))
+
+    return Target(lambda: damaged_json(content, rng), run)
+
+
+def _claims(rng: random.Random, scratch: Path) -> Target:
+    text = TextMutator(
+        [
+            '[hand]\nname = "x"\nvendor = "y"\nmodel = "dex1-1"\n[claims]\nforce = true\n',
+            "[claims]\n",
+            "",
+        ],
+        ["[hand]", "[claims]", "= true", "= [", "= {", '"""', "[[a]]", "[" * 5000, "nan",
+         "a = " + "[" * 5000, "a." * 3000 + "b = 1", "1979-05-27", "\\u0000", "model = 'x'"],
+        rng,
+    )  # fmt: skip
+    return Target(text, Claims.parse)
+
+
+def _stimulus(rng: random.Random, scratch: Path) -> Target:
+    phases = [
+        {
+            "name": "step", "sides": ["left"], "begin_ns": 1, "end_ns": 2,
+            "targets": {"left": {"0": 1.0}}, "params": {"a": 1.0}, "observed": {"b": 1.0},
+        }
+    ]  # fmt: skip
+    whole = {"phases": phases, "objects": {"left": 1.0}, "stalls": [[1, 2]], "beats": {}}
+
+    def make() -> str:
+        return damaged_json(whole, rng)
+
+    def run(text: str) -> None:
+        try:
+            content = json.loads(text)
+        except (ValueError, RecursionError):
+            content = {"phases": text, "objects": text, "stalls": text}
+        if not isinstance(content, dict):
+            return
+        record = {k: v if isinstance(v, str) else json.dumps(v) for k, v in content.items()}
+        Stimulus.from_metadata({"version": "1", **record})
+        UsbRecord.from_metadata({"version": "1", **record, "left": text})
+
+    return Target(make, run)
+
+
+def _settings(rng: random.Random, scratch: Path) -> Target:
+    backends: Sequence[tuple[Callable[[BackendOptions], object], Sequence[str]]] = [
+        (dex1_settings.from_options, list(dex1_settings.SETTINGS)),
+        (dex3_settings.from_options, list(dex3_settings.SETTINGS)),
+    ]
+    from dexkit.drivers.ezgripper import gripper
+
+    backends = [*backends, (gripper._make, list(gripper._SETTINGS))]
+    text = TextMutator(
+        ["1", "auto", "0.5", "yes", "0:1,1:2", "usbip://127.0.0.1:3240/1", "1234", "0x81"],
+        [*_NUMBERS, "usbip://", "[::1", ":99999", "/dev/null", "/", ",", "default", "no"],
+        rng,
+    )
+
+    def run(given: str) -> None:
+        for make, keys in backends:
+            for key in keys:
+                try:
+                    make(BackendOptions(Side.LEFT, "/dev/null", {key: given}))
+                except DexkitError:
+                    pass
+        try:
+            dex3_discovery.parse_server(given)
+        except DexkitError:
+            pass
+
+    _ = ezgripper_settings
+    return Target(text, run, ())
+
+
+def _uri(rng: random.Random, scratch: Path) -> Target:
+    text = TextMutator(
+        ["<CycloneDDS><Domain/></CycloneDDS>", "file:///dev/null", "<?xml version='1.0'?><a/>"],
+        [
+            "<",
+            ">",
+            "<!DOCTYPE a [<!ENTITY b 'c'>]>",
+            "&b;",
+            "file://",
+            "%00",
+            "/proc",
+            ",",
+            "\udc80",
+        ],
+        rng,
+    )
+    # the environment holds no NUL
+    return Target(lambda: text().replace("\0", ""), uri_problem, ())
+
+
+def cases() -> list[FuzzCase]:
+    """Every fuzzer of this module."""
+    slow = 300_000
+    return [
+        FuzzCase("mcap", "recordings, opened and read", _recording, size=400, aim=slow, weight=4),
+        FuzzCase("mcap.flip", "one bit of a recording of dexkit's own", _flips, size=300,
+                 aim=slow, weight=3),
+        FuzzCase("mcap.greedy", "small recordings that want much", _greedy, size=12, aim=2_000),
+        FuzzCase("check", "recordings of odd content, judged", _judged, size=12, aim=5_000,
+                 weight=2),
+        FuzzCase("result", "result files, and the reports of them", _results, size=300,
+                 aim=100_000, weight=2),
+        FuzzCase("faults", "fault specifications of three families", _faults, size=15_000,
+                 aim=1_000_000),
+        FuzzCase("stdin", "faults as lines of input", _stdin, size=40_000, aim=1_000_000),
+        FuzzCase("ezgripper.json", "calibration files", _store, size=3_000, aim=slow),
+        FuzzCase("eeprom", "EEPROM files of the emulator", _eeprom, size=2_000, aim=slow),
+        FuzzCase("capabilities.toml", "claims", _claims, size=5_000, aim=slow),
+        FuzzCase("stimulus", "records of stimuli in a recording", _stimulus, size=5_000, aim=slow),
+        FuzzCase("settings", "settings of the backends", _settings, size=300, aim=100_000),
+        FuzzCase("cyclonedds-uri", "configurations, as the doctor reads them", _uri,
+                 size=10_000, aim=slow),
+    ]  # fmt: skip

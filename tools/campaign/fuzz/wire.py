@@ -1,0 +1,686 @@
+"""Codecs of serial and USB packets, and the emulated devices that take them."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import socket
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import fastcrc
+
+from dexkit.clock import ManualClock
+from dexkit.drivers.dex3_usb import usbip
+from dexkit.emulators.dex3_mcu.device import Dex3Mcu
+from dexkit.emulators.m4010.bus import Bus as DexBus
+from dexkit.emulators.m4010.motor import Motor
+from dexkit.emulators.mx64 import Bus, Firmware, Servo
+from dexkit.emulators.mx64.protocol1 import Protocol1Servo
+from dexkit.hand import HandCommand, HandState, Side
+from dexkit.models import DEX3_1
+from dexkit.wire import dex3_usb, dynamixel, low_level, m4010, mx64, ris
+from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.dex3_usb import packets
+from tools.campaign.fuzz.case import Difference, FuzzCase, Prepare, Target
+from tools.campaign.mutate import Fix, mutator
+
+__all__ = ["cases"]
+
+_umts = fastcrc.crc16.umts
+
+
+# --- corpora
+
+
+def _read(address: int, size: int) -> bytes:
+    return struct.pack("<HH", address, size)
+
+
+def instruction_packets() -> list[bytes]:
+    """Instruction packets of every kind, to one servo and to all."""
+    code = dynamixel.Instruction
+    one = [
+        (code.PING, b""),
+        (code.READ, _read(132, 4)),
+        (code.READ, _read(0, 147)),
+        (code.WRITE, struct.pack("<HB", 64, 1)),
+        (code.WRITE, struct.pack("<Hi", 116, 2000)),
+        (code.WRITE, struct.pack("<H", 168) + bytes(range(20))),
+        (code.REG_WRITE, struct.pack("<Hi", 116, 2500)),
+        (code.ACTION, b""),
+        (code.FACTORY_RESET, b"\x02"),
+        (code.REBOOT, b""),
+        (code.CLEAR, dynamixel.CLEAR_POSITION_KEY),
+        (code.CONTROL_TABLE_BACKUP, b"\x01" + dynamixel.BACKUP_KEY),
+        (code.WRITE, b"\x40\x00\xff\xff\xfd\x01"),
+    ]
+    several = [
+        (code.SYNC_READ, _read(132, 4) + b"\x01\x02"),
+        (code.SYNC_WRITE, _read(116, 4) + b"\x01" + struct.pack("<i", 1800)),
+        (code.FAST_SYNC_READ, _read(132, 4) + b"\x01\x02"),
+        (code.BULK_READ, b"\x01" + _read(132, 4) + b"\x02" + _read(126, 2)),
+        (code.BULK_WRITE, b"\x01" + _read(116, 4) + struct.pack("<i", 1700)),
+        (code.FAST_BULK_READ, b"\x01" + _read(132, 4)),
+        (code.PING, b""),
+    ]
+    return [dynamixel.encode(1, c, p) for c, p in one] + [
+        dynamixel.encode(dynamixel.BROADCAST_ID, c, p) for c, p in several
+    ]
+
+
+def _status_packets() -> list[bytes]:
+    return [
+        dynamixel.status(1, 0, b"\x00\x08\x00\x00"),
+        dynamixel.status(1, 0x80, b""),
+        dynamixel.status(2, 3, b"\xff\xff\xfd\xfd"),
+        dynamixel.fast_status([(1, 0, b"\x01\x02"), (2, 0x80, b"\x03\x04")]),
+    ]
+
+
+def fix_dynamixel(data: bytearray) -> None:
+    """Make header, length and CRC of a Dynamixel packet right."""
+    if len(data) < 10:
+        return
+    data[0:4] = dynamixel.HEADER
+    if len(data) & 1:  # every other time the length stays wrong
+        data[5:7] = (len(data) - 7).to_bytes(2, "little")
+    data[-2:] = int(_umts(bytes(data[:-2]))).to_bytes(2, "little")
+
+
+def fix_words(first: int, head: bytes = b"") -> Fix:
+    """Make a word CRC right that covers everything from ``first`` on."""
+
+    def fix(data: bytearray) -> None:
+        if head:
+            data[0 : len(head)] = head
+        if len(data) >= first + 8 and (len(data) - first) % 4 == 0:
+            data[-4:] = crc32_words(data[first:-4]).to_bytes(4, "little")
+
+    return fix
+
+
+def _motor_commands() -> list[bytes]:
+    return [
+        m4010.MotorCmd.setpoint(0, q=q, dq=0.5, tau=0.1, kp=5.0, kd=0.05).pack()
+        for q in (0.0, 2.5, 5.4)
+    ] + [
+        m4010.MotorCmd(15, 0, False, 0, 0, 0, 0, 0).pack(),
+        m4010.Calibration(0, 0.0, time=1).pack(),
+    ]
+
+
+def _motor_data() -> list[bytes]:
+    plain = m4010.MotorData.measured(1, 1, q=1.0, dq=-2.0, tau=0.3, voltage=12.0)
+    return [plain.pack(), m4010.Calibration(1).answer().pack()]
+
+
+def _dex3_commands() -> list[bytes]:
+    joints = DEX3_1.joints[Side.LEFT]
+    found = []
+    for layout in (dex3_usb.COMMAND_1234, dex3_usb.COMMAND_734):
+        codec = dex3_usb.HandCodec(joints, layout=layout)
+        found.append(codec.encode(HandCommand.position([0.1] * 7, kp=1.5, kd=0.2)))
+        found.append(codec.encode(HandCommand.brake(7)))
+    return found
+
+
+def _dex3_states() -> list[bytes]:
+    codec = dex3_usb.HandCodec(DEX3_1.joints[Side.LEFT])
+    clock = ManualClock()
+    device = Dex3Mcu(Side.LEFT, clock=clock)
+    command = codec.encode(HandCommand.brake(7))
+    found = []
+    for _ in range(3):
+        clock.advance(0.01)
+        answer = device.exchange(command)
+        assert answer is not None
+        found.append(answer)
+    found.append(device.state([0, 1, 2]))
+    return found
+
+
+def _fix_frame(structure: ris.Structure) -> Fix:
+    start, end = structure.covered
+
+    def fix(data: bytearray) -> None:
+        if len(data) == structure.size:
+            data[end : end + 4] = crc32_words(data[start:end]).to_bytes(4, "little")
+
+    return fix
+
+
+# --- targets
+
+
+def _same(a: Any, b: Any, what: str) -> None:
+    if a != b:
+        raise Difference(f"{what}: {a!r} and {b!r}")
+
+
+def _bytes(corpus: Sequence[bytes], fix: Fix | None, run: Callable[[bytes], object]) -> Prepare:
+    def prepare(rng: random.Random, scratch: Path) -> Target:
+        return Target(mutator(corpus, rng, fix), run)
+
+    return prepare
+
+
+def _decode_dynamixel(data: bytes) -> None:
+    packet = dynamixel.decode(data)
+    if packet.id <= dynamixel.MAX_ID:
+        again = dynamixel.decode(dynamixel.encode(packet.id, packet.instruction, packet.params))
+        _same(again, packet, "encoded again")
+
+
+def _stream(make: Callable[[], Any], most: int) -> Callable[[random.Random, bytes], None]:
+    """Feed a stream parser in pieces; it must find what it finds in one piece."""
+
+    def run(rng: random.Random, data: bytes) -> None:
+        whole, pieces = make(), make()
+        found = whole.feed(data)
+        cut = rng.getrandbits(8) % (len(data) + 1)
+        _same(pieces.feed(data[:cut]) + pieces.feed(data[cut:]), found, "cut in two")
+        _same(pieces.pending, whole.pending, "bytes held")
+        if whole.pending > most:
+            raise Difference(f"{whole.pending} bytes are held, at most {most} should be")
+
+    return run
+
+
+def _streams(corpus: Sequence[bytes], fix: Fix, make: Callable[[], Any], most: int) -> Prepare:
+    def prepare(rng: random.Random, scratch: Path) -> Target:
+        damaged = mutator(corpus, rng, fix)
+        feed = _stream(make, most)
+        good = list(corpus)
+
+        def stream() -> bytes:
+            r = rng.getrandbits(8)
+            return damaged() + good[r % len(good)] if r & 128 else damaged()
+
+        return Target(stream, lambda data: feed(rng, data))
+
+    return prepare
+
+
+def _split(data: bytes) -> None:
+    packet = dynamixel.Packet(254, 0x55, data[2:])
+    sizes = [data[0] & 15, data[1] & 15] if len(data) > 1 else [2]
+    for _, _, part in dynamixel.split_fast_status(packet, sizes):
+        _same(len(part) in sizes, True, "size of a part")
+
+
+def _stuffing(data: bytes) -> None:
+    body = b"\x03" + data
+    _same(dynamixel.unstuff(dynamixel.stuff(body)), body, "unstuffed")
+
+
+def _status_fields(data: bytes) -> None:
+    packet = dynamixel.decode(data)
+    assert packet.error_number | packet.alert << 7 == packet.error
+    assert len(packet.data) + 1 == len(packet.params)
+
+
+def _table(data: bytes) -> None:
+    items = list(mx64.TABLE.values())
+    item = items[data[0] % len(items)] if data else items[0]
+    value = item.decode(data[1 : 1 + item.size].ljust(item.size, b"\0"))
+    _same(item.decode(item.encode(value)), value, item.name)
+
+
+def _pack_again(kind: Any) -> Callable[[bytes], None]:
+    def run(data: bytes) -> None:
+        _same(kind.parse(data).pack(), data, "packed again")
+
+    return run
+
+
+def _m4010_motor(data: bytes) -> None:
+    command = m4010.MotorCmd.parse(data)
+    _same(command.pack(), data, "packed again")
+    command.joint()
+    calibration = m4010.Calibration.of(command)
+    if calibration is not None:
+        calibration.answer().pack()
+
+
+def _m4010_data(data: bytes) -> None:
+    found = m4010.MotorData.parse(data)
+    _same(found.pack(), data, "packed again")
+    found.joint()
+    m4010.calibration_outcome(found)
+    assert found.voltage >= 0
+
+
+def _scan(data: bytes) -> None:
+    kinds = packets.FROM_HAND if data[-1:] > b"\x7f" else packets.TO_HAND
+    found, lost = packets.scan_bus(data, kinds)
+    for (at, kind), (then, _) in itertools.pairwise(found):
+        _same(at + kind.size <= then, True, "packets overlap")
+    for problem in lost:
+        str(problem)
+
+
+def _parsed_command(data: bytes) -> None:
+    frame = packets.parse_command(data)
+    str(frame.problems)
+    list(frame.motors)
+
+
+def _parsed_state(data: bytes) -> None:
+    frame = packets.parse_state(data)
+    str(frame.problems)
+    list(frame.motors)
+    list(frame.sensors)
+
+
+def _dex3_codec(rng: random.Random, scratch: Path) -> Target:
+    codec = dex3_usb.HandCodec(DEX3_1.joints[Side.LEFT])
+    states = _dex3_states()
+
+    def run(data: bytes) -> None:
+        state: HandState = codec.decode(data, 0.0)
+        if not codec.problems and not codec.missing_motors:
+            fresh = dex3_usb.HandCodec(DEX3_1.joints[Side.LEFT]).decode(data, 0.0)
+            _same(fresh.q.tobytes(), state.q.tobytes(), "remembered and fresh plan")
+
+    return Target(mutator(states, rng, _fix_deep_state), run)
+
+
+def _fix_deep_state(data: bytearray) -> None:
+    """The frame's CRC, and that of one packet in it, so that its values are reached."""
+    for at in range(0, len(data) - 60, 2):
+        if data[at : at + 2] == dex3_usb.MOTOR_STATE.head:
+            size = dex3_usb.MOTOR_STATE.size
+            start, end = dex3_usb.MOTOR_STATE.covered
+            data[at + end : at + size] = crc32_words(data[at + start : at + end]).to_bytes(
+                4, "little"
+            )
+            break
+    _fix_frame(dex3_usb.STATE)(data)
+
+
+def _dex3_decode_command(rng: random.Random, scratch: Path) -> Target:
+    codec = dex3_usb.HandCodec(DEX3_1.joints[Side.LEFT])
+    return Target(
+        mutator(_dex3_commands(), rng, _fix_command), lambda data: codec.decode_command(data)
+    )
+
+
+def _fix_command(data: bytearray) -> None:
+    for layout in dex3_usb.COMMAND_LAYOUTS:
+        _fix_frame(layout.structure)(data)
+
+
+def _crc(data: bytes) -> None:
+    whole = data[: len(data) & ~3]
+    value = crc32_words(whole)
+    _same(crc32_words(memoryview(whole)), value, "of a view")
+    assert 0 <= value <= 0xFFFFFFFF
+
+
+def _low(name: str) -> Prepare:
+    def prepare(rng: random.Random, scratch: Path) -> Target:
+        from dexkit.messages import message_type
+
+        good = low_level.encode_with_crc(message_type(name).cls())
+
+        def run(data: bytes) -> None:
+            low_level.verify_payload(name, data)
+            image = low_level.struct_of_payload(name, data)
+            back = low_level.payload_of_struct(name, image)
+            _same(low_level.struct_of_payload(name, back), image, "image and back")
+
+        return Target(mutator([good], rng), run)
+
+    return prepare
+
+
+def _scale(rng: random.Random, scratch: Path) -> Target:
+    scales = [ris.POSITION, m4010.VELOCITY, m4010.TORQUE, m4010.STIFFNESS, m4010.DAMPING]
+    corpus = [struct.pack("<d", v) for v in (0.0, 1.5, -3e5, 1e300, float("nan"), float("inf"))]
+
+    def run(data: bytes) -> None:
+        (value,) = struct.unpack("<d", data[:8].ljust(8, b"\0"))
+        scale = scales[len(data) % 5]
+        count = scale.encode(value, 25.0)
+        _same(scale.encode(scale.decode(count, 25.0), 25.0), count, scale.name)
+
+    return Target(mutator(corpus, rng), run)
+
+
+# --- emulated devices, without a line
+
+
+def _servo(fast: bool) -> Prepare:
+    def prepare(rng: random.Random, scratch: Path) -> Target:
+        firmware = Firmware(fast_reads=fast, backup=fast)
+
+        def bus() -> Bus:
+            return Bus([Servo(1, firmware=firmware), Servo(2, firmware=firmware)], line_time=False)
+
+        state: list[Any] = [bus(), 0.0, 0]
+
+        def run(data: bytes) -> None:
+            line, now, used = state
+            if used >= 200:  # a servo that was told to be silent is no test of anything
+                line, used = bus(), 0
+            state[:] = line, now + 1e-4, used + 1
+            line.advance_to(now)
+            line.receive(data, now)
+            line.due(now + 1.0)
+
+        return Target(mutator(instruction_packets(), rng, fix_dynamixel), run, ())
+
+    return prepare
+
+
+def _protocol_1(rng: random.Random, scratch: Path) -> Target:
+    def frame(body: bytes) -> bytes:
+        return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+
+    def fix(data: bytearray) -> None:
+        if len(data) > 5:
+            data[0:2] = b"\xff\xff"
+            data[3] = len(data) - 4 & 0xFF
+            data[-1] = ~sum(data[2:-1]) & 0xFF
+
+    corpus = [frame(b"\x01\x02\x01"), frame(b"\x01\x04\x02\x00\x03"), frame(b"\xfe\x02\x01")]
+    servo = Protocol1Servo(1)
+    return Target(mutator(corpus, rng, fix), servo.feed, ())
+
+
+def _dex1_motor(rng: random.Random, scratch: Path) -> Target:
+    state: list[Any] = [DexBus([Motor(0), Motor(1)], line_time=False), 0.0]
+
+    def run(data: bytes) -> None:
+        line, now = state
+        line.advance_to(now)
+        line.receive(data, now)
+        line.due(now + 1.0)
+        state[1] = now + 1e-4
+
+    return Target(mutator(_motor_commands(), rng, fix_words(0, m4010.COMMAND.head)), run, ())
+
+
+def _mcu(rng: random.Random, scratch: Path) -> Target:
+    clock = ManualClock()
+    device = Dex3Mcu(Side.LEFT, clock=clock)
+
+    def run(data: bytes) -> None:
+        clock.advance(1e-4)
+        device.exchange(data)
+
+    return Target(mutator(_dex3_commands(), rng, _fix_command), run, ())
+
+
+# --- USB/IP
+
+
+def _usbip_client(rng: random.Random, scratch: Path) -> Target:
+    """Replies of a server that is not one, to a read that waits."""
+    from usb.core import USBError
+
+    reply = struct.pack(">II12xii20x", 3, 1, 0, 18) + bytes(18)
+    unlinked = struct.pack(">II12xii20x", 4, 2, -104, 0)
+    corpus = [reply, reply[:48], unlinked, unlinked + reply, reply + reply]
+
+    def run(data: bytes) -> None:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            connection = usbip._Connection(ours, 0x10002)
+            theirs.sendall(data)
+            theirs.shutdown(socket.SHUT_WR)
+            _, got = connection.submit(
+                direction=1, ep=0, setup=bytes(8), transfer_buffer_length=18, timeout_ms=200
+            )
+            assert len(got) <= 18
+            connection.close()
+
+    return Target(mutator(corpus, rng), run, (USBError,))
+
+
+def _usbip_server(rng: random.Random, scratch: Path) -> Target:
+    """What clients send that do not speak the protocol; afterwards a good one is served."""
+    from dexkit.emulators.dex3_mcu import emulated_dex3
+
+    context = emulated_dex3(port=0)
+    hands: Any = context.__enter__()
+    place = ("127.0.0.1", hands.port)
+    enter = struct.pack(">HHI", 0x0111, 0x8003, 0) + b"1-1".ljust(32, b"\0")
+    listing = struct.pack(">HHI", 0x0111, 0x8005, 0)
+    submit = struct.pack(">IIIIIIiiii8s", 1, 1, 0x10002, 1, 1, 0, 64, 0, 0, 0, bytes(8))
+    control = struct.pack(
+        ">IIIIIIiiii8s", 1, 2, 0x10002, 1, 0, 0, 18, 0, 0, 0, bytes.fromhex("8006000100001200")
+    )
+    unlink = struct.pack(">IIIIII24x", 2, 3, 0x10002, 0, 0, 1)
+    corpus = [listing, enter + submit, enter + control, enter + submit + unlink, enter]
+    count = [0]
+
+    def run(data: bytes) -> None:
+        with socket.create_connection(place, timeout=5.0) as sock:
+            try:
+                sock.sendall(data)
+                sock.shutdown(socket.SHUT_WR)
+                while sock.recv(65536):
+                    pass
+            except ConnectionError:
+                pass
+        if hands.error is not None:
+            raise hands.error
+        count[0] += 1
+        if count[0] % 50 == 0:
+            with socket.create_connection(place, timeout=5.0) as sock:
+                sock.sendall(listing)
+                if sock.recv(12)[:4] != b"\x01\x11\x00\x05":
+                    raise Difference("a good client is not served any more")
+
+    return Target(mutator(corpus, rng), run, (), lambda: context.__exit__(None, None, None))
+
+
+def cases() -> list[FuzzCase]:
+    """Every fuzzer of this module."""
+    instructions, statuses = instruction_packets(), _status_packets()
+    both = instructions + statuses
+    fast, slow = 4_000_000, 300_000
+    motor = (_motor_commands(), fix_words(0, m4010.COMMAND.head))
+    data = (_motor_data(), fix_words(0, m4010.DATA.head))
+    serial = [
+        FuzzCase(
+            "dynamixel.decode",
+            "a Dynamixel packet",
+            _bytes(both, fix_dynamixel, _decode_dynamixel),
+            size=200_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "dynamixel.parser",
+            "a stream of Dynamixel packets, cut anywhere",
+            _streams(both, fix_dynamixel, lambda: dynamixel.PacketParser(keep_bad=True), 1024),
+            size=120_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "dynamixel.status",
+            "fields of a status packet",
+            _bytes(statuses, fix_dynamixel, _status_fields),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase(
+            "dynamixel.fast",
+            "a combined status",
+            _bytes(statuses, None, _split),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase(
+            "dynamixel.stuffing",
+            "byte stuffing there and back",
+            _bytes(both, None, _stuffing),
+            size=320_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "mx64.table",
+            "items of the control table",
+            _bytes(both, None, _table),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase(
+            "m4010.command",
+            "a command frame of the M4010",
+            _bytes(*motor, _m4010_motor),
+            size=200_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "m4010.data",
+            "a data frame of the M4010",
+            _bytes(*data, _m4010_data),
+            size=200_000,
+            aim=fast,
+            weight=3,
+        ),
+        FuzzCase(
+            "m4010.parser",
+            "a stream of M4010 frames, cut anywhere",
+            _streams(
+                motor[0] + data[0],
+                motor[1],
+                lambda: m4010.FrameParser((m4010.COMMAND, m4010.DATA)),
+                26,
+            ),
+            size=120_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase("ris.scale", "counts of a quantity", _scale, size=200_000, aim=fast, weight=2),
+        FuzzCase(
+            "crc32",
+            "the word CRC",
+            _bytes([*motor[0], *_dex3_states()], None, _crc),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        ),
+    ]
+    motor_packet = fix_words(0, dex3_usb.MOTOR_CMD.head)
+    dex3 = [
+        FuzzCase(
+            f"dex3.{kind.__name__}",
+            f"a {kind.__name__} packet of the Dex3-1",
+            _bytes(corpus, fix_words(0, structure.head), _pack_again(kind)),
+            size=200_000,
+            aim=fast,
+            weight=2,
+        )
+        for kind, structure, corpus in (
+            (
+                packets.MotorCmd,
+                dex3_usb.MOTOR_CMD,
+                [packets.MotorCmd(1, 1, True, 5, -6, 7, 8, 9).pack()],
+            ),
+            (
+                packets.MotorState,
+                dex3_usb.MOTOR_STATE,
+                [packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()],
+            ),
+            (
+                packets.SensorState,
+                dex3_usb.SENSOR_STATE,
+                [packets.SensorState(1, 0, tuple(range(12)), tuple(range(12))).pack()],
+            ),
+        )
+    ]
+    buses = [packets.MotorCmd(i, 1, True, 0, 0, 0, 0, 0).pack() * 2 for i in range(2)] + [
+        packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()
+        + packets.SensorState(1, 0, (0,) * 12, (0,) * 12).pack()
+    ]
+    dex3 += [
+        FuzzCase(
+            "dex3.bus",
+            "a bus buffer of the Dex3-1",
+            _bytes(buses, motor_packet, _scan),
+            size=120_000,
+            aim=fast,
+            weight=2,
+        ),
+        FuzzCase(
+            "dex3.command-frame",
+            "a frame to the Dex3-1",
+            _bytes(_dex3_commands(), _fix_command, _parsed_command),
+            size=25_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "dex3.state-frame",
+            "a frame from the Dex3-1",
+            _bytes(_dex3_states(), _fix_frame(dex3_usb.STATE), _parsed_state),
+            size=20_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "dex3.codec",
+            "the driver's reading of a state frame",
+            _dex3_codec,
+            size=15_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "dex3.codec-command",
+            "the hand's reading of a command frame",
+            _dex3_decode_command,
+            size=15_000,
+            aim=slow,
+        ),
+    ]
+    low = [
+        FuzzCase(
+            "low_level." + name.replace("::msg::dds_::", "."),
+            f"image and CRC of {name}",
+            _low(name),
+            size=50_000,
+            aim=1_000_000,
+        )
+        for name in (
+            "unitree_go::msg::dds_::LowCmd_",
+            "unitree_hg::msg::dds_::LowCmd_",
+            "unitree_hg::msg::dds_::LowState_",
+        )
+    ]
+    devices = [
+        FuzzCase(
+            "device.mx64", "the emulated MX-64, on its line", _servo(False), size=15_000, aim=slow
+        ),
+        FuzzCase(
+            "device.mx64-fast",
+            "the same with fast reads and backup",
+            _servo(True),
+            size=15_000,
+            aim=slow,
+        ),
+        FuzzCase(
+            "device.protocol-1", "the old firmware of it", _protocol_1, size=120_000, aim=fast
+        ),
+        FuzzCase(
+            "device.m4010", "the emulated M4010, on its line", _dex1_motor, size=25_000, aim=slow
+        ),
+        FuzzCase("device.dex3", "the emulated Dex3-1, behind USB", _mcu, size=10_000, aim=slow),
+        FuzzCase(
+            "usbip.client", "what a USB/IP server answers", _usbip_client, size=15_000, aim=slow
+        ),
+        FuzzCase(
+            "usbip.server", "what a USB/IP client sends", _usbip_server, size=2_000, aim=slow // 3
+        ),
+    ]
+    return serial + dex3 + low + devices

@@ -1,0 +1,170 @@
+"""Command lines that nobody should write: odd values for every option of every command.
+
+The commands are asked what options they have, so that a new one is tried without being named
+here. A traceback is a finding, and an exit code that is none of dexkit's.
+"""
+
+from __future__ import annotations
+
+import logging
+import resource
+import shutil
+import signal
+
+import click
+
+from tools.campaign.case import Batch, Case
+from tools.campaign.process import Program, traceback_in
+from tools.campaign.rig import until
+
+__all__ = ["cases", "command_lines"]
+
+_NUMBERS = (
+    "nan", "inf", "-inf", "-1", "0", "1e400", "1e-300", "1e18", "9" * 30, "9" * 5000, "0x10",
+    "", "\u00b2", "1_0", "\u0661", "x",
+)  # fmt: skip
+_PATHS = (
+    "/dev/full", "/", "/no/such/file", "/dev/null", "{scratch}", "{scratch}/" + "x" * 300, "",
+    "{scratch}/new", "/proc/self/mem", "{scratch}/empty", "{sample}", "\u00e9\n", "-",
+)  # fmt: skip
+_TEXTS = (
+    "",
+    "x",
+    "\x1b[31m",
+    "*",
+    "=",
+    "a=b",
+    "left.x=1",
+    "a" * 5000,
+    "\u00b2",
+    "/",
+    "-x",
+    "usbip://",
+)
+
+# what makes a command otherwise right, and short
+_BASE: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("backends",): (),
+    ("badge",): ("{result}", "--output", "{scratch}/badge.svg"),
+    ("bridge",): ("--from", "unitree_go", "--to", "unitree_hg", "--duration", "0.3"),
+    ("calibrate",): ("ezgripper", "--device", "/dev/null"),
+    ("check",): ("{sample}",),
+    ("compare",): ("{result}", "{result}"),
+    ("doctor",): ("--scan", "none", "--domain", "{domain}", "--seconds", "0.2"),
+    ("emulate", "all"): ("--duration", "0.3", "--domain", "{domain}"),
+    ("emulate", "dex1-motor"): ("--link", "{scratch}/link"),
+    ("emulate", "dex3-usb"): ("--port", "0"),
+    ("emulate", "g1"): ("--duration", "0.3", "--domain", "{domain}"),
+    ("emulate", "h1"): ("--duration", "0.3", "--domain", "{domain}"),
+    ("emulate", "mx64"): ("--link", "{scratch}/link"),
+    ("info",): ("{sample}",),
+    ("models",): (),
+    ("record",): ("{scratch}/out.mcap", "--duration", "0.3", "--domain", "{domain}"),
+    ("replay",): ("{sample}", "--no-wait", "--speed", "500", "--domain", "{domain}"),
+    ("report",): ("{result}",),
+    ("serve",): ("sim-dex1", "--side", "left", "--domain", "{domain}"),
+    ("teleop",): ("full-stroke", "--domain", "{domain}"),
+}
+_CODES = (0, 1, 2, 130)
+
+
+def command_lines() -> dict[tuple[str, ...], list[click.Option]]:
+    """Every command that is tried, with its options."""
+    from dexkit.cli import cli
+
+    found: dict[tuple[str, ...], list[click.Option]] = {}
+
+    def walk(command: click.Command, path: tuple[str, ...]) -> None:
+        context = click.Context(command)
+        if isinstance(command, click.Group):
+            for name in command.list_commands(context):
+                below = command.get_command(context, name)
+                if below is not None:
+                    walk(below, (*path, name))
+        elif path in _BASE:
+            found[path] = [p for p in command.params if isinstance(p, click.Option)]
+
+    walk(cli, ())
+    return found
+
+
+class OptionsCase(Case):
+    """Command lines with one odd option each."""
+
+    name = "options"
+    what = "odd values for every option of every command"
+    unit = "command lines"
+    aim = 800
+    limit = 300.0
+
+    def run(self, batch: Batch) -> None:
+        logging.disable()
+        from dexkit.traces import sample_path
+
+        places = {
+            "scratch": str(batch.scratch),
+            # a copy: some of these command lines write to it
+            "sample": str(batch.scratch / "sample.mcap"),
+            "result": str(batch.scratch / "result.json"),
+            "domain": str(batch.domain),
+        }
+        (batch.scratch / "empty").touch()
+        original = sample_path("dex1_hand_dropout")
+        shutil.copyfile(original, places["sample"])
+        made = Program(batch, ["dexkit", "check", places["sample"], "--json", places["result"]])
+        if made.wait() not in (0, 1):
+            raise RuntimeError(made.output)
+        lines = {path: options for path, options in command_lines().items() if options}
+        for _ in range(2 if batch.sample else 10):
+            path = batch.random.choice(sorted(lines))
+            option = batch.random.choice(lines[path])
+            self._try(batch, path, option, places)
+            shutil.copyfile(original, places["sample"])
+            batch.units += 1
+
+    def _try(
+        self, batch: Batch, path: tuple[str, ...], option: click.Option, places: dict[str, str]
+    ) -> None:
+        rng = batch.random
+        odd: list[str] = []
+        if not option.is_flag:
+            kind = option.type
+            pool: tuple[str, ...]
+            if isinstance(kind, click.types.IntParamType | click.types.FloatParamType):
+                pool = _NUMBERS
+            elif isinstance(kind, click.Path):
+                pool = _PATHS
+            else:
+                pool = rng.choice((_NUMBERS, _PATHS, _TEXTS))
+            value = rng.choice(pool)
+            if value.startswith("{"):
+                value = value.format(**places)
+            odd = [value]
+        words = [w.format(**places) for w in _BASE[path]]
+        limits = []
+        if path == ("doctor",) and rng.random() < 0.5:
+            limits = [(resource.RLIMIT_NOFILE, rng.randrange(16, 30))]
+        line = ["dexkit", *path, *words, option.opts[0], *odd]
+        program = Program(batch, line, limits=limits)
+        try:
+            until(lambda: "ready:" in program.output or not program.running, "a word", 10.0)
+        except Exception:
+            pass  # some say nothing while they wait
+        if program.running and "ready:" in program.output:
+            program.wait(1.0)
+        program.signal(signal.SIGINT)
+        code = program.wait(30.0)
+        told = traceback_in(program.output)
+        shown = " ".join(line)[:400]
+        if told is not None:
+            batch.found("traceback", told[0], f"{told[1]}\n{shown}\n{program.output[-2000:]}")
+        elif code is None:
+            batch.found("does not end", " ".join(path), f"{shown}\n{program.output[-2000:]}")
+        elif code not in _CODES and code != -signal.SIGINT:
+            batch.found("exit code", " ".join(path), f"{code}: {shown}\n{program.output[-2000:]}")
+        program.end()
+
+
+def cases() -> list[Case]:
+    """The one case."""
+    return [OptionsCase()]

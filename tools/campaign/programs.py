@@ -1,0 +1,679 @@
+"""Killing, stopping and interrupting every program, while it works.
+
+A run: start it, wait until it is ready, let it work, then SIGKILL, SIGTERM or SIGINT at a moment
+of chance; or SIGSTOP, half a second to three, and SIGCONT. Afterwards: no traceback, a right exit
+code, no child and no temporary file left, the recording readable, the hand at rest, and the next
+start works.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dexkit.errors import DexkitError
+from dexkit.hand import Side
+from dexkit.messages import encode, unitree_go
+from dexkit.models import dialect
+from tools.campaign.case import Batch, Case
+from tools.campaign.devices import Bench, bench_of
+from tools.campaign.process import Program, traceback_in
+from tools.campaign.rig import NotYet, until
+
+__all__ = ["Client", "Scene", "Spec", "bodies_and_hands", "cases", "specs"]
+
+SIDE = Side.LEFT
+_SETTLED = 0.2
+"""Seconds of rest that count as standing still."""
+
+
+class Client:
+    """A client on DDS in this process: commands at 100 Hz while it is told a goal, hears states.
+
+    :param spoken: name of its dialect.
+    """
+
+    def __init__(self, domain: int, spoken: str, message: Callable[[float], bytes]) -> None:
+        from dexkit.dds import DdsNode
+
+        self._message = message
+        chosen = dialect(spoken)
+        command, state = chosen.topics(SIDE)
+        self.node = DdsNode(domain, "lo")
+        self._writer = self.node.writer(command, chosen.cmd_type)
+        self._reader = self.node.reader(state, chosen.state_type)
+        self.states = 0
+        self.newest: Any = None
+        self.goal: float | None = None
+        self.sent = 0.0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="campaign-client", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            for sample in self._reader.take():
+                self.states += 1
+                self.newest = sample
+            goal = self.goal
+            if goal is not None:
+                self._writer.write_raw(self._message(goal))
+                self.sent = time.monotonic()
+
+    def wait_states(self, timeout: float = 60.0) -> None:
+        """Wait for new states.
+
+        :raises NotYet: none came.
+        """
+        before = self.states
+        until(lambda: self.states > before + 2, "states", timeout)
+
+    def close(self) -> None:
+        """Leave."""
+        self._stop.set()
+        self._thread.join()
+        self.node.close()
+
+
+@dataclass
+class Scene:
+    """What a program works with in a batch.
+
+    :ivar client: a client, where the program has one.
+    :ivar device: the emulated device, where it drives one, and ``bench`` what knows it.
+    """
+
+    batch: Batch
+    client: Client | None = None
+    device: Any = None
+    bench: Bench | None = None
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def domain(self) -> str:
+        """DDS domain, as text."""
+        return str(self.batch.domain)
+
+    @property
+    def scratch(self) -> Path:
+        """A folder of its own."""
+        return self.batch.scratch
+
+    def position(self) -> float | None:
+        """Where the device is, or None."""
+        if self.bench is None or self.device is None:
+            return None
+        return self.bench.position(self.device)
+
+
+Stage = Callable[[Scene], "contextlib.AbstractContextManager[None]"]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A program and how it is known to work.
+
+    :param command: its arguments behind ``python -m``.
+    :param stage: what must be there for it.
+    :param ready: what it prints when it works.
+    :param codes: exit codes that are right after SIGINT and SIGTERM.
+    :param works: waits until it does its work; after a start and after a stop.
+    :param after: looks at what it left.
+    """
+
+    name: str
+    command: Callable[[Scene], list[str]]
+    stage: Stage
+    ready: str = "ready:"
+    codes: tuple[int, ...] = (0,)
+    works: Callable[[Scene, Program], None] = lambda scene, program: None
+    after: Callable[[Scene, bool], None] = lambda scene, killed: None
+
+
+# --- stages
+
+
+@contextlib.contextmanager
+def _nothing(scene: Scene) -> Iterator[None]:
+    yield
+
+
+def _go(q: float) -> bytes:
+    return encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05)]))
+
+
+def _with_client(spoken: str, bench: str = "") -> Stage:
+    @contextlib.contextmanager
+    def stage(scene: Scene) -> Iterator[None]:
+        with contextlib.ExitStack() as stack:
+            scene.bench = bench_of(bench or _BENCH[spoken])(scene.scratch)
+            if bench:
+                scene.device = stack.enter_context(scene.bench.device())
+            scene.client = Client(scene.batch.domain, spoken, scene.bench.message)
+            stack.callback(scene.client.close)
+            yield
+
+    return stage
+
+
+_BENCH = {"unitree_go": "m4010", "dex3": "dex3", "dex5": "dex5"}
+
+
+@contextlib.contextmanager
+def _talk(scene: Scene, client: str = "unitree_go", *, states: bool = True) -> Iterator[None]:
+    """Somebody who publishes commands in a dialect, and states in today's."""
+    from dexkit.dds import DdsNode
+
+    stop = threading.Event()
+    spoken, today = dialect(client), dialect("unitree_go")
+    with DdsNode(scene.batch.domain, "lo") as node:
+        writers = [(node.writer(spoken.topics(SIDE)[0], spoken.cmd_type), _go(1.0))]
+        if states:
+            state = encode(unitree_go.MotorStates_([unitree_go.MotorState_(q=1.0)]))
+            writers.append((node.writer(today.topics(SIDE)[1], today.state_type), state))
+
+        def run() -> None:
+            while not stop.wait(0.005):
+                for writer, data in writers:
+                    writer.write_raw(data)
+
+        thread = threading.Thread(target=run, name="campaign-talk", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
+# --- what it means that a program works
+
+
+def _states(scene: Scene, program: Program) -> None:
+    assert scene.client is not None
+    scene.client.wait_states()
+
+
+def _topic_flows(
+    topic_type: Callable[[], tuple[str, str]], beside: int = 0
+) -> Callable[[Scene, Program], None]:
+    """Samples come on a topic, ``beside`` domains above that of the scene."""
+
+    def works(scene: Scene, program: Program) -> None:
+        from dexkit.dds import DdsNode
+
+        topic, kind = topic_type()
+        with DdsNode(scene.batch.domain + beside, "lo") as node:
+            reader = node.reader(topic, kind)
+            seen = 0
+            end = time.monotonic() + 60.0
+            while seen < 3:
+                if time.monotonic() > end or not program.running:
+                    raise NotYet(f"no {topic} from {program!r}")
+                if reader.wait(0.5):
+                    seen += len(reader.take())
+
+    return works
+
+
+def _body_state(name: str) -> tuple[str, str]:
+    from dexkit.bodies import body
+
+    return "rt/lowstate", body(name).state_type
+
+
+def _answers(name: str) -> Callable[[Scene, Program], None]:
+    """A driver can open the emulated device and exchange with it."""
+
+    def works(scene: Scene, program: Program) -> None:
+        from dexkit.hand import HandCommand
+
+        assert scene.bench is not None
+
+        def once() -> bool:
+            assert scene.bench is not None
+            hand = scene.bench.hand()
+            try:
+                hand.open()
+                hand.exchange(HandCommand.brake(hand.spec.n_joints))
+                return True
+            except DexkitError as error:
+                scene.extra["error"] = error
+                return False
+            finally:
+                hand.close()
+
+        until(once, f"{program!r} to answer a driver")
+
+    return works
+
+
+def _emulated(name: str) -> Stage:
+    @contextlib.contextmanager
+    def stage(scene: Scene) -> Iterator[None]:
+        scene.bench = bench_of(name)(scene.scratch)
+        yield
+
+    return stage
+
+
+def _recording_grows(scene: Scene, program: Program) -> None:
+    path = scene.scratch / "out.mcap"
+    size = path.stat().st_size if path.exists() else 0
+    until(
+        lambda: not program.running or (path.exists() and path.stat().st_size > size),
+        f"{path.name} to grow",
+    )
+
+
+def _readable(scene: Scene, killed: bool) -> None:
+    from dexkit.traces import open_trace
+
+    path = scene.scratch / "out.mcap"
+    if not path.exists():
+        scene.batch.found("no recording", "record", f"killed: {killed}")
+        return
+    try:
+        trace = open_trace(path)
+        count = len(list(trace.messages()))
+    except DexkitError as error:
+        scene.batch.found("unreadable recording", "record", f"killed: {killed}: {error}")
+        return
+    if not count:
+        scene.batch.found("empty recording", "record", f"killed: {killed}")
+    if not killed and (trace.truncated or trace.warnings):
+        scene.batch.found("recording not finished", "record", f"{trace.warnings}")
+
+
+def _says_more(scene: Scene, program: Program) -> None:
+    if scene.extra.get("heard") == program.process.pid:
+        return  # it speaks when something has changed
+    size = len(program.output)
+    scene.extra["heard"] = program.process.pid
+    until(lambda: len(program.output) > size or not program.running, f"more words of {program!r}")
+
+
+# --- the programs
+
+
+def _serve(backend: str, *options: str) -> Callable[[Scene], list[str]]:
+    def command(scene: Scene) -> list[str]:
+        words = ["dexkit", "serve", backend, "--side", "left", "--domain", scene.domain, *options]
+        if backend == "ezgripper":
+            words += ["--device", str(scene.scratch / "mx64"), "--set", "zero=1510"]
+        elif backend == "dex1-serial":
+            words += ["--device", str(scene.scratch / "m4010")]
+        elif backend == "dex3-usb":
+            words += ["--usb", scene.device.url]
+        return words
+
+    return command
+
+
+def _sample() -> str:
+    from dexkit.traces import sample_path
+
+    return str(sample_path("dex1_pick_place"))
+
+
+def specs() -> list[Spec]:
+    """Every program that runs until it is told to end."""
+
+    def emulate(*words: str) -> Callable[[Scene], list[str]]:
+        return lambda scene: [
+            "dexkit",
+            "emulate",
+            *(w.replace("SCRATCH", str(scene.scratch)) for w in words),
+        ]
+
+    def on_domain(*words: str) -> Callable[[Scene], list[str]]:
+        return lambda scene: ["dexkit", *words, "--domain", scene.domain]
+
+    served = [
+        ("sim-dex1", "unitree_go", ""),
+        ("sim-dex3", "dex3", ""),
+        ("sim-dex5", "dex5", ""),
+        ("ezgripper", "unitree_go", "mx64"),
+        ("dex1-serial", "unitree_go", "m4010"),
+        ("dex3-usb", "dex3", "dex3"),
+    ]
+    found = [
+        Spec(f"serve-{backend}", _serve(backend), _with_client(spoken, bench), works=_states)
+        for backend, spoken, bench in served
+    ]
+    found += [
+        Spec(
+            "bridge",
+            lambda s: [
+                "dexkit", "bridge", "--from", "unitree_go", "--to", "unitree_hg",
+                "--side", "left", "--domain", s.domain, "--to-domain", str(s.batch.domain + 1),
+            ],
+            lambda scene: _talk(scene, "unitree_go", states=False),
+            works=_topic_flows(
+                lambda: (dialect("unitree_hg").topics(SIDE)[0], dialect("unitree_hg").cmd_type), 1
+            ),
+        ),
+        Spec(
+            "record",
+            lambda s: [
+                "dexkit", "record", str(s.scratch / "out.mcap"), "--force", "--domain", s.domain,
+            ],
+            _talk,
+            works=_recording_grows,
+            after=_readable,
+        ),
+        Spec(
+            "replay",
+            lambda s: [
+                "dexkit", "replay", _sample(), "--loop", "--no-wait", "--domain", s.domain,
+                "--topic", "rt/dex1/left/cmd",
+            ],
+            _nothing,
+            ready="",
+            codes=(0, 1, 130),
+            works=_topic_flows(
+                lambda: (dialect("unitree_go").topics(SIDE)[0], dialect("unitree_go").cmd_type)
+            ),
+        ),
+        Spec("emulate-mx64", emulate("mx64", "--link", "SCRATCH/mx64", "--any-baudrate"),
+             _emulated("mx64"), works=_answers("mx64")),
+        Spec("emulate-dex1-motor", emulate("dex1-motor", "--link", "SCRATCH/m4010"),
+             _emulated("m4010"), works=_answers("m4010")),
+        Spec(
+            "emulate-dex3-usb",
+            lambda s: ["dexkit", "emulate", "dex3-usb", "--port", str(4000 + s.batch.domain)],
+            _emulated("dex3"),
+            works=_usb_answers,
+        ),
+        Spec("emulate-h1", on_domain("emulate", "h1"), _nothing,
+             works=_topic_flows(lambda: _body_state("h1"))),
+        Spec("emulate-g1", on_domain("emulate", "g1"), _nothing,
+             works=_topic_flows(lambda: _body_state("g1"))),
+        Spec("emulate-all", on_domain("emulate", "all"), _nothing,
+             works=_topic_flows(lambda: _body_state("g1"))),
+        Spec(
+            "doctor-watch",
+            lambda s: ["dexkit", "doctor", "--watch", "--domain", s.domain, "--scan", "none",
+                       "--seconds", "0.3"],
+            _talk,
+            ready="",
+            codes=(0, 1, 130, 143, -2, -15),
+            works=_says_more,
+        ),
+        Spec(
+            "conformance",
+            lambda s: [
+                "pytest", "conformance/", "--backend", "sim-dex1", "--quick", "--side", "left",
+                "-p", "no:cacheprovider", "--domain", s.domain,
+                "--json", str(s.scratch / "result.json"),
+            ],
+            _nothing,
+            ready="",
+            codes=(0, 1, 2, 130, 143, -2, -15),
+            works=_says_more,
+        ),
+    ]  # fmt: skip
+    return found
+
+
+def _usb_answers(scene: Scene, program: Program) -> None:
+    from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
+    from dexkit.drivers.dex3_usb.discovery import Server
+    from dexkit.hand import HandCommand
+
+    server = Server("127.0.0.1", 4000 + scene.batch.domain)
+
+    def once() -> bool:
+        hand = Dex3Usb(SIDE, Dex3Settings(server=server, timeout=1.0))
+        try:
+            hand.open()
+            hand.exchange(HandCommand.brake(7))
+            return True
+        except DexkitError:
+            return False
+        finally:
+            hand.close()
+
+    until(once, f"{program!r} to answer a driver")
+
+
+class _Runs(Case):
+    """Runs of one program."""
+
+    limit = 400.0
+
+    def __init__(self, spec: Spec) -> None:
+        self.spec = spec
+
+    def run(self, batch: Batch) -> None:
+        logging.disable()
+        scene = Scene(batch)
+        with self.spec.stage(scene):
+            try:
+                self.runs(batch, scene)
+            except NotYet as error:
+                batch.found("not ready", self.name, str(error))
+        temporary = batch.scratch / "tmp"
+        left = sorted(p.name for p in temporary.iterdir()) if temporary.exists() else []
+        if left and not batch.findings:
+            batch.found("temporary files left", self.name, ", ".join(left))
+
+    def runs(self, batch: Batch, scene: Scene) -> None:
+        """Start, disturb, look; several times in one scene."""
+        raise NotImplementedError
+
+    def start(self, batch: Batch, scene: Scene) -> Program:
+        """Start it and wait until it works."""
+        program = Program(batch, self.spec.command(scene))
+        try:
+            if self.spec.ready:
+                program.wait_for(self.spec.ready)
+            self.spec.works(scene, program)
+        except NotYet as error:
+            program.end()
+            self.look(batch, program)
+            raise NotYet(f"{error}; it printed: {program.output[-1500:]}") from None
+        except BaseException:
+            program.end()
+            raise
+        return program
+
+    def look(self, batch: Batch, program: Program) -> None:
+        """A traceback is a finding, whatever else happens."""
+        told = traceback_in(program.output)
+        if told is not None:
+            batch.found("traceback", told[0], f"{told[1]}\n{program!r}\n{program.output[-3000:]}")
+
+    def ended(self, batch: Batch, scene: Scene, program: Program, number: int) -> None:
+        """Wait for its end and look at everything that it must not leave."""
+        how = signal.Signals(number).name
+        code = program.wait()
+        if code is None:
+            batch.found("does not end", f"{self.name} {how}", program.output[-2000:])
+            program.end()
+        elif number == signal.SIGKILL:
+            if code != -signal.SIGKILL:
+                batch.found("ended by itself", self.name, f"{code}: {program.output[-2000:]}")
+        elif code not in self.spec.codes:
+            batch.found("exit code", f"{self.name} {how}", f"{code}: {program.output[-2000:]}")
+        self.look(batch, program)
+        left = program.left_behind()
+        if left:
+            batch.found("child left behind", f"{self.name} {how}", "\n".join(left))
+        self.spec.after(scene, number == signal.SIGKILL)
+
+
+class KillCase(_Runs):
+    """Ends it in every way."""
+
+    unit = "kills"
+
+    def __init__(self, spec: Spec) -> None:
+        super().__init__(spec)
+        self.name = f"kill:{spec.name}"
+        self.what = f"{spec.name}, ended by SIGKILL, SIGTERM and SIGINT"
+        self.aim = 100
+
+    def runs(self, batch: Batch, scene: Scene) -> None:
+        endings = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
+        batch.random.shuffle(endings)
+        if batch.sample:
+            endings = [signal.SIGKILL]
+        # the last one in good order: it cleans up behind those that could not
+        for number in [*endings, signal.SIGTERM]:
+            program = self.start(batch, scene)
+            try:
+                if scene.client is not None and scene.bench is not None:
+                    scene.client.goal = batch.random.choice((scene.bench.low, scene.bench.high))
+                time.sleep(batch.random.uniform(0.0, 0.6))
+                program.signal(number)
+                self.ended(batch, scene, program, number)
+                batch.units += 1
+                self._at_rest(batch, scene, number)
+            finally:
+                if scene.client is not None:
+                    scene.client.goal = None
+                program.end()
+
+    def _at_rest(self, batch: Batch, scene: Scene, number: int) -> None:
+        """The device stops by itself within its time-out, though the client goes on."""
+        if scene.device is None or scene.bench is None:
+            return
+        try:
+            _wait_still(scene, 5.0)
+        except NotYet:
+            batch.found("moves afterwards", f"{self.name} {signal.Signals(number).name}", "for 5 s")
+
+
+class StopCase(_Runs):
+    """Stops it for a while, and lets it go on."""
+
+    unit = "stops"
+
+    def __init__(self, spec: Spec) -> None:
+        super().__init__(spec)
+        self.name = f"stop:{spec.name}"
+        self.what = f"{spec.name}, stopped for half a second to three"
+        self.aim = 100
+
+    def runs(self, batch: Batch, scene: Scene) -> None:
+        program = self.start(batch, scene)
+        try:
+            for _ in range(1 if batch.sample else 6):
+                if not program.running:
+                    break  # a conformance run that came to its end
+                self._stop(batch, scene, program)
+                batch.units += 1
+            program.signal(signal.SIGTERM)
+            if program.running or self.spec.ready:
+                self.ended(batch, scene, program, signal.SIGTERM)
+            else:
+                self.look(batch, program)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                program.process.send_signal(signal.SIGCONT)
+            program.end()
+
+    def _stop(self, batch: Batch, scene: Scene, program: Program) -> None:
+        rng = batch.random
+        client, bench = scene.client, scene.bench
+        if client is not None and bench is not None:
+            # to and fro until it is in motion, then stop it there
+            client.goal = rng.choice((bench.low, bench.high))
+            if scene.device is not None:
+                self._set_off(scene, client, bench)
+        time.sleep(rng.uniform(0.0, 0.3))
+        program.signal(signal.SIGSTOP)
+        stopped = time.monotonic()
+        seconds = rng.uniform(0.5, 3.0) if rng.random() < 0.4 else rng.uniform(0.5, 1.0)
+        if client is not None and bench is not None:
+            if rng.random() < 0.7:
+                client.goal = bench.low + bench.high - (client.goal or bench.low)
+            time.sleep(rng.uniform(0.0, max(0.0, min(0.5, seconds - 0.8))))
+            client.goal = None  # the client goes away while the service is stopped
+        time.sleep(max(0.0, stopped + seconds - time.monotonic()))
+        before = None
+        if scene.device is not None:
+            with contextlib.suppress(NotYet):
+                before = _wait_still(scene, 3.0)
+        program.signal(signal.SIGCONT)
+        if before is not None and client is not None and bench is not None:
+            old_enough = time.monotonic() - client.sent > 0.4
+            time.sleep(0.6)
+            now = scene.position()
+            assert now is not None
+            if old_enough and abs(now - before) > bench.still:
+                batch.found(
+                    "moved unasked",
+                    self.name,
+                    f"by {now - before:.3f} when it went on after {seconds:.2f} s; the client had "
+                    f"gone {time.monotonic() - client.sent:.2f} s before",
+                )
+        self.spec.works(scene, program)
+        if scene.device is not None and client is not None and bench is not None:
+            client.goal = rng.choice((bench.low, bench.high))
+            self._set_off(scene, client, bench)
+            client.goal = None
+
+    def _set_off(self, scene: Scene, client: Client, bench: Bench) -> None:
+        """Wait until the device moves by what the client says."""
+        start, began = scene.position(), time.monotonic()
+        assert start is not None
+        turned = False
+
+        def moved() -> bool:
+            nonlocal turned
+            if not turned and time.monotonic() - began > 3.0:
+                turned = True
+                client.goal = bench.low + bench.high - (client.goal or bench.low)
+            return abs((scene.position() or 0.0) - start) > bench.still
+
+        until(moved, f"{self.spec.name} to obey a fresh command")
+
+
+def _wait_still(scene: Scene, timeout: float) -> float:
+    """Wait until the device has stood still for a moment; where.
+
+    :raises NotYet: it goes on moving.
+    """
+    assert scene.bench is not None
+    last, since = scene.position() or 0.0, time.monotonic()
+
+    def still() -> bool:
+        nonlocal last, since
+        assert scene.bench is not None
+        now = scene.position() or 0.0
+        if abs(now - last) > scene.bench.still / 10:
+            last, since = now, time.monotonic()
+        return time.monotonic() - since > _SETTLED
+
+    until(still, "the hand to stand still", timeout)
+    return last
+
+
+def cases() -> list[Case]:
+    """Every program, killed and stopped."""
+    found: list[Case] = []
+    for spec in specs():
+        found += [KillCase(spec), StopCase(spec)]
+    return found
+
+
+def bodies_and_hands() -> list[Spec]:
+    """The programs that listen to whoever is on a domain."""
+    names: tuple[str, ...] = (
+        "serve-sim-dex1",
+        "serve-sim-dex3",
+        "serve-sim-dex5",
+        "bridge",
+        "record",
+    )
+    names += ("emulate-h1", "emulate-g1", "doctor-watch")
+    return [spec for spec in specs() if spec.name in names]
