@@ -16,7 +16,6 @@ from typing import Any
 
 import zstandard
 from mcap.writer import CompressionType, Writer
-from rich.console import Console
 
 from dexkit.backends import BackendOptions
 from dexkit.conformance.claims import Claims
@@ -35,6 +34,7 @@ from dexkit.conformance.report.terminal import print_result
 from dexkit.conformance.results import read_json
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.conformance.view import Recording
+from dexkit.console import Console
 from dexkit.doctor.environment import uri_problem
 from dexkit.drivers.dex1_serial import settings as dex1_settings
 from dexkit.drivers.dex3_usb import discovery as dex3_discovery
