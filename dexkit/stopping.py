@@ -61,7 +61,7 @@ def stop_on_signals() -> Iterator[StopRequest]:
         ending.append(signal.SIGHUP)
     previous = {s: signal.signal(s, handle) for s in ending}
     try:
-        with threads.listen(lambda worker: request.set()):
+        with threads.on_death(lambda worker: request.set()):
             yield request
     finally:
         for signum, handler in previous.items():

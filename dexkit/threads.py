@@ -6,7 +6,7 @@ dexkit: **one that dies ends the program, with a message and an error exit code.
 
 :class:`Worker` is that rule. When its function raises, it logs why, keeps the exception as
 :attr:`Worker.failure`, tells its owner (``failed``), and tells everybody who asked by
-:func:`listen`. :func:`~dexkit.stopping.stop_on_signals` asks: its request is set, so that the
+:func:`on_death`. :func:`~dexkit.stopping.stop_on_signals` asks: its request is set, so that the
 program ends in good order, as on Ctrl-C: hands brake, recordings are finished. Last of all the
 command line asks :func:`check` and exits with 1.
 """
@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 
 from dexkit.errors import DexkitError
 
-__all__ = ["Worker", "check", "forget", "listen"]
+__all__ = ["Worker", "check", "forget", "on_death"]
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class Worker(threading.Thread):
 
 
 @contextlib.contextmanager
-def listen(hear: Callable[[Worker], object]) -> Iterator[None]:
+def on_death(hear: Callable[[Worker], object]) -> Iterator[None]:
     """Have ``hear`` called with every worker that dies meanwhile, in its thread."""
     with _lock:
         _listeners.append(hear)

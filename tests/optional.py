@@ -74,10 +74,10 @@ def _package(name: str) -> Callable[[], object]:
 
 OPTIONAL = (
     Optional("Chromium", chromium, ("conformance_report_browser",)),
-    Optional("user and network namespaces", namespaces, ("dds_multicast",)),
+    Optional("user and network namespaces", namespaces, ("dds_multicast", "lan")),
     Optional("Python 3.11", lambda: python("3.11"), ("package",)),
     Optional("Python 3.13", lambda: python("3.13"), ("package",)),
-    Optional("CycloneDDS 0.10", _package("cyclonedds"), ("demo", "everything on DDS")),
+    Optional("CycloneDDS 0.10", _package("cyclonedds"), ("campaign", "demo", "everything on DDS")),
     Optional(
         "the package unitree-sdk2",
         _package("unitree_sdk2py"),

@@ -42,7 +42,7 @@ def test_a_worker_that_dies_tells_everybody(caplog: pytest.LogCaptureFixture) ->
     owner: list[Exception] = []
     heard: list[Worker] = []
     threads.forget()
-    with threads.listen(heard.append), threads.listen(die), stop_on_signals() as stop:
+    with threads.on_death(heard.append), threads.on_death(die), stop_on_signals() as stop:
         worker = Worker("test", die, 1, 2, failed=owner.append)
         worker.start()
         assert stop.wait(10)
@@ -191,7 +191,7 @@ def test_a_node_whose_dispatcher_died_frees_its_waiters(monkeypatch: pytest.Monk
 def test_an_emulated_line_and_a_tool_tell(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Tool, "_listen", die)
     heard: list[Worker] = []
-    with threads.listen(heard.append), Tool("--version"):
+    with threads.on_death(heard.append), Tool("--version"):
         wait_until(lambda: heard)
     monkeypatch.setattr(Port, "run", die)
     port = Port.__new__(Port)
