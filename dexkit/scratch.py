@@ -1,7 +1,8 @@
 """Temporary folders that do not outlive their program, even one that was killed.
 
-Each holds a lock that its program has for as long as it lives; who makes a folder first removes
-those of this user whose lock nobody has.
+A program holds a lock on each of its folders (``flock`` on the folder itself) for as long as it
+lives. Who makes a folder first removes those of this user that nobody has locked. So nothing stays
+of a program that was killed, whenever that was, once another one has started.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import secrets
 import shutil
 import stat
 import tempfile
@@ -18,8 +18,8 @@ from types import TracebackType
 
 __all__ = ["PREFIX", "Scratch", "sweep"]
 
-PREFIX = "dexkit-"
-_LOCK = ".lock"
+PREFIX = "dexkit-scratch-"
+"""Of their names; a folder of such a name that nobody has locked is removed."""
 
 
 class Scratch:
@@ -32,12 +32,15 @@ class Scratch:
 
     def __init__(self, what: str = "run") -> None:
         sweep()
-        self.path = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{what}-"))
-        # locked before it has its name: nobody finds it unlocked
-        early = self.path / f"{_LOCK}-{secrets.token_hex(4)}"
-        self._lock = os.open(early, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
-        os.rename(early, self.path / _LOCK)
+        while True:
+            self.path = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{what}-"))
+            lock = _open(self.path)
+            if lock is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if _is(self.path, lock):
+                    break  # nobody swept it between its making and its lock
+                os.close(lock)
+        self._lock = lock
 
     def close(self) -> None:
         """Remove it. May be called twice."""
@@ -58,11 +61,14 @@ class Scratch:
         self.close()
 
 
-def sweep() -> list[Path]:
-    """Remove the folders that killed programs of this user have left; returns them."""
+def sweep(folder: Path | None = None) -> list[Path]:
+    """Remove the folders that killed programs of this user have left; returns them.
+
+    :param folder: where; by default the system's temporary folder.
+    """
     removed = []
     with contextlib.suppress(OSError):
-        for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        for path in (folder or Path(tempfile.gettempdir())).glob(f"{PREFIX}*"):
             with contextlib.suppress(OSError):
                 if _abandoned(path):
                     removed.append(path)
@@ -70,14 +76,30 @@ def sweep() -> list[Path]:
 
 
 def _abandoned(path: Path) -> bool:
-    """Remove a folder if nobody has its lock; whether it was so."""
+    """Remove a folder if nobody has locked it; whether it was so."""
     about = path.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.geteuid():
         return False
-    lock = os.open(path / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+    lock = _open(path)
+    if lock is None:
+        return False
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises where somebody has it
         shutil.rmtree(path, ignore_errors=True)
         return True
     finally:
         os.close(lock)
+
+
+def _open(path: Path) -> int | None:
+    """A descriptor of the folder; None if it has gone."""
+    try:
+        return os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+
+
+def _is(path: Path, descriptor: int) -> bool:
+    with contextlib.suppress(FileNotFoundError):
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
+    return False

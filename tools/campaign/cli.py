@@ -23,12 +23,17 @@ from tools.campaign.state import State
 __all__ = ["main"]
 
 SAMPLE_SEED = "sample"
-SAMPLE_SECONDS = 120.0
+MINUTES, SAMPLE_MINUTES = 10.0, 2.0
 FINDING, OWN_FAILURE = 1, 2
 
 
 @click.command(context_settings={"show_default": True, "help_option_names": ["-h", "--help"]})
-@click.option("--minutes", type=click.FloatRange(0, min_open=True), default=10.0, help="How long.")
+@click.option(
+    "--minutes",
+    type=click.FloatRange(0, min_open=True),
+    help=f"How long at most.  [default: {MINUTES:g}; {SAMPLE_MINUTES:g} for a sample]",
+)
+@click.option("--batches", type=click.IntRange(1), help="End when every case has had so many.")
 @click.option("--seed", help="Of everything random.  [default: that of the state file, or 1]")
 @click.option("--jobs", type=click.IntRange(1), help="Cores to use.  [default: all]")
 @click.option("--only", default="", help="Beginnings of case names, with commas.")
@@ -48,7 +53,8 @@ FINDING, OWN_FAILURE = 1, 2
     help="Try one finding again.",
 )
 def command(
-    minutes: float,
+    minutes: float | None,
+    batches: int | None,
     seed: str | None,
     jobs: int | None,
     only: str,
@@ -80,10 +86,10 @@ def command(
         shutil.rmtree(out / "findings", ignore_errors=True)
     state = State.load(out, seed, fresh=fresh)
     cores = jobs or len(os.sched_getaffinity(0))
-    seconds = SAMPLE_SECONDS if sample else 60.0 * minutes
+    seconds = 60.0 * (minutes or (SAMPLE_MINUTES if sample else MINUTES))
 
     def run(own: isolation.Isolation) -> int:
-        return _campaign(cases, state, cores, seconds, sample, own)
+        return _campaign(cases, state, cores, seconds, batches, sample, own)
 
     return isolation.inside(run)
 
@@ -93,6 +99,7 @@ def _campaign(
     state: State,
     jobs: int,
     seconds: float,
+    batches: int | None,
     sample: bool,
     own: isolation.Isolation,
 ) -> int:
@@ -104,6 +111,7 @@ def _campaign(
         state,
         jobs=jobs,
         seconds=seconds,
+        batches=batches,
         sample=sample,
         own_network=own.network,
         tell=line.tell,

@@ -115,6 +115,7 @@ class Engine:
     :param jobs: fuzzers at once; twice as many other batches run beside them, for they mostly
         wait.
     :param seconds: how long.
+    :param batches: of each case; None for as many as the time allows.
     :param sample: each case once, in miniature.
     :param tell: is given a line of progress now and then.
     """
@@ -126,6 +127,7 @@ class Engine:
         *,
         jobs: int,
         seconds: float,
+        batches: int | None = None,
         sample: bool = False,
         own_network: bool = False,
         tell: Callable[[str], object] = lambda line: None,
@@ -135,6 +137,7 @@ class Engine:
         self.stopping = False
         self._jobs = jobs
         self._seconds = seconds
+        self._batches = 1 if sample else batches
         self._sample = sample
         self._own_network = own_network
         self._tell = tell
@@ -223,7 +226,8 @@ class Engine:
                 continue
             progress = self.state.of(chosen.name)
             given = self._given.get(chosen.name, 0)
-            if progress.skipped or (given and (self._sample or lane is Lane.LONG)):
+            most = 1 if lane is Lane.LONG else self._batches
+            if progress.skipped or (most is not None and given >= most):
                 continue
             candidates.append((self._behind(chosen, progress), len(candidates), chosen))
         if not candidates or (lane is Lane.LIVE and not self._sample and self._enough()):

