@@ -313,6 +313,8 @@ def _serve(backend: str, *options: str) -> Callable[[Scene], list[str]]:
             words += ["--device", str(scene.scratch / "m4010")]
         elif backend == "dex3-usb":
             words += ["--usb", scene.device.url]
+        if scene.device is not None:
+            words.append("--wait-for-device")  # on a busy machine it may answer late
         return words
 
     return command
