@@ -25,7 +25,17 @@ from typing import IO, Any, NoReturn, TextIO, cast
 
 from dexkit.errors import OutputError
 
-__all__ = ["LONGEST", "REMARK", "Guard", "guarded", "html", "one_line", "output_error", "visible"]
+__all__ = [
+    "LONGEST",
+    "REMARK",
+    "Guard",
+    "guarded",
+    "html",
+    "one_line",
+    "open_standard_streams",
+    "output_error",
+    "visible",
+]
 
 LONGEST = 300
 """Characters of a name that are shown; the rest is an ellipsis."""
@@ -175,18 +185,36 @@ def output_error(what: object, error: OSError) -> OutputError:
     return found
 
 
+def open_standard_streams() -> None:
+    """Give whichever of the standard streams was closed by whoever started this the null device.
+
+    Else what is opened next, a device or a recording, has its number: libraries print into it, and
+    programs that are started read from it. Python's stream is None then, which nobody expects.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # takes the lowest number that is free; where there is no null device, none is used
+            with contextlib.suppress(OSError):
+                os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            mode = "w" if number else "r"
+            # not closed with the stream: the number must stay taken until the very end
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
+
+
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
     """Guard the standard output and error stream; flushes them at the end.
 
     :raises OutputError: the output cannot be written.
     """
+    open_standard_streams()
     before = sys.stdout, sys.stderr
-    # None where the descriptor was closed by whoever started this: what a program opens next would
-    # get its number
-    out, err = (stream or open(os.devnull, "w") for stream in before)  # noqa: SIM115
-    sys.stdout = cast(TextIO, Guard(out, "standard output"))
-    sys.stderr = cast(TextIO, Guard(err, "standard error"))
+    sys.stdout = cast(TextIO, Guard(sys.stdout, "standard output"))
+    sys.stderr = cast(TextIO, Guard(sys.stderr, "standard error"))
     try:
         try:
             yield

@@ -153,3 +153,44 @@ def test_without_standard_streams_nothing_is_written_into_what_is_opened_next(
     )
     assert done.returncode in (0, 1)
     assert out.read_text().startswith("{")
+
+
+_OPENED_NEXT = """
+import os, subprocess, sys
+from dexkit.untrusted import guarded
+with guarded():
+    assert os.open(sys.argv[1], os.O_RDWR) > 2
+    assert [s.fileno() for s in (sys.stdin, sys.stdout, sys.stderr)] == [0, 1, 2]
+    print("", file=sys.stderr)
+    check = "import os; [os.fstat(n) for n in range(3)]; assert os.read(0, 1) == b''"
+    subprocess.run([sys.executable, "-I", "-c", check], check=True)
+sys.stdout.flush()
+"""
+
+
+@pytest.mark.parametrize("closed", ["<&-", "<&- >&-", "<&- 2>&-", "<&- >&- 2>&-"])
+def test_no_file_gets_the_number_of_a_standard_stream(tmp_path: Path, closed: str) -> None:
+    there = tmp_path / "device"
+    there.write_bytes(b"answer")
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", _OPENED_NEXT, str(there)],
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert there.read_bytes() == b"answer"
+
+
+@pytest.mark.parametrize("gripper", [("ezgripper",), ("dex1-serial", "--side", "left")])
+def test_who_has_no_input_is_not_asked(tmp_path: Path, gripper: tuple[str, ...]) -> None:
+    command = command_line("calibrate", *gripper, "--device", str(tmp_path))
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$@" <&-', "sh", *command],
+        capture_output=True,
+        check=False,
+        timeout=60,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "nobody can be asked" in done.stderr
+    assert "--yes" in done.stderr
