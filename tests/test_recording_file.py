@@ -9,13 +9,14 @@ import subprocess
 import sys
 import textwrap
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
+from mcap.writer import Writer
 
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace
@@ -376,3 +377,133 @@ def test_a_long_recording_keeps_no_index_in_memory(tmp_path: Path) -> None:
     assert isinstance(kept, ChunkIndexes)
     assert set(vars(kept)) == {"_file"}
     recorder.close()
+
+
+# -- what others do to the file --------------------------------------------------------------------
+
+
+def cut(path: Path) -> None:
+    os.truncate(path, 0)
+
+
+def cut_a_little(path: Path) -> None:
+    os.truncate(path, path.stat().st_size - 10)
+
+
+def append(path: Path) -> None:
+    with path.open("ab") as file:
+        file.write(b"Z" * 100_000)
+
+
+def overwrite(path: Path, at: int) -> None:
+    before = path.stat()
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(b"Z" * 50)
+    # a disk may count time in steps of some ms: this is in another one
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1_000_000_000))
+
+
+@pytest.mark.parametrize("more", [0, 10])
+@pytest.mark.parametrize(
+    "change",
+    [
+        cut,
+        cut_a_little,
+        append,
+        lambda path: overwrite(path, 0),
+        lambda path: overwrite(path, 110),
+        lambda path: overwrite(path, path.stat().st_size - 50),
+    ],
+)
+def test_a_file_that_another_program_writes_to_is_told(
+    tmp_path: Path, change: Callable[[Path], None], more: int
+) -> None:
+    path = tmp_path / "a.mcap"
+    recorder = Recorder(path)
+    recorder.open()
+    put(recorder, 0, 10)
+    wait_until(lambda: recorder.written)
+    change(path)
+    put(recorder, 10, more)
+    with pytest.raises(TraceError, match="was changed by another program"):
+        recorder.close()
+
+
+def test_a_new_time_alone_is_no_change(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        put(recorder, 0, 10)
+        wait_until(lambda: recorder.written)
+        os.utime(path, ns=(0, 0))
+    trace = open_trace(path)
+    assert not trace.damage
+    assert not trace.truncated
+    assert trace.message_count == 10
+
+
+# -- what others have put there --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("content", [None, b"", b"V", b"something else altogether"])
+def test_a_link_beside_is_not_followed(tmp_path: Path, content: bytes | None) -> None:
+    path, victim = tmp_path / "a.mcap", tmp_path / "victim"
+    before = old(path)
+    if content is not None:
+        victim.write_bytes(content)
+    part(path).symlink_to(victim)
+    with pytest.raises(UsageError, match="is not a file"), Recorder(path, overwrite=True):
+        pass
+    assert (victim.read_bytes() if victim.exists() else None) == content
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo])
+def test_what_is_no_file_beside_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "a.mcap"
+    before = old(path)
+    make(part(path))
+    with pytest.raises(UsageError, match="is not a file"), Recorder(path, overwrite=True):
+        pass
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"V", b"short", b"a longer text"])
+def test_a_text_beside_is_kept(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.mcap"
+    old(path)
+    part(path).write_bytes(content)
+    with pytest.raises(UsageError, match="or is no recording"), Recorder(path, overwrite=True):
+        pass
+    assert part(path).read_bytes() == content
+
+
+def test_messages_outside_of_chunks_beside_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    old(path)
+    with part(path).open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start()
+        schema = writer.register_schema("a", "ros2msg", b"uint8 a")
+        channel = writer.register_channel("rt/a", "cdr", schema)
+        writer.add_message(channel, T0, b"\0\1\0\0\1", T0)
+        file.flush()  # killed here
+        before = part(path).read_bytes()
+    part(path).write_bytes(before)
+    with pytest.raises(UsageError, match="holds messages"), Recorder(path, overwrite=True):
+        pass
+    assert part(path).read_bytes() == before
+
+
+def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    with pytest.raises(TraceError, match="no program reads it"), Recorder(path, overwrite=True):
+        pass
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with Recorder(path, overwrite=True) as recorder:
+            put(recorder, 0, 1)
+        assert os.read(reader, 8) == b"\x89MCAP0\r\n"
+    finally:
+        os.close(reader)

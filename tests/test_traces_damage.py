@@ -4,6 +4,7 @@ time or memory than its size allows."""
 from __future__ import annotations
 
 import json
+import os
 import struct
 import tracemalloc
 import zlib
@@ -19,7 +20,7 @@ from dexkit.cli import main
 from dexkit.conformance.judge import judge
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording
-from dexkit.errors import DexkitError, TraceError, TraceUnsupported
+from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.messages import message_type
 from dexkit.messages.columns import Columns
 from dexkit.messages.layout import STRUCTS
@@ -396,3 +397,11 @@ def test_the_fuzzer_finds_nothing() -> None:
 def test_the_fuzzer_finds_nothing_in_many_files() -> None:
     result = mcap_fuzz.run(4, 20_000)
     assert [f"{f.number}: {f.what}" for f in result.findings] == []
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "a.mcap"
+    os.mkfifo(pipe)
+    for path in (pipe, tmp_path, Path("/dev/zero")):
+        with pytest.raises(TraceUnreadable, match="not an ordinary file"):
+            open_trace(path)

@@ -11,6 +11,7 @@ follow each other. Chunks are checked when they are read (:meth:`Container.read`
 from __future__ import annotations
 
 import os
+import stat
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -155,8 +156,14 @@ class Container:
         :raises TraceUnreadable: it is missing, not an mcap file, or ends within its header.
         """
         try:
-            with self.path.open("rb") as file:
-                self._size = os.fstat(file.fileno()).st_size
+            with open(self.path, "rb", opener=_at_once) as file:
+                status = os.fstat(file.fileno())
+                if not stat.S_ISREG(status.st_mode):
+                    raise TraceUnreadable(
+                        f"cannot read {self.path}: it is not an ordinary file",
+                        hint="a recording that comes through a pipe must be stored first",
+                    )
+                self._size = status.st_size
                 self._walk(file, self._read_start(file))
                 sound = self._check_sums(file)
                 self._repeat(sound)
@@ -807,3 +814,8 @@ def _are_all(data: bytes, starts: NDArray[np.int64]) -> bool:
         and int(starts[-1] + 9 + lengths[-1]) == len(data)
         and np.array_equal((starts + 9 + lengths)[:-1], starts[1:])
     )
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open without waiting for a pipe's writer."""
+    return os.open(path, flags | os.O_NONBLOCK)

@@ -357,6 +357,7 @@ class Recorder:
             },
         )
         self._commit()  # the end is made from what is in the file
+        self._file.verify()
         writer.finish()  # type: ignore[no-untyped-call]
         self._commit()
 

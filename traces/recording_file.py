@@ -5,6 +5,8 @@
   be written is what can be read.
 * A recording that replaces another is written beside it, under the same name with ``.part``, and
   takes its place when it holds a message. Until then the old one is untouched.
+* What others do to the file meanwhile is noticed: that it was deleted, renamed or cut at the next
+  commit, that bytes in it were changed at the end.
 * The file is locked (``flock``) while it is written. A second recorder is refused; readers do
   not look at the lock and may follow the file as it grows.
 
@@ -23,6 +25,7 @@ import os
 import stat
 import struct
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,9 +37,12 @@ __all__ = ["ChunkIndexes", "RecordingFile"]
 
 _PART = ".part"
 _CREATE = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+_BESIDE = _CREATE | os.O_NOFOLLOW | os.O_NONBLOCK
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # operation code, length
 _CHUNK, _MESSAGE_INDEX, _DATA_END = 0x06, 0x07, 0x0F
+_HEADER, _SCHEMA, _CHANNEL, _METADATA = 0x01, 0x03, 0x04, 0x0C
+_BLOCK = 1 << 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, size, CRC, length of a string
 _RETRIES = (0.001, 0.01, 0.05)  # seconds; a look at a lock takes microseconds
 _LEAST_CHUNK = _CHUNK_HEAD.size + 8
@@ -63,6 +69,9 @@ class RecordingFile:
         self._buffer: list[bytes] = []
         self._buffered = 0
         self._size = 0
+        self._crc = 0  # of what was committed
+        self._changed_ns = -1  # when the file was last changed by this program
+        self._touched = False  # it was changed by another one, or the clock of its disk differs
 
     # -- life ----------------------------------------------------------------------------------
 
@@ -89,7 +98,7 @@ class RecordingFile:
             if stat.S_ISDIR(existing.st_mode):
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
             self._regular = False  # a device or a pipe: nothing to keep, cut back or lock
-            self._fd = os.open(self._target, os.O_WRONLY | os.O_CLOEXEC)
+            self._fd = self._open_device()
             return
         self._refuse_company(self._part)
         if existing is None:
@@ -99,7 +108,7 @@ class RecordingFile:
             self._lock(self._fd, fcntl.LOCK_EX)
             return
         self._refuse_company(self._target)
-        fd = os.open(self._part, _CREATE, 0o666)
+        fd = self._open_beside()
         try:
             self._lock(fd, fcntl.LOCK_EX)
             # the lock may be that of a file which has got its name meanwhile
@@ -107,9 +116,10 @@ class RecordingFile:
             if now is None or now.st_ino != os.fstat(fd).st_ino:
                 raise self._busy()
             self._refuse_company(self._target)
-            if _holds_messages(fd):
+            if _is_worth_keeping(fd):
                 raise UsageError(
-                    f"{self._part} holds messages of a recorder that was killed",
+                    f"{self._part} holds messages of a recorder that was killed, "
+                    "or is no recording",
                     hint="rename it (dexkit info tells what is in it) or delete it",
                 )
             os.ftruncate(fd, 0)
@@ -119,6 +129,32 @@ class RecordingFile:
             os.close(fd)
             raise
         self._fd, self._hidden = fd, True
+
+    def _open_device(self) -> int:
+        """Open what is no file. A pipe that nobody reads is refused, not waited for."""
+        try:
+            fd = os.open(self._target, os.O_WRONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno == errno.ENXIO:
+                raise TraceError(
+                    f"cannot write to {self.path}: no program reads it",
+                    hint="start the reader first",
+                ) from error
+            raise
+        os.set_blocking(fd, True)
+        return fd
+
+    def _open_beside(self) -> int:
+        """Open ``.part``. Others may have put something there: a link is not followed."""
+        try:
+            fd = os.open(self._part, _BESIDE, 0o666)
+            if stat.S_ISREG(os.fstat(fd).st_mode):
+                return fd
+            os.close(fd)
+        except OSError as error:
+            if error.errno not in (errno.ELOOP, errno.EISDIR):
+                raise
+        raise UsageError(f"{self._part} is not a file", hint="rename it or delete it")
 
     def _lock(self, fd: int, how: int) -> None:
         for pause in (*_RETRIES, None):
@@ -218,6 +254,9 @@ class RecordingFile:
         :raises OSError: the disk is full, for example.
         """
         data, self._buffer, self._buffered = b"".join(self._buffer), [], 0
+        if not data:
+            return
+        self._look()
         view = memoryview(data)
         done = 0
         try:
@@ -229,24 +268,63 @@ class RecordingFile:
                     os.ftruncate(self._fd, self._size)
             raise
         self._size += len(view)
+        self._crc = zlib.crc32(view, self._crc)
+        if self._regular:
+            self._changed_ns = os.fstat(self._fd).st_mtime_ns
+
+    def _look(self) -> None:
+        """Remember whether another program has written to the file."""
+        if self._regular and self._size and not self._touched:
+            self._touched = os.fstat(self._fd).st_mtime_ns != self._changed_ns
 
     def check(self) -> None:
         """See whether it is still there.
 
-        :raises TraceError: it was deleted: what is written goes nowhere.
+        :raises TraceError: it was deleted: what is written goes nowhere. Or it was cut.
         """
         if not self._regular:
             return
-        if os.fstat(self._fd).st_nlink == 0:
+        status = os.fstat(self._fd)
+        if status.st_nlink == 0:
             raise TraceError(
                 f"{self._part if self._hidden else self.path} was deleted while it was recorded",
                 hint="what was recorded is lost",
             )
+        if status.st_size != self._size:
+            raise self._changed()
         if not self._hidden and not self.displaced and not self._is_at(self._target, self._fd):
             self.displaced = (
                 f"{self.path} was renamed or replaced while it was recorded; "
                 "the recording has another name now"
             )
+
+    def verify(self) -> None:
+        """See whether it holds what was committed.
+
+        It is read only if it has another time of change than after the last commit: a second
+        look at a long recording would keep its end waiting.
+
+        :raises TraceError: another program has written into it.
+        """
+        self._look()
+        if not self._touched:
+            return
+        crc = at = 0
+        while at < self._size:
+            block = os.pread(self._fd, min(_BLOCK, self._size - at), at)
+            if not block:
+                break
+            crc = zlib.crc32(block, crc)
+            at += len(block)
+        if at != self._size or crc != self._crc:
+            raise self._changed()
+
+    def _changed(self) -> TraceError:
+        return TraceError(
+            f"{self._part if self._hidden else self.path} was changed by another program "
+            "while it was recorded",
+            hint="dexkit info tells what can be read of it, if anything",
+        )
 
     def _is_at(self, path: Path, fd: int) -> bool:
         there, here = _status(path), os.fstat(fd)
@@ -323,17 +401,16 @@ def _status(path: Path) -> os.stat_result | None:
         return None
 
 
-def _holds_messages(fd: int) -> bool:
-    """Whether an unfinished recording has a chunk, or is something else altogether."""
+def _is_worth_keeping(fd: int) -> bool:
+    """Whether it is anything but a recording that ended before its first message."""
     size = os.fstat(fd).st_size
-    if size < len(_MAGIC):
-        return False
-    if os.pread(fd, len(_MAGIC), 0) != _MAGIC:
+    start = os.pread(fd, len(_MAGIC), 0)
+    if not _MAGIC.startswith(start):
         return True
     at = len(_MAGIC)
     while at + _RECORD.size <= size:
         operation, length = _RECORD.unpack(os.pread(fd, _RECORD.size, at))
-        if operation == _CHUNK:
+        if operation not in (_HEADER, _SCHEMA, _CHANNEL, _METADATA):
             return True
         at += _RECORD.size + length
     return False
