@@ -1,7 +1,8 @@
-"""The kit's own clients after a pause of theirs: nothing that fell due meanwhile goes out at once."""
+"""The kit's own clients after a pause: nothing that fell due meanwhile goes out at once."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import pytest
@@ -68,8 +69,8 @@ def test_the_kit_holds_the_session_while_it_stands_still() -> None:
     times = [now for _, now, _ in rows]
     calm = [row for row in driven("replay", -1) if row[0] == "replay"]
     assert len(rows) == len(calm)
-    expected = [b - a for (_, a, _), (_, b, _) in zip(calm, calm[1:], strict=False)]
-    found = [b - a for a, b in zip(times, times[1:], strict=False)]
+    expected = [b - a for (_, a, _), (_, b, _) in itertools.pairwise(calm)]
+    found = [b - a for a, b in itertools.pairwise(times)]
     assert [i for i, (a, b) in enumerate(zip(expected, found, strict=True)) if a != b] in ([99], [])
     assert sum(found) >= sum(expected) + 2_900_000_000
 
@@ -78,7 +79,7 @@ def test_the_kit_does_not_leap_on_its_first_way() -> None:
     rows = [row for row in driven("approach", 20) if row[0] == "approach"]
     for side in ("left", "right"):
         q = positions(rows, side)
-        assert max(abs(b - a) for a, b in zip(q, q[1:], strict=False)) <= 0.6 * 5.4 * 0.25 + 1e-6
+        assert max(abs(b - a) for a, b in itertools.pairwise(q)) <= 0.6 * 5.4 * 0.25 + 1e-6
 
 
 def test_a_client_that_begins_again_knows_nothing_of_before() -> None:

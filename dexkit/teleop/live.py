@@ -192,6 +192,8 @@ class LiveClient:
             session.note(session.states, now - start, self._read(now))
             inputs = operator.inputs(now - start, self._client.sides)
             commands = self._client.step(now, {}, inputs)
+            if self._watch.away() > PAUSE:  # they were made before a pause
+                continue
             self._send(commands)
             session.note(
                 session.commands,
@@ -243,8 +245,9 @@ class LiveClient:
             time.sleep(self._client.period)
 
     def _send(self, commands: Mapping[Side, Sequence[JointCommand]]) -> None:
+        now_ns = time.time_ns()  # a command that a stop holds back here is old, and is seen to be
         for topic, payload in self._wire.encode(commands):
-            self._writers[topic].write_raw(payload)
+            self._writers[topic].write_raw(payload, now_ns)
 
     def _read(self, now: float) -> dict[Side, Pose]:
         """What has come; it is handed to the client."""
