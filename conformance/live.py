@@ -38,6 +38,7 @@ from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.wire import Wire
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
+from dexkit.freshness import PauseWatch
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.sole import Place, SolePublisher
@@ -227,6 +228,7 @@ class _Driver:
     def __enter__(self) -> _Driver:
         self._wire = wire_for(self.plan.dialect)
         self._clock = RealClock()
+        self._watch = PauseWatch(self._clock)
         # wall clock, as recordings have it, on a monotonic footing
         self._offset = time.time_ns() - round(self._clock.now() * 1e9)
         self._client: _Client | None = self._new_client()
@@ -288,8 +290,9 @@ class _Driver:
         sender = self._client if action.by is None else self._others[action.by]
         assert isinstance(sender, _Client)
         stamp = None if not action.age_s else time.time_ns() - round(action.age_s * 1e9)
-        for topic, payload in action.payloads:
-            sender.send(topic, payload, stamp)
+        if not self._watch.look():  # or the kit stood still since it made up its mind
+            for topic, payload in action.payloads:
+                sender.send(topic, payload, stamp)
         self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
 
     def _new_client(self, type_name: str | None = None) -> _Client:
@@ -341,6 +344,7 @@ class _Driver:
                 else:
                     other.look()
         machine = self._wire.machine
+        self._watch.restart()
         return Observation(self.now_ns, q, dq, joined, self._stopped, machine)
 
 

@@ -4,6 +4,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -157,3 +158,77 @@ def test_in_real_time_no_message_is_early() -> None:
     stats = player.play(lambda message: sent.append(time.monotonic() - begin))
     assert stats.sent == len(sent) == 7278
     assert all(at >= due for at, due in zip(sent, player.offsets, strict=True))
+
+
+@pytest.mark.parametrize("suspended", [False, True], ids=["stopped", "suspended"])
+@pytest.mark.parametrize("at", ["while sending", "in a gap"])
+def test_what_fell_due_in_a_pause_is_not_sent_at_once(
+    tmp_path: Path, suspended: bool, at: str
+) -> None:
+    clock = ManualClock()
+    log = Log(clock)
+    told: list[float] = []
+
+    def stand_still() -> None:
+        (clock.suspend if suspended else clock.advance)(3.0)
+
+    class Gap(ManualClock):
+        stood = False
+
+        def sleep_until(self, deadline: float) -> None:
+            super().sleep_until(deadline)
+            if at == "in a gap" and not self.stood and self.now() > 0.5:
+                self.stood = True
+                stand_still()
+
+    clock = log.clock = Gap()
+
+    def publish(message: TraceMessage) -> None:
+        log(message)
+        if at == "while sending" and len(log.rows) == 3:
+            stand_still()
+
+    times_ms = [0.0, 10.0, 20.0, *(1000.0 + 10 * i for i in range(400))]
+    stats = Player(open_trace(trace_of(tmp_path, times_ms))).play(
+        publish, clock, paused=told.append
+    )
+    assert told == [pytest.approx(3.0, abs=0.03)]
+    assert (stats.sent, stats.pauses) == (len(times_ms), 1)
+    recorded = np.diff(times_ms) / 1e3
+    gaps = np.diff(log.times)
+    if not suspended:
+        recorded[2] += 3.0
+    assert gaps == pytest.approx(recorded, abs=0.05)  # the nap that was interrupted
+    assert np.delete(gaps, 2) == pytest.approx(np.delete(recorded, 2), abs=1e-6)
+    assert stats.error_max < 1e-6
+
+
+def test_a_listener_that_blocks_makes_no_backlog(tmp_path: Path) -> None:
+    """Each message takes longer than its distance; none goes out much later than is said."""
+    clock = ManualClock()
+    log = Log(clock)
+
+    def publish(message: TraceMessage) -> None:
+        log(message)
+        clock.advance(0.1)
+
+    paused: list[float] = []
+    path = trace_of(tmp_path, [i * 5.0 for i in range(100)] + [1000.0 + i * 200 for i in range(5)])
+    stats = Player(open_trace(path)).play(publish, clock, paused=paused.append)
+    assert stats.error_max <= 0.25
+    assert paused == []
+    assert np.diff(log.times)[-4:] == pytest.approx([0.2] * 4)
+
+
+def test_a_pause_ends_with_what_is_to_be_looked_at_first(tmp_path: Path) -> None:
+    clock = ManualClock()
+    log = Log(clock)
+    stop = threading.Event()
+
+    def publish(message: TraceMessage) -> None:
+        log(message)
+        clock.advance(1.0)
+
+    player = Player(open_trace(trace_of(tmp_path, [0, 10, 20])))
+    stats = player.play(publish, clock, stop, paused=lambda seconds: stop.set())
+    assert (stats.sent, stats.stopped, stats.pauses) == (1, True, 1)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,10 @@ from dexkit.cli import cli
 from dexkit.conformance.view import Recording
 from dexkit.dds import DdsNode
 from dexkit.errors import DexkitError, UsageError
+from dexkit.freshness import PAUSE
 from dexkit.hand import Side
+from dexkit.messages import message_type
+from dexkit.messages.unitree_go import MotorCmd_
 from dexkit.models import DIALECTS
 from dexkit.processes import command_line
 from dexkit.teleop import profile
@@ -168,6 +172,54 @@ def test_when_interrupted_it_locks_a_dex3_where_it_is(dex3: int) -> None:
             assert process.wait(60) == 130
             assert process.stderr is not None
             assert "Traceback" not in process.stderr.read()
+
+
+def test_after_a_stop_it_begins_where_the_hand_is_now(dex1: int, tmp_path: Path) -> None:
+    spoken = DIALECTS["unitree_go"]
+    cmd, state = spoken.topics(LEFT)
+    with DdsNode(domain=dex1, interface="lo") as node:
+        reader = node.reader(cmd, spoken.cmd_type)
+        states = node.reader(state, spoken.state_type)
+        with (
+            (tmp_path / "said").open("w+") as said,
+            subprocess.Popen(
+                [
+                    *TELEOP,
+                    "full-stroke",
+                    "--side",
+                    "left",
+                    "--domain",
+                    str(dex1),
+                    "--duration",
+                    "90",
+                ],
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+            ) as process,
+            ExitStack() as stack,
+        ):
+            stack.callback(process.kill)
+            take_until(reader, lambda samples: len(samples) > 3, 60)
+            process.send_signal(signal.SIGSTOP)
+            writer = node.writer(cmd, spoken.cmd_type)
+            writer.wait_matched(8)
+            there = message_type(spoken.cmd_type).cls([MotorCmd_(q=5.2, kp=5.0, kd=0.05)])
+            q, end = 0.0, time.monotonic() + 2 * PAUSE
+            while (
+                q < 5.0 or time.monotonic() < end
+            ):  # somebody else moves the hand meanwhile, and goes again
+                writer.write(there)
+                newest = take_until(states, bool, 8)
+                q = newest[-1].message.states[0].q
+            writer.close()
+            reader.take()
+            process.send_signal(signal.SIGCONT)
+            first = take_until(reader, bool, 60)[0]
+            assert first.message.cmds[0].q > 4.5
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 130
+            said.seek(0)
+            assert "stood still for" in said.read()
 
 
 def test_the_profiles_are_listed_without_any_hand() -> None:

@@ -3,6 +3,11 @@
 Each message has its deadline from the start of the pass, so lateness of one never delays the
 next. Gaps are kept unless capped. What is to be played is loaded beforehand (about 150 bytes a
 message beside its payload), so that no chunk is unpacked between two deadlines.
+
+**After a pause of the player itself** (stopped, suspended, starved; more than
+:data:`~dexkit.freshness.PAUSE`) nothing that fell due meanwhile is sent at once: it would be sent
+with the time of now, so that no hand could tell that it is old. The time line is held instead: the
+recording goes on where it was left. So it does when publishing itself cannot keep up.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import numpy as np
 
 from dexkit.clock import Clock, RealClock, wait_until
 from dexkit.errors import UsageError
+from dexkit.freshness import PAUSE, PauseWatch
 from dexkit.traces.names import select_topics
 from dexkit.traces.reader import Trace, TraceMessage
 
@@ -37,6 +43,7 @@ class PlayStats:
     :param passes: complete passes over the recording.
     :param stopped: it was stopped before its end.
     :param duration: seconds from the first deadline to the end.
+    :param pauses: times that the player itself stood still.
     """
 
     sent: int
@@ -47,6 +54,7 @@ class PlayStats:
     error_p99: float
     error_max: float
     per_topic: dict[str, int] = field(default_factory=dict)
+    pauses: int = 0
 
 
 class Player:
@@ -125,11 +133,14 @@ class Player:
         publish: Callable[[TraceMessage], object],
         clock: Clock | None = None,
         stop: threading.Event | None = None,
+        paused: Callable[[float], object] = lambda seconds: None,
     ) -> PlayStats:
         """Call ``publish`` with each message at its time.
 
         :param stop: ends the play-back when set; nothing is published after it is noticed,
             which takes at most 50 ms.
+        :param paused: told after each pause of the player how long that was. The recording goes
+            on when it returns.
         """
         clock = clock if clock is not None else RealClock()
         stop = stop if stop is not None else threading.Event()
@@ -137,16 +148,14 @@ class Player:
         counts: Counter[str] = Counter()
         self.sent = 0
         passes = 0
-        started = start = clock.now()
+        line = _TimeLine(clock, stop, paused)
+        started = clock.now()
         while not stop.is_set():
             for offset, message in zip(self._offsets, self._messages, strict=True):
-                deadline = start + offset
-                while deadline - clock.now() > _NAP and not stop.is_set():
-                    clock.sleep_until(min(deadline, clock.now() + _NAP / 2))
-                if stop.is_set():
+                late = line.reach(offset)
+                if late is None:
                     break
-                wait_until(clock, deadline, spin=SPIN)
-                errors.append(clock.now() - deadline)
+                errors.append(late)
                 publish(message)
                 counts[message.topic] += 1
                 self.sent += 1
@@ -154,7 +163,7 @@ class Player:
                 passes += 1
                 if not self.loop:
                     break
-                start += self.duration + self._pause
+                line.start += self.duration + self._pause
         p50, p99, worst = np.percentile(errors, (50, 99, 100)) if errors else (0.0, 0.0, 0.0)
         return PlayStats(
             sent=self.sent,
@@ -165,4 +174,53 @@ class Player:
             error_p99=float(p99),
             error_max=float(worst),
             per_topic=dict(counts),
+            pauses=line.pauses,
         )
+
+
+class _TimeLine:
+    """When each message of a pass is due; held while the player stands still.
+
+    :ivar start: when the pass began, or would have without pauses.
+    """
+
+    def __init__(
+        self, clock: Clock, stop: threading.Event, paused: Callable[[float], object]
+    ) -> None:
+        self._clock = clock
+        self._stop = stop
+        self._paused = paused
+        self._watch = PauseWatch(clock)
+        self._watch.restart()
+        self._seen = self.start = clock.now()
+        self.pauses = 0
+
+    def reach(self, offset: float) -> float | None:
+        """Wait for a message's time; seconds by which it is late, None when stopped."""
+        clock, stop = self._clock, self._stop
+        while True:
+            self._look()
+            left = self.start + offset - clock.now()
+            if stop.is_set():
+                return None
+            if left < -PAUSE:  # nobody stood still, but publishing does not keep up
+                self.start -= left
+                return 0.0
+            if left <= 0:
+                return -left
+            if left > _NAP:
+                clock.sleep_until(clock.now() + _NAP / 2)
+            else:
+                wait_until(clock, self.start + offset, spin=SPIN)
+
+    def _look(self) -> None:
+        """Notice a pause, and move what is still to come behind it."""
+        away = self._watch.look()
+        if away:
+            self.pauses += 1
+            self._paused(away)
+            self._watch.restart()
+        now = self._clock.now()
+        if away:  # not by ``away``: in suspend, the clock of the deadlines stands still as well
+            self.start += now - self._seen
+        self._seen = now

@@ -49,6 +49,7 @@ from dexkit.conformance.stimuli.script import (
     Steps,
 )
 from dexkit.conformance.wire import Motor, Motors
+from dexkit.freshness import PAUSE
 from dexkit.hand import Side
 
 __all__ = ["STEP", "BodyScript"]
@@ -195,10 +196,12 @@ class BodyScript(Script):
     def _ramp(self, goals: dict[int, float], seconds: float) -> Steps:
         """Lead joints to where they are to be."""
         start = {slot: self._order[slot].q for slot in goals}
-        begin = self._obs.now_ns
-        part = 0.0
+        seen, reached, part = self._obs.now_ns, 0.004, 0.0
         while part < 1.0:
-            part = min(1.0, ((self._obs.now_ns - begin) * 1e-9 + 0.004) / seconds)
+            now = self._obs.now_ns
+            # no leap to where it would be if the kit had not stood still
+            reached, seen = reached + min((now - seen) * 1e-9, PAUSE), now
+            part = min(1.0, reached / seconds)
             for slot, goal in goals.items():
                 q = start[slot] + part * (goal - start[slot])
                 self._order[slot] = replace(self._order[slot], q=q)

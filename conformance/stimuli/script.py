@@ -15,6 +15,7 @@ from dexkit.conformance.stimuli.operator import OPERATOR, operate
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import joints_of
 from dexkit.conformance.wire import Motor, Motors, Wire
+from dexkit.freshness import PAUSE
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, model
 
@@ -390,8 +391,11 @@ class Script(ABC):
         phase = self._begin("approach", self.plan.sides)
         home = {s: self._home(s) for s in self.plan.sides}
         start = {s: self._obs.q.get(s, home[s]) for s in self.plan.sides}
+        reach, seen = 0.0, self._elapsed(phase)
         while True:
-            reach = 0.6 * self._elapsed(phase)
+            now = self._elapsed(phase)
+            # the hand must not be told to leap to where it would be if the kit had not stood still
+            reach, seen = reach + 0.6 * min(now - seen, PAUSE), now
             self._goal = {
                 s: tuple(
                     q + max(-reach * j.stroke, min(reach * j.stroke, end - q))
@@ -434,6 +438,10 @@ class Script(ABC):
         phase = self._begin("replay", sides, session=session.name)
         start = self._obs.now_ns
         for i, (at, motors) in enumerate(timeline):
+            late = self._obs.now_ns - start - at
+            if late > PAUSE * 1e9:  # sent at once, what fell due would be the hand's wild motion
+                self._say(f"this program stood still for {late / 1e9:.2f} s; the session is held")
+                start += late
             newest.update(motors)
             payloads = self._wire.encode(newest if self._wire.shared else motors)
             later = timeline[i + 1][0] if i + 1 < len(timeline) else at + self._period_ns

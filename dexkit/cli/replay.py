@@ -83,8 +83,9 @@ def command(
     """Publish the commands in a recording on DDS, with their recorded timing.
 
     Waits until each topic is subscribed, then plays. Refuses to play while somebody else
-    publishes on the same topics, and ends when somebody comes who does. The default domain is 1,
-    the simulation's: --domain 0 with a robot's interface moves real hands.
+    publishes on the same topics, and ends when somebody comes who does. After a pause of its own
+    (Ctrl-Z, suspend) it goes on where it was left. The default domain is 1, the simulation's:
+    --domain 0 with a robot's interface moves real hands.
 
     Exit code: 0 all is sent (or a loop was stopped), 1 the recording is damaged (what can be read
     of it is sent) or the topics are not free, 2 it cannot be read, 130 stopped.
@@ -127,16 +128,27 @@ def command(
         with _smooth(), _status(player):
 
             def send(message: TraceMessage) -> object:
+                # stamped first: a command that a stop holds back here is old, and is seen to be
+                now_ns = time.time_ns()
                 sole.poll()
-                return writers[message.topic].write_raw(message.data)
+                return writers[message.topic].write_raw(message.data, now_ns)
 
-            stats = player.play(send, stop=stop.event)
+            def paused(seconds: float) -> None:
+                click.echo(
+                    f"this program stood still for {seconds:.2f} s; the recording goes on where it "
+                    "was left",
+                    err=True,
+                )
+                stop.wait(_SETTLE)  # whoever has come meanwhile is discovered first
+
+            stats = player.play(send, stop=stop.event, paused=paused)
         time.sleep(_LINGER)
     click.echo(
         f"sent {stats.sent} messages in {stats.duration:.1f} s"
         + (f", {stats.passes} passes" if loop else "")
         + f"; late by {stats.error_p50 * 1e3:.3f} ms (p50), {stats.error_p99 * 1e3:.3f} ms (p99), "
         f"{stats.error_max * 1e3:.3f} ms (max)"
+        + (f"; stood still {stats.pauses} times" if stats.pauses else "")
     )
     # for a loop, being stopped is the ordinary end
     if stats.stopped and not loop:

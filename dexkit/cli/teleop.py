@@ -160,6 +160,11 @@ def command(
             show.clear()
             live.leave()
         stopped = bool(stop)
+    for at, seconds_away in session.pauses:
+        _say(
+            f"this program stood still for {seconds_away:.2f} s, {at:.1f} s after the beginning; "
+            "figures of then are not the hand's"
+        )
     _report(session, operator, 1 / client.period, as_json=as_json)
     silent = [] if stopped else _silent(session, seconds)
     for side in silent:

@@ -132,6 +132,11 @@ class StateReceiver:
         """The sides that the next read brings."""
         return self._reads[self._at]
 
+    def forget(self) -> None:
+        """As if nothing had come yet."""
+        self._kept, self._seen, self._held, self.latest = {}, {}, {}, {}
+        self._at = 0
+
     def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
         """A message came, of one side or of both.
 
@@ -171,6 +176,10 @@ class StickyFilter:
 
     def __init__(self, weights: Sequence[float] = WEIGHTS) -> None:
         self._weights = tuple(reversed(weights))  # oldest first, as the values
+        self.forget()
+
+    def forget(self) -> None:
+        """As if no value had been put in yet."""
         self._recent: deque[Pose] = deque(maxlen=len(self._weights))
         self._output: Pose = ()
 
@@ -217,7 +226,9 @@ class TeleopClient(ABC):
     @property
     def ready(self) -> bool:
         """Whether it has seen the states that it waits for, and sends commands."""
-        if not self._ready and len(self.receiver.latest) == len(self.sides):
+        if len(self.receiver.latest) < len(self.sides):
+            return False
+        if not self._ready:
             self._ready = self._may_start(self.receiver.latest)
         return self._ready
 
@@ -231,6 +242,13 @@ class TeleopClient(ABC):
         if found:
             return found
         return {s: "every q is exactly 0" for s in self.sides if not any(latest[s])}
+
+    def begin_again(self) -> None:
+        """Forget every state, and what was made of them; the operator's targets stay.
+
+        For after a pause of the caller. The genuine client does not; it is restarted.
+        """
+        self.receiver.forget()
 
     def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
         """A state message came: q of the joints of the side, or sides, that are in it.
@@ -311,6 +329,12 @@ class Dex1Client(TeleopClient):
         self._lead = lead * self._scale
         self._filter = StickyFilter() if smooth else None
         self._targets = dict.fromkeys(self.sides, spoken.q_open / 2)
+
+    def begin_again(self) -> None:
+        """As in the base class; the values that are smoothed are states, too."""
+        super().begin_again()
+        if self._filter is not None:
+            self._filter.forget()
 
     @property
     def targets(self) -> Mapping[Side, float]:

@@ -4,6 +4,11 @@ It takes the genuine client's place: its quality of service, its rate (each peri
 so the mean is some 2 % below the nominal one), its order of reading and writing. It differs where
 the genuine one would be a nuisance: it waits until the hand listens before its first command, and
 it leaves the hand at rest (:meth:`LiveClient.leave`).
+
+It differs after a pause of its own, too (stopped, suspended, starved; more than
+:data:`~dexkit.freshness.PAUSE`). The genuine client would go on by what it last read, or by where
+the operator is by now. This one is silent until each hand has told where it is *now*, forgets what
+it smoothed, and lets the operator go on where he was.
 """
 
 from __future__ import annotations
@@ -16,8 +21,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexkit.clock import RealClock
 from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
+from dexkit.freshness import PAUSE, SETTLE, PauseWatch
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
 from dexkit.sole import Place, SolePublisher
@@ -34,9 +41,13 @@ _NAP = 0.1
 
 @dataclass
 class Session:
-    """What was sent and seen, in seconds from the operator's beginning."""
+    """What was sent and seen, in seconds from the operator's beginning, without pauses.
+
+    :ivar pauses: when the client stood still, and for how many seconds.
+    """
 
     sides: tuple[Side, ...]
+    pauses: list[tuple[float, float]] = field(default_factory=list)
     commands: dict[Side, list[tuple[float, Pose]]] = field(default_factory=dict)
     states: dict[Side, list[tuple[float, Pose]]] = field(default_factory=dict)
 
@@ -94,6 +105,7 @@ class LiveClient:
         self._client = client
         self._wire = ClientWire(client.dialect)
         self._arrived = threading.Event()
+        self._watch = PauseWatch(RealClock())
         dialect: Dialect = client.dialect
         commands = dict.fromkeys(self._wire.command_topics[s] for s in client.sides)
         states = dict.fromkeys(self._wire.state_topics[s] for s in client.sides)
@@ -157,20 +169,31 @@ class LiveClient:
     ) -> Session:
         """Let the operator perform for so many seconds, or until stopped.
 
+        After a pause of this program the operator goes on where he was.
+
         :param progress: told about twice a second.
         """
         session = Session(self._client.sides)
         period = self._client.period
-        start = time.monotonic()
-        told = start
+        start = told = seen = time.monotonic()
+        self._watch.restart()
         while not stop.is_set():
-            now = time.monotonic()
+            away = self._watch.look()
+            if away:
+                session.pauses.append((seen - start, away))
+                self._come_back(stop)
+                start += time.monotonic() - seen
+                seen = time.monotonic()
+                continue
+            now = seen = time.monotonic()
             if now - start >= duration:
                 break
             self._sole.poll()
             session.note(session.states, now - start, self._read(now))
             inputs = operator.inputs(now - start, self._client.sides)
             commands = self._client.step(now, {}, inputs)
+            if self._watch.away() > PAUSE:  # they were made before a pause
+                continue
             self._send(commands)
             session.note(
                 session.commands,
@@ -183,6 +206,20 @@ class LiveClient:
             self._sleep(now + period, start, session)
         return session
 
+    def _come_back(self, stop: threading.Event) -> None:
+        """After a pause: what has waited is thrown away, then each hand must say where it is."""
+        stop.wait(SETTLE)  # for what has waited, and for whoever has come meanwhile
+        self._sole.poll()
+        for reader in self._readers.values():
+            reader.take()
+        self._client.begin_again()
+        while not (stop.is_set() or self._client.ready):
+            self._sole.poll()
+            self._arrived.wait(_NAP)
+            self._arrived.clear()
+            self._read(time.monotonic())
+        self._watch.restart()
+
     def leave(self) -> None:
         """Leave the hands at rest: what the genuine client does not do.
 
@@ -190,18 +227,27 @@ class LiveClient:
         Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
         to stay where it is, a Dex3-1 or Dex5-1 with its motors locked (status 0 of the mode byte).
         """
+        if self._watch.away() > PAUSE:  # ended in a pause: the hands may be elsewhere by now
+            time.sleep(SETTLE)
+            for reader in self._readers.values():
+                reader.take()
+            self._client.begin_again()
+            time.sleep(SETTLE)
+            self._read(time.monotonic())
         if self._sole.lost:  # somebody else commands them now
             return
         poses = self._client.receiver.seen
         stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
+        self._watch.restart()
         end = time.monotonic() + _LEAVING
-        while stay and time.monotonic() < end:
+        while stay and time.monotonic() < end and not self._watch.look():
             self._send(stay)
             time.sleep(self._client.period)
 
     def _send(self, commands: Mapping[Side, Sequence[JointCommand]]) -> None:
+        now_ns = time.time_ns()  # a command that a stop holds back here is old, and is seen to be
         for topic, payload in self._wire.encode(commands):
-            self._writers[topic].write_raw(payload)
+            self._writers[topic].write_raw(payload, now_ns)
 
     def _read(self, now: float) -> dict[Side, Pose]:
         """What has come; it is handed to the client."""
