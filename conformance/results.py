@@ -27,7 +27,6 @@ from typing import Any
 
 from dexkit import __version__, documents
 from dexkit.conformance.requirements import Level, Requirement
-from dexkit.conformance.requirements.sources import told
 from dexkit.errors import UsageError
 from dexkit.untrusted import REMARK, one_line
 
@@ -186,7 +185,7 @@ class Result:
             if self.cause:
                 say("cause", self.cause)
             say("try", self.requirement.advice)
-            say("source", told(self.requirement.source))
+            say("source", self.requirement.source)
         return "\n".join(lines)
 
 

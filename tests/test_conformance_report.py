@@ -19,7 +19,6 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.plots import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import mutants as usb_mutants
 from dexkit.conformance.usb.judge import judge_usb
@@ -129,7 +128,7 @@ def test_every_verdict_is_rendered_from_the_result_alone() -> None:
     failed = next(r for r in result.results if r.verdict is Verdict.FAIL)
     need = failed.requirement
     card = page[page.index(f'id="card-{need.id}"') :].partition("</article>")[0]
-    who = told(need.source).partition(" (")[0]
+    who = need.source.partition(" (")[0]
     for text in (need.sentence, failed.observed, need.advice, who, need.confidence):
         assert escape(text) in card
     assert "1.250 s to 1.500 s" in card

@@ -25,7 +25,6 @@ from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.report.wording import VERDICTS
-from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import RunResult, Verdict, read_json
 from dexkit.conformance.session import SuiteOptions, judge_recording
 from dexkit.conformance.view import Recording
@@ -46,7 +45,7 @@ def test_markdown_tells_every_verdict_and_each_failure_wholly() -> None:
         assert VERDICTS[verdict].mark in text
     failed = next(r for r in result.results if r.verdict is Verdict.FAIL)
     need = failed.requirement
-    for part in (need.sentence, failed.observed, failed.cause, need.advice, told(need.source)):
+    for part in (need.sentence, failed.observed, failed.cause, need.advice, need.source):
         assert plain(part) in text
     assert "rt/plain words` at 1.250 s to 1.500 s, log time `1700000001250000000`" in text
     assert "left hand reached: **moving**" in text

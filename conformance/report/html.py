@@ -30,7 +30,6 @@ from dexkit.conformance.report.wording import (
     whose,
 )
 from dexkit.conformance.requirements import CAPABILITIES, Requirement
-from dexkit.conformance.requirements.sources import Section, linked, told
 from dexkit.conformance.results import (
     Evidence,
     Overall,
@@ -428,13 +427,8 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
 
 
 def _source(need: Requirement) -> str:
-    """Who says so; the codes of its sections explain themselves."""
-
-    def explained(code: str, section: Section) -> str:
-        return f'<abbr title="{escape(section.title)}: {escape(section.names)}">{code}</abbr>'
-
-    text = linked(escape(told(need.source), quote=False), explained)
-    return f"{text} (confidence: {escape(need.confidence)})"
+    """Who says so, and how sure that is."""
+    return f"{escape(need.source, quote=False)} (confidence: {escape(need.confidence)})"
 
 
 def _cell(result: Result) -> str:
@@ -506,7 +500,7 @@ def _glossary(result: RunResult) -> str:
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
         ("tau_est, N m", "torque that the motor feels: what the hand knows of touch."),
         ("not applicable", "this recording or hand gave no occasion for it; the row says why."),
-        ("docs/sources.md", "dexkit's list of documents and measurements, by section (A.1)."),
+        ("docs/sources", "pages of dexkit with the facts, documents and measurements, by section."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]
     if result.claims is not None:

@@ -22,7 +22,6 @@ from dexkit.conformance.report.wording import (
     whose,
 )
 from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.untrusted import REMARK, one_line
 
@@ -141,7 +140,7 @@ def _card(need: Requirement, group: Sequence[Result]) -> list[str]:
     lines += [f"- likely cause: {plain(cause)}" for _, cause in causes(list(group))]
     lines += [
         f"- try: {plain(need.advice)}",
-        f"- source: {plain(told(need.source))} ({plain(need.confidence)})",
+        f"- source: {plain(need.source)} ({plain(need.confidence)})",
         "",
     ]
     return lines

@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 from dexkit.conformance.report.wording import about_harness, causes
-from dexkit.conformance.requirements.sources import told
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape
@@ -137,7 +136,7 @@ def _lines(group: Sequence[Result]) -> Iterator[tuple[str, str]]:
         yield "cause", f"{sides}: {cause}" if len(found) > 1 else cause
     if group[0].verdict is not Verdict.ERROR:
         yield "try", need.advice
-        yield "source", f"{told(need.source)} ({need.confidence})"
+        yield "source", f"{need.source} ({need.confidence})"
 
 
 def _hung(console: Console, head: str, text: str) -> str:

@@ -5,17 +5,19 @@ requirement only the differences are told.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from dexkit.conformance.requirements import Requirement, catalogue, renamed
-from dexkit.conformance.requirements.sources import PAGE, anchor, linked, told
 
 __all__ = ["BEGIN", "END", "PAGES", "catalogue_page", "entry"]
 
 BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
 END = "<!-- end of catalogue -->"
 
+
+_CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z])([\d-]*))")
 
 PAGES = {"dds": "conformance.md", "body": "conformance-body.md"}
 """The page of each layer that is written here, in docs."""
@@ -77,9 +79,13 @@ def _told_of(requirement: Requirement) -> set[str]:
 
 
 def _source(requirement: Requirement) -> str:
-    """Who says so, with links to the list of sources."""
-    text = told(requirement.source).replace(f"{PAGE} ", "")
-    return linked(text, lambda code, _: f"[{code}](sources.md#{anchor(code)})")
+    """Who says so, with a link for each citation of docs/sources."""
+
+    def link(match: re.Match[str]) -> str:
+        target, letter, number = match.groups()
+        return f"[{letter.upper()}{'.' if number else ''}{number}]({target})"
+
+    return _CITED.sub(link, requirement.source)
 
 
 def _needs(requirement: Requirement) -> str:

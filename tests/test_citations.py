@@ -1,0 +1,158 @@
+"""Every citation can be followed: of the facts in docs/sources, and between the pages of docs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+from dexkit.conformance.requirements import catalogue
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ROOT / "docs" / "sources"
+
+CITATION = re.compile(r"(docs/[\w./-]+\.md)#([\w-]+)")
+INTERNAL = re.compile(
+    r"\bfacts/|\bfacts (?:[A-G]\b|\w+ [A-G]\.?\d)|\bfact sheet"  # what only the authors could read
+    r"|\bseed \d{3}\b|\bS00\d\b"
+    r"|(?<![\w[.#-])[A-G]\.\d{1,2}\b(?![.\d])"  # a section without its page
+    r"|\bF [A-G]\b(?! [A-G0-9]{1,2}\b)|\bD \d{1,2}\b|\((?:D10 \d+|[A-F]\d{1,2})[):;,]"
+)
+"""Fact sheets, numbered documents and bare section codes: of no use to anyone outside."""
+
+PROSE = (".py", ".toml", ".md", ".idl", ".c", ".h", ".sh", ".yml", ".yaml", ".html", "Makefile")
+MESSAGES = re.compile(r"@final struct \w+ \{.*")  # IDL in tests, whose struct is called F
+CODE = re.compile(r"(?ms)^```.*?^```$|`[^`\n]+`")
+LINK = re.compile(r"(?<!!)\[[^]]*\]\(<?([^)\s>]+)>?\)|!\[[^]]*\]\(([^)\s]+)\)")
+
+
+@cache
+def texts() -> dict[str, str]:
+    """Every text file that belongs to the repository, by its name there."""
+    try:
+        listed = subprocess.run(
+            ["git", "ls-files", "-z"],
+            cwd=ROOT,
+            capture_output=True,
+            check=True,
+            text=True,
+        ).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a checkout")
+    found: dict[str, str] = {}
+    for name in listed.split("\0"):
+        path = ROOT / name
+        if name and path.is_file() and not path.is_symlink() and path != Path(__file__).resolve():
+            try:
+                found[name] = path.read_text(encoding="utf-8")
+            except UnicodeDecodeError:
+                continue
+    return found
+
+
+@cache
+def anchors(path: Path) -> frozenset[str]:
+    """Ids of a page: those given, and those that GitHub makes of headings."""
+    text = path.read_text(encoding="utf-8")
+    found = set(re.findall(r'<a (?:id|name)="([^"]+)"', text))
+    times: dict[str, int] = {}
+    for heading in re.findall(r"(?m)^#{1,6} +(.+?) *#*$", re.sub(r"(?ms)^```.*?^```$", "", text)):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)|<[^>]+>", r"\1", heading)
+        slug = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+        number = times.get(slug, 0)
+        times[slug] = number + 1
+        found.add(f"{slug}-{number}" if number else slug)
+    return frozenset(found)
+
+
+def unresolved(page: Path, anchor: str) -> bool:
+    return not page.is_file() or anchor not in anchors(page)
+
+
+def places(pattern: re.Pattern[str], text: str) -> Iterator[tuple[int, re.Match[str]]]:
+    for match in pattern.finditer(text):
+        yield text.count("\n", 0, match.start()) + 1, match
+
+
+def test_every_citation_leads_to_a_section() -> None:
+    seen, lost = 0, []
+    for name, text in texts().items():
+        for line, match in places(CITATION, text):
+            seen += 1
+            if unresolved(ROOT / match.group(1), match.group(2)):
+                lost.append(f"{name}:{line}: {match.group()}")
+    assert not lost, "\n".join(lost)
+    assert seen > 300
+
+
+def test_nothing_is_cited_that_only_the_authors_can_read() -> None:
+    found = []
+    for name, text in texts().items():
+        if name.startswith("docs/sources/") or not name.endswith(PROSE):
+            continue
+        plain = MESSAGES.sub("", text)
+        for line, match in places(INTERNAL, plain):
+            found.append(f"{name}:{line}: {match.group()}")
+    assert not found, "\n".join(found)
+
+
+def test_every_link_of_the_pages_leads_somewhere() -> None:
+    lost = []
+    for name, text in texts().items():
+        if not name.endswith(".md"):
+            continue
+        page = ROOT / name
+        for line, match in places(LINK, CODE.sub(lambda m: "\n" * m.group().count("\n"), text)):
+            target, _, anchor = unquote(match.group(1) or match.group(2)).partition("#")
+            if re.match(r"[a-z]+:", target):
+                continue
+            there = (page.parent / target).resolve() if target else page
+            missing = anchor not in anchors(there) if anchor and there.suffix == ".md" else False
+            if not there.exists() or missing:
+                lost.append(f"{name}:{line}: {match.group()}")
+    assert not lost, "\n".join(lost)
+
+
+def test_anchors_are_given_once() -> None:
+    for path in SOURCES.glob("*.md"):
+        ids = re.findall(r'<a id="([^"]+)"', path.read_text(encoding="utf-8"))
+        assert len(ids) == len(set(ids)), path.name
+
+
+def test_the_list_of_sections_is_complete() -> None:
+    listed = (SOURCES / "README.md").read_text(encoding="utf-8")
+    for path in SOURCES.glob("*-*.md"):
+        text = path.read_text(encoding="utf-8")
+        for anchor in re.findall(r'(?m)^<a id="([^"]+)"></a>$', text):
+            assert f"]({path.name}#{anchor})" in listed
+
+
+def test_every_source_of_the_catalogue_has_words() -> None:
+    """A citation alone means nothing to a vendor: who says so stands beside it."""
+    for requirement in catalogue(None, None):
+        assert re.search(r"[A-Za-z]{3,}", CITATION.sub("", requirement.source)), requirement.id
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "(facts/unitree-dex B.1)", "facts/mx64 D2", "# F A.5", "seed 002", "(facts G)", "(D5)",
+        "(B.7)", "the fact sheet", "facts, Unitree D 17", "S002",
+    ],
+)  # fmt: skip
+def test_internal_names_are_found(text: str) -> None:
+    assert INTERNAL.search(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["docs/sources/unitree-dex.md#b1", "[B.1](sources/unitree-dex.md#b1)", "FE 0D 1F [D 2]"[:8],
+     "the facts are these", "--seed 7", "F 2.5"],
+)  # fmt: skip
+def test_other_words_are_not(text: str) -> None:
+    assert not INTERNAL.search(text)
