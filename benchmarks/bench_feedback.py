@@ -1,10 +1,11 @@
 """Why the speed of feedback matters: full-stroke time under xr_teleoperate's own rule.
 
 The client clips each command to 0.18 rad from the last reported position and smooths it over
-three values (facts/unitree-dex B.1, B.7), so what is reported late is commanded slowly. The
-gripper is the emulated MX-64 with an EZGripper on it, in virtual time; between it and the client
-stand the service's own rules (HandCore) with exchanges at each rate, with and without the
-predictor. The peer is the same gripper sent to the end of its stroke in one command.
+three values (docs/sources/unitree-dex.md#b1, docs/sources/unitree-dex.md#b7), so what is reported
+late is commanded slowly. The gripper is the emulated MX-64 with an EZGripper on it, in virtual
+time; between it and the client stand the service's own rules (HandCore) with exchanges at each
+rate, with and without the predictor. The peer is the same gripper sent to the end of its stroke in
+one command.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from dexkit.wire.dynamixel import Instruction, Packet
 
 _ZERO = 1510
 _EFFORT = 50.0  # percent, the driver's default while moving
-_LEAD = 0.18  # rad (facts/unitree-dex B.1)
-_WEIGHTS = (0.5, 0.3, 0.2)  # newest first (B.1)
+_LEAD = 0.18  # rad (docs/sources/unitree-dex.md#b1)
+_WEIGHTS = (0.5, 0.3, 0.2)  # newest first (docs/sources/unitree-dex.md#b1)
 _FROM, _TO = 0.05, 0.95  # of the stroke: where the time is taken
 _STROKE = DEX1_1.joints[Side.LEFT][0].stroke
 _TICK = 0.5e-3  # seconds of virtual time
@@ -88,7 +89,8 @@ class TeleopClient:
     def command(self, reported: float) -> float:
         """The next command, 200 times a second, from the last reported position."""
         goal = min(max(self._target, reported - _LEAD), reported + _LEAD)
-        if not self._recent or goal != self._recent[0]:  # an equal value is skipped (B.7)
+        # an equal value is skipped (docs/sources/unitree-dex.md#b7)
+        if not self._recent or goal != self._recent[0]:
             self._recent.appendleft(goal)
         if len(self._recent) < len(_WEIGHTS):
             return goal

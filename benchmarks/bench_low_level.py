@@ -22,7 +22,8 @@ CASES = (
     ("LowCmd_ of an H1", "unitree_go::msg::dds_::LowCmd_", COMMAND),
     ("LowState_ of a G1", "unitree_hg::msg::dds_::LowState_", STATE),
 )
-# facts/unitree-dex A.7: how unitree_sdk2_python packs an H1's command before it takes the CRC
+# docs/sources/unitree-dex.md#a7: how unitree_sdk2_python packs an H1's command before it takes the
+# CRC
 FORMAT = "<4B4IH2x" + "B3x5f3I" * 20 + "4B55Bx2I"
 _MANY = 2000
 

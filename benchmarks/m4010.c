@@ -1,5 +1,5 @@
 /* The M4010's frames in C, as a C++ service would do them: the peer of bench_dex1_serial.py.
- * Written from the fact sheet; little-endian hosts only. */
+ * Written from docs/sources/unitree-dex.md#g; little-endian hosts only. */
 #include "motor_crc.h"
 
 /* values: tau, dq, q, kp, kd of the joint; factors: their counts per SI unit */

@@ -128,7 +128,7 @@ class BodyWire(Wire):
             place.mode, place.q, place.dq = m.mode, m.q, m.dq
             place.tau, place.kp, place.kd = m.tau, m.kp, m.kd
         if hasattr(message, "head"):
-            message.head, message.level_flag = (0xFE, 0xEF), 0xFF  # facts/unitree-dex A.8
+            message.head, message.level_flag = (0xFE, 0xEF), 0xFF  # docs/sources/unitree-dex.md#a8
         return message
 
 

@@ -48,7 +48,9 @@ LIMP = Motor(kp=0.0, kd=0.0)
 
 
 def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
-    """RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (facts/unitree-dex B.4)."""
+    """RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7
+    (docs/sources/unitree-dex.md#b4).
+    """
     return index | status << 4 | timeout << 7
 
 
@@ -76,7 +78,7 @@ class Wire:
 
     def mode(self, index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
         """The mode byte of a motor: RIS_Mode for a Dex3-1; for a Dex5-1 just 1, position control
-        (facts/unitree-dex B.5); 0 where it has no meaning.
+        (docs/sources/unitree-dex.md#b5); 0 where it has no meaning.
         """
         if self._ids:
             return mode_byte(index, status, timeout)

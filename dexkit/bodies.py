@@ -1,7 +1,7 @@
 """The robots that carry the hands, as data: joints by motor slot, topics, types, rates.
 
 The body of a robot is not a hand: one message commands and reports all of its motors. Sources are
-sections of the fact sheet "Unitree Dex" (F), and Unitree's URDFs in unitree_ros (revision
+sections of docs/sources/unitree-dex.md, and Unitree's URDFs in unitree_ros (revision
 d6f13aad): ``h1_description/urdf/h1.urdf`` and ``g1_description/g1_29dof_rev_1_0.urdf``, the G1
 whose ``mode_machine`` is 5.
 """
@@ -17,9 +17,10 @@ from dexkit.hand import JointSpec
 __all__ = ["BODIES", "DQ_STOP", "G1", "H1", "Q_STOP", "BodyModel", "body"]
 
 Q_STOP = 2.146e9
-"""A ``q`` that means "no position" (F A.8); what is sent is the nearest single, 2146000000."""
+"""A ``q`` that means "no position" (docs/sources/unitree-dex.md#a8); what is sent is the nearest
+single, 2146000000."""
 DQ_STOP = 16000.0
-"""A ``dq`` that means "no velocity" (F A.8)."""
+"""A ``dq`` that means "no velocity" (docs/sources/unitree-dex.md#a8)."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,9 @@ class BodyModel:
     :param weight_slot: unused slot whose ``q`` on the arm topic is the arm's weight, 0 to 1.
     :param arm_slots: slots that the arm topic commands.
     :param state_rate: states a second.
-    :param command_rate: commands a second of Unitree's low-level examples (F B.1: 2 ms).
-    :param teleop_rate: commands a second of xr_teleoperate (F B.1).
+    :param command_rate: commands a second of Unitree's low-level examples
+        (docs/sources/unitree-dex.md#b1: 2 ms).
+    :param teleop_rate: commands a second of xr_teleoperate (docs/sources/unitree-dex.md#b1).
     :param remote_rate: messages of the wireless remote a second.
     :param command_timeout: seconds without a command after which the body damps.
     """
@@ -57,11 +59,13 @@ class BodyModel:
     arm_topic: str = "rt/arm_sdk"
     remote_topic: str = "rt/wirelesscontroller"
     remote_type: str = "unitree_go::msg::dds_::WirelessController_"
-    state_rate: float = 500.0  # F B.1: clients poll at 500 Hz, the examples' loops take 2 ms
+    # docs/sources/unitree-dex.md#b1: clients poll at 500 Hz, the examples' loops take 2 ms
+    state_rate: float = 500.0
     command_rate: float = 500.0
     teleop_rate: float = 250.0
     remote_rate: float = 50.0  # invented: the sources give the topic and no rate
-    # inferred: the sources are silent; the protection of the hands' motors trips after 1 s (F B.4)
+    # inferred: the sources are silent; the protection of the hands' motors trips after 1 s
+    # (docs/sources/unitree-dex.md#b4)
     command_timeout: float = 1.0
 
     @property
@@ -145,7 +149,8 @@ def _joints(
     return tuple(joints), tuple(rest)
 
 
-# Slots: F A.8. Rest positions of both bodies are invented: knees slightly bent, arms off the sides.
+# Slots: docs/sources/unitree-dex.md#a8. Rest positions of both bodies are invented: knees slightly
+# bent, arms off the sides.
 _H1_ORDER = (
     *("right_hip_roll", "right_hip_pitch", "right_knee"),
     *("left_hip_roll", "left_hip_pitch", "left_knee"),
@@ -176,11 +181,11 @@ H1 = BodyModel(
     title="H1 body",
     family="unitree_go",
     joints=_h1_joints,
-    # F A.8: 0x01 for weak motors (ankles, arms), 0x0A for the others
+    # docs/sources/unitree-dex.md#a8: 0x01 for weak motors (ankles, arms), 0x0A for the others
     enable=tuple(0x01 if i in _H1_WEAK else 0x0A for i in range(len(_H1_ORDER))),
     client_gains=tuple(
         (140.0, 3.0) if i in _H1_WEAK else (300.0, 5.0) for i in range(len(_H1_ORDER))
-    ),  # F B.1
+    ),  # docs/sources/unitree-dex.md#b1
     rest_q=_h1_rest,
     mode_machine=None,
     # unitree_sdk2 example/h1/high_level/h1_arm_sdk_dds_example.cpp: weight in the slot that is not
@@ -222,7 +227,9 @@ _g1_joints, _g1_rest = _joints(_G1_ORDER, _G1_KINDS, {})
 
 
 def _g1_gains(name: str | None) -> tuple[float, float]:
-    """F B.1; which motors are weak: xr_teleoperate's robot_arm.py (ankle pitch, not roll)."""
+    """docs/sources/unitree-dex.md#b1; which motors are weak: xr_teleoperate's robot_arm.py (ankle
+    pitch, not roll).
+    """
     part = (name or "").partition("_")[2]
     if part.startswith("wrist"):
         return 40.0, 1.5
@@ -236,11 +243,11 @@ G1 = BodyModel(
     title="G1 body (29 joints)",
     family="unitree_hg",
     joints=_g1_joints,
-    enable=(1,) * len(_G1_ORDER),  # F A.8: 1 enable, 0 disable
+    enable=(1,) * len(_G1_ORDER),  # docs/sources/unitree-dex.md#a8: 1 enable, 0 disable
     client_gains=tuple(_g1_gains(name) for name in _G1_ORDER),
     rest_q=_g1_rest,
     mode_machine=5,
-    weight_slot=29,  # F A.8
+    weight_slot=29,  # docs/sources/unitree-dex.md#a8
     # unitree_sdk2 example/g1/high_level/g1_arm7_sdk_dds_example.cpp: waist and arms
     arm_slots=tuple(range(12, 29)),
 )

@@ -21,7 +21,7 @@ because CycloneDDS's Python raises at text that is not UTF-8, and then loses wha
 announced together with it.
 
 On loopback a node finds every other process of the machine, whether or not ``lo`` carries the
-MULTICAST flag, without changing the system (facts/unitree-dex A.6).
+MULTICAST flag, without changing the system (docs/sources/unitree-dex.md#a6).
 
 Only what comes in by the node's interface, or from this machine, is seen (:mod:`dexkit.ingress`);
 CycloneDDS by itself would listen to every interface of the machine. Where the system has no
@@ -101,7 +101,7 @@ class Qos:
     :param depth: samples kept of the history; None keeps all.
 
     Unitree's SDKs write reliable and read best-effort, volatile, keep-last 1
-    (facts/unitree-dex A.5).
+    (docs/sources/unitree-dex.md#a5).
     """
 
     reliability: str = "reliable"
@@ -422,8 +422,8 @@ def cyclone_type(name: str) -> Any:
 def type_hash(name: str) -> str:
     """Hash of the layout that dexkit knows under a DDS name, as in :attr:`Endpoint.type_hash`.
 
-    Peers whose hash differs have another version of the message (facts/unitree-dex A.3) and do
-    not match.
+    Peers whose hash differs have another version of the message (docs/sources/unitree-dex.md#a3)
+    and do not match.
     """
     with _types_lock:
         description = cyclone_type(name).__idl__
@@ -450,7 +450,7 @@ _DEAF = "<Internal><ControlTopic><Deaf>true</Deaf></ControlTopic></Internal>"
 
 
 def _config(interface: str, more: str = "") -> str:
-    """CycloneDDS configuration of a domain (facts/unitree-dex A.6).
+    """CycloneDDS configuration of a domain (docs/sources/unitree-dex.md#a6).
 
     On loopback peers are called on 127.0.0.1 by port, since multicast may be off there;
     ``multicast="default"`` keeps listening to it where it is on, because an SDK process then
@@ -1301,7 +1301,8 @@ def _announced_hash(data: Any) -> str:
 def _policies(qos: Qos, user_data: bytes = b"", most: int | None = None) -> Any:
     policy = _cyclone().qos.Policy
     reliability = (
-        policy.Reliability.Reliable(max_blocking_time=100_000_000)  # 100 ms (F A.5)
+        # 100 ms (docs/sources/unitree-dex.md#a5)
+        policy.Reliability.Reliable(max_blocking_time=100_000_000)
         if qos.reliability == "reliable"
         else policy.Reliability.BestEffort
     )

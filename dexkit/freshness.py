@@ -55,7 +55,7 @@ of a pause. Covers a least latency of 0.14 s with the drift of a minute of silen
 QUIET = 1.0
 """Seconds after a pause until samples count whose age cannot be told."""
 DRIFT = 500e-6
-"""Most that a clock runs fast or slow: what NTP slews by (facts: RFC 5905, 500 PPM)."""
+"""Most that a clock runs fast or slow: what NTP slews by (RFC 5905: 500 PPM)."""
 FORGET = 60.0
 """Seconds without a sample after which a baseline is not trusted: drift adds up to 0.03 s."""
 

@@ -52,7 +52,7 @@ class Side(str, Enum):
 class JointMode(IntEnum):
     """What a joint's motor does; the RIS_Mode status values of Unitree's motors.
 
-    (facts/unitree-dex B.4, "Mode byte".)
+    (docs/sources/unitree-dex.md#b4, "Mode byte".)
     """
 
     BRAKE = 0
@@ -62,7 +62,7 @@ class JointMode(IntEnum):
 class MotorError(IntFlag):
     """Unitree's motor error bits, the one fault vocabulary of all hands.
 
-    (facts/unitree-dex B.6.)
+    (docs/sources/unitree-dex.md#b6.)
     """
 
     NONE = 0
@@ -184,8 +184,8 @@ class HandCommand:
     The motors follow ``tau_motor = kp (q - q_now) + kd (dq - dq_now) + tau`` in mode FOC.
 
     :param timeout: which joints the client wants braked when its commands stop (bit 7 of
-        RIS_Mode, facts/unitree-dex B.4), shape (n_joints,); None where the dialect has no such
-        bit, and the service's own time-out holds for all.
+        RIS_Mode, docs/sources/unitree-dex.md#b4), shape (n_joints,); None where the dialect has no
+        such bit, and the service's own time-out holds for all.
     """
 
     q: Floats
@@ -206,7 +206,9 @@ class HandCommand:
         kp: ArrayLike = 5.0,
         kd: ArrayLike = 0.05,
     ) -> HandCommand:
-        """Go to ``q``. The default gains are those xr_teleoperate sends to a Dex1 (facts B.1)."""
+        """Go to ``q``. The default gains are those xr_teleoperate sends to a Dex1
+        (docs/sources/unitree-dex.md#b1).
+        """
         goal = _vector(q)
         n = len(goal)
         return cls(
@@ -220,7 +222,9 @@ class HandCommand:
 
     @classmethod
     def brake(cls, n_joints: int) -> HandCommand:
-        """Brake every joint: what the vendor's service sends on time-out (facts B.2)."""
+        """Brake every joint: what the vendor's service sends on time-out
+        (docs/sources/unitree-dex.md#b2).
+        """
         return cls(
             q=np.zeros(n_joints),
             dq=np.zeros(n_joints),

@@ -1,7 +1,7 @@
 """The Dex family as data: joints, topics, types, rates, time-outs, per side and dialect.
 
-Every other module takes these facts from here. Sources are sections of the fact sheet
-"Unitree Dex" (F) and the DDS interface specification (seed 000).
+Every other module takes these facts from here. Sources are sections of
+docs/sources/unitree-dex.md and the gripper's DDS interface specification.
 """
 
 from __future__ import annotations
@@ -138,11 +138,14 @@ class HandModel:
         )
 
 
-# F B.3: 0 closed, rising q opens, 5.4 rad = 9 cm of jaw travel; closing is toward smaller q.
-# dq_max: two jaws at 0.2 m/s would need 24 rad/s (F B.3, derived; the real limit is uncertain).
+# docs/sources/unitree-dex.md#b3: 0 closed, rising q opens, 5.4 rad = 9 cm of jaw travel; closing is
+# toward smaller q.
+# dq_max: two jaws at 0.2 m/s would need 24 rad/s (docs/sources/unitree-dex.md#b3, derived; the real
+# limit is uncertain).
 # tau_max: 20 N a jaw x 2 jaws x 0.09 m / 5.4 rad = 0.67 N m at the URDF's effort limit; the
 # recordings reach kp * 0.18 = 0.9 N m, and vendor clients feed forward at most a few N m. 15 is
-# what the vendor library clamps to (F G, rotor side), so nothing a client sends is cut short.
+# what the vendor library clamps to (docs/sources/unitree-dex.md#g, rotor side), so nothing a client
+# sends is cut short.
 _DEX1_JOINT = JointSpec("gripper", q_min=0.0, q_max=5.4, dq_max=24.0, tau_max=15.0, closing=-1)
 
 DIALECTS: dict[str, Dialect] = {
@@ -179,7 +182,8 @@ DIALECTS: dict[str, Dialect] = {
             state_topic="rt/unitree_actuator/state",
             cmd_type="unitree_go::msg::dds_::MotorCmds_",
             state_type="unitree_go::msg::dds_::MotorStates_",
-            # F A.1: 0 is the right gripper, whatever XR11's enum says
+            # docs/sources/unitree-dex.md#a1: 0 is the right gripper, whatever the enum of
+            # xr_teleoperate v1.1 says
             index={Side.LEFT: 1, Side.RIGHT: 0},
             length=2,
             q_open=5.4,
@@ -196,7 +200,8 @@ DIALECTS: dict[str, Dialect] = {
             length=7,
             q_open=math.nan,
             summary="Dex3-1 of G1: 7 motors in the order of the IDL, RIS_Mode in the mode byte",
-            # F A.1: the only state topic to which the vendor's C++ example subscribes
+            # docs/sources/unitree-dex.md#a1: the only state topic to which the vendor's C++ example
+            # subscribes
             low_rate_topic="rt/lf/dex3/{side}/state",
         ),
         Dialect(
@@ -210,8 +215,8 @@ DIALECTS: dict[str, Dialect] = {
             length=20,
             q_open=math.nan,
             summary="Dex5-1: 20 joints, fingers first, thumb last; mode 1 is position control",
-            # F B.5: a comment in xr_teleoperate says that fingers report in mN m, the thumb in
-            # N m. Uncertain; the only statement there is.
+            # docs/sources/unitree-dex.md#b5: a comment in xr_teleoperate says that fingers report
+            # in mN m, the thumb in N m. Uncertain; the only statement there is.
             torque_units=(0.001,) * 16 + (1.0,) * 4,
         ),
     )
@@ -222,26 +227,28 @@ DEX1_1 = HandModel(
     title="Dex1-1 gripper",
     joints={Side.LEFT: (_DEX1_JOINT,), Side.RIGHT: (_DEX1_JOINT,)},
     dialects=tuple(d for d in DIALECTS.values() if d.model == "dex1-1"),
-    state_rate=500.0,  # F B.2: 2000 us loop
-    min_state_rate=200.0,  # F D conflict 7; seed 000 "200+ Hz"
-    command_rate=200.0,  # F B.1
-    command_timeout=1.0,  # F B.2: timeout_ms_ = 1000
-    client_gains=(5.0, 0.05),  # F B.1
+    state_rate=500.0,  # docs/sources/unitree-dex.md#b2: 2000 us loop
+    min_state_rate=200.0,  # docs/sources/unitree-dex.md#d7; the interface specification "200+ Hz"
+    command_rate=200.0,  # docs/sources/unitree-dex.md#b1
+    command_timeout=1.0,  # docs/sources/unitree-dex.md#b2: timeout_ms_ = 1000
+    client_gains=(5.0, 0.05),  # docs/sources/unitree-dex.md#b1
     rest_q=dict.fromkeys(Side, (0.2 * _DEX1_JOINT.stroke,)),
-    vendor_ids={Side.LEFT: 1, Side.RIGHT: 0},  # F B.2
+    vendor_ids={Side.LEFT: 1, Side.RIGHT: 0},  # docs/sources/unitree-dex.md#b2
 )
 
 
 def _dex3_joints(side: Side) -> tuple[JointSpec, ...]:
     """The seven joints in the order of the IDL, on both sides: thumb, middle, index.
 
-    Names and order: seed 002 "Message Structure Sorting"; xr_teleoperate's enum names 3 to 6
-    index-then-middle for the right hand, without effect (F D 13). Limits: Unitree's URDF, which
-    for thumb_1 is the manual's and narrower than xr_teleoperate's (F B.4, D 17). The sides are
+    Names and order: the Dex3-1 manual "Message Structure Sorting"; xr_teleoperate's enum names 3 to
+    6 index-then-middle for the right hand, without effect (docs/sources/unitree-dex.md#d13).
+    Limits: Unitree's URDF, which for thumb_1 is the manual's and narrower than xr_teleoperate's
+    (docs/sources/unitree-dex.md#b4, docs/sources/unitree-dex.md#d17). The sides are
     mirrored: every flexing sign of the left hand turns round on the right; thumb_0 swings both
-    ways. dq_max: xr_teleoperate's URDF (F D 27); tau_max: both URDFs (F B.4). Ratios: seed 002
-    "Miniature Brushless Force Control Joint"; that thumb_0 is the one with 214 follows from its
-    torque and speed, and is uncertain (F B.4).
+    ways. dq_max: xr_teleoperate's URDF (docs/sources/unitree-dex.md#d27); tau_max: both URDFs
+    (docs/sources/unitree-dex.md#b4). Ratios: the Dex3-1 manual "Miniature Brushless Force Control
+    Joint"; that thumb_0 is the one with 214 follows from its torque and speed, and is uncertain
+    (docs/sources/unitree-dex.md#b4).
     """
     mirror = 1 if side is Side.LEFT else -1
 
@@ -273,13 +280,13 @@ def _dex3_joints(side: Side) -> tuple[JointSpec, ...]:
 
 _DEX3_REST = (0.05, 0.2, 0.3, -0.3, -0.4, -0.3, -0.4)  # left; half relaxed, clear of all stops
 
-# F B.4, seed 002 "Number of Pressure Sensors": 9 packets, 33 elements: three areas of 2 x 2 on
-# the palm, 2 x 2 on each finger pad, 3 x 1 on each finger tip. Which packet is which, and which of
-# the 12 values are elements, is in a figure that the sources lost. Two public clients of real
-# hands read these slots, and no others: the Dex3 clients in sakuzeng/xiangyang_g1 and in a fork of
-# xr_teleoperate that names the packets so, too. They agree with each other and with the numbers of
-# elements; a third project names the first six tips before pads and index before middle. Likely,
-# not measured here.
+# docs/sources/unitree-dex.md#b4, the Dex3-1 manual "Number of Pressure Sensors": 9 packets, 33
+# elements: three areas of 2 x 2 on the palm, 2 x 2 on each finger pad, 3 x 1 on each finger tip.
+# Which packet is which, and which of the 12 values are elements, is in a figure that the sources
+# lost. Two public clients of real hands read these slots, and no others: the Dex3 clients in
+# sakuzeng/xiangyang_g1 and in a fork of xr_teleoperate that names the packets so, too. They agree
+# with each other and with the numbers of elements; a third project names the first six tips before
+# pads and index before middle. Likely, not measured here.
 _DEX3_SENSORS = (
     *(
         PressureSensor(f"{finger} {part}", slots)
@@ -294,17 +301,18 @@ DEX3_1 = HandModel(
     title="Dex3-1 hand",
     joints={side: _dex3_joints(side) for side in Side},
     dialects=tuple(d for d in DIALECTS.values() if d.model == "dex3-1"),
-    state_rate=1000.0,  # seed 002 "Communication rate"
+    state_rate=1000.0,  # the Dex3-1 manual "Communication rate"
     min_state_rate=200.0,  # inferred: twice the client's command rate, as for the Dex1-1
-    command_rate=100.0,  # F B.1
-    command_timeout=1.0,  # seed 002 RIS_Mode_t: "default 1s timeout"
-    client_gains=(1.5, 0.2),  # F B.1
+    command_rate=100.0,  # docs/sources/unitree-dex.md#b1
+    command_timeout=1.0,  # the Dex3-1 manual RIS_Mode_t: "default 1s timeout"
+    client_gains=(1.5, 0.2),  # docs/sources/unitree-dex.md#b1
     rest_q={
         Side.LEFT: _DEX3_REST,
         Side.RIGHT: tuple(q if i == 0 else -q for i, q in enumerate(_DEX3_REST)),
     },
     sensors=_DEX3_SENSORS,
-    low_rate=20.0,  # inferred: the sources give a topic and no rate (F A.1)
+    # inferred: the sources give a topic and no rate (docs/sources/unitree-dex.md#a1)
+    low_rate=20.0,
 )
 
 
@@ -312,10 +320,10 @@ def _dex5_joints(side: Side) -> tuple[JointSpec, ...]:
     """The 20 joints in the order of the IDL: index, middle, ring and little finger, thumb.
 
     Everything about this hand is from a pull request to xr_teleoperate that was open when it was
-    read, and from Unitree's URDF (F B.5). Names are the URDF's without the side's letter; the
-    left URDF calls joint 41 Link_41L. Limits: URDF; only Roll_12 is mirrored. dq_max and tau_max:
-    the left URDF, for both sides: the right one has zeros for torques and for the fingers'
-    sideways joints.
+    read, and from Unitree's URDF (docs/sources/unitree-dex.md#b5). Names are the URDF's without the
+    side's letter; the left URDF calls joint 41 Link_41L. Limits: URDF; only Roll_12 is mirrored.
+    dq_max and tau_max: the left URDF, for both sides: the right one has zeros for torques and for
+    the fingers' sideways joints.
     """
     letter = "L" if side is Side.LEFT else "R"
     across = -1 if side is Side.LEFT else 1
@@ -369,13 +377,14 @@ DEX5_1 = HandModel(
     title="Dex5-1 hand",
     joints={side: _dex5_joints(side) for side in Side},
     dialects=tuple(d for d in DIALECTS.values() if d.model == "dex5-1"),
-    # inferred: no source gives a rate; a client polls every 2 ms (F B.1)
+    # inferred: no source gives a rate; a client polls every 2 ms (docs/sources/unitree-dex.md#b1)
     state_rate=500.0,
     min_state_rate=200.0,  # inferred: twice the client's command rate, as for the others
-    command_rate=100.0,  # F B.1
+    command_rate=100.0,  # docs/sources/unitree-dex.md#b1
     command_timeout=1.0,  # inferred: that of its relatives
-    client_gains=(0.10, 0.001),  # F B.1, the fingers
-    joint_gains=dict.fromkeys(range(16, 20), (1.0, 0.02)),  # F B.1, the thumb
+    client_gains=(0.10, 0.001),  # docs/sources/unitree-dex.md#b1, the fingers
+    # docs/sources/unitree-dex.md#b1, the thumb
+    joint_gains=dict.fromkeys(range(16, 20), (1.0, 0.02)),
     rest_q={
         side: (
             *(4 * _DEX5_FINGER_REST),
@@ -383,8 +392,9 @@ DEX5_1 = HandModel(
         )
         for side in Side
     },
-    # derived: 16 motors for 20 joints (F B.5) leave four each for thumb and fingers less one in
-    # each finger, and what a finger of four joints shares is its two outer ones. Uncertain.
+    # derived: 16 motors for 20 joints (docs/sources/unitree-dex.md#b5) leave four each for thumb
+    # and fingers less one in each finger, and what a finger of four joints shares is its two outer
+    # ones. Uncertain.
     shared_motors=((2, 3), (6, 7), (10, 11), (14, 15)),
 )
 

@@ -125,7 +125,8 @@ def latency_warning(path: str, sysfs: Path = Path("/sys")) -> str:
     """What to tell the user of the latency timer, or an empty text when it is well set.
 
     An FTDI chip holds a short answer back until the next tick of its timer; at the usual 16 ms
-    that leaves 62 exchanges a second at most (facts/mx64 C2). Nothing is changed here.
+    that leaves 62 exchanges a second at most (docs/sources/mx64-ezgripper.md#c2). Nothing is
+    changed here.
     """
     milliseconds = latency_timer(path, sysfs)
     if milliseconds is None or milliseconds <= 1:

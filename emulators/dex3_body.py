@@ -50,17 +50,18 @@ def _f_1515(
     )
 
 
-# seed 002 "Miniature Brushless Force Control Joint Parameters". It gives three largest torques:
-# an "ideal" one, and "actual" ones with the torque in the direction of the speed and against it.
+# the Dex3-1 manual "Miniature Brushless Force Control Joint Parameters". It gives three largest
+# torques: an "ideal" one, and "actual" ones with the torque in the direction of the speed and
+# against it.
 F_1515_108 = _f_1515(108.0, 23.0, 0.76, 0.49, 1.37)
 F_1515_214 = _f_1515(214.0, 11.0, 1.498, 0.86, 3.1)
 _MOTORS = {m.gear_ratio: m for m in (F_1515_108, F_1515_214)}
 
 _FANS_ON, _FANS_OFF = 45.0, 40.0  # °C of the hottest case
 
-_STATIC_POWER = 0.2 * 58.0  # W (seed 002 "Static Current: 58V @ 0.2A")
-_BUCK_OUTPUT = 24.0  # V: motors take 12 to 24 V, the hand 24 to 58 V (seed 002)
-_CURRENT_MAX = 10.0  # A (seed 002)
+_STATIC_POWER = 0.2 * 58.0  # W (the Dex3-1 manual "Static Current: 58V @ 0.2A")
+_BUCK_OUTPUT = 24.0  # V: motors take 12 to 24 V, the hand 24 to 58 V (the Dex3-1 manual)
+_CURRENT_MAX = 10.0  # A (the Dex3-1 manual)
 
 # A grip, assumed: lever arms from a joint to where the object lies against its link, how a
 # link's force spreads over the elements there, and what the palm gets of it.
@@ -70,7 +71,7 @@ _TIP_SHARE = (0.25, 0.5, 0.25)
 _PALM_SHARES = (1.0 / 12.0,) * 4
 _PALM_FROM = 6.0  # N of the fingers' pads from which the object is pressed into the palm
 _GRAVITY = 9.81
-_FORCE_MIN, _FORCE_MAX = 0.010 * _GRAVITY, 2.5 * _GRAVITY  # seed 002 "Range of Perception"
+_FORCE_MIN, _FORCE_MAX = 0.010 * _GRAVITY, 2.5 * _GRAVITY  # the Dex3-1 manual "Range of Perception"
 # m² of one element. A square centimetre, and a little more so that a full reading stays below
 # the code for "no value" on the wire (30000 counts of 8 Pa).
 _ELEMENT_AREA = 1.05e-4

@@ -1,8 +1,8 @@
 """The body of a Dex5-1: 20 joints, each moved alone.
 
 :mod:`dexkit.emulators.finger_body` has the mechanics. From Unitree's URDF: the joints' limits,
-speeds and torques, which look like place-holders in part (facts/unitree-dex B.5). The rest is
-assumed, so that the joints follow xr_teleoperate's gains without swinging: inertia, friction,
+speeds and torques, which look like place-holders in part (docs/sources/unitree-dex.md#b5). The rest
+is assumed, so that the joints follow xr_teleoperate's gains without swinging: inertia, friction,
 brake, heat.
 
 Not modelled: that 16 motors move the 20 joints, pressure sensors, IMU and supply, of which no

@@ -154,7 +154,7 @@ M4010_FAULTS = FaultFamily(
     max_id=1,
 )
 """Faults of the Dex1-1's motor; ``id`` is its own, 0 right, 1 left. ``short``, ``pause`` and
-``stray`` are those that put the vendor's library out of step (facts/unitree-dex G)."""
+``stray`` are those that put the vendor's library out of step (docs/sources/unitree-dex.md#g)."""
 
 FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kinds}
 """The kinds of the MX-64 by name."""

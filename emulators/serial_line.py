@@ -1,9 +1,9 @@
 """What lies between the devices on a serial line and the host's program, sans-IO.
 
 A byte takes its ten bits at the baud rate, both ways, and what the devices send goes through a
-USB-serial adapter, which is modelled as an FTDI chip (facts/mx64 C2): bytes are handed to the host
-at the ticks of a free-running timer, or as soon as 62 of them are there. On the way an answer may
-meet a fault.
+USB-serial adapter, which is modelled as an FTDI chip (docs/sources/mx64-ezgripper.md#c2): bytes are
+handed to the host at the ticks of a free-running timer, or as soon as 62 of them are there. On the
+way an answer may meet a fault.
 
 Not modelled: USB scheduling beyond that, collisions of a host that talks while a device answers.
 """

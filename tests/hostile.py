@@ -31,7 +31,7 @@ TEXTS = (
     "::set-output name=x::y", "[bold]markup[/bold]", "[link=http://evil.example]x[/link]", "[/]",
     "<script>alert(1)</script>", "\"'><img src=x onerror=alert(1)>", "| a | b |", "`code`",
     "@everyone", "](javascript:alert(1))", "\\", "%s%n", "{0}", "../../etc/passwd", "²",
-    "facts/unitree-dex A.99", "seed 999", "]]>", "\u2028", "DEX1-RATE-01", "left", "dex1-1",
+    "docs/sources/#b1", "[B.1](#b1)", "]]>", "\u2028", "DEX1-RATE-01", "left", "dex1-1",
 )  # fmt: skip
 """What a name, a note or any other text may be."""
 

@@ -35,7 +35,7 @@ FIELDS = ("q", "dq", "tau", "kp", "kd")
 
 
 def test_slots() -> None:
-    """A few of the indices that Unitree's examples name (facts A.8)."""
+    """A few of the indices that Unitree's examples name (docs/sources/unitree-dex.md#a8)."""
     assert (H1.slots, len(H1.used), H1.joints[9]) == (20, 19, None)
     assert (G1.slots, G1.used) == (35, tuple(range(29)))
     for model, slots in (
@@ -165,7 +165,7 @@ def test_turning_off_lets_it_coast(model: BodyModel) -> None:
 
 
 def test_mode_of_another_kind_of_motor() -> None:
-    """Strong motors of an H1 take 10, weak ones 1 (facts A.8)."""
+    """Strong motors of an H1 take 10, weak ones 1 (docs/sources/unitree-dex.md#a8)."""
     hip, elbow = H1.slot("left_hip_pitch"), H1.slot("left_elbow")
     order = low_cmd(H1, {hip: 0.4, elbow: 0.8}, mode=[1] * 20)
     bench = Bench(H1)
@@ -184,7 +184,9 @@ def test_mode_of_another_kind_of_motor() -> None:
 
 @both
 def test_stop_constants(model: BodyModel) -> None:
-    """Position and velocity terms can be left out with kp and kd set (facts A.8)."""
+    """Position and velocity terms can be left out with kp and kd set
+    (docs/sources/unitree-dex.md#a8).
+    """
     slot = model.slot("left_elbow")
     bench = Bench(model)
     order = {"q": Q_STOP, "dq": DQ_STOP, "kp": 100.0, "kd": 5.0}

@@ -123,7 +123,7 @@ class TestTranslation:
         assert astuple(there_and_back(HG, "state", back)) == near_all(back)
 
     def test_a_state_of_the_specification(self) -> None:
-        """Seed 000, "Gripper Publishes State"."""
+        """The interface specification, "Gripper Publishes State"."""
         motor = unitree_hg.MotorState_(
             q=3.14, tau_est=0.5, temperature=(31, 40), vol=12.0, motorstate=0x20
         )
@@ -398,7 +398,7 @@ class TestReachable:
 
     @staticmethod
     def goes_to(q: float) -> float:
-        """Where a gripper of the specification goes (seed 000)."""
+        """Where a gripper of the interface specification goes."""
         return 0.0 if q <= 0.1 else 2 * math.pi if q >= 6.0 else q
 
     @given(st.floats(0.0, 2 * math.pi), st.none() | st.floats(0.0, 2 * math.pi))

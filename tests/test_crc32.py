@@ -1,4 +1,4 @@
-"""The words CRC against the vectors of the fact sheet and a bitwise implementation."""
+"""The words CRC against the vectors of docs/sources and a bitwise implementation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from dexkit.errors import EncodeError
 from dexkit.wire.crc32 import crc32_swapped, crc32_words
 
-# facts/unitree-dex C.8; the last four are all-zero LowCmd_/LowState_ images, go and hg (A.7)
+# docs/sources/unitree-dex.md#c8; the last four are all-zero LowCmd_/LowState_ images, go and hg
+# (docs/sources/unitree-dex.md#a7)
 VECTORS = [
     (bytes(4), 0xC704DD7B),
     (b"\xff" * 4, 0x00000000),

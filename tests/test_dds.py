@@ -319,7 +319,9 @@ with DdsNode(number) as node:
 
 
 def test_a_peer_with_an_older_layout_is_seen_and_told_apart(dds_node: DdsNode) -> None:
-    """HandState_ of 2024-08 (facts/unitree-dex A.3) has the same name and does not match."""
+    """HandState_ of 2024-08
+    (docs/sources/unitree-dex.md#a3) has the same name and does not match.
+    """
     name = "unitree_hg::msg::dds_::HandCmd_"
     script = f"""
 import sys

@@ -1,8 +1,8 @@
 """Loopback with and without the MULTICAST flag, each in a network namespace of its own.
 
-Unitree's SDK behaves differently in the two (facts/unitree-dex A.6): with the flag its process
-listens to multicast only. A dexkit node must meet it in both, whatever this machine's ``lo`` is
-like, and nothing of this machine is changed.
+Unitree's SDK behaves differently in the two (docs/sources/unitree-dex.md#a6): with the flag its
+process listens to multicast only. A dexkit node must meet it in both, whatever this machine's
+``lo`` is like, and nothing of this machine is changed.
 """
 
 from __future__ import annotations

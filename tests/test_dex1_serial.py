@@ -143,7 +143,9 @@ def test_both_hands_on_one_line_take_turns() -> None:
 
 
 def test_without_protection_its_frames_are_those_of_the_vendors_service() -> None:
-    """facts/unitree-dex G, the table of frames; the protection is one bit more while it drives."""
+    """docs/sources/unitree-dex.md#g, the table of frames; the protection is one bit more while it
+    drives.
+    """
     right = Dex1Serial(Side.RIGHT, Dex1Settings(protect=False))
     frame = right._frame(HandCommand.position(2.7))
     assert frame.hex() == "feee100000000000195f05006600010099db492c"
@@ -261,7 +263,9 @@ def test_a_motor_that_wakes_up_late_is_found() -> None:
     ],
 )
 def test_a_damaged_answer_costs_its_own_exchange_only(spec: str, fails: bool) -> None:
-    """What puts the vendor's library out of step for good (facts G) passes without trace."""
+    """What puts the vendor's library out of step for good (docs/sources/unitree-dex.md#g) passes
+    without trace.
+    """
     with Dex1Motors(start_pct=50.0) as motors, opened(motors) as hand:
         hand.exchange(BRAKE)
         patient = hand.configuration
@@ -479,7 +483,7 @@ def test_calibration_makes_closed_the_zero_once() -> None:
 
 
 def test_silence_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The vendor's library says "successful" (facts G)."""
+    """The vendor's library says "successful" (docs/sources/unitree-dex.md#g)."""
     monkeypatch.setattr("dexkit.drivers.dex1_serial.hand._FLASH_TIME", 0.05)
     with Dex1Motors() as motors, opened(motors) as hand:
         motors.inject("silent:for=100ms")

@@ -23,7 +23,7 @@ from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb.page import BLOCKS, PAGE, fill, worked_example
 
-# --- layouts, against the numbers of facts/unitree-dex C.2 to C.6
+# --- layouts, against the numbers of docs/sources/unitree-dex.md#c
 
 
 def test_sizes_and_offsets() -> None:
@@ -77,7 +77,7 @@ SENSOR = d.SensorState(1, 0, tuple(range(1000, 1012)), (25,) * 12)
 
 
 def test_packets_of_the_fact_sheet() -> None:
-    # facts C.10
+    # docs/sources/unitree-dex.md#c10
     motor = bytes.fromhex("fcee101e283000000000f82a0000000000000000000044998d9c")
     sensor = bytes.fromhex(
         "7ee70100e803e903ea03eb03ec03ed03ee03ef03f003f103f203f30319191919191919191919191995ba86b6"
@@ -91,7 +91,8 @@ def test_packets_of_the_fact_sheet() -> None:
 @pytest.mark.parametrize(
     ("packet", "expected"),
     [
-        # measured from the vendor's library for the M4010 motor, which has the same frame (facts G)
+        # measured from the vendor's library for the M4010 motor, which has the same frame
+        # (docs/sources/unitree-dex.md#g)
         (d.MotorCmd(0, 1, False, 0, 0, 0, 0, 0), "feee1000000000000000000000000000" "73d71398"),
         (d.MotorCmd(1, 0, True, 0, 0, 0, 0, 0), "feee8100000000000000000000000000" "6f78f4b3"),
         (d.MotorCmd(0, 1, False, 0, 0, 0x55F19, 0x66, 1),

@@ -43,7 +43,7 @@ scales = st.sampled_from(d.SCALES)
 
 
 def test_factors_of_the_fact_sheet() -> None:
-    # facts/unitree-dex C.9, "Combined"
+    # docs/sources/unitree-dex.md#c9, "Combined"
     for scale, direct, geared in (
         (units.POSITION, 563240.4, 1116050.5),
         (units.VELOCITY, 44.003, 87.191),
@@ -56,7 +56,8 @@ def test_factors_of_the_fact_sheet() -> None:
 
 
 def test_figures_of_the_fact_sheet() -> None:
-    # facts C.6, C.9: 24 V and 58 V, full scales; 0.76 N m of a joint
+    # docs/sources/unitree-dex.md#c6, docs/sources/unitree-dex.md#c9: 24 V and 58 V, full scales;
+    # 0.76 N m of a joint
     assert round(24 * units.VOLTAGE.factor()) == 22696
     assert units.VOLTAGE.encode(58.0) in (54848, 54849)
     assert units.VOLTAGE.limits()[1] == pytest.approx(69.3, abs=0.01)

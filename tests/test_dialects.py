@@ -53,7 +53,9 @@ class TestGoCommand:
 
     @given(st.integers(0, 255))
     def test_the_mode_byte_is_ignored(self, mode: int) -> None:
-        """F D.11: clients send 0 and 1; limp is kp = kd = 0, not a mode."""
+        """docs/sources/unitree-dex.md#d11: clients send 0 and 1; limp is kp = kd = 0, not a
+        mode.
+        """
         command = one("unitree_go").command(go_cmd(unitree_go.MotorCmd_(mode=mode)), LEFT)
         assert command is not None
         assert command.mode[0] == JointMode.FOC
@@ -72,7 +74,7 @@ class TestGoCommand:
         assert one("unitree_go").command(go_cmd(), LEFT) is None
 
     def test_of_a_long_one_the_first_counts(self) -> None:
-        """As the vendor's service reads cmds()[0] (F B.2)."""
+        """As the vendor's service reads cmds()[0] (docs/sources/unitree-dex.md#b2)."""
         message = go_cmd(*(unitree_go.MotorCmd_(q=q) for q in (1.0, 2.0, 3.0)))
         mapping = one("unitree_go")
         command = mapping.command(message, LEFT)
@@ -106,8 +108,8 @@ class TestActuator:
 
 class TestHgCommand:
     @staticmethod
-    def seed(q_radians: float) -> float:
-        """dex1_to_ezgripper of seed 000, in percent."""
+    def specified(q_radians: float) -> float:
+        """dex1_to_ezgripper of the interface specification, in percent."""
         if q_radians <= 0.1:
             return 0.0
         elif q_radians >= 6.0:
@@ -119,7 +121,7 @@ class TestHgCommand:
     def test_the_seeds_formula(self, q: float) -> None:
         command = one("unitree_hg").command(hg_cmd(q), LEFT)
         assert command is not None
-        assert command.q[0] / 5.4 * 100.0 == pytest.approx(self.seed(q))
+        assert command.q[0] / 5.4 * 100.0 == pytest.approx(self.specified(q))
 
     @pytest.mark.parametrize(
         ("q", "percent"),
@@ -157,7 +159,9 @@ class TestHgCommand:
 
 class TestGoState:
     def test_the_golden_bytes(self) -> None:
-        """F A.4: q 1.5, dq 0.25, tau_est -0.5, rest 0, as CycloneDDS writes it."""
+        """docs/sources/unitree-dex.md#a4: q 1.5, dq 0.25, tau_est -0.5, rest 0, as CycloneDDS
+        writes it.
+        """
         message = one("unitree_go").state({LEFT: view(1.5, dq=0.25, tau_est=-0.5)})
         data = message_type(dialect("unitree_go").state_type).encode(message)
         assert data.hex() == (
@@ -196,8 +200,10 @@ class TestGoState:
 
 
 class TestHgState:
-    def test_the_seeds_example(self) -> None:
-        """Seed 000, "Gripper Publishes State": 50 % open with an effort of 5 %."""
+    def test_the_example_of_the_specification(self) -> None:
+        """The interface specification, "Gripper Publishes State": 50 % open with an effort of 5
+        %.
+        """
         message = one("unitree_hg", fill=Fill.VENDOR).state({LEFT: view(2.7, tau_est=0.5)})
         motor = message.motor_state[0]
         assert motor == unitree_hg.MotorState_(

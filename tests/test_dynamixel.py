@@ -1,4 +1,6 @@
-"""Protocol 2.0 framing against the manual's byte-exact packets (facts/mx64 A6)."""
+"""Protocol 2.0 framing against the manual's byte-exact packets
+(docs/sources/mx64-ezgripper.md#a6).
+"""
 
 from __future__ import annotations
 

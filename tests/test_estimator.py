@@ -1,4 +1,6 @@
-"""The predictive estimator of seed 003: its promises, and what happens at an obstacle."""
+"""The predictive estimator of the note on predictive state: its promises, and what happens at an
+obstacle.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +95,7 @@ def test_never_teleports_overshoots_or_reverses(
 def test_without_measurements_it_is_the_seeds_model(
     start: float, command: float, speed: tuple[float, float]
 ) -> None:
-    """Phase 2 of seed 003, its 200 Hz loop written out."""
+    """Phase 2 of the note on predictive state, its 200 Hz loop written out."""
     e = JointEstimator(JOINT, speed)
     e.measure(start, 0.0)
     e.follow(command, 0.0)
@@ -220,7 +222,9 @@ def test_turning_round_ends_a_stall() -> None:
 
 
 def test_a_speed_that_is_too_high_is_not_a_stall() -> None:
-    """The 952 %/s of seed 003 cannot be (facts/mx64 D10.6); the hand is slow, not stuck."""
+    """The 952 %/s of the note on predictive state cannot be (docs/sources/mx64-ezgripper.md#d10-6);
+    the hand is slow, not stuck.
+    """
     e = JointEstimator(JOINT, (952.43 / 100 * STROKE,) * 2)
     true, v = 0.0, 1.0 * STROKE  # 100 %/s
     e.measure(true, 0.0)

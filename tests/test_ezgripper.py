@@ -166,7 +166,7 @@ class _FakePort:
 
 
 def test_stuffing_on_transmit_is_that_of_the_manual_not_of_the_sdk() -> None:
-    # facts/mx64 A6: write 116 = 0x00FDFFFF, correctly stuffed
+    # docs/sources/mx64-ezgripper.md#a6: write 116 = 0x00FDFFFF, correctly stuffed
     port = _FakePort(bytes.fromhex("FFFFFD00010400 5500 A10C"))
     packet = [0, 0, 0, 0, 1, 9, 0, 3, 116, 0, 0xFF, 0xFF, 0xFD, 0, 0, 0]
     _, result, error = PacketHandler().txRxPacket(port, packet)
@@ -177,8 +177,10 @@ def test_stuffing_on_transmit_is_that_of_the_manual_not_of_the_sdk() -> None:
 @pytest.mark.parametrize(
     "payload",
     [
-        bytes.fromhex("FFFFFDFFFFFF00080000"),  # current -1, velocity -3 (facts/mx64 A3)
-        bytes.fromhex("FFFFFDFFFDFD00000000"),  # loses a byte in the SDK (A3)
+        # current -1, velocity -3 (docs/sources/mx64-ezgripper.md#a3)
+        bytes.fromhex("FFFFFDFFFFFF00080000"),
+        # loses a byte in the SDK (docs/sources/mx64-ezgripper.md#a3)
+        bytes.fromhex("FFFFFDFFFDFD00000000"),
         bytes.fromhex("FFFFFDFFFFFDFFFFFDFD"),
         bytes(10),
     ],
@@ -467,7 +469,8 @@ def test_closing_on_nothing_reports_no_force(tmp_path: Path) -> None:
 
 
 def test_the_position_is_right_whatever_turn_the_servo_counts_in(tmp_path: Path) -> None:
-    # closed at 3010: fully open is 5510, which a reboot folds to 1414 (facts/mx64 D4)
+    # closed at 3010: fully open is 5510, which a reboot folds to 1414
+    # (docs/sources/mx64-ezgripper.md#d4)
     with emulated(start=10.0, closed_at=3010) as gripper:
         configuration = configured(tmp_path, zero=3010)
         with gripper_on(gripper.path, configuration) as hand:
@@ -851,7 +854,8 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
         # closing squeezes the fingers together a little: at most 2 %
         assert (3900 - zero) % 4096 <= 50
         speeds = content["movement_speed"][key]
-        # 172 %/s is what the motor could do without load at 12 V (facts/mx64 D1)
+        # 172 %/s is what the motor could do without load at 12 V
+        # (docs/sources/mx64-ezgripper.md#d1)
         assert 60 < speeds["opening"] < 175
         assert 60 < speeds["closing"] < 175
 

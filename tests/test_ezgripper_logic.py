@@ -43,7 +43,7 @@ def test_relative_position_does_not_depend_on_the_turn(
 
 
 def test_fact_sheet_example_of_a_folded_position() -> None:
-    # zero 3010, fully open: 5510, reads 1414 after a reboot (facts/mx64 D4)
+    # zero 3010, fully open: 5510, reads 1414 after a reboot (docs/sources/mx64-ezgripper.md#d4)
     assert scaling.relative_position(5510, 3010) == 2500
     assert scaling.relative_position(1414, 3010) == 2500
 

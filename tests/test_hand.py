@@ -157,7 +157,9 @@ class TestSpec:
 
 class TestModels:
     def test_dex1_is_what_the_fact_sheet_says(self) -> None:
-        """facts/unitree-dex A.1, B.1, B.2, B.3."""
+        """docs/sources/unitree-dex.md#a1, docs/sources/unitree-dex.md#b1,
+        docs/sources/unitree-dex.md#b2, docs/sources/unitree-dex.md#b3.
+        """
         joint = DEX1_1.joints[Side.LEFT][0]
         assert (joint.q_min, joint.q_max) == (0.0, 5.4)
         assert (DEX1_1.state_rate, DEX1_1.command_rate) == (500.0, 200.0)

@@ -24,7 +24,7 @@ from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import of
 
 ACTUATOR = dialect("unitree_actuator")
-INDEX = {Side.RIGHT: 0, Side.LEFT: 1}  # facts/unitree-dex A.1
+INDEX = {Side.RIGHT: 0, Side.LEFT: 1}  # docs/sources/unitree-dex.md#a1
 # mode, padding, q dq ddq tau_est q_raw dq_raw ddq_raw, temperature, padding, lost, reserve[2]
 STATE = struct.Struct("<B3x7fB3x3I")
 # mode, padding, q dq tau kp kd, reserve[3]
@@ -143,7 +143,7 @@ def test_the_figures_are_those_of_the_bytes() -> None:
 
 
 def test_the_right_one_holds_the_object() -> None:
-    """Index 0, whatever the enum of that release says (facts/unitree-dex A.1)."""
+    """Index 0, whatever the enum of that release says (docs/sources/unitree-dex.md#a1)."""
     s = session()
     q, tau = s.states[:, INDEX[Side.RIGHT], 1], s.states[:, INDEX[Side.RIGHT], 4]
     held = (tau < -0.85) & (np.abs(s.states[:, INDEX[Side.RIGHT], 2]) < 0.02)

@@ -28,8 +28,8 @@ from tests.messages_helpers import messages
 
 GO_CMD, GO_STATE, HG_CMD, HG_STATE = LOW_LEVEL_TYPES
 
-# facts/unitree-dex A.7: how Unitree's Python SDK packs the struct (its signed go temperatures
-# as the unsigned numbers that the IDL makes of them)
+# docs/sources/unitree-dex.md#a7: how Unitree's Python SDK packs the struct (its signed go
+# temperatures as the unsigned numbers that the IDL makes of them)
 FORMATS = {
     GO_CMD: "<4B4IH2x" + "B3x5f3I" * 20 + "4B55Bx2I",
     GO_STATE: "<4B4IH2x13fB3x" + "B3x7fB3x3I" * 20 + "4BiH4B15H8hI41B3xf2B2x2f4H2I",

@@ -35,7 +35,7 @@ def _drive(number: int, q: float) -> MotorCmd:
     return MotorCmd.setpoint(number, q=q, kp=5.0, kd=0.05)
 
 
-# facts/unitree-dex G: bytes read from the vendor's library
+# docs/sources/unitree-dex.md#g: bytes read from the vendor's library
 @pytest.mark.parametrize(
     ("command", "wire"),
     [
@@ -87,7 +87,7 @@ def test_calibration_is_that_of_the_vendors_library() -> None:
     assert Calibration.of(MotorCmd.setpoint(0, tau=-10.0)) is None
 
 
-# facts G: codes that were read at single values, rotor side
+# docs/sources/unitree-dex.md#g: codes that were read at single values, rotor side
 @pytest.mark.parametrize(
     ("name", "value", "code"),
     [

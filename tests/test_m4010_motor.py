@@ -86,7 +86,9 @@ def motor(
 
 
 def test_it_answers_any_probe_with_what_it_measures() -> None:
-    """The vendor's probe has undefined fields but for id and mode (facts G)."""
+    """The vendor's probe has undefined fields but for id and mode
+    (docs/sources/unitree-dex.md#g).
+    """
     host = Host(motor())
     data = host.ask(MotorCmd(0, Status.FOC, res=0x5A))
     assert data is not None
@@ -109,7 +111,9 @@ def test_zero_gains_leave_it_alone() -> None:
 
 
 def test_gains_below_a_count_are_no_gains() -> None:
-    """kd 0.0487 is 0 on the wire (facts G): the resolution is part of the product."""
+    """kd 0.0487 is 0 on the wire (docs/sources/unitree-dex.md#g): the resolution is part of the
+    product.
+    """
     assert MotorCmd.setpoint(0, kd=0.0487).k_spd == 0
     assert MotorCmd.setpoint(0, kd=0.05).k_spd == 1
 
@@ -210,7 +214,7 @@ def test_the_protection_trips_after_a_second_and_waits_for_a_clear_bit(brakes: b
 
 
 def test_without_the_bit_it_goes_on_for_ever() -> None:
-    """What the vendor's service asks for while it drives (facts B.2)."""
+    """What the vendor's service asks for while it drives (docs/sources/unitree-dex.md#b2)."""
     one = motor()
     host = Host(one)
     host.ask(MotorCmd.setpoint(0, q=5.4, kp=5.0, kd=0.05))
@@ -346,7 +350,9 @@ def test_any_command_keeps_it_finite_and_within_the_stops(
     ],
 )
 def test_faults_of_answers(spec: str, first: object) -> None:
-    """Those that put the vendor's library out of step are among them (facts G)."""
+    """Those that put the vendor's library out of step are among them
+    (docs/sources/unitree-dex.md#g).
+    """
     host = Host(
         motor(), faults=(f"{spec}@10ms" if ":" not in spec else spec.replace(":", "@10ms:"),)
     )

@@ -11,7 +11,7 @@ from dexkit.messages import unitree_hg as hg
 from dexkit.messages.generate import main as generate
 from dexkit.messages.layout import MAX_ELEMENTS
 
-# facts/unitree-dex A.4, measured there on Unitree's SDK classes
+# docs/sources/unitree-dex.md#a4, measured there on Unitree's SDK classes
 GOLDEN_CMDS = bytes.fromhex(
     "00010000 01000000 01000000 0000c03f 00000000 00000000"
     "0000a040 cdcc4c3d 00000000 00000000 00000000"
@@ -67,7 +67,7 @@ def test_golden_states() -> None:
     ids=lambda v: type(v).__name__ if not isinstance(v, int) else str(v),
 )
 def test_sizes(message: object, size: int) -> None:
-    # facts/unitree-dex A.4
+    # docs/sources/unitree-dex.md#a4
     assert len(encode(message)) == size
 
 

@@ -1,4 +1,6 @@
-"""Several servos on a line: order, line time, garbage, faults (facts/mx64 A5, C1, C2)."""
+"""Several servos on a line: order, line time, garbage, faults (docs/sources/mx64-ezgripper.md#a5,
+docs/sources/mx64-ezgripper.md#c1, docs/sources/mx64-ezgripper.md#c2).
+"""
 
 from __future__ import annotations
 
@@ -291,7 +293,7 @@ def transaction(host: Host, data: bytes) -> float:
 @pytest.mark.parametrize(
     ("what", "data", "wire_us"),
     [
-        # the manual's table at 1 Mbaud without return delay (facts/mx64 C1)
+        # the manual's table at 1 Mbaud without return delay (docs/sources/mx64-ezgripper.md#c1)
         ("ping", PING, 240),
         ("read 4", dxl.encode(1, 2, READ_POSITION), 290),
         ("read 10", dxl.encode(1, 2, bytes([126, 0, 10, 0])), 350),
@@ -361,7 +363,7 @@ def test_an_untuned_adapter_gives_sixty_reads_a_second() -> None:
         assert host.exchange_raw(dxl.encode(1, 2, READ_POSITION))
         host.now = host.at
         n += 1
-    assert n == 63  # one at each tick of the first second; facts/mx64 C2
+    assert n == 63  # one at each tick of the first second; docs/sources/mx64-ezgripper.md#c2
 
 
 def test_without_line_time_everything_is_there_at_once() -> None:

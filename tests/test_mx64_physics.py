@@ -50,7 +50,9 @@ def test_stall_torque_and_current_are_the_makers() -> None:
 
 
 def test_full_stroke_takes_what_the_motor_can() -> None:
-    """No faster than the no-load bound of 0.58 s (facts/mx64 D1), no slower than 0.75 s."""
+    """No faster than the no-load bound of 0.58 s (docs/sources/mx64-ezgripper.md#d1), no slower
+    than 0.75 s.
+    """
     target = servo(start=0.0)
     ready(target, EZ)
     write(target, mx64.GOAL_CURRENT, 800)
@@ -64,7 +66,7 @@ def test_full_stroke_takes_what_the_motor_can() -> None:
 
 
 def test_free_motion_draws_what_logs_show() -> None:
-    """8 to 106 units in free motion (facts/mx64 B7)."""
+    """8 to 106 units in free motion (docs/sources/mx64-ezgripper.md#b7)."""
     target = servo(start=0.0)
     ready(target, EZ)
     write(target, mx64.GOAL_POSITION, read(target, mx64.PRESENT_POSITION) + 2400)
@@ -295,7 +297,7 @@ def test_profile_arrives_exactly_and_keeps_its_limits(
 
 @pytest.mark.parametrize(
     ("velocity", "acceleration", "seconds"),
-    # t = 64 dPos / V + 64 V / A ms (facts/mx64 B5)
+    # t = 64 dPos / V + 64 V / A ms (docs/sources/mx64-ezgripper.md#b5)
     [(100, 0, 0.64 * 1), (100, 100, 0.64 + 0.064), (50, 100, 1.28 + 0.032)],
 )
 def test_profile_takes_the_manuals_time(velocity: int, acceleration: int, seconds: float) -> None:
@@ -347,7 +349,9 @@ def test_shape_of_a_step_is_none() -> None:
 
 @pytest.mark.parametrize(("percent", "rate"), [(15, 0.0149), (30, 0.0326), (45, 0.0647)])
 def test_holding_heats_as_measured(percent: int, rate: float) -> None:
-    """SAKE's three holds: time for the first 5 degC, within 20 % (facts/mx64 D6)."""
+    """SAKE's three holds: time for the first 5 degC, within 20 %
+    (docs/sources/mx64-ezgripper.md#d6).
+    """
     target = servo(start=1.0, firmware=dataclasses.replace(QUIET, overload_level=9.0))
     ready(target, EZ)
     write(target, mx64.GOAL_CURRENT, 1600 * percent // 100)
@@ -382,7 +386,9 @@ def test_it_cools_down_towards_the_surroundings() -> None:
 
 @pytest.mark.parametrize(("units", "trips"), [(720, False), (800, True)])
 def test_overload_needs_load_and_time(units: int, trips: bool) -> None:
-    """45 % of 1600 holds for minutes, 50 % does not (facts/mx64 D6, E)."""
+    """45 % of 1600 holds for minutes, 50 % does not (docs/sources/mx64-ezgripper.md#d6,
+    docs/sources/mx64-ezgripper.md#e).
+    """
     target = servo(start=1.0)
     ready(target, EZ)
     write(target, mx64.GOAL_CURRENT, units)

@@ -1,7 +1,7 @@
 """ROBOTIS' own SDK, unmodified, talks to the emulated servos over the pseudo-terminal.
 
-Where the SDK has a defect (facts/mx64 A3, C3) the emulator keeps to the manual, and the test says
-so.
+Where the SDK has a defect (docs/sources/mx64-ezgripper.md#a3, docs/sources/mx64-ezgripper.md#c3)
+the emulator keeps to the manual, and the test says so.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ OK = (sdk.COMM_SUCCESS, 0)
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers within 34 ms are not what is tested here, and a busy machine may not make it.
 
-    The constant is the one the SDK's users edit for slow adapters (facts/mx64 C3).
+    The constant is the one the SDK's users edit for slow adapters
+    (docs/sources/mx64-ezgripper.md#c3).
     """
     monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 300)
 
@@ -125,7 +126,9 @@ def test_errors_are_understood(port: sdk.PortHandler) -> None:
 
 
 def test_goals_that_the_sdk_forgets_to_stuff_are_still_understood(port: sdk.PortHandler) -> None:
-    """The SDK does not stuff what it sends (facts/mx64 A3), but its length and CRC agree."""
+    """The SDK does not stuff what it sends (docs/sources/mx64-ezgripper.md#a3), but its length and
+    CRC agree.
+    """
     goal = mx64.GOAL_POSITION.address
     assert PACKETS.write1ByteTxRx(port, 1, mx64.OPERATING_MODE.address, 5) == OK
     # FF FF FD 00, a whole header inside the packet: understood, and out of range

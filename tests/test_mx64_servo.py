@@ -1,4 +1,6 @@
-"""Registers and instructions of one emulated servo (facts/mx64 A4, A5, B2 to B7)."""
+"""Registers and instructions of one emulated servo (docs/sources/mx64-ezgripper.md#a4,
+docs/sources/mx64-ezgripper.md#a5, docs/sources/mx64-ezgripper.md#b).
+"""
 
 from __future__ import annotations
 
@@ -240,7 +242,9 @@ def test_mode_change_resets_what_the_manual_says() -> None:
 
 
 def test_reboot_folds_the_position_into_one_turn() -> None:
-    """Zero at 3010: open is 5510, which reads 1414 after a reboot (facts/mx64 D4)."""
+    """Zero at 3010: open is 5510, which reads 1414 after a reboot
+    (docs/sources/mx64-ezgripper.md#d4).
+    """
     target = servo(closed_at=3010, start=0.0)
     ready(target, OperatingMode.CURRENT_BASED_POSITION)
     assert read(target, mx64.PRESENT_POSITION) == pytest.approx(3010, abs=1)

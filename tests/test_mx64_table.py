@@ -18,7 +18,8 @@ def test_items_do_not_overlap_and_gaps_are_the_manuals() -> None:
         assert not covered & span, item.name
         covered |= span
     gaps = sorted(set(range(mx64.TABLE_END)) - covered)
-    # facts/mx64 B2; 20..23 and 24..27 are items, so the manual's 14-19 and 28-30 remain
+    # docs/sources/mx64-ezgripper.md#b2; 20..23 and 24..27 are items, so the manual's 14-19 and
+    # 28-30 remain
     expected = [
         *range(14, 20),
         *range(28, 31),
@@ -65,7 +66,7 @@ def test_units() -> None:
     assert duty == pytest.approx(1.0, abs=1e-3)
     assert mx64.CURRENT_LIMIT.maximum is not None
     assert mx64.CURRENT_LIMIT.maximum * mx64.CURRENT_UNIT == pytest.approx(6.52, abs=0.01)
-    # 63 rpm without load at 12 V are 4301 ticks/s (facts/mx64 B1)
+    # 63 rpm without load at 12 V are 4301 ticks/s (docs/sources/mx64-ezgripper.md#b1)
     rad_s = 63 / mx64.VELOCITY_UNIT_RPM * mx64.VELOCITY_UNIT
     assert rad_s / mx64.TICK == pytest.approx(4301, abs=1)
     assert math.isclose(mx64.EZGRIPPER_STROKE * mx64.TICK, math.radians(219.7), rel_tol=1e-3)

@@ -91,7 +91,7 @@ class TestModeByte:
         assert "send 0x10 (0x10 | index) to drive motor 0" in remark.text
 
     def test_calibration_is_not_passed_on(self) -> None:
-        """Status 6 means calibration on a sibling motor (facts/unitree-dex B.4)."""
+        """Status 6 means calibration on a sibling motor (docs/sources/unitree-dex.md#b4)."""
         modes = [0x10 | i for i in range(N)]
         modes[2] = 0x62
         assert understood(modes).mode.tolist() == [1, 1, 0, 1, 1, 1, 1]
@@ -196,7 +196,7 @@ class TestState:
         )
         assert (m.power_v, m.power_a, m.system_v, m.device_v) == (24.5, 0.5, 12.25, 5.0)
         assert tuple(m.error) == (0x10, 3)
-        assert len(mapping().encode({LEFT: self.VIEW})) == 1428  # facts/unitree-dex A.4
+        assert len(mapping().encode({LEFT: self.VIEW})) == 1428  # docs/sources/unitree-dex.md#a4
 
     def test_the_message_is_what_is_encoded(self) -> None:
         m = mapping()

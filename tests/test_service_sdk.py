@@ -36,7 +36,7 @@ def go(*q: float) -> Any:
 
 
 def hg(q: float) -> Any:
-    """As a client by seed 000 sends it: gains and all else 0."""
+    """As a client by the interface specification sends it: gains and all else 0."""
     return unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=q)])
 
 

@@ -70,7 +70,7 @@ uint32 lost 0
 uint32[2] reserve
 """
 
-# the layout of August 2024 (facts/unitree-dex A.3): imu before pressure, two fields fewer
+# the layout of August 2024 (docs/sources/unitree-dex.md#a3): imu before pressure, two fields fewer
 OLD_HAND_STATE = """\
 module unitree_hg { module msg { module dds_ {
 struct MotorState_ { octet mode; float q; float dq; float ddq; float tau_est;

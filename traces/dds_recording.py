@@ -3,7 +3,7 @@
 A plain DDS reader must know the type. Types come from discovery (any endpoint of a known type
 on a wanted topic, reader or writer) and, for topics asked for by name on which there is nobody
 yet, from the hand models, so that the reader is there before the writer: a controller that forks
-never learns of readers that appear later (facts/unitree-dex B.7).
+never learns of readers that appear later (docs/sources/unitree-dex.md#b7).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Schema texts of recordings, read into one form so that layouts can be compared.
 
 A recording carries the layout its payloads had when they were written. Layouts have changed
-(facts/unitree-dex A.3) and plain CDR does not say which one it is, so a payload of an old
+(docs/sources/unitree-dex.md#a3) and plain CDR does not say which one it is, so a payload of an old
 layout decodes to nonsense without any error. Therefore the recorded schema, in whichever of
 ``ros2msg``, ``ros2idl`` and ``omgidl`` it is, is compared with dexkit's own.
 """

@@ -43,7 +43,8 @@ from dexkit.hand import Side
 
 __all__ = ["GripperScript"]
 
-LEAD = 0.18 / 5.4  # of the stroke: how far xr_teleoperate commands ahead (facts/unitree-dex B.3)
+# of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)
+LEAD = 0.18 / 5.4
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -59,7 +60,7 @@ class GripperScript(Script):
     def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(plan, say)
         self._stroke = plan.dialect.q_open
-        # seed 000: in unitree_hg the gains, dq and tau of a command are not used
+        # the interface specification: in unitree_hg the gains, dq and tau of a command are not used
         self._gains_used = plan.dialect.name != "unitree_hg"
 
     def _provoke(self) -> Steps:

@@ -2,11 +2,11 @@
 
 Written apart from :mod:`dexkit.wire.dex3_usb`, which drivers and emulators share: a mistake there
 would be made on both ends of the wire and never be seen. The two are compared by the tests, and
-with the vectors of the fact sheet. This one is lenient: it reads what can be read in any bytes
-and leaves it to the checks to find fault.
+with the vectors of docs/sources/unitree-dex.md#c8. This one is lenient: it reads what can be read
+in any bytes and leaves it to the checks to find fault.
 
-Layouts and units: seed 002 "Introduction to Send and Receive Structures", facts/unitree-dex
-C.2 to C.9. All little endian, one-byte alignment.
+Layouts and units: the Dex3-1 manual "Introduction to Send and Receive Structures",
+docs/sources/unitree-dex.md#c. All little endian, one-byte alignment.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ COMMAND_SIZES = {1234: 240, 734: 140}
 STATE_SIZE = 1270
 STATE_BUS = 240
 NO_VALUE = 30000
-"""Pressure of a slot without sensor element (seed 002 "30000 represents no value")."""
+"""Pressure of a slot without sensor element (the Dex3-1 manual "30000 represents no value")."""
 
 _MOTOR_CMD = struct.Struct("<2sBBhhihh")
 _MOTOR_STATE = struct.Struct("<2sBbBBhhiIHH")
@@ -60,8 +60,8 @@ def crc(data: bytes) -> int:
     """The manual's CRC32 of whole 32-bit little-endian words; bytes beyond the last are left out.
 
     Polynomial 0x04C11DB7 from 0xFFFFFFFF, most significant bit first, nothing inverted at the end
-    (seed 002 "CRC32 Function Calculation Method"). zlib computes the same polynomial with all bits
-    in mirrored order, so the bits are mirrored before and after.
+    (the Dex3-1 manual "CRC32 Function Calculation Method"). zlib computes the same polynomial with
+    all bits in mirrored order, so the bits are mirrored before and after.
     """
     words = array("I", data[: len(data) // 4 * 4])
     if _LITTLE:
@@ -72,7 +72,7 @@ def crc(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Scale:
-    """Counts on the wire for one joint's SI figures (facts/unitree-dex C.9).
+    """Counts on the wire for one joint's SI figures (docs/sources/unitree-dex.md#c9).
 
     The rotor turns ``ratio`` times as fast as the joint. 32768/2pi counts are a radian, 256/2pi
     are 100 rad/s, 256 are 1 mN·m, 1280 are 1 mN·m/rad and 1 mN·m per 100 rad/s.
@@ -159,7 +159,7 @@ def pack_command(
     """``LinuxToMcuCmd_t``, ``size`` bytes: 1234, or 734.
 
     The manual gives the head no value and leaves it out of the CRC; FE FD stands there, as the
-    motor packets' head differs from their state's (facts/unitree-dex C.5).
+    motor packets' head differs from their state's (docs/sources/unitree-dex.md#c5).
 
     :param buses: packets by bus.
     :param sizes: a bus's ``cmd_size`` that is not its true one.

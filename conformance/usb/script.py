@@ -64,7 +64,7 @@ __all__ = [
 
 BUSES: tuple[tuple[int, int], ...] = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0), (2, 1))
 """(bus, id) of each joint's motor: thumb, middle, index. The manual's figure of it is lost, and
-this is assumed (facts/unitree-dex C.7)."""
+this is assumed (docs/sources/unitree-dex.md#c7)."""
 DAMAGES: dict[str, str] = {
     "frame-crc": "a frame with a wrong CRC",
     "packet-crc": "motor packets with a wrong CRC",
@@ -78,9 +78,9 @@ DAMAGES: dict[str, str] = {
 """The phases ``malformed`` by ``params["kind"]``."""
 DRIVEN, FREE = 3, 5
 """Joints of the time-out test: middle_0 is driven with protection, index_0 without."""
-ANSWER_TIMEOUT = 1.0  # s; IN timeout of the manual's code (seed 002 receiveState)
+ANSWER_TIMEOUT = 1.0  # s; IN timeout of the manual's code (the Dex3-1 manual receiveState)
 _STEP = 0.2  # rad
-_KP, _KD = 1.5, 0.1  # grip of the vendor's C++ example (facts/unitree-dex B.1)
+_KP, _KD = 1.5, 0.1  # grip of the vendor's C++ example (docs/sources/unitree-dex.md#b1)
 _SPEED = 0.4  # rad/s
 _GIVE_UP = 3  # commands in a row without an answer
 _SETTLE = 0.08  # s in which an accepted step is seen, and a late answer comes

@@ -20,11 +20,12 @@ __all__ = ["Dex3Service", "Dex5Service", "FingerHand", "FingerService"]
 
 Flags: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]
-NO_VALUE = 30000.0  # seed 002
+NO_VALUE = 30000.0  # the Dex3-1 manual
 # the joint that presses each sensor packet, in the order of the model's sensors
 _PRESSED_BY = {"thumb": (2, 1), "middle": (4, 3), "index": (6, 5)}
 
-# one motor and one sensor packet of a HandState_ on the wire (facts/unitree-dex A.2, A.4)
+# one motor and one sensor packet of a HandState_ on the wire (docs/sources/unitree-dex.md#a2,
+# docs/sources/unitree-dex.md#a4)
 _MOTOR = np.dtype(
     {
         "names": ["mode", "q", "dq", "ddq", "tau_est", "reserve", "values"],
@@ -198,7 +199,7 @@ class FingerHand:
 
 
 class Dex3Hand(FingerHand):
-    """Seven joints and RIS_Mode (facts/unitree-dex B.4)."""
+    """Seven joints and RIS_Mode (docs/sources/unitree-dex.md#b4)."""
 
     model = DEX3_1
     inertia = 0.001
@@ -235,7 +236,7 @@ class Dex3Hand(FingerHand):
 
 
 class Dex5Hand(FingerHand):
-    """Twenty joints; mode 1 drives them (facts/unitree-dex B.5)."""
+    """Twenty joints; mode 1 drives them (docs/sources/unitree-dex.md#b5)."""
 
     model = DEX5_1
     # light enough for the fingers' gains

@@ -109,7 +109,7 @@ class ReferenceHand:
 class ReferenceService(Service):
     """Grippers on their topics.
 
-    Its period is the slowest of the vendor's service, 333 Hz (facts/unitree-dex B.2).
+    Its period is the slowest of the vendor's service, 333 Hz (docs/sources/unitree-dex.md#b2).
     """
 
     hand: type[ReferenceHand] = ReferenceHand
@@ -127,7 +127,8 @@ class ReferenceService(Service):
     def command(self, side: Side, motor: Motor) -> None:
         """A gripper's motor is commanded."""
         if self.dialect.name == "unitree_hg" and math.isfinite(motor.q):
-            # seed 000: gains and feed-forward of a command are not used, the ends snap
+            # the interface specification: gains and feed-forward of a command are not used, the
+            # ends snap
             q = 0.0 if motor.q <= 0.1 else self.dialect.q_open if motor.q >= 6.0 else motor.q
             motor = Motor(q=q)
         self.hands[side].command(motor)
@@ -149,7 +150,8 @@ class ReferenceService(Service):
     def fields(self, side: Side) -> dict[str, Any]:
         """What a side's motor says of itself."""
         found: dict[str, Any] = {**self.hands[side].fields(), "temperature": 35}
-        if self.dialect.name == "unitree_hg":  # seed 000: mode 0, 25 degrees, 12 V, no sign
+        # the interface specification: mode 0, 25 degrees, 12 V, no sign
+        if self.dialect.name == "unitree_hg":
             grip = abs(found["tau_est"])
             found |= {"mode": 0, "tau_est": grip, "temperature": (25, 25), "vol": 12.0}
         return found

@@ -3,20 +3,20 @@
 A *part* is that: one motor of a ``MotorCmds_`` or ``MotorStates_``, or a whole ``HandCmd_`` or
 ``HandState_``, which is of one gripper anyway. Between dialects of the same types a part passes
 as it is, every field. Between 0 .. 5.4 rad (``unitree_go``, ``unitree_actuator``) and 0 .. 2 pi
-(``unitree_hg``), with s = 2 pi / 5.4:
+(``unitree_hg``, as the interface specification has it), with s = 2 pi / 5.4:
 
 =============  =====================================  =============================================
 what           to unitree_hg                          from unitree_hg
 =============  =====================================  =============================================
 q, dq, ddq     times s; see "near the ends"           by s; a command at or below 0.1 closes, at
-                                                      or above 6.0 opens (seed 000)
-tau            as it is                               of a command: 0, it is unused (seed 000)
+                                                      or above 6.0 opens
+tau            as it is                               of a command: 0, it is unused
 kp, kd         by s                                   5.0 and 0.05, whatever the command says, as
                                                       ``dexkit serve`` takes them
 tau_est        grip strength: without its sign        with the sign of closing
-temperature    0 (not filled) becomes 25 (seed 000)   the first of the two, 0 .. 127
-vol            12.0 (seed 000): there is no field     dropped
-mode           0: it means "position" (seed 000)      of a command 1 (drive), of a state 0
+temperature    0 (not filled) becomes 25              the first of the two, 0 .. 127
+vol            12.0: there is no field                dropped
+mode           0: it means "position"                 of a command 1 (drive), of a state 0
 fault, lost    motorstate and error                   reserve[0] and lost
 predicted      reserve[0]                             reserve[1]
 =============  =====================================  =============================================

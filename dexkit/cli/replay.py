@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 # Seconds from a match seen here to the first message, for the other side to see it too: what comes
-# before is lost to it. Unitree's SDK sleeps as long after making a writer (facts/unitree-dex A.6).
+# before is lost to it. Unitree's SDK sleeps as long after making a writer
+# (docs/sources/unitree-dex.md#a6).
 _SETTLE = 0.2
 # Seconds for the other side's readers after the last message, before the writers vanish.
 _LINGER = 0.1

@@ -2,9 +2,9 @@
 
 An observer speaks RTPS itself instead of joining with CycloneDDS, for three reasons. It sees
 peers that CycloneDDS 0.10 does not survive: what kills a 0.10 process is the type object that an
-11.x peer sends when asked for it (facts/unitree-dex F), and an observer never asks. It needs no
-CycloneDDS, so it works on any Python. And it costs a socket a domain, so that a dozen domains
-are looked at in a second.
+11.x peer sends when asked for it (docs/sources/unitree-dex.md#f), and an observer never asks. It
+needs no CycloneDDS, so it works on any Python. And it costs a socket a domain, so that a dozen
+domains are looked at in a second.
 
 Numbers are those of the OMG's "DDS Interoperability Wire Protocol" 2.5, chapter 9. Vendor ids
 are from the OMG's registry; the vendor parameter 0x8007, in which CycloneDDS announces its

@@ -31,7 +31,8 @@ _FROZEN_COMMANDS = 0.1  # rad that commands move while an honest state could not
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
 _DRIVER_BAUD = 1_000_000
 _DURABILITY = ("volatile", "transient_local", "transient", "persistent")
-# xr_teleoperate v1.1 and every client of a Dex3-1 wait for a q that is not 0 (F B.1)
+# xr_teleoperate v1.1 and every client of a Dex3-1 wait for a q that is not 0
+# (docs/sources/unitree-dex.md#b1)
 _ZERO_IS_NO_STATE = frozenset({"unitree_actuator", "dex3", "dex5"})
 # whose client is two processes, of which one sends: readers that come late hear nothing of it
 _FORKING = frozenset({"dex3-1", "dex5-1"})
@@ -179,7 +180,9 @@ def _wanted(views: Iterable[DomainView], wish: Wish) -> list[Dialect]:
 
 
 def readiness(seen: Observations, wish: Wish | None = None) -> list[Readiness]:
-    """Whether a client would get past 'Waiting to subscribe dds...' (facts/unitree-dex B.1)."""
+    """Whether a client would get past 'Waiting to subscribe dds...'
+    (docs/sources/unitree-dex.md#b1).
+    """
     wish = wish or Wish()
     out = []
     for view in _focus(seen, wish):
@@ -623,7 +626,7 @@ def _elsewhere(seen: Observations) -> str:
 
 
 def _robot(addresses: Iterable[str]) -> bool:
-    return any(a.startswith("192.168.123.") for a in addresses)  # F A.6
+    return any(a.startswith("192.168.123.") for a in addresses)  # docs/sources/unitree-dex.md#a6
 
 
 # --- network

@@ -33,8 +33,9 @@ __all__ = [
 ]
 
 MAX_ELEMENTS = 1024
-"""Longest sequence that is encoded or decoded. The largest known has 35 elements (F A.1); the
-bound is only there so that a hostile sample cannot ask for more than a fixed amount of work."""
+"""Longest sequence that is encoded or decoded. The largest known has 35 elements
+(docs/sources/unitree-dex.md#a1); the bound is only there so that a hostile sample cannot ask for
+more than a fixed amount of work."""
 
 
 class IdlError(UsageError):

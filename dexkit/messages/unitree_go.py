@@ -81,7 +81,7 @@ class MotorState_:
     q_raw: float = 0.0
     dq_raw: float = 0.0
     ddq_raw: float = 0.0
-    temperature: int = 0  # degrees Celsius; keep it at 127 or less (facts/unitree-dex A.7)
+    temperature: int = 0  # degrees Celsius; keep it at 127 or less (docs/sources/unitree-dex.md#a7)
     lost: int = 0  # packets lost
     reserve: tuple[int, ...] = (0,) * 2
 
@@ -107,7 +107,7 @@ class IMUState_:
     gyroscope: tuple[float, ...] = (0.0,) * 3  # rad/s
     accelerometer: tuple[float, ...] = (0.0,) * 3  # m/s^2
     rpy: tuple[float, ...] = (0.0,) * 3  # rad
-    temperature: int = 0  # degrees Celsius; keep it at 127 or less (facts/unitree-dex A.7)
+    temperature: int = 0  # degrees Celsius; keep it at 127 or less (docs/sources/unitree-dex.md#a7)
 
 
 @dataclass(slots=True)
@@ -159,7 +159,7 @@ class LowCmd_:
     fan: tuple[int, ...] = (0,) * 2
     gpio: int = 0
     reserve: int = 0
-    crc: int = 0  # over the C struct (facts/unitree-dex A.7)
+    crc: int = 0  # over the C struct (docs/sources/unitree-dex.md#a7)
 
 
 @dataclass(slots=True)
@@ -190,7 +190,7 @@ class LowState_:
     power_a: float = 0.0  # A
     fan_frequency: tuple[int, ...] = (0,) * 4
     reserve: int = 0
-    crc: int = 0  # over the C struct (facts/unitree-dex A.7)
+    crc: int = 0  # over the C struct (docs/sources/unitree-dex.md#a7)
 
 
 @dataclass(slots=True)

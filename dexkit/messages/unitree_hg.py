@@ -140,7 +140,7 @@ class LowCmd_:
     mode_machine: int = 0  # as the state says
     motor_cmd: list[MotorCmd_] = field(default_factory=lambda: [MotorCmd_() for _ in range(35)])
     reserve: tuple[int, ...] = (0,) * 4
-    crc: int = 0  # over the C struct (facts/unitree-dex A.7)
+    crc: int = 0  # over the C struct (docs/sources/unitree-dex.md#a7)
 
 
 @dataclass(slots=True)
@@ -158,7 +158,7 @@ class LowState_:
     motor_state: list[MotorState_] = field(default_factory=lambda: [MotorState_() for _ in range(35)])
     wireless_remote: tuple[int, ...] = (0,) * 40
     reserve: tuple[int, ...] = (0,) * 4
-    crc: int = 0  # over the C struct (facts/unitree-dex A.7)
+    crc: int = 0  # over the C struct (docs/sources/unitree-dex.md#a7)
 
 
 _MotorCmd_0 = (Struct("<B3x5fI"), Struct(">B3x5fI"))

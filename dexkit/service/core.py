@@ -310,8 +310,8 @@ class HandCore:
         a pause until a command comes that is newer.
 
         When the newest command is older than the model's command time-out: the brake, where the
-        dialect has no time-out bit. Where it has one (seed 002, RIS_Mode), a joint whose bit
-        was set *trips*: it brakes until a command comes with the bit clear. A joint whose bit
+        dialect has no time-out bit. Where it has one (the Dex3-1 manual, RIS_Mode), a joint whose
+        bit was set *trips*: it brakes until a command comes with the bit clear. A joint whose bit
         was clear is unprotected and keeps its position command, without the feed-forward
         velocity and torque, which would move it on.
         """

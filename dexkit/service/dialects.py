@@ -3,32 +3,35 @@
 Pure functions of values; which topics and types a dialect uses is in :mod:`dexkit.models`.
 
 =================  ================================================================================
-unitree_go         q, dq, tau, kp, kd as they are; the mode byte is ignored (facts/unitree-dex B.2),
-                   so kp = kd = 0 is limp and not a brake.
-unitree_actuator   the same, two motors in one message: 0 right, 1 left (A.1).
-unitree_hg         seed 000: q runs to 2 pi; a command at or below 0.1 closes, at or above 6.0
-                   opens; dq, tau, kp and kd of a command are unused (clients send 0), the gains
-                   are those of xr_teleoperate; tau_est of the state is grip strength, not signed.
+unitree_go         q, dq, tau, kp, kd as they are; the mode byte is ignored, so kp = kd = 0
+                   is limp and not a brake (docs/sources/unitree-dex.md#b2).
+unitree_actuator   the same, two motors in one message: 0 right, 1 left
+                   (docs/sources/unitree-dex.md#a1).
+unitree_hg         the interface specification: q runs to 2 pi; a command at or below 0.1
+                   closes, at or above 6.0 opens; dq, tau, kp and kd of a command are unused
+                   (clients send 0), the gains are those of xr_teleoperate; tau_est of the
+                   state is grip strength, not signed.
 dex3               seven motors in the order of the IDL, all values as they are; the mode byte is
-                   RIS_Mode (seed 002): id, status (0 lock, 1 FOC) and the time-out bit.
-dex5               20 joints in the order of the IDL; mode 1 is position control (B.5), 0 brakes;
-                   the fingers' tau and tau_est are in mN·m, as a comment in the only client says.
+                   RIS_Mode (the Dex3-1 manual): id, status (0 lock, 1 FOC) and the time-out bit.
+dex5               20 joints in the order of the IDL; mode 1 is position control, 0 brakes
+                   (docs/sources/unitree-dex.md#b5); the fingers' tau and tau_est are in mN·m,
+                   as a comment in the only client says.
 =================  ================================================================================
 
 **What a state holds.** ``Fill.VENDOR`` fills what the reference fills and leaves the rest 0:
-q, dq, tau_est for unitree_go (the vendor's service, B.2); q, tau_est and the fixed temperature
-25, 25 and vol 12.0 for unitree_hg (seed 000). ``Fill.KNOWN``, the default, adds what the backend
-really measured, and what is wrong:
+q, dq, tau_est for unitree_go (the vendor's service, docs/sources/unitree-dex.md#b2); q, tau_est and
+the fixed temperature 25, 25 and vol 12.0 for unitree_hg (the interface specification).
+``Fill.KNOWN``, the default, adds what the backend really measured, and what is wrong:
 
 ======================  ===========================  ==============================================
 what                    unitree_go, _actuator        unitree_hg
 ======================  ===========================  ==============================================
-braking or driven       mode 0 or 1                  mode stays 0 (it means "position" in seed 000)
+braking or driven       mode 0 or 1                  mode stays 0 (it means "position")
 ddq                     ddq                          ddq
 dq                      dq                           dq
-temperature             temperature, 0..127          temperature, twice; 25 where unknown (seed 000)
-voltage                 no field                     vol; 12.0 where unknown (seed 000); supply in
-                                                     power_v, power_a, system_v, device_v
+temperature             temperature, 0..127          temperature, twice; 25 where unknown
+voltage                 no field                     vol; 12.0 where unknown; supply in power_v,
+                                                     power_a, system_v, device_v
 MotorError bits         reserve[0]                   motorstate; all joints together in error[0]
 exchanges missed since  lost                         error[1]
 the last good one
@@ -38,8 +41,8 @@ q is predicted          reserve[1] = 1               reserve[0] = 1
 The states of dex3 and dex5 are described in docs/dex3.md and docs/dex5.md;
 :mod:`dexkit.service.finger_state` encodes them.
 
-``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more (A.7).
-What a backend does not know (NaN) is sent as 0.
+``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more
+(docs/sources/unitree-dex.md#a7). What a backend does not know (NaN) is sent as 0.
 """
 
 from __future__ import annotations
@@ -71,10 +74,10 @@ from dexkit.service.finger_state import FingerStateEncoder
 
 __all__ = ["HG_CLOSED", "HG_OPEN", "DialectMap", "Fill", "Remark", "StateView", "dialect_map"]
 
-# what xr_teleoperate sends to a Dex1 (facts/unitree-dex B.1)
+# what xr_teleoperate sends to a Dex1 (docs/sources/unitree-dex.md#b1)
 _KP, _KD = 5.0, 0.05
-HG_CLOSED, HG_OPEN = 0.1, 6.0  # rad; seed 000, "Position Conversion"
-_HG_TEMPERATURE, _HG_VOL = 25, 12.0  # seed 000, "MotorState_"
+HG_CLOSED, HG_OPEN = 0.1, 6.0  # rad; the interface specification, "Position Conversion"
+_HG_TEMPERATURE, _HG_VOL = 25, 12.0  # the interface specification, "MotorState_"
 _ROUNDING = 1e-6  # rad; more than float32 loses of a limit
 _U32 = 0xFFFFFFFF
 _FLOAT_MAX = float(np.finfo(np.float32).max)
@@ -328,7 +331,9 @@ class _FingerMap(DialectMap):
 
 
 class _Dex3Map(_FingerMap):
-    """Mode bytes are RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (seed 002)."""
+    """Mode bytes are RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (the Dex3-1
+    manual).
+    """
 
     def command(self, message: Any, side: Side) -> HandCommand | None:
         command = super().command(message, side)
@@ -362,7 +367,9 @@ class _Dex3Map(_FingerMap):
 
 
 class _Dex5Map(_FingerMap):
-    """Mode bytes are plain numbers: 1 is position control (facts/unitree-dex B.5, D 26)."""
+    """Mode bytes are plain numbers: 1 is position control (docs/sources/unitree-dex.md#b5,
+    docs/sources/unitree-dex.md#d26).
+    """
 
     _ids = False
 

@@ -1,12 +1,13 @@
-"""Prediction of joint positions between the measurements of a slow link (seed 003).
+"""Prediction of joint positions between the measurements of a slow link (the note on predictive
+state).
 
 Unitree's clients steer by the newest reported position: xr_teleoperate clips each command to
-0.18 rad from it, so a gripper that reports at 5 Hz is driven at a crawl (facts/mx64 D7). Where
-the link is slower than that, the service publishes what a velocity-limited model says and lets
-the measurements correct the model.
+0.18 rad from it, so a gripper that reports at 5 Hz is driven at a crawl
+(docs/sources/mx64-ezgripper.md#d7). Where the link is slower than that, the service publishes what
+a velocity-limited model says and lets the measurements correct the model.
 
-Seed 003 states the model and three promises (never teleports, never overshoots, never
-reverses), and its correction step breaks the third: a measurement behind the prediction pulls
+The note on predictive state states the model and three promises (never teleports, never overshoots,
+never reverses), and its correction step breaks the third: a measurement behind the prediction pulls
 it back. Here the two are kept apart. The *model* is the seed's: it runs to the command at the
 calibrated speed, each measurement moves it by 10 % of the difference, and a difference above
 10 % of the stroke puts it on the measurement. The *prediction* that is published follows the
@@ -14,7 +15,7 @@ model, and these hold of it, between two resynchronisations, for one standing co
 
 V  it never moves faster than the calibrated speed of the direction in which it moves;
 O  it never passes the command in the direction in which it came to it, not even when the hand
-   does (seed 003: "never overshoots");
+   does (the note on predictive state: "never overshoots");
 R  travelling, it never moves away from the command: it waits until the model has caught up.
 
 A resynchronisation (difference above the threshold) is the one jump, onto what was measured:
@@ -23,8 +24,8 @@ nothing is predicted in that direction until the hand is seen to move or the com
 round, so a gripper that holds an object is not reported to creep through it.
 
 Travelling ends when the model arrives. From then on the velocity model has nothing to add, and
-the prediction follows the measurements alone, up to the command (seed 003 would return to the
-command after each correction and so report an arrival that never happened).
+the prediction follows the measurements alone, up to the command (the note on predictive state would
+return to the command after each correction and so report an arrival that never happened).
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ from dexkit.hand import HandCommand, HandSpec, HandState, JointSpec
 
 __all__ = ["CORRECTION", "STALL_THRESHOLD", "JointEstimator", "StateEstimator"]
 
-STALL_THRESHOLD = 0.1  # of the stroke (seed 003, "Thresholds")
-CORRECTION = 0.1  # of the difference, per measurement (seed 003, "Thresholds")
+STALL_THRESHOLD = 0.1  # of the stroke (the note on predictive state, "Thresholds")
+CORRECTION = 0.1  # of the difference, per measurement (the note on predictive state, "Thresholds")
 _MOVING = 0.005  # of the stroke between two measurements: the hand moves, it is not stuck
 
 

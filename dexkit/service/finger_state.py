@@ -21,7 +21,7 @@ from dexkit.messages import message_type, unitree_hg
 
 __all__ = ["NO_VALUE", "FingerStateEncoder"]
 
-NO_VALUE = 30000.0  #: the pressure of a slot without a sensor element (seed 002)
+NO_VALUE = 30000.0  #: the pressure of a slot without a sensor element (the Dex3-1 manual)
 
 _TYPE = message_type("unitree_hg::msg::dds_::HandState_")
 _BESIDE_NO_VALUE = np.nextafter(np.float32(NO_VALUE), np.float32(np.inf))
@@ -64,8 +64,8 @@ class FingerStateEncoder:
 
     :param known: also what the vendor's service does not say: ddq, missed exchanges, whether q
         is predicted.
-    :param ids: the mode byte is RIS_Mode, with id and time-out bit (facts/unitree-dex B.4);
-        else it is the bare status.
+    :param ids: the mode byte is RIS_Mode, with id and time-out bit
+        (docs/sources/unitree-dex.md#b4); else it is the bare status.
     :param torque_units: N·m in one unit of each motor's tau_est; empty for N·m throughout.
     """
 

@@ -1,9 +1,9 @@
 """Unitree's teleoperation clients, sans-IO: states and the operator's input in, commands out.
 
 What xr_teleoperate does to a hand between the hand tracking and the topics, with all of its
-quirks (facts/unitree-dex B.1 and B.7; read in its ``robot_hand_unitree.py`` and
-``weighted_moving_filter.py``, releases 1.1, 1.4 and the newest one of the fact sheet; that of the
-Dex5-1 in a pull request that was open then):
+quirks (docs/sources/unitree-dex.md#b1 and docs/sources/unitree-dex.md#b7; read in its
+``robot_hand_unitree.py`` and ``weighted_moving_filter.py``, releases 1.1, 1.4 and the newest one
+listed there; that of the Dex5-1 in a pull request that was open then):
 
 - States are received by one thread that reads left, then right, each time waiting for a sample
   that it has not had, and pauses for 2 ms: :class:`StateReceiver`. A side that falls silent stops
@@ -51,16 +51,19 @@ __all__ = [
 ]
 
 POLL_PAUSE = 0.002
-"""Seconds that the receiving thread pauses after each pair of states (B.1, "polls every >= 2 ms").
+"""Seconds that the receiving thread pauses after each pair of states
+(docs/sources/unitree-dex.md#b1, "polls every >= 2 ms").
 """
 LEAD = 0.18
-"""Rad by which a Dex1-1 command may be ahead of the last state: 3 mm of jaw travel (B.3)."""
+"""Rad by which a Dex1-1 command may be ahead of the last state: 3 mm of jaw travel
+(docs/sources/unitree-dex.md#b3)."""
 LEAD_SIMULATED_1_1 = 1.0
-"""The same in simulation, release 1.1; later ones do not clip there (B.3)."""
+"""The same in simulation, release 1.1; later ones do not clip there
+(docs/sources/unitree-dex.md#b3)."""
 WEIGHTS = (0.5, 0.3, 0.2)
-"""Of the three last values, newest first (B.3)."""
+"""Of the three last values, newest first (docs/sources/unitree-dex.md#b3)."""
 PINCH_MIN, PINCH_MAX = 5.0, 7.0
-"""Pinch distance or trigger that means closed, and open (B.3)."""
+"""Pinch distance or trigger that means closed, and open (docs/sources/unitree-dex.md#b3)."""
 
 Pose: TypeAlias = tuple[float, ...]
 """q of every joint of a hand, rad."""
@@ -170,8 +173,8 @@ class StickyFilter:
     """Weighted mean of the last three values; one equal to the last is not counted.
 
     So a value that no longer changes is never reached: the output stays a mixture of the last
-    three different ones (B.7, "the smoothing filter sticks"). The values of both hands are one:
-    while either changes, both are counted.
+    three different ones (docs/sources/unitree-dex.md#b7, "the smoothing filter sticks"). The values
+    of both hands are one: while either changes, both are counted.
     """
 
     def __init__(self, weights: Sequence[float] = WEIGHTS) -> None:
@@ -384,7 +387,8 @@ class FingerClient(TeleopClient):
     The genuine ones get hand skeletons, and a retargeting library makes joint targets of them;
     that library is not modelled. States are only waited for: nothing is clipped or smoothed, and
     the hand hears no more of where it is. One more quirk cannot be had without a process that
-    forks: the genuine clients' commands reach only readers that were there before them (B.7).
+    forks: the genuine clients' commands reach only readers that were there before them
+    (docs/sources/unitree-dex.md#b7).
     """
 
     model: HandModel
@@ -423,7 +427,9 @@ class Dex3Client(FingerClient):
 
 
 class Dex5Client(FingerClient):
-    """xr_teleoperate's ``Dex5_1_Controller``: mode 1, other gains for the thumb (B.1, B.5)."""
+    """xr_teleoperate's ``Dex5_1_Controller``: mode 1, other gains for the thumb
+    (docs/sources/unitree-dex.md#b1, docs/sources/unitree-dex.md#b5).
+    """
 
     model = DEX5_1
 

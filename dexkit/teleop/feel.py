@@ -5,7 +5,7 @@
 - *reaction*: seconds from a step until the hand has moved by 2 % of the stroke.
 - *overshoot*: how far it goes past the end of a step, rad.
 - *stuck*: how far from the wanted place it rests, rad. Xr_teleoperate's filter alone leaves some
-  (facts/unitree-dex B.7); friction under a weak kp adds to it.
+  (docs/sources/unitree-dex.md#b7); friction under a weak kp adds to it.
 - *lag*: seconds by which the hand follows a steadily moving operator.
 """
 

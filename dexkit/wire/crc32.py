@@ -2,8 +2,9 @@
 
 Polynomial 0x04C11DB7, initial value 0xFFFFFFFF, not reflected, no final xor. The vendor's function
 takes the data as 32-bit little-endian words and feeds each of them most significant byte first,
-which is CRC-32/MPEG-2 over the data with the bytes of every word turned round (facts/unitree-dex
-C.8, A.7; seed 002 "CRC32 Function Calculation Method").
+which is CRC-32/MPEG-2 over the data with the bytes of every word turned round
+(docs/sources/unitree-dex.md#c8, docs/sources/unitree-dex.md#a7; the Dex3-1 manual "CRC32 Function
+Calculation Method").
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A frame is ``FF FF FD 00, ID, length (2, little-endian), instruction, parameters, CRC (2)``;
 the length counts everything behind itself. A status packet has instruction 0x55 and an error
-byte before its data. (facts/mx64 A1 to A5.)
+byte before its data. (docs/sources/mx64-ezgripper.md#a.)
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ BROADCAST_ID = 0xFE
 ALERT = 0x80
 """Bit of a status packet's error byte: Hardware Error Status is not zero."""
 MAX_PACKET = 1024
-"""Longest packet, header and CRC included: the bound of ROBOTIS' own SDK (facts/mx64 A1)."""
+"""Longest packet, header and CRC included: the bound of ROBOTIS' own SDK
+(docs/sources/mx64-ezgripper.md#a1)."""
 MAX_LENGTH = MAX_PACKET - 7
 """Largest value of a packet's length field."""
 CLEAR_POSITION_KEY = bytes.fromhex("0144584c22")
@@ -58,7 +59,7 @@ _STUFFED = b"\xff\xff\xfd\xfd"
 
 
 class Instruction(IntEnum):
-    """Instruction codes (facts/mx64 A5)."""
+    """Instruction codes (docs/sources/mx64-ezgripper.md#a5)."""
 
     PING = 0x01
     READ = 0x02
@@ -79,7 +80,7 @@ class Instruction(IntEnum):
 
 
 class ErrorNumber(IntEnum):
-    """Bits 0 to 6 of a status packet's error byte (facts/mx64 A4)."""
+    """Bits 0 to 6 of a status packet's error byte (docs/sources/mx64-ezgripper.md#a4)."""
 
     NONE = 0x00
     RESULT_FAIL = 0x01
@@ -306,7 +307,9 @@ class PacketParser:
         return len(self._buffer)
 
     def reset(self) -> None:
-        """Forget a packet begun: what a servo does after 1.5 ms of silence (facts/mx64 A1)."""
+        """Forget a packet begun: what a servo does after 1.5 ms of silence
+        (docs/sources/mx64-ezgripper.md#a1).
+        """
         self.skipped += len(self._buffer)
         self._buffer.clear()
 

@@ -1,4 +1,5 @@
-"""The CRC that ``LowCmd_`` and ``LowState_`` carry in their last member (facts/unitree-dex A.7).
+"""The CRC that ``LowCmd_`` and ``LowState_`` carry in their last member
+(docs/sources/unitree-dex.md#a7).
 
     >>> from dexkit.messages.unitree_go import LowCmd_
     >>> hex(crc_of(LowCmd_()))

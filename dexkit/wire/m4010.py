@@ -1,8 +1,8 @@
-"""The M4010's serial frames, sans-IO: the motor of the Dex1-1 (facts/unitree-dex G, measured from
-the vendor's library).
+"""The M4010's serial frames, sans-IO: the motor of the Dex1-1 (docs/sources/unitree-dex.md#g,
+measured from the vendor's library).
 
-A command is 20 bytes, the data that answer it 26: the structures of the Dex3-1's motors (seed 002)
-with other units. Several motors on a line are told apart by the id in the mode byte; id 15
+A command is 20 bytes, the data that answer it 26: the structures of the Dex3-1's motors (the Dex3-1
+manual) with other units. Several motors on a line are told apart by the id in the mode byte; id 15
 addresses all of them, and none answers.
 
 :class:`MotorCmd`, :class:`MotorData` and :class:`Calibration` are frames as raw integers with ways
@@ -68,19 +68,21 @@ __all__ = [
 ]
 
 GEAR_RATIO = 25.0
-"""Turns of the rotor for one of the gripper's joint (facts G "Constants")."""
+"""Turns of the rotor for one of the gripper's joint (docs/sources/unitree-dex.md#g "Constants")."""
 BAUD_RATE = 6_000_000
 OPENING_BAUD_RATE = 4_000_000
 """The vendor's library opens the port at this rate; its first exchange with an M4010 switches to
-:data:`BAUD_RATE` (facts G "Serial")."""
+:data:`BAUD_RATE` (docs/sources/unitree-dex.md#g "Serial")."""
 REPLY_TIMEOUT = 0.02
-"""Seconds that the vendor's library waits for an answer (facts G "Serial")."""
+"""Seconds that the vendor's library waits for an answer
+(docs/sources/unitree-dex.md#g "Serial")."""
 STROKE = math.radians(322.0)
-"""Range that the vendor's service writes into the motor, rad at the joint (facts B.2)."""
+"""Range that the vendor's service writes into the motor, rad at the joint
+(docs/sources/unitree-dex.md#b2)."""
 USER_ID = 0x776C
-"""User id of the vendor's calibration frame (facts G "Calibration")."""
+"""User id of the vendor's calibration frame (docs/sources/unitree-dex.md#g "Calibration")."""
 SIDES = {number: side for side, number in DEX1_1.vendor_ids.items()}
-"""Which hand the motor with an id is: 0 right, 1 left (facts B.2)."""
+"""Which hand the motor with an id is: 0 right, 1 left (docs/sources/unitree-dex.md#b2)."""
 
 VELOCITY = Scale(
     "velocity", ("spd_des", "speed"), "rad/s", 256 / (2 * math.pi), -0x8000, 0x7FFF, power=1
@@ -137,7 +139,9 @@ _CALIBRATED = 2  # speed field of the answer
 
 
 class Status(IntEnum):
-    """What a motor is told to do; bits 4 to 6 of the mode byte (facts G, D 28)."""
+    """What a motor is told to do; bits 4 to 6 of the mode byte (docs/sources/unitree-dex.md#g,
+    docs/sources/unitree-dex.md#d28).
+    """
 
     BRAKE = 0
     FOC = 1
@@ -148,7 +152,9 @@ _FOC = int(Status.FOC)
 
 
 class CalibrationProblem(IntFlag):
-    """MError bits of the answer to a calibration (facts G "Calibration"); the lowest wins."""
+    """MError bits of the answer to a calibration (docs/sources/unitree-dex.md#g "Calibration"); the
+    lowest wins.
+    """
 
     NONE = 0
     ALREADY_CALIBRATED = 0x01  # since power-up
@@ -463,7 +469,7 @@ def calibration_outcome(data: MotorData) -> str:
     """What an answer to a calibration says: empty when it succeeded, else why it did not.
 
     The vendor's library takes everything that is not the answer to a calibration, silence
-    included, for success (facts G).
+    included, for success (docs/sources/unitree-dex.md#g).
     """
     if data.status != Status.CALIBRATE or data.torque != _CALIBRATION_TORQUE:
         return "the motor does not know the command (firmware without calibration?)"

@@ -1,7 +1,8 @@
 """The MX-64(2.0) servo as data: control table, units, modes, error bits.
 
-Addresses, sizes, access, initial values, ranges and units are those of facts/mx64 B2; where a
-value is contested there it says so here. Driver and emulator take them all from this module.
+Addresses, sizes, access, initial values, ranges and units are those of
+docs/sources/mx64-ezgripper.md#b2; where a value is contested there it says so here. Driver and
+emulator take them all from this module.
 
 ``mx64.PRESENT_POSITION`` is an :class:`Item`; ``mx64.TABLE`` holds all of them by address.
 """
@@ -14,14 +15,14 @@ from enum import Enum, IntEnum, IntFlag
 
 from dexkit.errors import EncodeError, TruncatedError
 
-# --- identity (facts/mx64 B1)
+# --- identity (docs/sources/mx64-ezgripper.md#b1)
 MODEL = 311
 MODEL_PROTOCOL_1 = 310
 """An MX-64 whose firmware speaks Protocol 1.0."""
 FIRMWARE = 45
 TICKS_PER_TURN = 4096
 
-# --- units (facts/mx64 B2)
+# --- units (docs/sources/mx64-ezgripper.md#b2)
 TICK = 2 * math.pi / TICKS_PER_TURN
 """rad of one position unit."""
 CURRENT_UNIT = 3.36e-3
@@ -55,9 +56,9 @@ BAUD_RATES: dict[int, int] = {
     6: 4_000_000,
     7: 4_500_000,
 }
-"""Value of Baud Rate(8) to bits a second (facts/mx64 B3)."""
+"""Value of Baud Rate(8) to bits a second (docs/sources/mx64-ezgripper.md#b3)."""
 
-# --- the EZGripper on its shaft (facts/mx64 D1, D2)
+# --- the EZGripper on its shaft (docs/sources/mx64-ezgripper.md#d)
 EZGRIPPER_STROKE = 2500
 """Ticks between fully closed and fully open."""
 EZGRIPPER_CLOSING = -1
@@ -65,7 +66,7 @@ EZGRIPPER_CLOSING = -1
 
 
 class OperatingMode(IntEnum):
-    """Values of Operating Mode(11) (facts/mx64 B4)."""
+    """Values of Operating Mode(11) (docs/sources/mx64-ezgripper.md#b4)."""
 
     CURRENT = 0
     VELOCITY = 1
@@ -76,7 +77,7 @@ class OperatingMode(IntEnum):
 
 
 class DriveMode(IntFlag):
-    """Bits of Drive Mode(10) (facts/mx64 B5)."""
+    """Bits of Drive Mode(10) (docs/sources/mx64-ezgripper.md#b5)."""
 
     NORMAL = 0
     REVERSE = 0x01
@@ -84,7 +85,7 @@ class DriveMode(IntFlag):
 
 
 class HardwareError(IntFlag):
-    """Bits of Hardware Error Status(70) and of Shutdown(63) (facts/mx64 B6)."""
+    """Bits of Hardware Error Status(70) and of Shutdown(63) (docs/sources/mx64-ezgripper.md#b6)."""
 
     NONE = 0
     INPUT_VOLTAGE = 0x01
@@ -95,7 +96,7 @@ class HardwareError(IntFlag):
 
 
 class MovingStatus(IntFlag):
-    """Bits of Moving Status(123) (facts/mx64 B7)."""
+    """Bits of Moving Status(123) (docs/sources/mx64-ezgripper.md#b7)."""
 
     NONE = 0
     IN_POSITION = 0x01
@@ -212,7 +213,7 @@ MIN_VOLTAGE_LIMIT = Item(34, 2, "Min Voltage Limit", _RW, 95, 95, 160, "0.1 V")
 PWM_LIMIT = Item(36, 2, "PWM Limit", _RW, PWM_MAX, 0, PWM_MAX, "0.113 %")
 CURRENT_LIMIT = Item(38, 2, "Current Limit", _RW, 1941, 0, 1941, "3.36 mA")
 ACCELERATION_LIMIT = Item(40, 4, "Acceleration Limit", _RW, 32767, 0, 32767, "214.577 rev/min2")
-# 435 is the e-Manual's; firmware from V42 on may come with 285 (facts/mx64 F1)
+# 435 is the e-Manual's; firmware from V42 on may come with 285 (docs/sources/mx64-ezgripper.md#f1)
 VELOCITY_LIMIT = Item(44, 4, "Velocity Limit", _RW, 435, 0, 1023, "0.229 rpm")
 MAX_POSITION_LIMIT = Item(48, 4, "Max Position Limit", _RW, 4095, 0, 4095, "tick")
 MIN_POSITION_LIMIT = Item(52, 4, "Min Position Limit", _RW, 0, 0, 4095, "tick")

@@ -1,8 +1,9 @@
 """What Unitree's hand motors share on the wire, whatever carries it: packed structures as data, the
 mode byte, and how quantities are counted.
 
-The Dex3-1's packets (seed 002) and the frames of the Dex1-1's M4010 (facts/unitree-dex G) are of
-one family: the same mode byte, position count and checksum, in layouts of their own.
+The Dex3-1's packets (the Dex3-1 manual) and the frames of the Dex1-1's M4010
+(docs/sources/unitree-dex.md#g) are of one family: the same mode byte, position count and checksum,
+in layouts of their own.
 """
 
 from __future__ import annotations
@@ -169,7 +170,7 @@ RIS_MODE = (
         "protection has tripped, until a command with 0 comes",
     ),
 )
-"""``RIS_Mode_t``, the mode byte (seed 002 "Motor Control Structure")."""
+"""``RIS_Mode_t``, the mode byte (the Dex3-1 manual "Motor Control Structure")."""
 
 
 def ris_mode(number: int, status: int, timeout: bool | int) -> int:
@@ -208,7 +209,8 @@ class Scale:
         return self.counts * ratio**self.power
 
     def encode(self, value: float, ratio: float = 1.0) -> int:
-        """Counts of ``value``: toward zero (as the vendor's library, facts C.9), saturated.
+        """Counts of ``value``: toward zero (as the vendor's library,
+        docs/sources/unitree-dex.md#c9), saturated.
 
         :raises EncodeError: ``value`` is NaN or infinite.
         """

@@ -1,4 +1,6 @@
-"""Finding a motor: which port, as the vendor's service probes them (facts/unitree-dex B.2)."""
+"""Finding a motor: which port, as the vendor's service probes them
+(docs/sources/unitree-dex.md#b2).
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ __all__ = ["Dex1Serial", "Dex1Statistics", "backend"]
 
 log = logging.getLogger(__name__)
 
-_IO_RATE = 500.0  # facts/unitree-dex B.2: 2000 us loop
+_IO_RATE = 500.0  # docs/sources/unitree-dex.md#b2: 2000 us loop
 _GOODBYES = 3
 """Times that closing tries to brake a motor which is there and does not answer."""
 _FLASH_TIME = 1.0
@@ -221,9 +221,9 @@ class Dex1Serial:
     ) -> float:
         """Make the motor take the place where it is for ``position``; what it reports then, rad.
 
-        The vendor's way: the jaws are held closed and that is zero (facts/unitree-dex B.2, G). The
-        motor stores it, once between two power-ups. Nothing moves. Unlike the vendor's library it
-        fails unless the motor has said that it succeeded.
+        The vendor's way: the jaws are held closed and that is zero (docs/sources/unitree-dex.md#b2,
+        docs/sources/unitree-dex.md#g). The motor stores it, once between two power-ups. Nothing
+        moves. Unlike the vendor's library it fails unless the motor has said that it succeeded.
 
         :param position: rad, 0 or more.
         :raises HandRefused: the motor does not do it; says why.

@@ -3,9 +3,10 @@
 The two motors of a robot may share a line, and one process may serve both: its hands then share
 one :class:`MotorLine`, which :func:`acquire` gives out, and take turns on it.
 
-Unlike the vendor's library (facts/unitree-dex G "Receive behaviour") it looks for frames by head
-and CRC, checks the id, forgets what was left over before each command, and waits for an answer that
-is late before it sends the next command: a stray byte or a late answer costs one exchange at most.
+Unlike the vendor's library (docs/sources/unitree-dex.md#g "Receive behaviour") it looks for frames
+by head and CRC, checks the id, forgets what was left over before each command, and waits for an
+answer that is late before it sends the next command: a stray byte or a late answer costs one
+exchange at most.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from dexkit.wire import m4010
 __all__ = ["PORTS", "SETTINGS", "Dex1Settings", "from_options"]
 
 PORTS = ("/dev/ttyUSB*", "/dev/ttyCH343USB*")
-"""Where the vendor's service looks for motors (facts/unitree-dex B.2)."""
+"""Where the vendor's service looks for motors (docs/sources/unitree-dex.md#b2)."""
 
 
 @dataclass(frozen=True)

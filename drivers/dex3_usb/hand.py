@@ -23,7 +23,7 @@ __all__ = ["Dex3Statistics", "Dex3Usb", "backend"]
 
 log = logging.getLogger(__name__)
 
-_IO_RATE = 1000.0  # seed 002 "Communication rate"
+_IO_RATE = 1000.0  # the Dex3-1 manual "Communication rate"
 _SLACK = 0.05  # seconds of an exchange beyond its two time-outs: waiting for a late answer
 _MISSED = 10
 """Exchanges in a row without a motor's packet until it is reported as lost: a hundredth of a
@@ -158,7 +158,8 @@ class Dex3Usb:
         )
 
     def _greet(self, link: UsbLink) -> HandState:
-        # bit 7 = 0: whatever tripped while nobody drove the hand is cleared (seed 002 RIS_Mode_t)
+        # bit 7 = 0: whatever tripped while nobody drove the hand is cleared (the Dex3-1 manual
+        # RIS_Mode_t)
         frame = self._codec.encode(self._brake, False)
         problem: HandError | None = None
         answer = b""

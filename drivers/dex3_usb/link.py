@@ -348,7 +348,9 @@ def _kernel_driver(backend: Backend, handle: Any) -> bool:
 def _endpoints(
     backend: Backend, device: Any, name: str, out: int | None, into: int | None
 ) -> Endpoints:
-    """The first bulk endpoints of interface 0; the manual does not number them (facts C.1)."""
+    """The first bulk endpoints of interface 0; the manual does not number them
+    (docs/sources/unitree-dex.md#c1).
+    """
     interface = backend.get_interface_descriptor(device, _INTERFACE, 0, 0)
     found = [
         backend.get_endpoint_descriptor(device, index, _INTERFACE, 0, 0)

@@ -29,9 +29,10 @@ class Dex3Settings:
     :param serial: serial number, or None for the only hand of its side.
     :param server: USB/IP server to look on, or None for this machine's USB.
     :param local: without a server, look on the local one too if USB has no such hand.
-    :param layout: of the command frame; the manual has two sizes (facts/unitree-dex C.5).
+    :param layout: of the command frame; the manual has two sizes (docs/sources/unitree-dex.md#c5).
     :param head: first two bytes of the command frame, which the manual does not give.
-    :param bus_map: which motor and sensor is where; the manual's figure of it is lost (C.7).
+    :param bus_map: which motor and sensor is where; the manual's figure of it is lost
+        (docs/sources/unitree-dex.md#c7).
     :param protect: have the motors stop by themselves after a second without a command.
     :param timeout: seconds to wait for an answer.
     :param send_timeout: seconds that the hand may take to accept a command.

@@ -1,7 +1,8 @@
 """What is exchanged with the servo each cycle: one write and one contiguous read.
 
 The items wanted are scattered over the control table (64, 70, 98, 102, 112 to 120, 126 to 146),
-so their bytes are mapped side by side through Indirect Address 1 to 28 (facts/mx64 B2)::
+so their bytes are mapped side by side through Indirect Address 1 to 28
+(docs/sources/mx64-ezgripper.md#b2)::
 
     Indirect Data   1..4    5..6    7..10      11    12     13       14..15 16.. ..28
                     profile goal    goal       torque error watchdog tick   present current,
@@ -19,7 +20,7 @@ so their bytes are mapped side by side through Indirect Address 1 to 28 (facts/m
   within 256 µs, 500 for one that needs up to 1.256 ms (serial_port.exchange_period).
 
 A spanning write of 102..119 would be 18 bytes and would touch Goal Velocity, a read of 102..146
-45 bytes, without torque and error (facts/mx64 C1).
+45 bytes, without torque and error (docs/sources/mx64-ezgripper.md#c1).
 """
 
 from __future__ import annotations

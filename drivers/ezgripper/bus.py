@@ -1,6 +1,7 @@
 """The serial line to the servo: dynamixel-sdk on pyserial, made bounded and typed.
 
-What is different from the plain SDK, and why (facts/mx64 A3, C3):
+What is different from the plain SDK, and why (docs/sources/mx64-ezgripper.md#a3,
+docs/sources/mx64-ezgripper.md#c3):
 
 - The SDK polls the port without pause while it waits. :class:`DevicePort` blocks in ``select``
   until bytes or the deadline come, so that a waiting gripper costs no processor time (and does
@@ -84,7 +85,7 @@ class Ping:
 class ServoError(HandRefused):
     """The servo answers that it will not do what it was told.
 
-    :param number: error number of the status packet (facts/mx64 A4).
+    :param number: error number of the status packet (docs/sources/mx64-ezgripper.md#a4).
     """
 
     def __init__(self, message: str, number: int, *, hint: str = "") -> None:
@@ -336,7 +337,9 @@ class ServoBus:
         return Ping(servo_id, int.from_bytes(data[:2], "little"), data[2])
 
     def ping_all(self) -> list[Ping]:
-        """Every servo that answers a broadcast; takes about a second (facts/mx64 C3)."""
+        """Every servo that answers a broadcast; takes about a second
+        (docs/sources/mx64-ezgripper.md#c3).
+        """
         with self._line():
             found, _ = self._packets.broadcastPing(self._port)
         return [Ping(i, model, firmware) for i, (model, firmware) in sorted(found.items())]

@@ -1,13 +1,15 @@
 """Calibration: the zero (where the gripper is closed) and the speed of either direction.
 
-The zero is found by closing at reduced current until the fingers stop (facts/mx64 D4). A servo
-alone cannot tell closed fingers from fingers on an object, nor from fingers that are stuck, so
-the stop is believed only if the gripper then opens by its whole stroke. Even so an object can
-deceive it where the fingers open wider than the stroke: the gripper must be empty.
+The zero is found by closing at reduced current until the fingers stop
+(docs/sources/mx64-ezgripper.md#d4). A servo alone cannot tell closed fingers from fingers on an
+object, nor from fingers that are stuck, so the stop is believed only if the gripper then opens by
+its whole stroke. Even so an object can deceive it where the fingers open wider than the stroke: the
+gripper must be empty.
 
-The speed is measured as in seed 003 over the full stroke at full effort, but between 10 % and
-90 % of it and from positions with their times, so that neither the command's way nor the
-settling is counted (facts/mx64 D10 6, 7).
+The speed is measured as in the note on predictive state over the full stroke at full effort, but
+between 10 % and 90 % of it and from positions with their times, so that neither the command's way
+nor the settling is counted (docs/sources/mx64-ezgripper.md#d10-6,
+docs/sources/mx64-ezgripper.md#d10-7).
 
 Pure logic over a :class:`Drive` and a clock.
 """
@@ -44,11 +46,13 @@ __all__ = [
 ]
 
 EFFORT = 30.0
-"""Percent, while looking for the closed position (facts/mx64 D2, D4)."""
+"""Percent, while looking for the closed position (docs/sources/mx64-ezgripper.md#d2,
+docs/sources/mx64-ezgripper.md#d4)."""
 SPEED = 60.0
 """Percent of stroke a second, while looking for it."""
 UNLIMITED = 600.0
-"""Percent of stroke a second that no motor of this kind reaches (facts/mx64 D1)."""
+"""Percent of stroke a second that no motor of this kind reaches
+(docs/sources/mx64-ezgripper.md#d1)."""
 _BEYOND = 1500
 """Ticks that are closed beyond one stroke before the search is given up: the gripper may
 stand open wider than its stroke."""

@@ -1,6 +1,7 @@
 """What is known of each gripper: its zero, its speed, its force table, in a user's JSON file.
 
-The layout is that of seed 003, so that a file of SAKE's driver can be read as it is::
+The layout is that of the note on predictive state, so that a file of SAKE's driver can be read as
+it is::
 
     {"calibration":    {"DA1Z9T40": 3010},
      "movement_speed": {"DA1Z9T40": {"opening": 131.0, "closing": 127.5}},

@@ -1,8 +1,10 @@
-"""Contact: motion was commanded, and the fingers do not follow (facts/mx64 D10 14).
+"""Contact: motion was commanded, and the fingers do not follow
+(docs/sources/mx64-ezgripper.md#d10-14).
 
 Pure logic on positions and time. Current is left out on purpose: Present Current of an MX-64
-is no basis for a decision (facts/mx64 D10 11), and a comparison with a predicted speed calls
-every normal move a stall when the speed is wrong (D8).
+is no basis for a decision (docs/sources/mx64-ezgripper.md#d10-11), and a comparison with a
+predicted speed calls every normal move a stall when the speed is wrong
+(docs/sources/mx64-ezgripper.md#d8).
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class ContactDetector:
     The defaults: 2 ticks in 0.1 s are 0.8 %/s, below any speed the driver allows
     (:data:`MIN_FREE_SPEED`), a tick of noise either way and the start included; 25 ticks are
     1 % of the stroke, beyond what the servo's position loop leaves as its own error, and below
-    the 83 ticks (0.18 rad) by which xr_teleoperate leads (facts/mx64 D7).
+    the 83 ticks (0.18 rad) by which xr_teleoperate leads (docs/sources/mx64-ezgripper.md#d7).
     """
 
     window: float = 0.1

@@ -3,20 +3,23 @@
 Pure logic on the injected time. The phases:
 
 - *limp*: command with kp = 0. The motor carries no current (the springs open the fingers), as
-  the vendor's motor with zero gains (facts/unitree-dex B.2, D 10). tau and kd do not act.
+  the vendor's motor with zero gains (docs/sources/unitree-dex.md#b2,
+  docs/sources/unitree-dex.md#d10). tau and kd do not act.
 - *brake*: command mode BRAKE, and the time after a recovery until a new command comes. The
   fingers are stopped and then held where they came to rest, at hold effort. Before the first FOC
   command since opening or since a recovery there is nothing to brake: the motor carries no current,
-  as the servo itself leaves it off at power-up (facts/mx64 B5), and nobody has asked for torque.
+  as the servo itself leaves it off at power-up (docs/sources/mx64-ezgripper.md#b5), and nobody has
+  asked for torque.
 - *moving*: the fingers go to q at most at the effort limit, or rest there.
 - *contact*: they are stopped short of q (:mod:`contact`). For ``hold_after`` seconds the effort
   stays, so that the grip closes.
 - *holding*: contact that lasts: the limit sinks to the hold effort, because a stalled motor
-  turns all its current to heat (facts/mx64 D5, D6).
+  turns all its current to heat (docs/sources/mx64-ezgripper.md#d5,
+  docs/sources/mx64-ezgripper.md#d6).
 
 kp > 0 selects position control, its size does not matter: the servo has a position loop of its
 own, whose force is bounded by Goal Current. dq, kd and tau of a position command are ignored
-(facts/mx64 D10 20).
+(docs/sources/mx64-ezgripper.md#d10-20).
 """
 
 from __future__ import annotations
@@ -57,11 +60,14 @@ class Phase(str, Enum):
 class ControlSettings:
     """What a user may set of the behaviour.
 
-    :param effort: limit while moving and at first contact, percent (facts/mx64 D2, D3).
+    :param effort: limit while moving and at first contact, percent
+        (docs/sources/mx64-ezgripper.md#d2, docs/sources/mx64-ezgripper.md#d3).
     :param hold_effort: limit while an object is held, braking, or hot, percent.
-    :param hold_after: seconds of contact after which the limit sinks to ``hold_effort`` (D5).
+    :param hold_after: seconds of contact after which the limit sinks to ``hold_effort``
+        (docs/sources/mx64-ezgripper.md#d5).
     :param speed: limit, percent of stroke a second. At 12 V the motor can do 172 without load
-        (D1); a profile that it cannot follow runs ahead, and a reversal waits until it is back.
+        (docs/sources/mx64-ezgripper.md#d1); a profile that it cannot follow runs ahead, and a
+        reversal waits until it is back.
     :param startup_speed: the same from opening until the fingers have once come to rest at
         their goal.
     :param startup_time: seconds after which the start-up limit ends in any case.
@@ -96,7 +102,8 @@ class ControlSettings:
 
 
 _ARRIVED = 25
-"""Ticks (1 %) from the goal within which the fingers count as there (facts/mx64 D5)."""
+"""Ticks (1 %) from the goal within which the fingers count as there
+(docs/sources/mx64-ezgripper.md#d5)."""
 _STILL = 2
 """Velocity units (31 ticks/s, 1.3 %/s) below which the fingers count as stopped."""
 _REST_TIME = 0.2
@@ -110,7 +117,8 @@ def at_once(position: int, current: int) -> Goal:
 
     While fingers are blocked the servo's profile runs on to its goal, and the next profile
     starts from there: told to open, the fingers would wait until it has come all the way back.
-    A Profile Velocity of 0 makes the trajectory jump to the goal (facts/mx64 B5).
+    A Profile Velocity of 0 makes the trajectory jump to the goal
+    (docs/sources/mx64-ezgripper.md#b5).
     """
     return Goal(_bounded(position), current, 0)
 

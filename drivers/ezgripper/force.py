@@ -1,11 +1,11 @@
-"""Force from motor current, through a table that can be calibrated (seed 003).
+"""Force from motor current, through a table that can be calibrated (the note on predictive state).
 
 The table maps Present Current (absolute value, units of 3.36 mA) to grip force; between its
 points it is interpolated, beyond them it stays at its end. The state's ``tau_est`` is the force
-divided by ten, as seed 003 and the interface specification (seed 000) have it.
+divided by ten, as the note on predictive state and the interface specification have it.
 
-Present Current of an MX-64 is a noisy estimate (facts/mx64 D10 11): good for feedback, never
-for a decision.
+Present Current of an MX-64 is a noisy estimate (docs/sources/mx64-ezgripper.md#d10-11): good for
+feedback, never for a decision.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dexkit.errors import UsageError
 __all__ = ["DEFAULT_FORCE_TABLE", "TAU_PER_FORCE", "ForceTable"]
 
 TAU_PER_FORCE = 0.1
-"""tau_est of one unit of force (seed 003: ``tau_est = grip_force / 10``)."""
+"""tau_est of one unit of force (the note on predictive state: ``tau_est = grip_force / 10``)."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ForceTable:
 
     @classmethod
     def from_mapping(cls, table: Mapping[str, object]) -> ForceTable:
-        """A table as seed 003 stores it: ``{"0": 0.0, "100": 0.5, ...}``.
+        """A table as the note on predictive state stores it: ``{"0": 0.0, "100": 0.5, ...}``.
 
         :raises UsageError: keys or values are not numbers, or make no table.
         """
@@ -67,7 +67,7 @@ class ForceTable:
         return cls(tuple(sorted(points)))
 
     def to_mapping(self) -> dict[str, float]:
-        """The table as seed 003 stores it."""
+        """The table as the note on predictive state stores it."""
         return {f"{current:g}": force for current, force in self.points}
 
     def force(self, current: float) -> float:
@@ -89,4 +89,4 @@ class ForceTable:
 DEFAULT_FORCE_TABLE = ForceTable(
     ((0.0, 0.0), (100.0, 0.5), (200.0, 1.2), (300.0, 2.0), (1023.0, 10.0))
 )
-"""The example of seed 003, used until a gripper has a table of its own."""
+"""The example of the note on predictive state, used until a gripper has a table of its own."""

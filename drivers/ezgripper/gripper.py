@@ -126,7 +126,7 @@ _LONGEST_PAUSE = 2.0
 
 
 def _is_shutdown(error: int) -> bool:
-    # an input voltage error does not cut the torque by default (facts/mx64 B6)
+    # an input voltage error does not cut the torque by default (docs/sources/mx64-ezgripper.md#b6)
     return error > HardwareError.INPUT_VOLTAGE
 
 
@@ -442,7 +442,7 @@ class EZGripper:
     def _state(self, control: Control, sample: Sample) -> HandState:
         contact = control.contact
         # signed as the joint: closing is toward smaller q, so squeezing is negative, as the
-        # vendor's gripper reports it (facts/unitree-dex B.7)
+        # vendor's gripper reports it (docs/sources/unitree-dex.md#b7)
         tau = contact.direction * self._force.tau(sample.current) if contact else 0.0
         mode = JointMode.BRAKE if control.phase is Phase.BRAKE else JointMode.FOC
         return HandState(

@@ -1,9 +1,9 @@
 """When a servo that has shut itself down may be restarted.
 
 After a shutdown (overload, overheating, electrical shock) only a reboot brings torque back
-(facts/mx64 B6). Rebooting at once and for ever would heat the motor against the same load, so
-each further fault within a while waits twice as long, and a hot motor first cools down.
-Pure logic: no device, no clock of its own.
+(docs/sources/mx64-ezgripper.md#b6). Rebooting at once and for ever would heat the motor against the
+same load, so each further fault within a while waits twice as long, and a hot motor first cools
+down. Pure logic: no device, no clock of its own.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ __all__ = ["RebootPolicy", "describe", "motor_error"]
 
 _MOTOR_ERRORS = {
     HardwareError.OVERHEATING: MotorError.WINDING_OVERTEMPERATURE,
-    # the MX-64's encoder sits on the output shaft (facts/mx64 B1)
+    # the MX-64's encoder sits on the output shaft (docs/sources/mx64-ezgripper.md#b1)
     HardwareError.ENCODER: MotorError.OUTPUT_ENCODER,
-    # "electrical shock on the circuit, or insufficient power to operate the motor" (B6)
+    # "electrical shock on the circuit, or insufficient power to operate the motor"
+    # (docs/sources/mx64-ezgripper.md#b6)
     HardwareError.ELECTRICAL_SHOCK: MotorError.UNDERVOLTAGE,
     HardwareError.OVERLOAD: MotorError.OVERCURRENT,
 }
 
 
 def motor_error(error: int, voltage: float, voltage_min: float, voltage_max: float) -> MotorError:
-    """The servo's error bits in the vocabulary of all hands (facts/unitree-dex B.6).
+    """The servo's error bits in the vocabulary of all hands (docs/sources/unitree-dex.md#b6).
 
     The servo keeps an input voltage error until it is rebooted; it is reported while the
     voltage is outside the limits.

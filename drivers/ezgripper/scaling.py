@@ -1,7 +1,9 @@
 """Units: servo ticks, percent of stroke, joint radians, effort, current, speed.
 
 Everything here is relative to the calibrated zero: 0 ticks is closed, 2500 ticks, 100 %, and
-5.4 rad of the Dex1 joint are fully open (facts/mx64 D2, D7; conflicts D10 3 to 5).
+5.4 rad of the Dex1 joint are fully open (docs/sources/mx64-ezgripper.md#d2,
+docs/sources/mx64-ezgripper.md#d7; docs/sources/mx64-ezgripper.md#d10-3,
+docs/sources/mx64-ezgripper.md#d10-4, docs/sources/mx64-ezgripper.md#d10-5).
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ JOINT_PER_TICK = _JOINT.stroke / STROKE
 """rad of the Dex1 joint in one servo tick: 2500 ticks are 5.4 rad."""
 
 CURRENT_LIMIT = 1600
-"""Current units that are 100 % effort (facts/mx64 D2); 76 % already stalls the servo at 12 V."""
+"""Current units that are 100 % effort (docs/sources/mx64-ezgripper.md#d2); 76 % already stalls the
+servo at 12 V."""
 
 VELOCITY_LIMIT = 1023
 """Highest value of Velocity Limit(44): 640 % of the stroke a second, far beyond the motor."""
@@ -67,14 +70,16 @@ def profile_velocity(percent_per_second: float) -> int:
     """Profile Velocity register value for a speed.
 
     At least 1, because 0 means no limit, and at most Velocity Limit's 1023, because the servo
-    may refuse more (facts/mx64 B5).
+    may refuse more (docs/sources/mx64-ezgripper.md#b5).
     """
     units = round(percent_per_second * TICKS_PER_PERCENT / _TICKS_PER_SECOND)
     return min(max(units, 1), VELOCITY_LIMIT)
 
 
 def current_of_effort(effort: float) -> int:
-    """Goal Current units of an effort in percent, clamped to 0..100 (facts/mx64 D2)."""
+    """Goal Current units of an effort in percent, clamped to 0..100
+    (docs/sources/mx64-ezgripper.md#d2).
+    """
     return round(min(max(effort, 0.0), 100.0) * CURRENT_LIMIT / 100)
 
 
@@ -87,11 +92,11 @@ def relative_position(present: int, zero: int) -> int:
     """Ticks between the zero and ``present``, whatever turn either was counted in.
 
     The encoder is absolute only within one turn: after power-on or a reboot the servo reports
-    0..4095, while the zero may have been stored in another turn (facts/mx64 B4, D4). The
-    difference modulo 4096 is still unique, because the stroke is 2500 ticks: a closed gripper
-    is near 0 and an open one near 2500, which leaves 1596 ticks that no position can be in.
-    Their middle is where the answer flips: up to 798 ticks (32 %) past open still read as open,
-    up to 798 below the zero as negative.
+    0..4095, while the zero may have been stored in another turn (docs/sources/mx64-ezgripper.md#b4,
+    docs/sources/mx64-ezgripper.md#d4). The difference modulo 4096 is still unique, because the
+    stroke is 2500 ticks: a closed gripper is near 0 and an open one near 2500, which leaves 1596
+    ticks that no position can be in. Their middle is where the answer flips: up to 798 ticks (32 %)
+    past open still read as open, up to 798 below the zero as negative.
     """
     margin = (mx64.TICKS_PER_TURN - STROKE) // 2
     return (present - zero + margin) % mx64.TICKS_PER_TURN - margin

@@ -22,7 +22,7 @@ __all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "line_time
 
 BOOT_TIME = 5.0
 """Seconds after which a rebooted servo should answer again; the real time is not published
-(facts/mx64 D6: 0.5 to 1.5 s were waited)."""
+(docs/sources/mx64-ezgripper.md#d6: 0.5 to 1.5 s were waited)."""
 
 _SYNC_WRITE_OVERHEAD = 15
 _READ_INSTRUCTION = 14

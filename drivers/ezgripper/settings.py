@@ -1,9 +1,10 @@
 """The servo's registers: what they must hold, compared before they are written and verified after.
 
 EEPROM is written only where it differs (its life is limited), with torque off, because the
-servo refuses otherwise (facts/mx64 A4, D3). RAM is lost at power-off and reboot, so it is set
-at every start. The order matters: the operating mode resets Goal Current and the profile, and
-Velocity Limit bounds the profile (facts/mx64 B4, B5).
+servo refuses otherwise (docs/sources/mx64-ezgripper.md#a4, docs/sources/mx64-ezgripper.md#d3). RAM
+is lost at power-off and reboot, so it is set at every start. The order matters: the operating mode
+resets Goal Current and the profile, and Velocity Limit bounds the profile
+(docs/sources/mx64-ezgripper.md#b4, docs/sources/mx64-ezgripper.md#b5).
 """
 
 from __future__ import annotations
@@ -32,21 +33,22 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 EEPROM: tuple[tuple[mx64.Item, int], ...] = (
-    # current-based position: force is Goal Current, and changing it needs no torque-off (D10 8)
+    # current-based position: force is Goal Current, and changing it needs no torque-off
+    # (docs/sources/mx64-ezgripper.md#d10-8)
     (mx64.OPERATING_MODE, OperatingMode.CURRENT_BASED_POSITION),
     (mx64.DRIVE_MODE, 0),  # closing is toward smaller ticks; profile in velocities
     (mx64.HOMING_OFFSET, 0),
-    (mx64.RETURN_DELAY_TIME, 2),  # 4 us (D3)
+    (mx64.RETURN_DELAY_TIME, 2),  # 4 us (docs/sources/mx64-ezgripper.md#d3)
     (mx64.CURRENT_LIMIT, CURRENT_LIMIT),
     (mx64.VELOCITY_LIMIT, VELOCITY_LIMIT),
 )
-"""EEPROM items and the values that they must have (facts/mx64 D3)."""
+"""EEPROM items and the values that they must have (docs/sources/mx64-ezgripper.md#d3)."""
 
 RAM: tuple[tuple[mx64.Item, int], ...] = (
     (mx64.STATUS_RETURN_LEVEL, StatusReturnLevel.ALL),
     (mx64.PROFILE_ACCELERATION, 800),
 )
-"""RAM items and their values (facts/mx64 D3); the rest is in every exchange."""
+"""RAM items and their values (docs/sources/mx64-ezgripper.md#d3); the rest is in every exchange."""
 
 WATCHDOG_TIME = 0.5
 """Seconds without an instruction after which the servo stops by itself: the dead man's switch

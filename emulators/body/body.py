@@ -35,7 +35,8 @@ _IMU_TEMPERATURE = 60
 _GYRO_NOISE, _ACCELEROMETER_NOISE = 0.005, 0.05
 _BOARD_TEMPERATURE = 35
 _CYCLES = 10
-_LOW_LEVEL = [0xFE, 0xEF], 0xFF  # head and level_flag of unitree_go (F A.8)
+# head and level_flag of unitree_go (docs/sources/unitree-dex.md#a8)
+_LOW_LEVEL = [0xFE, 0xEF], 0xFF
 _REMOTE = struct.Struct("<2xH5f16x")  # head, keys, lx rx ry L2 ly, idle
 
 

@@ -1,7 +1,8 @@
 """Messages as the C structs that Unitree's SDK makes of them, in the eyes of numpy.
 
 So all motors of a message are read and written at once, without one Python object for each of
-them, 500 times a second; and it is the C struct that the CRC is over (facts/unitree-dex A.7).
+them, 500 times a second; and it is the C struct that the CRC is over
+(docs/sources/unitree-dex.md#a7).
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ class Settings:
             raise UsageError(f"a time-out must be positive, not {self.command_timeout}")
         if self.noise < 0:
             raise UsageError(f"noise must not be negative, got {self.noise}")
-        # the SDK's CRC cannot pack temperatures above 127 (facts/unitree-dex A.7)
+        # the SDK's CRC cannot pack temperatures above 127 (docs/sources/unitree-dex.md#a7)
         if not 0 <= self.ambient <= 127 or not 0 <= self.heating <= 127 - self.ambient:
             raise UsageError("a motor's temperature must stay between 0 and 127 degrees")
         if not 0 <= self.charge <= 100:

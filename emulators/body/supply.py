@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 PERIOD = 0.1
 """Seconds between two looks."""
 _CELLS = {"unitree_go": 15, "unitree_hg": 13}
-# of the battery: as many as H1's state has room for (F A.2); the G1's datasheet
+# of the battery: as many as H1's state has room for (docs/sources/unitree-dex.md#a2); the G1's
+# datasheet
 _CELL_FULL, _CELL_EMPTY = 4.15, 3.3  # V
 _COPPER_LOSS = 60.0  # W that a motor turns into heat at full torque
 

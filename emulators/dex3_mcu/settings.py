@@ -1,6 +1,6 @@
 """What can be set about an emulated Dex3-1: the points on which the manual is silent or unclear.
 
-The default of each is the reading that is best supported (facts/unitree-dex C), and
+The default of each is the reading that is best supported (docs/sources/unitree-dex.md#c), and
 docs/emulators.md lists them.
 """
 

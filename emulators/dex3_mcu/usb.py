@@ -1,7 +1,7 @@
 """A Dex3-1's USB side: descriptors, strings, two bulk endpoints.
 
-Numbers and strings are the manual's (facts/unitree-dex C.1); those of the endpoints are in none
-of the sources that can be trusted, so they are options.
+Numbers and strings are the manual's (docs/sources/unitree-dex.md#c1); those of the endpoints are in
+none of the sources that can be trusted, so they are options.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
 __all__ = ["IN_ENDPOINT", "OUT_ENDPOINT", "SERIAL", "Dex3Usb"]
 
 OUT_ENDPOINT, IN_ENDPOINT = 0x02, 0x81
-"""Of a single, unattributed sample (facts C.1): uncertain."""
+"""Of a single, unattributed sample (docs/sources/unitree-dex.md#c1): uncertain."""
 SERIAL = {Side.LEFT: "2024061800", Side.RIGHT: "2024061801"}
 """The left one is the manual's example."""
 MAX_PACKET = 512

@@ -1,7 +1,7 @@
 """What can be set about an emulated M4010: what no source says of the real one, and its heat.
 
-Only the vendor's library was measured (facts/unitree-dex G), no motor. The default of each point
-is the reading that is best supported; docs/emulators.md lists them.
+Only the vendor's library was measured (docs/sources/unitree-dex.md#g), no motor. The default of
+each point is the reading that is best supported; docs/emulators.md lists them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Firmware:
 
     :param baudrate: bits a second that it understands.
     :param command_timeout: seconds without a command until its time-out protection trips, if the
-        last command asked for it (seed 002 RIS_Mode_t, of the sibling motor).
+        last command asked for it (the Dex3-1 manual RIS_Mode_t, of the sibling motor).
     :param tripped_brakes: it then brakes; otherwise it goes limp.
     :param other_status_brakes: a status that is neither brake, FOC nor calibration brakes;
         otherwise such a command is ignored.

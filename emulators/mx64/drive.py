@@ -54,7 +54,8 @@ class Demand:
 
 
 class Profile:
-    """Trajectory from where it is to a goal: step, rectangle, trapezoid or triangle (B5).
+    """Trajectory from where it is to a goal: step, rectangle, trapezoid or triangle
+    (docs/sources/mx64-ezgripper.md#b5).
 
     A new goal while moving keeps position and velocity continuous.
 

@@ -164,7 +164,9 @@ class Servo:
 
     @property
     def led(self) -> bool:
-        """Whether the LED is lit now; it blinks at 1 Hz in shutdown (facts/mx64 B6)."""
+        """Whether the LED is lit now; it blinks at 1 Hz in shutdown
+        (docs/sources/mx64-ezgripper.md#b6).
+        """
         if self._shut_down:
             return self.now % 1.0 < 0.5
         return bool(self._table[mx64.LED.address])

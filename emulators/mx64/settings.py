@@ -1,8 +1,8 @@
 """What can be set about an emulated MX-64: the uncertain points, and the body it drives.
 
 Each field of :class:`Firmware` is a point on which the manual is silent or sources disagree
-(facts/mx64 F); the default is the reading that is best supported, and docs/emulators.md lists
-them. :class:`Physics` holds the figures of motor, supply, heat and gripper.
+(docs/sources/mx64-ezgripper.md#f); the default is the reading that is best supported, and
+docs/emulators.md lists them. :class:`Physics` holds the figures of motor, supply, heat and gripper.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ class Firmware:
 
     :param version: Firmware Version(6).
     :param velocity_limit: factory value of Velocity Limit(44): 435 by the e-Manual, lower from
-        V42 on by hearsay (F1).
+        V42 on by hearsay (docs/sources/mx64-ezgripper.md#f1).
     :param undefined_address_error: error number for a write to no item: 0x07 by the protocol's
-        page, 0x04 in a field report (F2).
+        page, 0x04 in a field report (docs/sources/mx64-ezgripper.md#f2).
     :param read_across_gaps: answer a read that spans undefined addresses with zeros there
-        instead of an Access Error (F2).
+        instead of an Access Error (docs/sources/mx64-ezgripper.md#f2).
     :param answer_bad_crc: answer a packet with a wrong CRC with error 0x03 instead of silence
-        (F3).
-    :param boot_time: seconds of silence after a reboot (F5).
+        (docs/sources/mx64-ezgripper.md#f3).
+    :param boot_time: seconds of silence after a reboot (docs/sources/mx64-ezgripper.md#f5).
     :param refuse_torque_in_shutdown: error number for Torque Enable = 1 in shutdown; 0 takes the
-        write and leaves torque off (F6).
+        write and leaves torque off (docs/sources/mx64-ezgripper.md#f6).
     :param sync_write_clamps: an out-of-limit goal in a Sync or Bulk Write is clamped instead of
-        ignored (F7).
+        ignored (docs/sources/mx64-ezgripper.md#f7).
     :param current_follows_goal: Present Current is what the controller wants instead of what
-        flows (F8).
+        flows (docs/sources/mx64-ezgripper.md#f8).
     :param current_noise: standard deviation of Present Current, units.
     :param ping_slot: seconds that each id below the own delays the answer to a broadcast ping
-        (F10); ids answer in order in any case.
+        (docs/sources/mx64-ezgripper.md#f10); ids answer in order in any case.
     :param missing_id_stalls: in a Sync or Bulk Read the servos behind a missing one stay silent
         (they wait for its status); otherwise they answer as if it were not listed.
     :param level_0_answers_sync: at Status Return Level 0, Sync and Bulk Read are answered.
@@ -48,8 +48,10 @@ class Firmware:
     :param fast_reads: Fast Sync and Fast Bulk Read, which no MX is listed to have.
     :param backup: Control Table Backup, which no MX is listed to have.
     :param byte_gap: seconds between bytes after which a packet begun is dropped.
-    :param overload_level: part of the 12 V stall current above which load counts (F4).
-    :param overload_delay: seconds of such load until the overload error (F4).
+    :param overload_level: part of the 12 V stall current above which load counts
+        (docs/sources/mx64-ezgripper.md#f4).
+    :param overload_delay: seconds of such load until the overload error
+        (docs/sources/mx64-ezgripper.md#f4).
     :param in_position_window: ticks around the goal that count as "in position".
     :param following_error_window: ticks behind the trajectory that count as following error.
     """
@@ -83,9 +85,11 @@ class Firmware:
 class GripperBody:
     """The EZGripper as the servo's shaft feels it; 0 % is closed, 100 % open.
 
-    Stroke and closing direction are facts (D1, D2). Nobody publishes stiffness or friction of
-    the whole gripper: free motion at some 50 to 90 current units is what the logs of D4/B7 show,
-    and the contact stiffness gives a few percent of travel at full grip.
+    Stroke and closing direction are facts (docs/sources/mx64-ezgripper.md#d1,
+    docs/sources/mx64-ezgripper.md#d2). Nobody publishes stiffness or friction of the whole gripper:
+    free motion at some 50 to 90 current units is what the logs of docs/sources/mx64-ezgripper.md#d4
+    and docs/sources/mx64-ezgripper.md#b7 show, and the contact stiffness gives a few percent of
+    travel at full grip.
 
     :param closed_at: encoder tick, 0 to 4095, at which the fingers are closed.
     :param start: opening at power-on, percent.
@@ -122,10 +126,10 @@ class Physics:
     """Motor, heat and supply.
 
     Torque constant, gear loss and resistance are chosen so that the maker's figures at 12 V come
-    out (stall 6.0 N·m at 4.1 A, 63 rpm without load: B1) with the inertia and friction of an
-    identified model (BAM M1). The heat figures fit SAKE's three holds (D6: 0.0149, 0.0326 and
-    0.0647 °C/s at 15, 30 and 45 % of 1600 units) within 15 %; the cooling time is a guess from
-    the maker's advice to wait 20 minutes.
+    out (stall 6.0 N·m at 4.1 A, 63 rpm without load: docs/sources/mx64-ezgripper.md#b1) with the
+    inertia and friction of an identified model (BAM M1). The heat figures fit SAKE's three holds
+    (docs/sources/mx64-ezgripper.md#d6: 0.0149, 0.0326 and 0.0647 °C/s at 15, 30 and 45 % of 1600
+    units) within 15 %; the cooling time is a guess from the maker's advice to wait 20 minutes.
 
     :param kt: N·m/A, and V·s/rad, at the output.
     :param gear_loss: part of the motor's torque that friction in the gears takes.

@@ -1,4 +1,5 @@
-"""The Dex3-1's USB protocol, sans-IO (seed 002; facts/unitree-dex C; docs/dex3-protocol.md).
+"""The Dex3-1's USB protocol, sans-IO (the Dex3-1 manual; docs/sources/unitree-dex.md#c;
+docs/dex3-protocol.md).
 
 - :mod:`.layout`: every structure as data, and the identity of the device;
 - :mod:`.packets`: packets, bus buffers and frames as raw integers;

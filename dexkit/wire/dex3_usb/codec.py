@@ -96,9 +96,10 @@ class BusMap:
                 raise UsageError(f"a bus map with two {what}s at one address: {addresses}")
 
 
-# Which finger is on which bus is in a figure that the sources lost (facts C.7); ids start at 0 on
-# every bus. The sensors in the order of dexkit.models.DEX3_1.sensors: two of each finger on the
-# finger's bus, the palm's three on one of their own.
+# Which finger is on which bus is in a figure that the sources lost
+# (docs/sources/unitree-dex.md#c7); ids start at 0 on every bus. The sensors in the order of
+# dexkit.models.DEX3_1.sensors: two of each finger on the finger's bus, the palm's three on one of
+# their own.
 DEFAULT_BUS_MAP = BusMap(
     motors=((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0), (2, 1)),
     sensors=((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (3, 0), (3, 1), (3, 2)),

@@ -1,8 +1,8 @@
 """The Dex3-1's USB structures as data: what struct formats, offsets and docs/dex3-protocol.md
 are made from.
 
-All structures are little-endian and packed to one byte (seed 002 "Introduction to Send and
-Receive Structures"; facts/unitree-dex C.1 to C.6).
+All structures are little-endian and packed to one byte (the Dex3-1 manual "Introduction to Send and
+Receive Structures"; docs/sources/unitree-dex.md#c).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
     "CommandLayout",
 ]
 
-# --- identity (facts/unitree-dex C.1)
+# --- identity (docs/sources/unitree-dex.md#c1)
 VENDOR_ID = 0x34B7
 PRODUCT_ID = {Side.LEFT: 0x1010, Side.RIGHT: 0x1011}
 MANUFACTURER = "UnitreeTC"
@@ -50,7 +50,7 @@ MOTOR_CMD = Structure(
         Field("head", "u8", 2, "FE EE"),
         Field("mode", "u8", 1, "RIS_Mode_t"),
         # the manual's second listing moves this byte to the end, which would break the words of
-        # the CRC (facts D 23)
+        # the CRC (docs/sources/unitree-dex.md#d23)
         Field("res", "u8", 1, "reserved"),
         Field("tor_des", "i16", 1, "torque to add, of the rotor", "1/256 mN·m"),
         Field("spd_des", "i16", 1, "velocity wanted, of the rotor", "100 · 2π/256 rad/s"),
@@ -138,8 +138,8 @@ class CommandLayout:
         return self.structure.offsets["cmd"] + bus * self.bus_size
 
 
-# seed 002: the specification table says 1234 bytes, SUPPORTED_SEND_BUFFER_SIZE says 140 a bus
-# (facts C.5, D 22)
+# the Dex3-1 manual: the specification table says 1234 bytes, SUPPORTED_SEND_BUFFER_SIZE says 140 a
+# bus (docs/sources/unitree-dex.md#c5, docs/sources/unitree-dex.md#d22)
 COMMAND_1234 = CommandLayout("1234", 240)
 COMMAND_734 = CommandLayout("734", 140)
 COMMAND_LAYOUTS = (COMMAND_1234, COMMAND_734)

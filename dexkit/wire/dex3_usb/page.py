@@ -199,7 +199,9 @@ def _crc_vectors() -> str:
 
 
 def worked_example(layout: CommandLayout) -> bytes:
-    """Seven motors in FOC, kp 1.5, kd 0.2; all of ratio 108, head FC FD (facts C.10)."""
+    """Seven motors in FOC, kp 1.5, kd 0.2; all of ratio 108, head FC FD
+    (docs/sources/unitree-dex.md#c10).
+    """
     targets = ((0.0, 0.2, 0.5), (-0.3, -0.6), (-0.4, -0.8), (), ())
     buses = [
         [

@@ -2,9 +2,9 @@
 
 The manual's figures are read as counts per unit on the *rotor's* side, with a torque unit of
 1 mN·m and a velocity unit of 100 rad/s, although its command structure says "joint output": a
-joint's 0.76 N·m would not fit an int16 of 1/256 mN·m (facts/unitree-dex C.9, D 24). A rotor turns
-``ratio`` times as far and as fast as its joint and gives 1 / ratio of its torque, so stiffness and
-damping go with 1 / ratio².
+joint's 0.76 N·m would not fit an int16 of 1/256 mN·m (docs/sources/unitree-dex.md#c9,
+docs/sources/unitree-dex.md#d24). A rotor turns ``ratio`` times as far and as fast as its joint and
+gives 1 / ratio of its torque, so stiffness and damping go with 1 / ratio².
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ __all__ = [
 ]
 
 NO_VALUE = 30000
-"""Pressure count where a packet has no sensor element (seed 002 "30000 represents no value")."""
+"""Pressure count where a packet has no sensor element (the Dex3-1 manual "30000 represents no
+value")."""
 
 _INT16 = (-0x8000, 0x7FFF)
 _UINT16 = (0, 0xFFFF)
