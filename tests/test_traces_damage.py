@@ -405,3 +405,30 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     for path in (pipe, tmp_path, Path("/dev/zero")):
         with pytest.raises(TraceUnreadable, match="not an ordinary file"):
             open_trace(path)
+
+
+def test_a_recording_that_grows_while_it_is_opened_is_read_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reader may look at any moment of a recorder's writing."""
+    path = recorded(tmp_path / "grows.mcap")
+    whole, cut = path.read_bytes(), tmp_path / "cut.mcap"
+    genuine, shown = os.fstat, len(whole)
+
+    def smaller(descriptor: int) -> os.stat_result:
+        found = genuine(descriptor)
+        if not os.path.samestat(found, path.stat()):
+            return found
+        return os.stat_result((*found[:6], shown, *found[7:10]))
+
+    def read(file: Path) -> object:
+        try:
+            return content(file)
+        except TraceUnreadable as error:
+            return str(error).replace(str(file), "")
+
+    monkeypatch.setattr("dexkit.traces.container.os.fstat", smaller)
+    for size in range(0, len(whole), 7):
+        shown = size
+        cut.write_bytes(whole[:size])
+        assert read(path) == read(cut), size

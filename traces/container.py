@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import fastcrc
 import lz4.frame  # type: ignore[import-untyped]
@@ -108,6 +108,20 @@ class Segment:
     index_offsets: dict[int, int] = field(default_factory=dict)
 
 
+class _Snapshot:
+    """A file as long as it was when it was opened; a recorder may be writing on meanwhile."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._size = file, size
+
+    def seek(self, at: int) -> int:
+        return self._file.seek(at)
+
+    def read(self, count: int = -1) -> bytes:
+        left = max(0, self._size - self._file.tell())
+        return self._file.read(left if count < 0 else min(count, left))
+
+
 class Container:
     """The records of a file; see :meth:`open`.
 
@@ -164,10 +178,11 @@ class Container:
                         hint="a recording that comes through a pipe must be stored first",
                     )
                 self._size = status.st_size
-                self._walk(file, self._read_start(file))
-                sound = self._check_sums(file)
+                snapshot = cast(BinaryIO, _Snapshot(file, self._size))
+                self._walk(snapshot, self._read_start(snapshot))
+                sound = self._check_sums(snapshot)
                 self._repeat(sound)
-                self._complete(file, sound)
+                self._complete(snapshot, sound)
         except OSError as error:
             raise TraceUnreadable(f"cannot read {self.path}: {error.strerror}") from error
         for text in contradictions(self._summary, self._found, complete=self._complete_definitions):
