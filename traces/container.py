@@ -210,8 +210,8 @@ class Container:
                 problem = f"the header cannot be read ({error})"
         else:
             problem = "it ends, or goes wrong, within its header"
-        found = None if close else self._resume(file, at + 1)
-        if found is None or not self._closed(file):
+        found = None if close or not self._closed(file) else self._resume(file, at + 1)
+        if found is None:
             raise TraceUnreadable(f"{self.path}: {problem}")
         self.hurt(problem)
         return found
