@@ -7,7 +7,6 @@ commands, the recorder, and later a monitor that joins in mid-session.
 from __future__ import annotations
 
 import contextlib
-import random
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -45,7 +44,7 @@ from dexkit.sole import Place, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
 
-__all__ = ["LiveOptions", "free_domain", "record_run"]
+__all__ = ["LiveOptions", "record_run"]
 
 TOOLS = "dexkit.tools"
 """Metadata record with the last lines that each process of the run printed."""
@@ -79,18 +78,6 @@ class LiveOptions:
             session=self.session,
             phases=self.phases,
         )
-
-
-def free_domain(interface: str = "lo") -> int:
-    """A domain from 100 to 200 on which nobody is."""
-    for _ in range(20):
-        domain = random.randint(100, 200)
-        with DdsNode(domain=domain, interface=interface) as node:
-            if not node.discovery.wait(
-                lambda endpoints: any(not e.own for e in endpoints), timeout=0.15
-            ):
-                return domain
-    raise ConformanceError("no DDS domain from 100 to 200 is free", hint="give one: --domain")
 
 
 def record_run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -351,7 +352,8 @@ def run_suite(
     :raises TopicConflict: somebody else commands it.
     :raises DdsError: DDS cannot be used here.
     """
-    from dexkit.conformance.live import free_domain, record_run
+    from dexkit.conformance.live import record_run
+    from dexkit.domains import reserve_free_domain
     from dexkit.traces import open_trace
 
     room_for_files(_FILES, "a conformance run")
@@ -360,9 +362,10 @@ def run_suite(
         if result is not None:
             say("the machine was too busy to be fair to the hand; once more")
         attempts -= 1
-        given = options.domain
-        domain = given if given is not None else free_domain(options.interface)
-        with Scratch() as folder:
+        with contextlib.ExitStack() as stack:
+            folder = stack.enter_context(Scratch())
+            if (domain := options.domain) is None:
+                domain = stack.enter_context(reserve_free_domain(options.interface)).domain
             path = options.recording or folder / "run.mcap"
             if not record_run(live_options(options, domain), path, say=say, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")

@@ -5,6 +5,8 @@ Importing this skips the test module where CycloneDDS is not installed.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
 import random
 import time
@@ -18,33 +20,36 @@ from tests.patience import PATIENCE
 pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
 
 from dexkit.dds import DdsNode, Reader, Sample
+from dexkit.domains import AUTOMATIC_DOMAINS, ReservedDomain
 
 __all__ = ["dds_domain", "dds_node", "free_domain", "take_until", "wait_until"]
 
-_random = random.Random(os.getpid() ^ time.time_ns())
+_reserved: list[ReservedDomain] = []
 
 
-def _of_this_worker() -> list[int]:
-    """The domains from 100 to 200 that fall to this worker of pytest-xdist, in random order.
+@functools.cache
+def _of_this_process() -> deque[int]:
+    """Domains that this worker of pytest-xdist reserves for its life, in random order.
 
-    Two workers on one domain would be taken for two robots. Those of other checkouts, which may
-    be tested at once on this machine, are avoided by chance.
+    Two workers on one domain would be taken for two robots; so would two checkouts that are
+    tested at once, or a test and a program that chooses its domain itself.
     """
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    domains = [d for d in range(100, 201) if d % count == worker % count]
-    _random.shuffle(domains)
-    return domains
-
-
-_domains = deque(_of_this_worker())
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    wanted = max(min(30, 100 // workers), 3)
+    for domain in random.Random(os.urandom(8)).sample(AUTOMATIC_DOMAINS, len(AUTOMATIC_DOMAINS)):
+        if len(_reserved) == wanted:
+            break
+        with contextlib.suppress(OSError):
+            _reserved.append(ReservedDomain(domain))
+    assert _reserved, "no DDS domain is free on this machine: other runs of the tests have them"
+    return deque(reserved.domain for reserved in _reserved)
 
 
 def free_domain() -> int:
-    """A domain from 100 to 200 that no other worker uses, and this one has not used for long."""
-    domain = _domains.popleft()
-    _domains.append(domain)
-    return domain
+    """A domain that no other process uses, and this one has not used for long."""
+    domains = _of_this_process()
+    domains.rotate(-1)
+    return domains[-1]
 
 
 @pytest.fixture(scope="module")
