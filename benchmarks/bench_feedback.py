@@ -17,7 +17,7 @@ from itertools import count
 from benchmarks import Result
 from dexkit.clock import ManualClock
 from dexkit.drivers.ezgripper.scaling import current_of_effort, joint_of_ticks, ticks_of_joint
-from dexkit.emulators.mx64 import Firmware, GripperBody, Physics, Servo
+from dexkit.emulators.mx64 import Firmware, GripperMechanics, Physics, Servo
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import Estimation, HandCore
@@ -44,7 +44,7 @@ class VirtualGripper:
             1,
             baudrate=1_000_000,
             firmware=Firmware(current_noise=0.0),
-            physics=Physics(gripper=GripperBody(closed_at=_ZERO, start=0.0)),
+            physics=Physics(gripper=GripperMechanics(closed_at=_ZERO, start=0.0)),
         )
         for item, value in (
             (mx64.OPERATING_MODE, mx64.OperatingMode.CURRENT_BASED_POSITION),

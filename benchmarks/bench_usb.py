@@ -177,7 +177,7 @@ def run() -> list[Result]:
             peer="raw echo device, the driver's link",
             peer_value=bare.rate,
             ratio=fast.rate / bare.rate,
-            note="the rest is frames made and taken apart at both ends, and the hand's body",
+            note="the rest is frames made and taken apart at both ends, and the hand's mechanics",
         ),
         Result(
             name="p99 of an exchange at 1000 a second",

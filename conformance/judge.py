@@ -39,10 +39,10 @@ def judge(
     every = claims.apply(catalogue(recording.model.name, recording.layer))
     wanted = None if requirements is None else {r.id for r in requirements}
     checks = all_checks()
-    if recording.layer == "body":
-        from dexkit.conformance.checks.body import body_checks
+    if recording.layer == "robot":
+        from dexkit.conformance.checks.robot import robot_checks
 
-        checks = body_checks()
+        checks = robot_checks()
     results: list[Result] = []
     for side in recording.judged:
         found: dict[str, Result] = {}

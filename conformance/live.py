@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.clock import RealClock
-from dexkit.conformance.body import wire_for
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
+from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli import (
     Action,
     Join,

@@ -18,9 +18,9 @@ from dexkit.errors import TraceUnsupported
 from dexkit.hand import Floats, Side
 
 __all__ = [
-    "BODY",
     "IDLE",
     "RECORD",
+    "ROBOT",
     "Beats",
     "Lost",
     "Phase",
@@ -34,8 +34,8 @@ _LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
-BODY = cast(Side, "body")
-"""What a whole body has where a hand has its side."""
+ROBOT = cast(Side, "robot")
+"""What a whole robot has where a hand has its side."""
 IDLE = 1e-3
 """Seconds by which timers are late on a machine that has nothing else to do."""
 
@@ -213,7 +213,7 @@ class Stimulus:
 
 
 def _side(name: str) -> Side:
-    return BODY if name == BODY else Side(name)
+    return ROBOT if name == ROBOT else Side(name)
 
 
 def _joints(value: Any) -> dict[int, float]:

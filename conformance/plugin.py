@@ -44,8 +44,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     Each also has a long name, ``--dexkit-NAME``. Should another plug-in of the environment own
     the short one, that is the only one: this plug-in must not break anybody's pytest.
     """
-    from dexkit.bodies import BODIES
     from dexkit.models import DIALECTS
+    from dexkit.robots import ROBOTS
 
     group = parser.getgroup("dexkit conformance", "judge a hand on Unitree's topics")
 
@@ -61,7 +61,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "backend",
         metavar="NAME",
         help="hand to judge: a name from 'dexkit backends', package.module:Class, or 'external' "
-        "for a service that already runs; sim-h1 or sim-g1 for an emulated body",
+        "for a service that already runs; sim-h1 or sim-g1 for an emulated robot",
     )
     add(
         "device",
@@ -78,8 +78,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     add(
         "dialect",
-        choices=[*DIALECTS, *BODIES],
-        help="how the hand speaks, or which body it is (default: as its model does; unitree_go "
+        choices=[*DIALECTS, *ROBOTS],
+        help="how the hand speaks, or which robot it is (default: as its model does; unitree_go "
         "with external)",
     )
     add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")

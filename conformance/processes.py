@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit import processes
-from dexkit.bodies import BODIES
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
+from dexkit.robots import ROBOTS
 from dexkit.scratch import Scratch
 
 __all__ = [
@@ -71,8 +71,8 @@ SIMULATED = ("sim-dex1", "sim-dex3", "sim-dex5")
 """Backends without a device, which are told of an object by the setting ``object``."""
 
 
-BODY_EMULATORS = {f"sim-{name}": name for name in BODIES}
-"""Backends that are emulated bodies: the names of their emulators."""
+BODY_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
+"""Backends that are emulated robots: the names of their emulators."""
 
 
 class Tool(processes.Tool):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 
-from dexkit.bodies import BODIES, G1, H1
-from dexkit.conformance.body import body_dialect
-from dexkit.conformance.phases import BODY
+from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Level, Requirement
+from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
+from dexkit.robots import G1, H1, ROBOTS
 
 __all__ = ["QUICK", "length", "print_selection", "quick"]
 
@@ -22,8 +22,10 @@ QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0, H1.name: 13.0, 
 @cache
 def length(model_name: str, phases: frozenset[str]) -> float:
     """Seconds that a pair of hands which obey at once takes for these phases."""
-    if model_name in BODIES:
-        return SCRIPTS[model_name](Plan(body_dialect(model_name), (BODY,), phases=phases)).length()
+    if model_name in ROBOTS:
+        return SCRIPTS[model_name](
+            Plan(robot_dialect(model_name), (ROBOT,), phases=phases)
+        ).length()
     dialect = model(model_name).dialects[0]
     return SCRIPTS[model_name](Plan(dialect, tuple(Side), phases=phases)).length()
 

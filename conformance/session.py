@@ -10,11 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dexkit.bodies import BODIES
-from dexkit.conformance.body import body_dialect, recording_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import BODY
+from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.processes import (
     BODY_EMULATORS,
     EMULATED,
@@ -25,6 +23,7 @@ from dexkit.conformance.processes import (
 )
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
+from dexkit.conformance.robot import recording_of, robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
@@ -35,6 +34,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.limits import room_for_files
 from dexkit.models import DEX1_1, Dialect, dialect, model
+from dexkit.robots import ROBOTS
 from dexkit.scratch import Scratch
 
 if TYPE_CHECKING:
@@ -133,9 +133,9 @@ class SuiteOptions:
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
         """
-        of_body = _body_of(backend, dialect_name)
-        if of_body:
-            _refuse_for_bodies(side=side, device=devices, object=objects, set=settings, trace=trace)
+        of_robot = _robot_of(backend, dialect_name)
+        if of_robot:
+            _refuse_for_robots(side=side, device=devices, object=objects, set=settings, trace=trace)
         one_device = len(devices) == 1 and "=" not in devices[0]
         sides = sides_of(side or ("left" if one_device else "both"))
         if one_device and len(sides) > 1:
@@ -143,8 +143,8 @@ class SuiteOptions:
                 "one --device for two hands", hint="--device left=PATH --device right=PATH"
             )
         named = _by_side(devices, sides, str, "--device")
-        if of_body:
-            sides, chosen = (BODY,), body_dialect(of_body)
+        if of_robot:
+            sides, chosen = (ROBOT,), robot_dialect(of_robot)
         else:
             chosen = _dialect(backend, dialect_name, sides[0], named, settings)
         touch = [o for o in objects if o != "none"]
@@ -172,7 +172,7 @@ class SuiteOptions:
                 raise UsageError(f"cannot write {file}: it is a directory")
             if file is not None and not os.access(file.absolute().parent, os.W_OK):
                 raise UsageError(f"cannot write {file}: its directory is read-only")
-        every = catalogue(chosen.model, "body" if of_body else "dds")
+        every = catalogue(chosen.model, "robot" if of_robot else "dds")
         if backend in ON_USB:
             every += catalogue(chosen.model, "usb")
         claims = Claims.load(capabilities, chosen.model)
@@ -236,7 +236,7 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
     if config.getoption("dexkit_backend"):
         return SuiteOptions.from_pytest(config).requirements
     name = config.getoption("dexkit_dialect")
-    model_name = name if name in BODIES else dialect(name).model if name else None
+    model_name = name if name in ROBOTS else dialect(name).model if name else None
     path = config.getoption("dexkit_capabilities")
     claims = Claims.load(Path(path) if path else None, model_name)
     found = select(
@@ -247,28 +247,28 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
     return quick_ones(found) if config.getoption("dexkit_quick") else found
 
 
-def _body_of(backend: str, dialect_name: str | None) -> str:
-    """The body that is to be judged; empty for a hand.
+def _robot_of(backend: str, dialect_name: str | None) -> str:
+    """The robot that is to be judged; empty for a hand.
 
     :raises UsageError: a backend and a dialect of two of them.
     """
     started = BODY_EMULATORS.get(backend, "")
-    wanted = dialect_name if dialect_name in BODIES else ""
+    wanted = dialect_name if dialect_name in ROBOTS else ""
     if (started and dialect_name and wanted != started) or (
         wanted and not started and backend != EXTERNAL
     ):
         raise UsageError(
             f"{backend} does not speak {dialect_name}",
-            hint=f"bodies: --backend {' or '.join(BODY_EMULATORS)}, or external with --dialect "
-            f"{' or '.join(BODIES)}",
+            hint=f"robots: --backend {' or '.join(BODY_EMULATORS)}, or external with --dialect "
+            f"{' or '.join(ROBOTS)}",
         )
     return started or wanted or ""
 
 
-def _refuse_for_bodies(**given: Any) -> None:
+def _refuse_for_robots(**given: Any) -> None:
     wrong = [f"--{name}" for name, value in given.items() if value]
     if wrong:
-        raise UsageError(f"{', '.join(wrong)} is about hands, and a body is to be judged")
+        raise UsageError(f"{', '.join(wrong)} is about hands, and a robot is to be judged")
 
 
 def _dialect(

@@ -1,14 +1,14 @@
-"""``sim-dex3``: a Dex3-1 that is only a body, with no device or wire around it.
+"""``sim-dex3``: a Dex3-1 as simulated mechanics, with no device or wire around it.
 
-See :mod:`dexkit.emulators.dex3_body` for what is modelled, what is tuned and what is not there.
+See :mod:`dexkit.emulators.dex3_mechanics` for what is modelled, tuned and not there.
 """
 
 from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
-from dexkit.emulators.dex3_body import Dex3Body
-from dexkit.emulators.finger_body import SETTINGS, STEP
+from dexkit.emulators.dex3_mechanics import Dex3Mechanics
+from dexkit.emulators.finger_mechanics import SETTINGS, STEP
 from dexkit.emulators.simulated import SimulatedHand, number
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
@@ -38,9 +38,9 @@ class SimDex3(SimulatedHand):
         supply_v: float = 24.0,
         clock: Clock | None = None,
     ) -> None:
-        self.body = Dex3Body(side, object_at=object_at, start=start, supply_v=supply_v)
+        self.mechanics = Dex3Mechanics(side, object_at=object_at, start=start, supply_v=supply_v)
         spec = DEX3_1.spec(side, io_rate=DEX3_1.state_rate, simulated=True)
-        super().__init__(spec, self.body, STEP, clock)
+        super().__init__(spec, self.mechanics, STEP, clock)
 
 
 def _make(options: BackendOptions) -> SimDex3:

@@ -1,14 +1,14 @@
-"""``sim-dex5``: a Dex5-1 that is only a body, with no device or wire around it.
+"""``sim-dex5``: a Dex5-1 as simulated mechanics, with no device or wire around it.
 
-See :mod:`dexkit.emulators.dex5_body` for what is modelled, what is assumed and what is not there.
+See :mod:`dexkit.emulators.dex5_mechanics` for what is modelled, assumed and not there.
 """
 
 from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
-from dexkit.emulators.dex5_body import Dex5Body
-from dexkit.emulators.finger_body import SETTINGS, STEP
+from dexkit.emulators.dex5_mechanics import Dex5Mechanics
+from dexkit.emulators.finger_mechanics import SETTINGS, STEP
 from dexkit.emulators.simulated import SimulatedHand, number
 from dexkit.hand import Side
 from dexkit.models import DEX5_1
@@ -35,9 +35,9 @@ class SimDex5(SimulatedHand):
         start: float | None = None,
         clock: Clock | None = None,
     ) -> None:
-        self.body = Dex5Body(side, object_at=object_at, start=start)
+        self.mechanics = Dex5Mechanics(side, object_at=object_at, start=start)
         spec = DEX5_1.spec(side, io_rate=DEX5_1.state_rate, simulated=True)
-        super().__init__(spec, self.body, STEP, clock)
+        super().__init__(spec, self.mechanics, STEP, clock)
 
 
 def _make(options: BackendOptions) -> SimDex5:

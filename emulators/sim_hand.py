@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
-from dexkit.emulators.dex1_body import STEP, Dex1Body
+from dexkit.emulators.dex1_mechanics import STEP, Dex1Mechanics
 from dexkit.emulators.simulated import SimulatedHand, number
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
@@ -36,10 +36,10 @@ class SimHand(SimulatedHand):
         start_pct: float = 20.0,
         clock: Clock | None = None,
     ) -> None:
-        self.body = Dex1Body(object_pct=object_pct, start_pct=start_pct)
-        self.joint = self.body.joint
+        self.mechanics = Dex1Mechanics(object_pct=object_pct, start_pct=start_pct)
+        self.joint = self.mechanics.joint
         spec = DEX1_1.spec(side, io_rate=1000.0, simulated=True)
-        super().__init__(spec, self.body, STEP, clock)
+        super().__init__(spec, self.mechanics, STEP, clock)
 
 
 def _make(options: BackendOptions) -> SimHand:

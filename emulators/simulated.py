@@ -1,4 +1,4 @@
-"""A hand that is only a body, with no device or wire around it.
+"""A hand that is simulated mechanics alone, with no device or wire around it.
 
 The command in force stays in force until the next one, as in a real motor.
 """
@@ -9,15 +9,15 @@ from typing import Protocol
 
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
-from dexkit.emulators.mechanics import FixedSteps
+from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.errors import HandLost, UsageError
 from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandSpec, HandState
 
-__all__ = ["Body", "SimulatedHand", "number"]
+__all__ = ["Mechanics", "SimulatedHand", "number"]
 
 
-class Body(Protocol):
+class Mechanics(Protocol):
     """Mechanics on steps instead of a clock."""
 
     def brake(self) -> None:
@@ -37,17 +37,19 @@ class Body(Protocol):
 
 
 class SimulatedHand:
-    """A body on a clock.
+    """A mechanics on a clock.
 
-    :param step: seconds of one step of the body.
+    :param step: seconds of one step of the mechanics.
     :param clock: real time unless given; with a manual clock the hand is deterministic. A caller
         that stays away for more than a quarter of a second finds it braked since, and of more
         than half a second only the end is lived through.
     """
 
-    def __init__(self, spec: HandSpec, body: Body, step: float, clock: Clock | None = None) -> None:
+    def __init__(
+        self, spec: HandSpec, mechanics: Mechanics, step: float, clock: Clock | None = None
+    ) -> None:
         self._spec = spec
-        self._body = body
+        self._mechanics = mechanics
         self._clock: Clock = clock or RealClock()
         self._steps = FixedSteps(step, most=0.5)
         self._last = 0.0  # when the last exchange was
@@ -60,7 +62,7 @@ class SimulatedHand:
 
     def open(self) -> None:
         """Start to live; brakes until the first command."""
-        self._body.brake()
+        self._mechanics.brake()
         self._last = self._clock.now()
         self._steps.restart(self._last)
         self._open = True
@@ -68,7 +70,7 @@ class SimulatedHand:
     def close(self) -> None:
         """Stop where it is."""
         self._open = False
-        self._body.stop()
+        self._mechanics.stop()
 
     def exchange(self, command: HandCommand) -> HandState:
         """Live up to now under the command before, take this one, and say where the hand is.
@@ -79,11 +81,11 @@ class SimulatedHand:
             raise HandLost("the simulated hand is not open")
         now = self._clock.now()
         if now - self._last > PAUSE:
-            self._body.brake()
+            self._mechanics.brake()
         self._last = now
-        self._body.step(self._steps.due(now))
-        self._body.use(command)
-        return self._body.state(now)
+        self._mechanics.step(self._steps.due(now))
+        self._mechanics.use(command)
+        return self._mechanics.state(now)
 
 
 def number(options: BackendOptions, key: str) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from dexkit.emulators.faults import parse_fault
-from dexkit.emulators.mx64 import Bus, Firmware, GripperBody, Physics, Servo
+from dexkit.emulators.mx64 import Bus, Firmware, GripperMechanics, Physics, Servo
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import Instruction, Packet
@@ -25,12 +25,12 @@ def servo(
     baudrate: int = 1_000_000,
     **physics: float,
 ) -> Servo:
-    body = GripperBody(closed_at=closed_at, start=start, object_pct=object_pct)
+    mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
     return Servo(
         servo_id,
         baudrate=baudrate,
         firmware=firmware,
-        physics=dataclasses.replace(Physics(gripper=body), **physics),
+        physics=dataclasses.replace(Physics(gripper=mechanics), **physics),
         eeprom=eeprom,
     )
 

@@ -83,7 +83,7 @@ OPTIONAL = (
         _package("unitree_sdk2py"),
         ("dds_multicast", "dds_sdk", "dds_types", "service_sdk"),
     ),
-    Optional("the package far-unitree-sdk", _package("unitree_interface"), ("body_sdk",)),
+    Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 

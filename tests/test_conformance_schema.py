@@ -11,7 +11,7 @@ import pytest
 
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import BODY
+from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
 from dexkit.conformance.results import VERSION, Overall, Stage, Verdict
 from dexkit.conformance.view import Recording
@@ -64,7 +64,7 @@ def test_the_schema_knows_every_value() -> None:
     assert set(properties["counts"]["properties"]) == {str(v) for v in Verdict}
     assert set(defs["result"]["properties"]["verdict"]["enum"]) == {str(v) for v in Verdict}
     assert properties["stage"]["additionalProperties"]["enum"] == [str(s) for s in Stage]
-    assert defs["side"]["enum"] == [*map(str, Side), BODY]
+    assert defs["side"]["enum"] == [*map(str, Side), ROBOT]
     assert defs["level"]["enum"] == [str(level) for level in Level]
     assert defs["requirement"]["properties"]["confidence"]["enum"] == list(CONFIDENCE)
     assert defs["requirement"]["properties"]["layer"]["enum"] == list(LAYERS)

@@ -79,7 +79,7 @@ def test_it_follows_measures_and_brakes_at_the_end() -> None:
     with Dex1Motors() as motors:
         with opened(motors) as hand:
             assert isinstance(hand, Hand)
-            assert motors.motor.body.mode is JointMode.BRAKE
+            assert motors.motor.mechanics.mode is JointMode.BRAKE
             start = hand.exchange(BRAKE)
             assert float(start.q[0]) == pytest.approx(1.08, abs=1e-3)
             assert start.mode[0] == JointMode.BRAKE
@@ -93,9 +93,9 @@ def test_it_follows_measures_and_brakes_at_the_end() -> None:
             assert float(end.voltage[0]) == 24.0
             assert end.fault[0] == 0
             assert before <= end.stamp <= time.monotonic()
-            assert motors.motor.body.joint.q == pytest.approx(float(end.q[0]), abs=0.05)
+            assert motors.motor.mechanics.joint.q == pytest.approx(float(end.q[0]), abs=0.05)
             drive(hand, CLOSE, moving)
-        assert motors.motor.body.mode is JointMode.BRAKE
+        assert motors.motor.mechanics.mode is JointMode.BRAKE
         hand.close()
         with pytest.raises(HandLost, match="not open"):
             hand.exchange(BRAKE)
@@ -103,12 +103,12 @@ def test_it_follows_measures_and_brakes_at_the_end() -> None:
 
 def test_opening_and_closing_move_nothing_and_limp_neither() -> None:
     with Dex1Motors() as motors:
-        before = motors.motor.body.joint.q
+        before = motors.motor.mechanics.joint.q
         with opened(motors) as hand:
             hand.open()  # again: nothing happens
             for _ in range(50):
                 hand.exchange(LIMP)
-        assert motors.motor.body.joint.q == before
+        assert motors.motor.mechanics.joint.q == before
 
 
 def test_both_hands_on_one_line_take_turns() -> None:
@@ -347,7 +347,7 @@ def test_a_pause_trips_the_protection_and_work_goes_on() -> None:
     with Dex1Motors(firmware=quick) as motors, opened(motors) as hand:
         drive(hand, OPEN, moving)
         wait_for(lambda: motors.motor.tripped)
-        assert motors.motor.body.mode is JointMode.BRAKE
+        assert motors.motor.mechanics.mode is JointMode.BRAKE
         found = hand.exchange(CLOSE)
         assert found.fault[0] & MotorError.MOTOR_SAW_HOST_TIMEOUT
         cleared = hand.exchange(CLOSE)
@@ -362,7 +362,7 @@ def test_protection_can_be_left_off() -> None:
         hand.exchange(OPEN)
         time.sleep(0.3)
         assert not motors.motor.tripped
-        assert motors.motor.body.mode is JointMode.FOC
+        assert motors.motor.mechanics.mode is JointMode.FOC
 
 
 @pytest.mark.parametrize("where", ["write", "read"])
@@ -382,8 +382,8 @@ def test_ctrl_c_in_an_exchange_brakes(monkeypatch: pytest.MonkeyPatch, where: st
                 patched.setattr(line_module.os, "write", interrupt)
                 with pytest.raises(KeyboardInterrupt):
                     hand.exchange(CLOSE)
-            assert motors.motor.body.mode is JointMode.FOC
-        assert motors.motor.body.mode is JointMode.BRAKE
+            assert motors.motor.mechanics.mode is JointMode.FOC
+        assert motors.motor.mechanics.mode is JointMode.BRAKE
 
 
 def test_a_killed_driver_leaves_nothing_moving() -> None:
@@ -402,11 +402,11 @@ def test_a_killed_driver_leaves_nothing_moving() -> None:
         driver = subprocess.Popen([sys.executable, "-c", code, motors.path], stdout=subprocess.PIPE)
         assert driver.stdout is not None
         driver.stdout.readline()
-        wait_for(lambda: motors.motor.body.joint.dq > 0.2)
+        wait_for(lambda: motors.motor.mechanics.joint.dq > 0.2)
         driver.send_signal(signal.SIGKILL)
         driver.communicate()
         wait_for(lambda: motors.motor.tripped, 3.0)
-        wait_for(lambda: motors.motor.body.joint.dq == 0.0)
+        wait_for(lambda: motors.motor.mechanics.joint.dq == 0.0)
         with opened(motors) as hand:  # and whoever comes next can drive
             drive(hand, OPEN, moving)
 
@@ -427,7 +427,7 @@ def test_unplugged_in_motion_and_plugged_in_again() -> None:
             hand.open()
         wait_for(lambda: os.path.exists(motors.path))
         hand.open()
-        assert motors.motor.body.mode is JointMode.BRAKE
+        assert motors.motor.mechanics.mode is JointMode.BRAKE
         drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
     assert line_module._lines == {}
 
@@ -566,7 +566,7 @@ def test_asking_who_else_is_there_leaves_a_hand_alone_that_is_driven() -> None:
         wait_for(lambda: motors.motors[Side.LEFT].silent)
         with pytest.raises(HandNotFound), opened(motors, timeout=0.01):
             pass
-        assert motors.motors[Side.RIGHT].body.mode is JointMode.FOC
+        assert motors.motors[Side.RIGHT].mechanics.mode is JointMode.FOC
         line = acquire(motors.path, 6_000_000)
         assert is_shared(line)
         assert line.exchange(MotorCmd(0).pack(), 0, TIMEOUT).id == 0

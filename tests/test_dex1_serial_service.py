@@ -62,12 +62,12 @@ def test_unplugged_in_motion_it_says_so_and_moves_for_nothing_stale() -> None:
             done = core.counters.exchanges
             wait_until(lambda: core.counters.exchanges > done + 20)
             assert not core.driving
-            assert motor.body.mode is JointMode.BRAKE
+            assert motor.mechanics.mode is JointMode.BRAKE
             assert not motor.tripped
             node.deliver(command, message(2.0))
             wait_until(lambda: core.driving)
             assert core.counters.reconnects >= 1
-        assert motor.body.mode is JointMode.BRAKE
+        assert motor.mechanics.mode is JointMode.BRAKE
 
 
 def test_a_fault_is_published_with_the_temperatures() -> None:
@@ -111,7 +111,7 @@ def test_two_hands_on_one_line_in_one_process(tmp_path: Path) -> None:
         finally:
             for service in services:
                 service.stop()
-        assert all(m.body.mode is JointMode.BRAKE for m in motors.motors.values())
+        assert all(m.mechanics.mode is JointMode.BRAKE for m in motors.motors.values())
         for side in Side:
             with hand_at(str(link), side) as hand:  # the port is free again
                 hand.exchange(HandCommand.brake(1))

@@ -86,10 +86,10 @@ def test_both_hands_go_where_they_are_told(process: bool) -> None:
 
 
 def test_the_units_are_right_on_both_ends() -> None:
-    """What the motors are told and what the driver reads are the body's own values."""
+    """What the motors are told and what the driver reads are the mechanics's own values."""
     with emulated_dex3() as emulated:
         assert isinstance(emulated, Dex3Hands)
-        body = emulated.device().body
+        mechanics = emulated.device().mechanics
         with hand_at(emulated.url) as hand:
             state = drive(hand, go(GOAL[Side.LEFT], kp=1.0), lambda s: np.abs(s.dq).max() > 1.0)
             assert (
@@ -99,7 +99,7 @@ def test_the_units_are_right_on_both_ends() -> None:
             drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.01)
             time.sleep(0.3)
             state = hand.exchange(go(GOAL[Side.LEFT]))
-            assert state.q == pytest.approx(body.q, abs=1e-3)
+            assert state.q == pytest.approx(mechanics.q, abs=1e-3)
             # a torque of its own, held against nothing but the gains: kp (q - q_now) + tau = 0
             push = 0.15
             pushed = go(GOAL[Side.LEFT], tau=push)
@@ -112,13 +112,13 @@ def test_the_units_are_right_on_both_ends() -> None:
 def test_opening_and_closing_move_nothing() -> None:
     with emulated_dex3() as emulated:
         assert isinstance(emulated, Dex3Hands)
-        body = emulated.device().body
-        before = np.array(body.q)
+        mechanics = emulated.device().mechanics
+        before = np.array(mechanics.q)
         for _ in range(2):
             with hand_at(emulated.url) as hand:
                 for _ in range(20):
                     hand.exchange(HandCommand.brake(7))
-        assert np.array(body.q) == pytest.approx(before, abs=1e-3)
+        assert np.array(mechanics.q) == pytest.approx(before, abs=1e-3)
 
 
 class TestFaults:
@@ -218,7 +218,7 @@ for count in range(10**9):
             device = emulated.device()
             with hand_at(emulated.url) as hand:
                 hand.exchange(go(GOAL[Side.LEFT]))
-            state = device.body.state(0.0)
+            state = device.mechanics.state(0.0)
             assert state.mode.tolist() == [JointMode.BRAKE] * 7
             time.sleep(1.2)
             assert not any(device.tripped)
@@ -290,14 +290,14 @@ class TestService:
                 # the motors stop by themselves; the last command, and one sent meanwhile, do not
                 # count any more when the cable is back
                 wait_until(lambda: all(device.tripped), what="the protection")
-                still = np.array(device.body.q)
+                still = np.array(device.mechanics.q)
                 node.deliver(CMD, message(-0.5 * GOAL[Side.LEFT]))
                 wait_until(lambda: device.plugged)
                 wait_until(lambda: core.connected, what="the reconnection")
                 done = core.counters.exchanges
                 wait_until(lambda: core.counters.exchanges > done + 50)
                 assert not core.driving
-                assert np.array(device.body.q) == pytest.approx(still, abs=0.02)
+                assert np.array(device.mechanics.q) == pytest.approx(still, abs=0.02)
                 assert not any(device.tripped)
                 view = core.view()
                 assert view is not None

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.emulators.dex3_body import Dex3Body
 from dexkit.emulators.dex3_mcu import Dex3Mcu, Firmware
 from dexkit.emulators.dex3_mcu.command import CommandReader
+from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.faults import DEX3_FAULTS, grammar, parse_fault
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, MotorError, Side
@@ -52,10 +52,10 @@ class Bench:
     ) -> None:
         self.side = side
         self.clock = ManualClock(100.0)
-        self.body = Dex3Body(side, object_at=object_at)
+        self.mechanics = Dex3Mechanics(side, object_at=object_at)
         self.mcu = Dex3Mcu(
             side,
-            body=self.body,
+            mechanics=self.mechanics,
             clock=self.clock,
             firmware=firmware,
             faults=[parse_fault(spec, DEX3_FAULTS) for spec in faults],
@@ -131,7 +131,7 @@ def test_the_state_is_that_of_the_answer() -> None:
     bench.ask(bench.frame(bench.away()))
     bench.clock.advance(0.05)
     state = bench.ask(empty())
-    assert state.q == pytest.approx(bench.body.q, abs=1e-5)
+    assert state.q == pytest.approx(bench.mechanics.q, abs=1e-5)
     assert np.abs(state.q - bench.rest).max() > 0.01
 
 
@@ -188,12 +188,12 @@ def test_answers_are_those_of_the_codec(
         q = [j.q_min + p * (j.q_max - j.q_min) for j, p in zip(joints, part, strict=True)]
         bench.clock.advance(seconds)
         answer = bench.mcu.exchange(bench.frame(q))
-        state = bench.body.state(0.0)
+        state = bench.mechanics.state(0.0)
         assert state.sensor_temperature is not None
         heat = np.nan_to_num(state.sensor_temperature)
         assert answer == bench.codec.encode_state(
             dataclasses.replace(state, sensor_temperature=heat),
-            fans=bytes([bench.body.fans] * 2),
+            fans=bytes([bench.mechanics.fans] * 2),
         )
 
 
@@ -528,7 +528,7 @@ def test_a_silent_motor_hears_nothing_and_stops_itself() -> None:
     assert bench.codec.missing_motors == (3,)
     assert math.isnan(state.q[3])
     assert bench.mcu.tripped == [i == 3 for i in range(7)]
-    assert bench.body.q[3] == pytest.approx(bench.rest[3], abs=0.02)
+    assert bench.mechanics.q[3] == pytest.approx(bench.rest[3], abs=0.02)
     state = bench.run(2.0, bench.frame(bench.away()))
     assert bench.codec.missing_motors == ()
     assert state.fault.tolist() == [TRIPPED if i == 3 else 0 for i in range(7)]
@@ -552,7 +552,7 @@ def test_a_motor_with_an_error_brakes_until_it_is_over(spec: str, bits: int) -> 
     assert state.q[5] == pytest.approx(bench.rest[5], abs=0.02)
     bench.clock.advance(0.2)
     bench.mcu.advance()
-    assert bench.body.mode[5] == 0  # not on the command of before
+    assert bench.mechanics.mode[5] == 0  # not on the command of before
     state = bench.run(1.0, bench.frame(bench.away()))
     assert not state.fault.any()
     assert state.q == pytest.approx(bench.away(), abs=0.03)
@@ -604,10 +604,10 @@ def test_pulling_the_cable_stops_no_motor_but_their_protection_does() -> None:
     bench.ask(bench.frame(bench.away()))
     bench.clock.advance(0.9)
     bench.mcu.advance()
-    assert bench.body.mode == [1] * 7
+    assert bench.mechanics.mode == [1] * 7
     bench.clock.advance(0.2)
     bench.mcu.advance()
-    assert bench.body.mode == [0] * 7
+    assert bench.mechanics.mode == [0] * 7
 
 
 # --- the grammar of the family

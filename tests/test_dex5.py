@@ -142,7 +142,7 @@ def test_fingers_and_thumb_press_on_an_object_towards_closing() -> None:
 def test_settings_are_those_of_a_hand_of_several_joints() -> None:
     hand = sim_dex5.make(BackendOptions(LEFT, settings={"start": "0", "object": "40"}))
     assert isinstance(hand, SimDex5)
-    assert not hand.body.q[CLOSING[LEFT] != 0].any()
+    assert not hand.mechanics.q[CLOSING[LEFT] != 0].any()
     with pytest.raises(UsageError, match="start=half is not a number"):
         sim_dex5.make(BackendOptions(LEFT, settings={"start": "half"}))
     with pytest.raises(UsageError, match="inside the object"):

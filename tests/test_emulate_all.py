@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from dexkit.bodies import G1
 from dexkit.cli import cli
 from dexkit.cli.emulate import command as emulate
 from dexkit.dds import DdsNode
@@ -20,6 +19,7 @@ from dexkit.hand import Side
 from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.processes import Tool
+from dexkit.robots import G1
 from dexkit.wire import low_level
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until
 
@@ -66,7 +66,7 @@ class Robot:
 
 
 @contextmanager
-def robot(*arguments: object) -> Iterator[Robot]:
+def whole_robot(*arguments: object) -> Iterator[Robot]:
     one = Robot(*arguments)
     try:
         one.tool.ready.wait(60)
@@ -81,15 +81,15 @@ def test_a_g1_with_two_dex3_moves_and_ends_whole(dds_domain: int, dds_node: DdsN
     orders = dds_node.writer(G1.cmd_topic, G1.cmd_type)
     grips = {s: dds_node.writer(DEX3.topics(s)[0], DEX3.cmd_type) for s in Side}
     elbow = G1.slot("right_elbow")
-    with robot("--domain", dds_domain) as whole:
-        assert any(line.startswith("ready: G1 body") for line in whole.lines), whole.lines
-        body = unitree_hg.LowCmd_(mode_machine=take_until(states, bool)[-1].message.mode_machine)
+    with whole_robot("--domain", dds_domain) as whole:
+        assert any(line.startswith("ready: G1 robot") for line in whole.lines), whole.lines
+        robot = unitree_hg.LowCmd_(mode_machine=take_until(states, bool)[-1].message.mode_machine)
         for slot in G1.used:
-            motor = body.motor_cmd[slot]
+            motor = robot.motor_cmd[slot]
             motor.mode, motor.q = G1.enable[slot], G1.rest_q[slot]
             motor.kp, motor.kd = G1.client_gains[slot]
-        body.motor_cmd[elbow].q = 1.2
-        order = low_level.encode_with_crc(body)
+        robot.motor_cmd[elbow].q = 1.2
+        order = low_level.encode_with_crc(robot)
         grip = {
             side: unitree_hg.HandCmd_(
                 [unitree_hg.MotorCmd_(mode=0x10 | i, q=j.q_max if j.closing > 0 else j.q_min,
@@ -120,7 +120,7 @@ def test_a_g1_with_two_dex3_moves_and_ends_whole(dds_domain: int, dds_node: DdsN
 
 
 def test_a_part_that_dies_ends_the_whole() -> None:
-    with robot("--body", "h1", "--hands", "dex1", "--domain", free_domain()) as whole:
+    with whole_robot("--robot", "h1", "--hands", "dex1", "--domain", free_domain()) as whole:
         parts = children(whole.pid)
         assert whole.end(signal.SIGKILL, whole.part("sim-dex1")) == 1
         assert "error: hands: killed by signal 9" in whole.lines
@@ -128,7 +128,7 @@ def test_a_part_that_dies_ends_the_whole() -> None:
 
 
 def test_no_part_survives_the_whole() -> None:
-    with robot("--hands", "none", "--domain", free_domain(), "--quiet") as whole:
+    with whole_robot("--hands", "none", "--domain", free_domain(), "--quiet") as whole:
         parts = children(whole.pid)
         assert whole.end(signal.SIGKILL) == -signal.SIGKILL
         wait_until(lambda: all(gone(pid) for pid in parts), 10.0)
@@ -138,7 +138,7 @@ def test_topics_that_are_taken_are_refused(dds_domain: int, dds_node: DdsNode) -
     topic = "rt/dex1/right/state"
     with (
         dds_node.writer(topic, dialect("unitree_go").state_type),
-        robot("--body", "h1", "--hands", "dex1", "--domain", dds_domain) as whole,
+        whole_robot("--robot", "h1", "--hands", "dex1", "--domain", dds_domain) as whole,
     ):
         assert whole.tool._process.wait(60) == 1
         whole.tool.stop()
@@ -176,7 +176,7 @@ class TestArguments:
         assert result.exit_code == 2
         assert "there are none" in result.output
 
-    def test_it_is_listed_with_the_bodies(self) -> None:
+    def test_it_is_listed_with_the_robots(self) -> None:
         listed = CliRunner().invoke(emulate, ["--help"]).output
         for name in ("all", "g1", "h1"):
             assert f"  {name} " in listed

@@ -955,8 +955,8 @@ def test_a_lost_link_does_not_calibrate_again(
 
 def test_calibration_without_fingers_on_the_tendon(tmp_path: Path) -> None:
     # nothing stops a servo that nothing is attached to: closed lies beyond the search
-    body = replace(Physics().gripper, closed_stiffness=1e-6)
-    with emulated(start=90.0, physics=Physics(gripper=body)) as gripper:
+    mechanics = replace(Physics().gripper, closed_stiffness=1e-6)
+    with emulated(start=90.0, physics=Physics(gripper=mechanics)) as gripper:
         hand = EZGripper(
             gripper.path, configuration=configured(tmp_path, zero=None, calibrate=Calibrate.AUTO)
         )

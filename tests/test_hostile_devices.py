@@ -78,8 +78,8 @@ def flooded(data: bytes):  # type: ignore[no-untyped-def]
 
 
 def foreign_motor() -> bytes:
-    body = m4010.DATA.head + b"\x05" + bytes(19)
-    return body + crc32_words(body[2:]).to_bytes(4, "little")
+    mechanics = m4010.DATA.head + b"\x05" + bytes(19)
+    return mechanics + crc32_words(mechanics[2:]).to_bytes(4, "little")
 
 
 @pytest.mark.parametrize("data", [b"noise", foreign_motor()], ids=["noise", "another motor"])

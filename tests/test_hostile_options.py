@@ -230,7 +230,7 @@ def _feed(lines: list[Any], inject: Callable[[str], None], monkeypatch: Any) -> 
 
 
 def test_lines_of_input_do_not_end_an_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    from dexkit.emulators.body import Remote
+    from dexkit.emulators.robot import Remote
 
     rng = random.Random(5)
     pieces = [fault_text(rng).encode(errors="surrogatepass") + b"\n" for _ in range(500)]

@@ -380,7 +380,7 @@ def test_every_program_hears_this_machine_only(hosts: dict[str, Host], tmp_path:
     ends = ("--from", "unitree_actuator", "--to", "unitree_go")
     commands: dict[str, tuple[object, ...]] = {
         "bridge": ("bridge", *ends, "--domain", 111, "--to-domain", 112),
-        "body": ("emulate", "h1", "--domain", 113),
+        "robot": ("emulate", "h1", "--domain", 113),
         "recorder": ("record", recording, "--domain", 114),
         "USB device": ("emulate", "dex3-usb", "--port", 0),
         "doctor": ("doctor", "--watch", "--domain", 115),

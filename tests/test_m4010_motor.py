@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.cli.emulate import command
-from dexkit.emulators.dex1_body import Dex1Body
+from dexkit.emulators.dex1_mechanics import Dex1Mechanics
 from dexkit.emulators.faults import M4010_FAULTS, parse_fault
 from dexkit.emulators.m4010 import Bus, Dex1Motors, Dex1Process, Firmware, Motor, emulated_dex1
 from dexkit.emulators.m4010.motor import LOCKING
@@ -78,8 +78,8 @@ class Host:
 def motor(
     number: int = 0, *, start: float = 20.0, touch: float | None = None, **options: object
 ) -> Motor:
-    body = Dex1Body(start_pct=start, object_pct=touch, locking=LOCKING)
-    return Motor(number, body=body, **options)  # type: ignore[arg-type]
+    mechanics = Dex1Mechanics(start_pct=start, object_pct=touch, locking=LOCKING)
+    return Motor(number, mechanics=mechanics, **options)  # type: ignore[arg-type]
 
 
 # --- commands
@@ -135,7 +135,7 @@ def test_a_held_object_stays_held_when_the_motor_brakes() -> None:
     assert held.status == Status.BRAKE
     assert held.joint().tau == 0.0
     assert held.joint().q == pytest.approx(pressed.joint().q, abs=1e-3)
-    assert host.bus.motors[0].body.joint.contact > 0.3  # self-locking
+    assert host.bus.motors[0].mechanics.joint.contact > 0.3  # self-locking
 
 
 def test_brake_stops_it_at_once() -> None:
@@ -525,9 +525,9 @@ def test_settings_that_cannot_be() -> None:
     for wrong in (
         lambda: Firmware(command_timeout=0.0),
         lambda: Firmware(baudrate=0),
-        lambda: Dex1Body(start_pct=101.0),
-        lambda: Dex1Body(object_pct=0.0),
-        lambda: Dex1Body(locking=-1.0),
+        lambda: Dex1Mechanics(start_pct=101.0),
+        lambda: Dex1Mechanics(object_pct=0.0),
+        lambda: Dex1Mechanics(locking=-1.0),
         lambda: Bus([]),
         lambda: Bus([Motor(0)], latency_timer=-1.0),
     ):

@@ -12,17 +12,17 @@ from xml.etree import ElementTree
 import pytest
 from click.testing import CliRunner
 
-from dexkit.bodies import BODIES
 from dexkit.cli import cli
 from dexkit.cli.emulate import command as emulate
 from dexkit.errors import UsageError
 from dexkit.family import facts, layout
-from dexkit.family.drawing import draw_body, draw_hand
+from dexkit.family.drawing import draw_hand, draw_robot
 from dexkit.family.facts import describe, indices, names
 from dexkit.family.page import DOCS, drawing, files
 from dexkit.family.svg import Box, Sheet
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX3_1, MODELS
+from dexkit.robots import ROBOTS
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -39,7 +39,7 @@ def joints(name: str) -> Iterator[tuple[int, JointSpec]]:
         for side in Side:
             yield from enumerate(MODELS[name].joints[side])
     else:
-        yield from ((i, BODIES[name].joint(i)) for i in BODIES[name].used)
+        yield from ((i, ROBOTS[name].joint(i)) for i in ROBOTS[name].used)
 
 
 def gap(a: Box, b: Box) -> float:
@@ -54,7 +54,7 @@ class TestCommandLine:
         assert max(map(len, lines)) <= 80
         for name in names():
             (line,) = (text for text in lines if text.startswith(f"{name} "))
-            title = MODELS[name].title if name in MODELS else BODIES[name].title
+            title = MODELS[name].title if name in MODELS else ROBOTS[name].title
             assert title in line
         for model in MODELS.values():
             assert f"{model.state_rate:g} Hz" in "\n".join(lines)
@@ -114,9 +114,9 @@ class TestCommandLine:
         assert {b["name"] for b in data["backends"]} >= {"sim-dex3", "dex3-usb"}
         assert sum(len(s["slots"]) for s in data["pressure_sensors"]) == 33
 
-    def test_bodies_name_a_command_that_exists(self) -> None:
+    def test_robots_name_a_command_that_exists(self) -> None:
         listed = CliRunner().invoke(emulate, ["--help"]).output
-        for name in BODIES:
+        for name in ROBOTS:
             assert describe(name)["emulator"] == f"dexkit emulate {name}"
             assert f"  {name} " in listed
 
@@ -143,7 +143,7 @@ def test_no_drawing_is_left_of_a_model_that_is_gone() -> None:
 class TestDrawings:
     @pytest.fixture
     def sheet(self, name: str) -> Sheet:
-        return draw_hand(MODELS[name]) if name in MODELS else draw_body(BODIES[name])
+        return draw_hand(MODELS[name]) if name in MODELS else draw_robot(ROBOTS[name])
 
     def test_every_joint_once_with_its_index(self, name: str, sheet: Sheet) -> None:
         texts = Counter(box.text for box in sheet.texts)

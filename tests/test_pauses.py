@@ -1,4 +1,4 @@
-"""After a pause nothing that was sent before moves: service, drivers, bridge, emulated bodies."""
+"""After a pause nothing that was sent before moves: service, drivers, bridge, emulated robots."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dexkit.bodies import G1, H1, BodyModel
 from dexkit.bridge import Bridge, End
 from dexkit.bridge.core import PATIENCE, Commands, States
 from dexkit.clock import ManualClock, RealClock
@@ -22,22 +21,23 @@ from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings
-from dexkit.emulators.body import Body, EmulatedBody
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.m4010 import Dex1Motors
 from dexkit.emulators.mx64 import EmulatedThread, emulated_ezgripper
+from dexkit.emulators.robot import EmulatedRobot, RobotMechanics
 from dexkit.emulators.sim_hand import SimHand
 from dexkit.errors import HandTimeout
 from dexkit.freshness import PAUSE
 from dexkit.hand import Hand, HandCommand, JointMode, Side
 from dexkit.messages import encode, message_type, unitree_go
 from dexkit.models import dialect
+from dexkit.robots import G1, H1, RobotModel
 from dexkit.service import HandService
 from dexkit.wire import mx64
 from dexkit.wire.low_level import encode_with_crc
-from tests.body_helpers import low_cmd
 from tests.dds_helpers import free_domain, wait_until
 from tests.pause_live import BACKENDS
+from tests.robot_helpers import low_cmd
 from tests.service_helpers import FakeNode, FakeSample, ScriptedHand
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
@@ -220,9 +220,9 @@ def test_a_held_command_is_not_written_to_the_m4010() -> None:
         with Dex1Serial(LEFT, settings, clock=clock) as hand:
             hand.exchange(HandCommand.brake(1))
             _refuses(hand, clock, HandCommand.position(5.0))
-            assert motors.motor.body.mode is JointMode.BRAKE
+            assert motors.motor.robot.mode is JointMode.BRAKE
             hand.exchange(HandCommand.position(5.0))
-            assert motors.motor.body.mode is JointMode.FOC
+            assert motors.motor.robot.mode is JointMode.FOC
 
 
 def test_a_held_command_is_not_sent_to_the_dex3() -> None:
@@ -336,28 +336,28 @@ class TestBridge:
             wait_until(lambda: send(1.5) or arrived.take())  # type: ignore[func-returns-value]
 
 
-# -- emulated bodies --------------------------------------------------------------------------
+# -- emulated robots --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("model", [G1, H1], ids=lambda m: m.name)
-def test_a_body_damps_after_a_pause(model: BodyModel) -> None:
+def test_a_robot_damps_after_a_pause(model: RobotModel) -> None:
     said: list[str] = []
-    body = Body(model, report=said.append)
-    assert body.command(encode_with_crc(low_cmd(model)), 0.0)
-    assert body.driven
-    body.paused()
-    assert not body.driven
-    assert body.counters.pauses == 1
-    assert body.counters.timeouts == 0
+    robot = RobotMechanics(model, report=said.append)
+    assert robot.command(encode_with_crc(low_cmd(model)), 0.0)
+    assert robot.driven
+    robot.paused()
+    assert not robot.driven
+    assert robot.counters.pauses == 1
+    assert robot.counters.timeouts == 0
     assert any("stood still" in text for text in said)
-    assert body.command(encode_with_crc(low_cmd(model)), 5.0)
-    assert body.driven
+    assert robot.command(encode_with_crc(low_cmd(model)), 5.0)
+    assert robot.driven
 
 
-def test_an_emulated_body_that_was_suspended_obeys_only_what_was_sent_later() -> None:
+def test_an_emulated_robot_that_was_suspended_obeys_only_what_was_sent_later() -> None:
     clock = Suspendable()
     domain = free_domain()
-    with EmulatedBody(G1, domain=domain, clock=clock) as robot, DdsNode(domain) as client:
+    with EmulatedRobot(G1, domain=domain, clock=clock) as robot, DdsNode(domain) as client:
         writer = client.writer(G1.cmd_topic, G1.cmd_type)
         assert writer.wait_matched(10)
 
@@ -365,17 +365,17 @@ def test_an_emulated_body_that_was_suspended_obeys_only_what_was_sent_later() ->
             writer.write_raw(command, time.time_ns() + round((clock.away - ago) * 1e9))
             time.sleep(0.005)
 
-        command, counters = encode_with_crc(low_cmd(G1)), robot.body.counters
+        command, counters = encode_with_crc(low_cmd(G1)), robot.robot.counters
         began = time.monotonic()
-        wait_until(lambda: send() or (robot.body.driven and time.monotonic() - began > 0.4))  # type: ignore[func-returns-value]
+        wait_until(lambda: send() or (robot.robot.driven and time.monotonic() - began > 0.4))  # type: ignore[func-returns-value]
         clock.away += 100.0
         wait_until(lambda: counters.pauses)
-        assert not robot.body.driven
+        assert not robot.robot.driven
         stale = counters.stale
         send(ago=50.0)
         wait_until(lambda: counters.stale > stale)
-        assert not robot.body.driven
-        wait_until(lambda: send() or robot.body.driven)  # type: ignore[func-returns-value]
+        assert not robot.robot.driven
+        wait_until(lambda: send() or robot.robot.driven)  # type: ignore[func-returns-value]
 
 
 # -- stopped processes ------------------------------------------------------------------------

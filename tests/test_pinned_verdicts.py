@@ -1,4 +1,4 @@
-"""Judging gives the pinned verdicts: of every sample, and of every wrong hand and body."""
+"""Judging gives the pinned verdicts: of every sample, and of every wrong hand and robot."""
 
 from __future__ import annotations
 

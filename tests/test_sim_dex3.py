@@ -110,7 +110,7 @@ def test_follows_the_recorded_session_as_the_recorded_hand_did(side: Side) -> No
     goals = commands.columns()["motor_cmd[].q"]
     start = trace.first_ns
     hand, clock = opened(side)
-    for joint, q in zip(hand.body.joints, recorded[0], strict=True):
+    for joint, q in zip(hand.mechanics.joints, recorded[0], strict=True):
         joint.q = float(q)
     # the right hand closes on an object from 11 s on
     last = int(np.searchsorted(states.log_time_ns - start, 11e9 if side is Side.RIGHT else 20e9))
@@ -151,7 +151,7 @@ def test_only_an_open_hand_exchanges_and_a_closed_one_is_still() -> None:
     hand.close()
     with pytest.raises(HandLost):
         hand.exchange(HandCommand.brake(7))
-    where = hand.body.q
+    where = hand.mechanics.q
     clock.advance(5.0)
     hand.open()
     state = hold(hand, clock, HandCommand.brake(7), 0.1)
@@ -163,8 +163,8 @@ def test_settings() -> None:
         BackendOptions(Side.RIGHT, settings={"object": "60", "start": "50", "supply": "36"})
     )
     assert isinstance(hand, SimDex3)
-    assert hand.body.q[6] == pytest.approx(0.5 * 1.7453)
-    assert hand.body.supply_v == 36.0
+    assert hand.mechanics.q[6] == pytest.approx(0.5 * 1.7453)
+    assert hand.mechanics.supply_v == 36.0
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from dexkit.bodies import G1
 from dexkit.dds import DdsNode
-from dexkit.emulators.body import run_body
+from dexkit.emulators.robot import run_robot
 from dexkit.emulators.sim_hand import SimHand
 from dexkit.errors import TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
+from dexkit.robots import G1
 from dexkit.service import HandService
 from dexkit.sole import LOOK, SETTLE, Claim, Place, SolePublisher
 from dexkit.teleop import Operator, client_for, profile
@@ -328,7 +328,7 @@ def test_the_teleoperation_client_gives_way_without_a_last_word() -> None:
             assert sent == []
 
 
-def test_bodies_started_together_leave_one() -> None:
+def test_robots_started_together_leave_one() -> None:
     domain = free_domain()
     stop = threading.Event()
     ended: list[TopicConflict] = []
@@ -337,7 +337,7 @@ def test_bodies_started_together_leave_one() -> None:
     def live() -> None:
         barrier.wait()
         try:
-            run_body(G1, domain=domain, stop=stop)
+            run_robot(G1, domain=domain, stop=stop)
         except TopicConflict as error:
             ended.append(error)
 

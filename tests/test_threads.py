@@ -13,7 +13,7 @@ from dexkit import threads
 from dexkit.bridge import bridge as bridge_module
 from dexkit.cli import main
 from dexkit.dds import DdsNode
-from dexkit.emulators.body.run import EmulatedBody
+from dexkit.emulators.robot.run import EmulatedRobot
 from dexkit.emulators.serial_port import Port
 from dexkit.errors import DexkitError, HandLost
 from dexkit.processes import Tool
@@ -89,7 +89,7 @@ def test_a_worker_that_ends_well_is_not_told() -> None:
 SERVE = ("serve", "sim-dex1", "--side", "left", "--quiet", "--domain")
 BRIDGE = ("bridge", "--from", "unitree_actuator", "--to", "unitree_go", "--domain")
 RECORD = ("record", "OUT", "--topic", STATE, "--domain")
-BODY = ("emulate", "g1", "--quiet", "--domain")
+ROBOT = ("emulate", "g1", "--quiet", "--domain")
 
 # (command, whose method dies, method)
 PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [
@@ -103,9 +103,9 @@ PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [
     (SERVE, Publisher, "_run"),
     (BRIDGE, bridge_module._Way, "_turn"),
     (BRIDGE, DdsNode, "_dispatch"),
-    (BODY, Publisher, "_run"),
-    (BODY, EmulatedBody, "_live"),
-    (BODY, DdsNode, "_dispatch"),
+    (ROBOT, Publisher, "_run"),
+    (ROBOT, EmulatedRobot, "_live"),
+    (ROBOT, DdsNode, "_dispatch"),
 ]
 
 

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dexkit.conformance import mutants as dds
-from dexkit.conformance.mutants import body, shared
+from dexkit.conformance.mutants import robot, shared
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.conformance.usb import mutants as usb
 from dexkit.console import Console
@@ -68,7 +68,7 @@ class Outcome:
 
 
 def trials() -> tuple[Trial, ...]:
-    """Every wrong hand, on the topics and on USB, and every wrong body."""
+    """Every wrong hand, on the topics and on USB, and every wrong robot."""
     found = [
         Trial(
             "dds",
@@ -84,7 +84,7 @@ def trials() -> tuple[Trial, ...]:
     return (
         *found,
         *(Trial("usb", DEX3_1.name, m.name, m.kills, m.also, m.summary, 0.5) for m in usb.MUTANTS),
-        *(Trial("body", m.model, m.name, m.kills, m.also, m.summary, 4.0) for m in body.MUTANTS),
+        *(Trial("robot", m.model, m.name, m.kills, m.also, m.summary, 4.0) for m in robot.MUTANTS),
     )
 
 
@@ -119,8 +119,8 @@ def try_one(trial: Trial, *, short: bool = False) -> Outcome:
         wrong = next(m for m in usb.MUTANTS if (m.name, m.kills) == (trial.name, trial.kills))
         _, blamed = usb.try_mutant(wrong.device, catalogue(trial.model, "usb"))
         return _outcome(trial, blamed)
-    if trial.layer == "body":
-        bad = next(m for m in body.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
+    if trial.layer == "robot":
+        bad = next(m for m in robot.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
         return _outcome(trial, bad.blamed(short=short))
     mutant = next(m for m in dds.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
     plan = mutant.short_plan if short and mutant.name not in shared.DILUTED else mutant.plan

@@ -75,7 +75,7 @@ def write_html(
     write_file(path, render(result, view, link=link))
 
 
-def document(title: str, body: str) -> str:
+def document(title: str, content: str) -> str:
     """A page with the reports' style. It can load nothing: its content policy forbids it."""
     policy = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
     return (
@@ -85,7 +85,7 @@ def document(title: str, body: str) -> str:
         '<meta name="color-scheme" content="light dark">'
         '<meta name="referrer" content="no-referrer">'
         f"<title>{escape(title)}</title><style>{_STYLE.read_text(encoding='utf-8')}</style></head>"
-        f"<body><main>{body}</main></body></html>\n"
+        f"<body><main>{content}</main></body></html>\n"
     )
 
 
@@ -94,7 +94,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
 
     :param link: where the recording is, relative to the page; empty where it is not kept.
     """
-    body = [
+    sections = [
         _verdict(result),
         _facts(result),
         _areas(result),
@@ -107,7 +107,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _environment(result),
     ]
     answer = ANSWERS[result.overall].text
-    return document(f"{answer}: {hand_name(result)} as {model_title(result)}", "".join(body))
+    return document(f"{answer}: {hand_name(result)} as {model_title(result)}", "".join(sections))
 
 
 # ------------------------------------------------------------------------------- the verdict
@@ -462,9 +462,9 @@ def _what(result: RunResult) -> str:
         "<em>state</em> back (this is where I am) 500 to 1000 times a second. Another hand "
         "can take the original's place only if it speaks and behaves the same. "
     ]
-    if subject(result) == "body":
+    if subject(result) == "robot":
         text = [
-            "<h2>What was done</h2><p>A program leads the body of a Unitree robot joint by joint: "
+            "<h2>What was done</h2><p>A program leads a Unitree robot joint by joint: "
             "it sends <em>commands</em> (positions, speeds, torques and gains of all motors) some "
             "hundred times a second and gets <em>state</em> back 500 times a second. A simulator "
             "can take the robot's place only if it speaks and behaves the same. "
@@ -475,7 +475,7 @@ def _what(result: RunResult) -> str:
             "selected requirements need, and recorded everything. The verdicts were read off the "
             "recording.</p>"
         )
-    elif "backend" in result.subject and subject(result) == "body":
+    elif "backend" in result.subject and subject(result) == "robot":
         text.append(
             "Here a test program led it: it listened, moved each joint, sent broken commands, fell "
             "silent and came back. Everything was recorded, and the verdicts were read off the "

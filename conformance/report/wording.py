@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
-from dexkit.bodies import BODIES
-from dexkit.conformance.phases import BODY
+from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.models import MODELS
+from dexkit.robots import ROBOTS
 
 __all__ = [
     "ANSWERS",
@@ -113,20 +113,20 @@ def tally(result: RunResult) -> Tally:
 def model_title(result: RunResult) -> str:
     """``Dex1-1``, or ``hand`` where the model is not known."""
     name = result.subject.get("model", "")
-    known = MODELS.get(name) or BODIES.get(name)
+    known = MODELS.get(name) or ROBOTS.get(name)
     return known.title if known else "hand"
 
 
 def subject(result: RunResult, *, many: bool = False) -> str:
-    """``hand`` or ``body``: what was judged; with ``many``, ``hands`` where there may be two."""
-    if result.subject.get("model") in BODIES:
-        return "body"
+    """``hand`` or ``robot``: what was judged; with ``many``, ``hands`` where there may be two."""
+    if result.subject.get("model") in ROBOTS:
+        return "robot"
     return "hands" if many else "hand"
 
 
 def whose(side: str) -> str:
-    """``left hand``, or ``body`` where there are no sides."""
-    return "body" if side == BODY else f"{side} hand"
+    """``left hand``, or ``robot`` where there are no sides."""
+    return "robot" if side == ROBOT else f"{side} hand"
 
 
 def hand_name(result: RunResult) -> str:

@@ -20,10 +20,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dexkit.bodies import BodyModel, body
 from dexkit.documents import parse_toml, read_toml
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS, HandModel, model
+from dexkit.robots import RobotModel, robot
 
 __all__ = [
     "CAPABILITIES",
@@ -58,8 +58,8 @@ CAPABILITIES: Mapping[str, str] = {
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
-LAYERS = ("dds", "usb", "body")
-"""Where a requirement is judged: on a hand's topics, on its USB device, or on a body's topics."""
+LAYERS = ("dds", "usb", "robot")
+"""Where a requirement is judged: on a hand's topics, on its USB device, or on a robot's topics."""
 _KEYS = {
     "id",
     "area",
@@ -188,12 +188,12 @@ class Requirement:
             raise ConformanceError(f"{self.id} has no tolerance {name!r}") from None
 
 
-def _model_of(document: Mapping[str, Any]) -> HandModel | BodyModel:
+def _model_of(document: Mapping[str, Any]) -> HandModel | RobotModel:
     name = str(document.get("model", ""))
-    return body(name) if document.get("layer") == "body" else model(name)
+    return robot(name) if document.get("layer") == "robot" else model(name)
 
 
-def _resolve(value: Any, hand: HandModel | BodyModel, where: str) -> float:
+def _resolve(value: Any, hand: HandModel | RobotModel, where: str) -> float:
     if isinstance(value, str) and value.startswith("model:"):
         fact = getattr(hand, value.removeprefix("model:"), None)
         if isinstance(fact, int | float):
@@ -297,7 +297,7 @@ def _parse(
     if layer not in LAYERS:
         raise UsageError(f"{origin}: layer is one of {', '.join(LAYERS)}")
     dialect_names = (
-        (hand.name,) if isinstance(hand, BodyModel) else tuple(d.name for d in hand.dialects)
+        (hand.name,) if isinstance(hand, RobotModel) else tuple(d.name for d in hand.dialects)
     )
     found: dict[str, Requirement] = {}
     for entry in _entries(document, others, origin):
@@ -403,7 +403,7 @@ def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requ
 
 def models() -> tuple[str, ...]:
     """The hand models that have requirements."""
-    return tuple(dict.fromkeys(name for name, layer in _files().values() if layer != "body"))
+    return tuple(dict.fromkeys(name for name, layer in _files().values() if layer != "robot"))
 
 
 def select(

@@ -1,5 +1,5 @@
 """The catalogue as a page: ``python -m dexkit.conformance.requirements.page`` brings it up to date
-in docs/conformance.md, that of bodies in docs/conformance-body.md. Of what is like another
+in docs/conformance.md, that of robots in docs/conformance-robots.md. Of what is like another
 requirement only the differences are told.
 """
 
@@ -19,24 +19,24 @@ END = "<!-- end of catalogue -->"
 
 _CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z])([\d-]*))")
 
-PAGES = {"dds": "conformance.md", "body": "conformance-body.md"}
+PAGES = {"dds": "conformance.md", "robot": "conformance-robots.md"}
 """The page of each layer that is written here, in docs."""
 
 
 def catalogue_page(layer: str = "dds") -> str:
     """Markdown of a layer's requirements, by area."""
-    from dexkit.conformance.mutants import MUTANTS, body
+    from dexkit.conformance.mutants import MUTANTS, robot
 
     lines: list[str] = []
     area = ""
     every = catalogue(layer=layer)
     derived = {r.model for r in every if r.like}  # they come after what they are like
     for requirement in sorted(every, key=lambda r: r.model in derived):
-        whose = f"{requirement.model.upper()}: " if layer == "body" else ""
+        whose = f"{requirement.model.upper()}: " if layer == "robot" else ""
         if f"{whose}{requirement.area}" != area:
             area = f"{whose}{requirement.area}"
             lines += ["", f"### {area}", ""]
-        zoo = body.MUTANTS if layer == "body" else MUTANTS
+        zoo = robot.MUTANTS if layer == "robot" else MUTANTS
         killers = [m.name for m in zoo if m.kills == requirement.id]
         lines += entry(requirement, _needs(requirement), killers)
     return "\n".join(lines)
@@ -101,7 +101,7 @@ def _needs(requirement: Requirement) -> str:
         kind, _, name = requirement.needs.partition(":")
         other = " of the other hand" if kind.startswith("other") else ""
         where = f"stimulus `{name}`{other}"
-    if len(requirement.dialects) == 3 or requirement.layer == "body":
+    if len(requirement.dialects) == 3 or requirement.layer == "robot":
         return where
     return f"{where}, in {' and '.join(requirement.dialects)}"
 

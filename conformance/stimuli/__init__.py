@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from dexkit.bodies import G1, H1
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.stimuli.body import BodyScript
 from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.robot import RobotScript
 from dexkit.conformance.stimuli.script import (
     Action,
     Join,
@@ -31,6 +30,7 @@ from dexkit.conformance.stimuli.script import (
 )
 from dexkit.conformance.stimuli.session import Session
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1
+from dexkit.robots import G1, H1
 
 __all__ = [
     "SCRIPTS",
@@ -54,8 +54,8 @@ SCRIPTS: dict[str, type[Script]] = {
     DEX1_1.name: GripperScript,
     DEX3_1.name: FingerScript,
     DEX5_1.name: FingerScript,
-    H1.name: BodyScript,
-    G1.name: BodyScript,
+    H1.name: RobotScript,
+    G1.name: RobotScript,
 }
 """The script of each model."""
 

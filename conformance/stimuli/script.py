@@ -88,7 +88,7 @@ class Observation:
     :param stopped: after :class:`StopService`: ``exit_s``, the seconds until the services had
         ended, and ``gone_s``, until their publishers had vanished from the domain after that;
         None is never. Nothing at all where the kit has not started the services.
-    :param machine: ``mode_machine`` of a body's newest state.
+    :param machine: ``mode_machine`` of a robot's newest state.
     """
 
     now_ns: int

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dexkit.conformance.body import wire_for
 from dexkit.conformance.phases import RECORD, Stimulus
+from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli import (
     Join,
     Leave,

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from dexkit.bodies import BODIES
 from dexkit.console import Console
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS
+from dexkit.robots import ROBOTS
 
 
 @click.command("check")
@@ -27,10 +27,10 @@ from dexkit.models import DIALECTS
 )
 @click.option(
     "--dialect",
-    type=click.Choice(["auto", *DIALECTS, *BODIES]),
+    type=click.Choice(["auto", *DIALECTS, *ROBOTS]),
     default="auto",
     show_default=True,
-    help="How the hand speaks, or which body it is; auto takes it from topics and types.",
+    help="How the hand speaks, or which robot it is; auto takes it from topics and types.",
 )
 @click.option(
     "--require",
@@ -79,25 +79,25 @@ def command(
     Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
     usable or damaged (what is left is judged all the same), or nothing in it could be judged.
     """
-    from dexkit.conformance.body import body_in, recording_of
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import catalogue, select
+    from dexkit.conformance.robot import recording_of, robot_in
     from dexkit.conformance.view import sides_of
     from dexkit.traces import open_trace
 
     view, model_name, also = None, None, ""
     if dialect != "auto":
-        model_name = dialect if dialect in BODIES else DIALECTS[dialect].model
+        model_name = dialect if dialect in ROBOTS else DIALECTS[dialect].model
     if recording is not None:
         trace = open_trace(recording)
         for text in trace.damage:
             click.echo(f"warning: {text}", err=True)
         wanted = None if dialect == "auto" else dialect
         view = recording_of(trace, wanted, sides_of(side) if side else ())
-        body = body_in(trace) if dialect == "auto" and view.layer != "body" else None
-        also = f"there is a body, too: judge it with --dialect {body.name}" if body else ""
+        robot = robot_in(trace) if dialect == "auto" and view.layer != "robot" else None
+        also = f"there is a robot, too: judge it with --dialect {robot.name}" if robot else ""
         model_name = view.model.name
     claims = Claims.load(capabilities, model_name)
     model_name = model_name or claims.hand.get("model")

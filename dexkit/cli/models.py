@@ -1,4 +1,4 @@
-"""``dexkit models``: every hand and body that dexkit knows, as it is on DDS."""
+"""``dexkit models``: every hand and robot that dexkit knows, as it is on DDS."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     for i, data in enumerate(models):
         if i:
             console.print()
-        (_hand if data["kind"] == "hand" else _body)(console, data)
+        (_hand if data["kind"] == "hand" else _robot)(console, data)
 
 
 def _table(
@@ -144,7 +144,7 @@ def _hand(console: Console, data: dict[str, Any]) -> None:
         console.print(_table(("packet", "place", "slots with an element"), rows, ["packet"]))
 
 
-def _body(console: Console, data: dict[str, Any]) -> None:
+def _robot(console: Console, data: dict[str, Any]) -> None:
     from dexkit.family.facts import indices
 
     console.print(f"[bold]{data['name']}[/bold]  {data['title']}\n")

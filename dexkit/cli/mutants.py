@@ -9,17 +9,17 @@ from pathlib import Path
 import click
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from dexkit.bodies import BODIES
 from dexkit.cli.common import stop_on_signals
 from dexkit.console import Console
 from dexkit.models import MODELS
+from dexkit.robots import ROBOTS
 
 
 @click.command("mutants")
 @click.option(
     "--model",
-    type=click.Choice([*MODELS, *BODIES]),
-    help="Only wrong hands, or bodies, of this model.",
+    type=click.Choice([*MODELS, *ROBOTS]),
+    help="Only wrong hands, or robots, of this model.",
 )
 @click.option(
     "--require",

@@ -8,13 +8,13 @@ from typing import Any
 
 from rich.table import Column, Table
 
-from dexkit.bodies import BODIES
 from dexkit.console import Console
 from dexkit.console import markup as escape
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
 from dexkit.doctor.rules import Readiness, Verdict
 from dexkit.doctor.topics import short
+from dexkit.robots import ROBOTS
 from dexkit.topics import roles
 from dexkit.untrusted import LONGEST
 
@@ -25,8 +25,8 @@ SCHEMA_VERSION = 1
 
 _BODY_TOPICS = {
     topic
-    for body in BODIES.values()
-    for topic in (body.cmd_topic, body.state_topic, body.arm_topic, body.remote_topic)
+    for robot in ROBOTS.values()
+    for topic in (robot.cmd_topic, robot.state_topic, robot.arm_topic, robot.remote_topic)
 }
 _COLOUR = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dexkit.bodies import BodyModel
-from dexkit.family.layout import BODIES, HANDS, BodyLayout, Finger, HandLayout
+from dexkit.family.layout import HANDS, ROBOTS, Finger, HandLayout, RobotLayout
 from dexkit.family.svg import Point, Sheet
 from dexkit.hand import JointSpec, Side
 from dexkit.models import HandModel
+from dexkit.robots import RobotModel
 
-__all__ = ["WIDTH", "draw_body", "draw_hand"]
+__all__ = ["WIDTH", "draw_hand", "draw_robot"]
 
 WIDTH = 880
 _MARGIN = 24.0
@@ -224,15 +224,15 @@ def _joint_beside(sheet: Sheet, at: Point, index: int, joint: JointSpec) -> None
     sheet.text((x + 84, y + 4), f"{_SIGNS[joint.closing]} closes", style, size=12, anchor="end")
 
 
-# -- bodies ---------------------------------------------------------------------------------
+# -- robots ---------------------------------------------------------------------------------
 
 
-def draw_body(model: BodyModel) -> Sheet:
-    """A body from behind, so that its left is left.
+def draw_robot(model: RobotModel) -> Sheet:
+    """A robot from behind, so that its left is left.
 
-    :raises KeyError: a body that has no layout.
+    :raises KeyError: a robot that has no layout.
     """
-    layout = BODIES[model.name]
+    layout = ROBOTS[model.name]
     top = 138.0
     height = top + layout.bottom + 74
     sheet = _sheet(height, model.title, "joints by motor slot", "from behind: its left is left")
@@ -249,18 +249,18 @@ def draw_body(model: BodyModel) -> Sheet:
                 _slot(sheet, place(at), model, f"{side}_{part}", outward)
     for name, at in layout.trunk:
         _slot(sheet, places[Side.LEFT](at), model, name, 1.0)
-    _body_legend(sheet, model)
+    _robot_legend(sheet, model)
     return sheet
 
 
-def _trunk(sheet: Sheet, layout: BodyLayout, neck: Point) -> None:
+def _trunk(sheet: Sheet, layout: RobotLayout, neck: Point) -> None:
     x, y = neck
     upper, lower, half = layout.torso
     sheet.rect((x, y - 34), (52, 60), "solid", radius=22)
     sheet.rect((x, y + (upper + lower) / 2), (2 * half, lower - upper), "solid", radius=26)
 
 
-def _slot(sheet: Sheet, at: Point, model: BodyModel, name: str, outward: float) -> None:
+def _slot(sheet: Sheet, at: Point, model: RobotModel, name: str, outward: float) -> None:
     x, y = at
     slot = model.slot(name)
     sheet.circle(at, _RADIUS, "plus" if slot in model.arm_slots else "none")
@@ -271,7 +271,7 @@ def _slot(sheet: Sheet, at: Point, model: BodyModel, name: str, outward: float) 
     sheet.text((x, y + 13), _degrees(model.joint(slot)), "muted", size=10.5, anchor=anchor)
 
 
-def _body_legend(sheet: Sheet, model: BodyModel) -> None:
+def _robot_legend(sheet: Sheet, model: RobotModel) -> None:
     top = sheet.height - 60.0
     sheet.line([(_MARGIN, top), (WIDTH - _MARGIN, top)], "leader")
     y = top + 34

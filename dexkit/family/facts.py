@@ -16,9 +16,9 @@ A hand::
      "pressure_sensors": [{"packet", "place", "slots": [...]}],
      "backends": [{"name", "summary", "needs"}]}
 
-A body::
+A robot::
 
-    {"name", "title", "kind": "body", "slots", "mode_machine", "weight_slot",
+    {"name", "title", "kind": "robot", "slots", "mode_machine", "weight_slot",
      "joints": [JOINT and "enable_mode", "on_arm_topic"], "rest_q_rad": [...],
      "command_topic", "state_topic", "arm_topic", "command_type", "state_type", "emulator",
      "rates_hz": {"state", "command", "teleop_command"}, "command_timeout_s",
@@ -30,7 +30,7 @@ JOINT::
      "dq_max_rad_s", "tau_max_nm", "closing": -1 | 0 | 1, "gear_ratio"}
 
 ``closing`` is the sign of dq that closes the hand, 0 where neither does. ``index`` is the place
-in the message; a body's ``joints`` and ``client_gains`` leave out the slots without a joint, its
+in the message; a robot's ``joints`` and ``client_gains`` leave out the slots without a joint, its
 ``rest_q_rad`` does not. ``client_gains`` are those that xr_teleoperate sends, joint by joint.
 """
 
@@ -41,10 +41,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from dexkit.backends import list_backends
-from dexkit.bodies import BODIES, BodyModel
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, Side
 from dexkit.models import MODELS, Dialect, HandModel
+from dexkit.robots import ROBOTS, RobotModel
 
 __all__ = ["describe", "gain_groups", "indices", "names", "short_type", "torque_units"]
 
@@ -52,20 +52,20 @@ _OWN = "dexkit "  # the origin of a built-in backend, before its version
 
 
 def names() -> list[str]:
-    """All models: hands, then bodies."""
-    return [*MODELS, *BODIES]
+    """All models: hands, then robots."""
+    return [*MODELS, *ROBOTS]
 
 
 def describe(name: str, *, plugins: bool = True) -> dict[str, Any]:
-    """The model called ``name``, hand or body.
+    """The model called ``name``, hand or robot.
 
     :param plugins: whether the backends of other packages are listed as well.
     :raises UsageError: there is none.
     """
     if name in MODELS:
         return _hand(MODELS[name], plugins)
-    if name in BODIES:
-        return _body(BODIES[name])
+    if name in ROBOTS:
+        return _robot(ROBOTS[name])
     raise UsageError(f"no model {name!r}", hint=f"known: {', '.join(names())}")
 
 
@@ -100,11 +100,11 @@ def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
     }
 
 
-def _body(model: BodyModel) -> dict[str, Any]:
+def _robot(model: RobotModel) -> dict[str, Any]:
     return {
         "name": model.name,
         "title": model.title,
-        "kind": "body",
+        "kind": "robot",
         "slots": model.slots,
         "mode_machine": model.mode_machine,
         "weight_slot": model.weight_slot,
@@ -200,7 +200,7 @@ def indices(values: Sequence[int]) -> str:
 
 def gain_groups(data: dict[str, Any]) -> list[tuple[str, float, float]]:
     """(which joints, kp, kd) of a described model; joints of equal gains together."""
-    joints = data["joints"] if data["kind"] == "body" else data["sides"]["left"]["joints"]
+    joints = data["joints"] if data["kind"] == "robot" else data["sides"]["left"]["joints"]
     groups: dict[tuple[float, float], list[int]] = {}
     for joint, gains in zip(joints, data["client_gains"], strict=True):
         pair = (gains["kp_nm_per_rad"], gains["kd_nms_per_rad"])

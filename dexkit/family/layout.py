@@ -1,8 +1,8 @@
 """Where the drawings put joints and sensors.
 
 Schematic: chosen so that the labels find room, not measured and not to scale. Names, limits and
-directions come from :mod:`dexkit.models` and :mod:`dexkit.bodies`; only places are here. Lengths
-in px on the sheet, y downward, relative to the centre of a hand or body; hands are left hands,
+directions come from :mod:`dexkit.models` and :mod:`dexkit.robots`; only places are here. Lengths
+in px on the sheet, y downward, relative to the centre of a hand or robot; hands are left hands,
 the right one is their mirror image.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from dexkit.family.svg import Point
 
-__all__ = ["BODIES", "HANDS", "BodyLayout", "Finger", "HandLayout", "Limb"]
+__all__ = ["HANDS", "ROBOTS", "Finger", "HandLayout", "Limb", "RobotLayout"]
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ class Limb:
 
 
 @dataclass(frozen=True)
-class BodyLayout:
-    """One body, seen from behind. The origin is the middle of the neck.
+class RobotLayout:
+    """One robot, seen from behind. The origin is the middle of the neck.
 
     :param limbs: on the left; the right ones are their mirror images.
     :param trunk: joints in the middle, from the legs upward, with their places.
@@ -129,8 +129,8 @@ def _row(joints: tuple[str, ...], start: Point, step: Point, tip: float) -> Limb
     return Limb(joints, tuple((x + k * dx, y + k * dy) for k in steps))
 
 
-BODIES: dict[str, BodyLayout] = {
-    "h1": BodyLayout(
+ROBOTS: dict[str, RobotLayout] = {
+    "h1": RobotLayout(
         limbs=(
             _row(
                 ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"),
@@ -145,7 +145,7 @@ BODIES: dict[str, BodyLayout] = {
         torso=(4.0, 270.0, 66.0),
         bottom=510.0,
     ),
-    "g1": BodyLayout(
+    "g1": RobotLayout(
         limbs=(
             _row(
                 (
@@ -168,4 +168,4 @@ BODIES: dict[str, BodyLayout] = {
         bottom=530.0,
     ),
 }
-"""By body name."""
+"""By robot name."""

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from dexkit.bodies import BODIES
-from dexkit.family.drawing import draw_body, draw_hand
+from dexkit.family.drawing import draw_hand, draw_robot
 from dexkit.family.facts import describe, gain_groups, indices, names, short_type, torque_units
 from dexkit.models import MODELS
+from dexkit.robots import ROBOTS
 
 __all__ = ["DOCS", "drawing", "files", "page"]
 
@@ -21,8 +21,8 @@ _INTRO = """\
 
 # The models
 
-Every hand and body that dexkit knows, as it is on DDS. This page and its drawings are made from
-`dexkit/models.py` and `dexkit/bodies.py`, which name the source of each figure and say what is
+Every hand and robot that dexkit knows, as it is on DDS. This page and its drawings are made from
+`dexkit/models.py` and `dexkit/robots.py`, which name the source of each figure and say what is
 inferred or uncertain; `dexkit models NAME` prints the same in a terminal, `dexkit models --json`
 for programs. The drawings are schematic: they show order, names and directions, not dimensions.
 Nothing here was measured on a real hand or robot.
@@ -34,8 +34,8 @@ limits that dexkit uses; where sources disagree, the code says which was taken."
 
 
 def drawing(name: str) -> str:
-    """The drawing of a model, hand or body, as SVG."""
-    return (draw_hand(MODELS[name]) if name in MODELS else draw_body(BODIES[name])).svg()
+    """The drawing of a model, hand or robot, as SVG."""
+    return (draw_hand(MODELS[name]) if name in MODELS else draw_robot(ROBOTS[name])).svg()
 
 
 def page() -> str:
@@ -43,7 +43,7 @@ def page() -> str:
     models = [describe(name, plugins=False) for name in names()]
     lines = [_INTRO, *_overview(models), _JOINTS, ""]
     for data in models:
-        lines += _hand(data) if data["kind"] == "hand" else _body(data)
+        lines += _hand(data) if data["kind"] == "hand" else _robot(data)
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -172,7 +172,7 @@ def _dialect_row(dialect: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _body(data: dict[str, Any]) -> list[str]:
+def _robot(data: dict[str, Any]) -> list[str]:
     lines = _head(data)
     rows: list[Sequence[object]] = [
         ("command", f"`{data['command_topic']}`", f"`{short_type(data['command_type'])}`"),
@@ -196,7 +196,7 @@ def _body(data: dict[str, Any]) -> list[str]:
     lines += [
         f"- States: {rates['state']:g} Hz. Commands: {rates['command']:g} Hz of the SDK's "
         f"examples, {rates['teleop_command']:g} Hz of xr_teleoperate, {_gains(data)}.",
-        f"- Time-out of commands: {data['command_timeout_s']:g} s, then the body damps.",
+        f"- Time-out of commands: {data['command_timeout_s']:g} s, then the robot damps.",
         f"- Slots without a joint: {empty}; `q` of slot {data['weight_slot']} is the weight of "
         f"`{data['arm_topic']}`, 0 to 1.",
     ]

@@ -1,8 +1,8 @@
 """An emulated Unitree Dex3-1: the hand's processor and motors, on USB by way of USB/IP.
 
 From the inside out: :mod:`settings` (uncertain points), :mod:`device` (the processor: frames,
-motors, time-outs, faults) and :mod:`answer` (its state as bytes) are sans-IO, over the body of
-:mod:`dexkit.emulators.dex3_body`; :mod:`usb` gives it descriptors and endpoints; :mod:`server`
+motors, time-outs, faults) and :mod:`answer` (its state as bytes) are sans-IO, over the mechanics of
+:mod:`dexkit.emulators.dex3_mechanics`; :mod:`usb` gives it descriptors and endpoints; :mod:`server`
 exports those on TCP; :mod:`hands` has the helper :func:`emulated_dex3` for tests.
 """
 

@@ -1,4 +1,4 @@
-"""A body's state as a frame, at a thousand a second.
+"""A mechanics's state as a frame, at a thousand a second.
 
 The bytes are those of :meth:`dexkit.wire.dex3_usb.HandCodec.encode_state`, which takes a whole
 :class:`~dexkit.hand.HandState` apart for every frame; this writes what changes.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dexkit.emulators.dex3_body import Dex3Body
+from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.hand import MotorError
 from dexkit.models import DEX3_1
 from dexkit.wire.crc32 import crc32_words
@@ -31,14 +31,14 @@ _TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 
 
 class AnswerWriter:
-    """Writes the state frames of one body.
+    """Writes the state frames of one mechanics.
 
     :param bus_map: which packet is whose.
     :param model: ``mode[0]`` of the frames.
     """
 
-    def __init__(self, body: Dex3Body, bus_map: BusMap, model: int) -> None:
-        self._body = body
+    def __init__(self, mechanics: Dex3Mechanics, bus_map: BusMap, model: int) -> None:
+        self._mechanics = mechanics
         self._map = bus_map
         self._model = model
         self._factors = [
@@ -46,18 +46,18 @@ class AnswerWriter:
                 scale.factor(joint.gear_ratio) * NUDGE
                 for scale in (units.TORQUE, units.VELOCITY, units.POSITION)
             )
-            for joint in DEX3_1.joints[body.side]
+            for joint in DEX3_1.joints[mechanics.side]
         ]
         self._pressure = b""
         self._sensors = [b""] * len(bus_map.sensors)
 
     def frame(self, motors: Sequence[int], tripped: Sequence[bool]) -> bytes:
-        """A state frame of the body as it is now.
+        """A state frame of the mechanics as it is now.
 
         :param motors: indices of those that answer.
         :param tripped: whether each motor's time-out protection has tripped.
         """
-        body = self._body
+        mechanics = self._mechanics
         buses = [b""] * N_BUSES
         packets = self._motor_packets(tripped)
         for index in motors:
@@ -65,12 +65,12 @@ class AnswerWriter:
         self._renew_sensors()
         for (bus, _), packet in zip(self._map.sensors, self._sensors, strict=True):
             buses[bus] += packet
-        supply, imu = body.supply, body.imu
+        supply, imu = mechanics.supply, mechanics.imu
         data = STATE.pack(
             STATE.head,
             self._model,
             int(any(tripped)),
-            bytes([body.fans] * 2),
+            bytes([mechanics.fans] * 2),
             *map(len, buses),
             b"".join(bus.ljust(STATE_BUS_SIZE, b"\0") for bus in buses),
             *(units.VOLTAGE.encode(v) for v in (supply.power_v, supply.system_v, supply.device_v)),
@@ -84,21 +84,21 @@ class AnswerWriter:
         return data[:-4] + crc32_words(data[2:-4]).to_bytes(4, "little")
 
     def _motor_packets(self, tripped: Sequence[bool]) -> list[bytes]:
-        body = self._body
-        volts = units.MOTOR_VOLTAGE.encode(body.motor_v)
+        mechanics = self._mechanics
+        volts = units.MOTOR_VOLTAGE.encode(mechanics.motor_v)
         pack = MOTOR_STATE.struct.pack
         packets = []
         for (_, number), factors, mode, trip, error, case, winding, tau, dq, q in zip(
             self._map.motors,
             self._factors,
-            body.mode,
+            mechanics.mode,
             tripped,
-            body.errors,
-            body.temperature.tolist(),
-            body.winding_temperature.tolist(),
-            body.tau.tolist(),
-            body.dq.tolist(),
-            body.q.tolist(),
+            mechanics.errors,
+            mechanics.temperature.tolist(),
+            mechanics.winding_temperature.tolist(),
+            mechanics.tau.tolist(),
+            mechanics.dq.tolist(),
+            mechanics.q.tolist(),
             strict=True,
         ):
             torque, speed, position = factors
@@ -121,7 +121,7 @@ class AnswerWriter:
 
     def _renew_sensors(self) -> None:
         """Write the sensor packets again, if anything is felt otherwise than before."""
-        pressure = self._body.pressure
+        pressure = self._mechanics.pressure
         key = pressure.tobytes()
         if key == self._pressure:
             return
@@ -133,7 +133,7 @@ class AnswerWriter:
         counts[counts == units.NO_VALUE] += 1.0  # a real reading is never "no value"
         counts[np.isnan(pressure)] = units.NO_VALUE
         rows = counts.astype("<u2")
-        heat = np.nan_to_num(self._body.sensor_temperature).astype("i1")
+        heat = np.nan_to_num(self._mechanics.sensor_temperature).astype("i1")
         for i, (_, number) in enumerate(self._map.sensors):
             data = SENSOR_STATE.head + bytes([number, 0]) + rows[i].tobytes() + heat[i].tobytes()
             self._sensors[i] = data + crc32_words(data).to_bytes(4, "little")

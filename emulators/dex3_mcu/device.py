@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.clock import Clock, RealClock
-from dexkit.emulators.dex3_body import Dex3Body
 from dexkit.emulators.dex3_mcu.answer import AnswerWriter
 from dexkit.emulators.dex3_mcu.command import CommandReader, MotorCommand
 from dexkit.emulators.dex3_mcu.settings import Firmware
+from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.faults import Fault, FaultSchedule
-from dexkit.emulators.finger_body import AMBIENT, STEP
+from dexkit.emulators.finger_mechanics import AMBIENT, STEP
 from dexkit.errors import ChecksumError, WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.models import DEX3_1
@@ -69,7 +69,7 @@ class _Motor:
 class Dex3Mcu:
     """One Dex3-1, from its USB endpoints inwards.
 
-    :param body: of the same side; its own by default.
+    :param mechanics: of the same side; its own by default.
     :param clock: real time unless given; with a manual clock the hand is deterministic.
     :param faults: to come, times counted from now. Those for the other side are left out.
     :param seed: of the faults' chance.
@@ -83,7 +83,7 @@ class Dex3Mcu:
         self,
         side: Side,
         *,
-        body: Dex3Body | None = None,
+        mechanics: Dex3Mechanics | None = None,
         clock: Clock | None = None,
         firmware: Firmware | None = None,
         bus_map: BusMap = DEFAULT_BUS_MAP,
@@ -91,7 +91,7 @@ class Dex3Mcu:
         seed: int = 0,
     ) -> None:
         self.side = side
-        self.body = body or Dex3Body(side)
+        self.mechanics = mechanics or Dex3Mechanics(side)
         self.firmware = firmware or Firmware()
         self.counters = Counters()
         self.plugged = True
@@ -99,7 +99,7 @@ class Dex3Mcu:
         self.on_stall: Callable[[str], None] = lambda endpoint: None
         self._codec = HandCodec(DEX3_1.joints[side], bus_map)
         self._reader = CommandReader(side, bus_map)
-        self._writer = AnswerWriter(self.body, bus_map, self.firmware.model_code)
+        self._writer = AnswerWriter(self.mechanics, bus_map, self.firmware.model_code)
         self._clock: Clock = clock or RealClock()
         self._random = random.Random(seed)
         self._motors = [_Motor() for _ in DEX3_1.joints[side]]
@@ -144,7 +144,7 @@ class Dex3Mcu:
             for fault, begins in self.schedule.poll(self._now):
                 self._strike(fault, begins)
             for index, celsius in self._hot.items():
-                self.body.heat(index, celsius)
+                self.mechanics.heat(index, celsius)
             if until >= now:
                 return
 
@@ -155,7 +155,7 @@ class Dex3Mcu:
         if due - self._steps > most:
             self._steps = due - most
         if due > self._steps:
-            self.body.step(due - self._steps)
+            self.mechanics.step(due - self._steps)
             self._steps = due
 
     def _trip(self, index: int) -> None:
@@ -165,7 +165,7 @@ class Dex3Mcu:
         self.counters.trips += 1
         # without gains FOC is limp
         mode = JointMode.BRAKE if self.firmware.tripped_brakes else JointMode.FOC
-        self.body.command(index, mode)
+        self.mechanics.command(index, mode)
 
     def _strike(self, fault: Fault, begins: bool) -> None:
         kind = fault.kind
@@ -192,13 +192,13 @@ class Dex3Mcu:
         }
         for index, motor in enumerate(self._motors):
             motor.silent = index in silent
-            self.body.jam(index, index in stuck)
+            self.mechanics.jam(index, index in stuck)
             if index in overcurrent and index not in self._overcurrent:
-                self.body.fail(index, MotorError.OVERCURRENT)
+                self.mechanics.fail(index, MotorError.OVERCURRENT)
             elif index in self._overcurrent and index not in overcurrent:
-                self.body.recover(index, MotorError.OVERCURRENT)
+                self.mechanics.recover(index, MotorError.OVERCURRENT)
             if index in self._hot and index not in hot:
-                self.body.heat(index, AMBIENT)
+                self.mechanics.heat(index, AMBIENT)
         self._overcurrent, self._hot = overcurrent, hot
 
     # --- frames
@@ -262,7 +262,7 @@ class Dex3Mcu:
             return
         else:
             motor.deadline = self._now + self.firmware.command_timeout
-        self.body.command(index, status if known else JointMode.BRAKE, *setpoint)
+        self.mechanics.command(index, status if known else JointMode.BRAKE, *setpoint)
 
     def state(self, motors: Sequence[int] | None = None) -> bytes:
         """A state frame of now.

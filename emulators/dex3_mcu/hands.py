@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 from dexkit.clock import Clock, RealClock
-from dexkit.emulators.dex3_body import Dex3Body
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.server import Server
 from dexkit.emulators.dex3_mcu.settings import Firmware
 from dexkit.emulators.dex3_mcu.usb import IN_ENDPOINT, OUT_ENDPOINT, Dex3Usb
+from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.faults import DEX3_FAULTS, parse_fault
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.errors import UsageError
@@ -62,7 +62,7 @@ class Dex3Hands:
             side: Dex3Usb(
                 Dex3Mcu(
                     side,
-                    body=Dex3Body(side, object_at=object_pct, start=start),
+                    mechanics=Dex3Mechanics(side, object_at=object_pct, start=start),
                     clock=clock,
                     firmware=firmware,
                     faults=plan,

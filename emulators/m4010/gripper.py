@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 
 from dexkit.clock import RealClock
-from dexkit.emulators.dex1_body import Dex1Body
+from dexkit.emulators.dex1_mechanics import Dex1Mechanics
 from dexkit.emulators.faults import M4010_FAULTS, parse_fault
 from dexkit.emulators.m4010.bus import Bus
 from dexkit.emulators.m4010.motor import LOCKING, Motor
@@ -59,10 +59,10 @@ class Dex1Motors:
         now = RealClock().now()
         self.motors: dict[Side, Motor] = {}
         for side in sides:
-            body = Dex1Body(object_pct=object_pct, start_pct=start_pct, locking=LOCKING)
+            mechanics = Dex1Mechanics(object_pct=object_pct, start_pct=start_pct, locking=LOCKING)
             self.motors[side] = Motor(
                 DEX1_1.vendor_ids[side],
-                body=body,
+                mechanics=mechanics,
                 firmware=firmware,
                 zero_error=zero_error,
                 now=now,

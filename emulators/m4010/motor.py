@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from dexkit.emulators.dex1_body import STEP, Dex1Body
+from dexkit.emulators.dex1_mechanics import STEP, Dex1Mechanics
 from dexkit.emulators.faults import Fault
+from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.emulators.m4010.settings import Firmware, Heat
-from dexkit.emulators.mechanics import FixedSteps
 from dexkit.errors import UsageError
 from dexkit.hand import JointMode, MotorError
 from dexkit.wire.m4010 import (
@@ -37,7 +37,7 @@ class Motor:
     """The motor of one gripper.
 
     :param number: its id, 0 to 14.
-    :param body: the gripper; a new one by default.
+    :param mechanics: the gripper; a new one by default.
     :param zero_error: rad by which the position that it reports is too large, until it is
         calibrated.
     :param now: time on the caller's clock.
@@ -52,7 +52,7 @@ class Motor:
         self,
         number: int,
         *,
-        body: Dex1Body | None = None,
+        mechanics: Dex1Mechanics | None = None,
         firmware: Firmware | None = None,
         heat: Heat | None = None,
         zero_error: float = 0.0,
@@ -61,7 +61,7 @@ class Motor:
         if not 0 <= number < BROADCAST_ID:
             raise UsageError(f"an id is 0 to {BROADCAST_ID - 1}, not {number}")
         self.number = number
-        self.body = body or Dex1Body(locking=LOCKING)
+        self.mechanics = mechanics or Dex1Mechanics(locking=LOCKING)
         self.firmware = firmware or Firmware()
         self.heat = heat or Heat()
         self.zero_error = zero_error
@@ -89,12 +89,12 @@ class Motor:
     @property
     def resting(self) -> bool:
         """Whether nothing changes for now."""
-        return self.body.mode is JointMode.BRAKE and self.body.joint.dq == 0.0
+        return self.mechanics.mode is JointMode.BRAKE and self.mechanics.joint.dq == 0.0
 
     @property
     def q(self) -> float:
         """Position that it reports, rad at the joint."""
-        return self.body.joint.q + self.zero_error
+        return self.mechanics.joint.q + self.zero_error
 
     # --- time and faults
 
@@ -106,9 +106,9 @@ class Motor:
             self.tripped = True
             self.trips += 1
             if self.firmware.tripped_brakes:
-                self.body.brake()
+                self.mechanics.brake()
             else:
-                self.body.drive(0.0, 0.0, 0.0, 0.0, 0.0)
+                self.mechanics.drive(0.0, 0.0, 0.0, 0.0, 0.0)
         self._live(now)
 
     def _live(self, now: float) -> None:
@@ -116,7 +116,7 @@ class Motor:
         left = self._steps.due(now)
         while left:
             part = min(left, self._to_heat)
-            self.body.step(part)
+            self.mechanics.step(part)
             left -= part
             self._to_heat -= part
             if not self._to_heat:
@@ -127,7 +127,7 @@ class Motor:
         heat = self.heat
         to_case = (self.winding - self.case) / heat.winding_to_case
         to_air = (self.case - heat.ambient) / heat.case_to_air
-        loss = heat.copper_loss * self.body.torque**2
+        loss = heat.copper_loss * self.mechanics.torque**2
         self.winding += dt * (loss - to_case) / heat.winding_capacity
         self.case += dt * (to_case - to_air) / heat.case_capacity
         if self._held_hot is not None:
@@ -151,15 +151,15 @@ class Motor:
         self._stop_on_error()
 
     def _stop_on_error(self) -> None:
-        if (self._own_errors | self._faults) and self.body.mode is not JointMode.BRAKE:
-            self.body.brake()
+        if (self._own_errors | self._faults) and self.mechanics.mode is not JointMode.BRAKE:
+            self.mechanics.brake()
 
     def suffer(self, faults: Iterable[Fault]) -> None:
         """The faults that are on now, for this motor or for all."""
         mine = [fault for fault in faults if fault.device in (None, self.number)]
         kinds = {fault.kind: fault for fault in mine}
         self.silent = "silent" in kinds
-        self.body.joint.locked = "stuck" in kinds
+        self.mechanics.joint.locked = "stuck" in kinds
         hot = kinds.get("overheat")
         self._held_hot = None if hot is None else hot["c"]
         if self._held_hot is not None:
@@ -205,13 +205,13 @@ class Motor:
         else:
             self._deadline = self._now + self.firmware.command_timeout
         if command.status != Status.FOC or self._own_errors | self._faults:
-            self.body.brake()
+            self.mechanics.brake()
             return
         q, dq, tau, kp, kd = command.joint()
-        self.body.drive(q - self.zero_error, dq, tau, kp, kd)
+        self.mechanics.drive(q - self.zero_error, dq, tau, kp, kd)
 
     def _calibrate(self, calibration: Calibration) -> MotorData:
-        self.body.brake()
+        self.mechanics.brake()
         if not self.firmware.calibration_enabled:
             return calibration.answer(done=False)
         problem = CalibrationProblem.NONE
@@ -227,20 +227,20 @@ class Motor:
             if wrong:
                 problem |= bit
         if not problem:
-            self.zero_error = calibration.position - self.body.joint.q
+            self.zero_error = calibration.position - self.mechanics.joint.q
             self.calibrated = True
         return calibration.answer(problem)
 
     def data(self) -> MotorData:
         """What it measures now."""
-        status = Status.FOC if self.body.mode is JointMode.FOC else Status.BRAKE
+        status = Status.FOC if self.mechanics.mode is JointMode.FOC else Status.BRAKE
         return MotorData.measured(
             self.number,
             status,
             q=self.q,
-            dq=self.body.joint.dq,
+            dq=self.mechanics.joint.dq,
             # braking, its windings are shorted: no current is controlled, none reported
-            tau=self.body.torque if status is Status.FOC else 0.0,
+            tau=self.mechanics.torque if status is Status.FOC else 0.0,
             temperature=self.case,
             winding=self.winding,
             voltage=self.supply,

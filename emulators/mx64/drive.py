@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from dexkit.emulators.mechanics import Joint, Wall
+from dexkit.emulators.joint_mechanics import Joint, Wall
 from dexkit.emulators.mx64.settings import Physics
 from dexkit.wire import mx64
 from dexkit.wire.mx64 import MovingStatus, OperatingMode
@@ -152,21 +152,23 @@ class Drive:
 
     def __init__(self, physics: Physics) -> None:
         self.physics = physics
-        body = physics.gripper
+        mechanics = physics.gripper
         stroke = mx64.EZGRIPPER_STROKE * _TICK
         walls = [
-            Wall(0.0, +1, body.closed_stiffness, 0.6),
-            Wall(stroke, -1, body.open_stiffness, 1.0),
+            Wall(0.0, +1, mechanics.closed_stiffness, 0.6),
+            Wall(stroke, -1, mechanics.open_stiffness, 1.0),
         ]
-        if body.object_pct is not None:
-            walls.append(Wall(stroke * body.object_pct / 100, +1, body.object_stiffness, 1.0))
+        if mechanics.object_pct is not None:
+            walls.append(
+                Wall(stroke * mechanics.object_pct / 100, +1, mechanics.object_stiffness, 1.0)
+            )
         self.joint = Joint(
-            inertia=physics.inertia + body.inertia,
-            coulomb=physics.coulomb + body.coulomb,
-            viscous=physics.viscous + body.viscous,
+            inertia=physics.inertia + mechanics.inertia,
+            coulomb=physics.coulomb + mechanics.coulomb,
+            viscous=physics.viscous + mechanics.viscous,
             walls=tuple(walls),
-            q=stroke * body.start / 100,
-            spring=body.spring,
+            q=stroke * mechanics.start / 100,
+            spring=mechanics.spring,
             spring_rest=stroke * 1.2,
         )
         self.demand = Demand()

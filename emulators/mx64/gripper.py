@@ -146,16 +146,16 @@ def emulated_ezgripper(
         if extra:
             raise UsageError("extra arguments can be given to a process only")
         physics = physics or Physics()
-        body = dataclasses.replace(physics.gripper, start=start)
+        mechanics = dataclasses.replace(physics.gripper, start=start)
         if object_pct is not None:
-            body = dataclasses.replace(body, object_pct=object_pct)
+            mechanics = dataclasses.replace(mechanics, object_pct=object_pct)
         if closed_at is not None:
-            body = dataclasses.replace(body, closed_at=closed_at)
+            mechanics = dataclasses.replace(mechanics, closed_at=closed_at)
         now = RealClock().now()
         servo = Servo(
             servo_id,
             baudrate=baudrate,
-            physics=dataclasses.replace(physics, gripper=body),
+            physics=dataclasses.replace(physics, gripper=mechanics),
             firmware=firmware,
             now=now,
             seed=seed,

@@ -1,4 +1,4 @@
-"""What can be set about an emulated MX-64: the uncertain points, and the body it drives.
+"""What can be set about an emulated MX-64: the uncertain points, and the mechanics it drives.
 
 Each field of :class:`Firmware` is a point on which the manual is silent or sources disagree
 (docs/sources/mx64-ezgripper.md#f); the default is the reading that is best supported, and
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from dexkit.errors import UsageError
 from dexkit.wire import mx64
 
-__all__ = ["Firmware", "GripperBody", "Physics"]
+__all__ = ["Firmware", "GripperMechanics", "Physics"]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Firmware:
 
 
 @dataclass(frozen=True)
-class GripperBody:
+class GripperMechanics:
     """The EZGripper as the servo's shaft feels it; 0 % is closed, 100 % open.
 
     Stroke and closing direction are facts (docs/sources/mx64-ezgripper.md#d1,
@@ -156,4 +156,4 @@ class Physics:
     supply_resistance: float = 0.15
     idle_current: float = 0.1
     brown_out_reset: float = 6.5
-    gripper: GripperBody = field(default_factory=GripperBody)
+    gripper: GripperMechanics = field(default_factory=GripperMechanics)

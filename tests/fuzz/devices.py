@@ -14,10 +14,7 @@ import socket
 import struct
 from collections.abc import Callable
 
-from dexkit.bodies import BODIES, BodyModel
 from dexkit.clock import ManualClock
-from dexkit.emulators.body.body import Body
-from dexkit.emulators.body.settings import Settings
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.settings import Firmware as Dex3Firmware
@@ -33,9 +30,12 @@ from dexkit.emulators.m4010.bus import Bus as MotorBus
 from dexkit.emulators.m4010.motor import Motor
 from dexkit.emulators.mx64 import Bus, Firmware, Servo
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
+from dexkit.emulators.robot.mechanics import RobotMechanics
+from dexkit.emulators.robot.settings import Settings
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import message_type
+from dexkit.robots import ROBOTS, RobotModel
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import low_level, m4010, mx64
 from dexkit.wire.crc32 import crc32_words
@@ -44,12 +44,12 @@ from dexkit.wire.dynamixel import Instruction
 
 __all__ = [
     "FUZZERS",
-    "bodies",
     "dex3",
     "faults",
     "m4010_line",
     "mx64_line",
     "packet",
+    "robots",
     "usbip_server",
 ]
 
@@ -112,9 +112,9 @@ _ITEMS = list(mx64.TABLE.values())
 
 def packet(packet_id: int, instruction: int, params: bytes) -> bytes:
     """An instruction packet with a true length and CRC, whatever its id and size."""
-    body = dxl.stuff(bytes((instruction,)) + params)
-    length = len(body) + 2
-    data = dxl.HEADER + bytes((packet_id, length & 0xFF, length >> 8 & 0xFF)) + body
+    robot = dxl.stuff(bytes((instruction,)) + params)
+    length = len(robot) + 2
+    data = dxl.HEADER + bytes((packet_id, length & 0xFF, length >> 8 & 0xFF)) + robot
     return data + dxl.crc16(data).to_bytes(2, "little")
 
 
@@ -180,8 +180,8 @@ def _instruction(case: _Case) -> bytes:
 def _protocol_1(case: _Case) -> bytes:
     rnd = case.random
     params = rnd.randbytes(rnd.choice((0, 1, 2, 2, 2, 3, 20)))
-    body = bytes((rnd.choice((3, 254, 1)), len(params) + 2, rnd.choice((1, 2, 3, 0x83)))) + params
-    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+    robot = bytes((rnd.choice((3, 254, 1)), len(params) + 2, rnd.choice((1, 2, 3, 0x83)))) + params
+    return b"\xff\xff" + robot + bytes((~sum(robot) & 0xFF,))
 
 
 def _servos(case: _Case, now: float) -> Bus:
@@ -314,14 +314,14 @@ def _motor_frame(case: _Case) -> bytes:
     rnd = case.random
     number = rnd.choice((0, 1, 2, 15))
     mode = number | rnd.choice((0, 1, 1, 1, 2, 5, 6, 7)) << 4 | rnd.choice((0, 0x80))
-    body = b"\xfe\xee" + bytes((mode, rnd.randrange(256)))
+    robot = b"\xfe\xee" + bytes((mode, rnd.randrange(256)))
     if rnd.random() < 0.1:  # a calibration is told by these
-        body += struct.pack("<h", -0x400)
+        robot += struct.pack("<h", -0x400)
     else:
-        body += case.number_of(2).to_bytes(2, "little")
-    body += case.number_of(2).to_bytes(2, "little") + case.number_of(4).to_bytes(4, "little")
-    body += case.number_of(2).to_bytes(2, "little") + case.number_of(2).to_bytes(2, "little")
-    return body + crc32_words(body).to_bytes(4, "little")
+        robot += case.number_of(2).to_bytes(2, "little")
+    robot += case.number_of(2).to_bytes(2, "little") + case.number_of(4).to_bytes(4, "little")
+    robot += case.number_of(2).to_bytes(2, "little") + case.number_of(2).to_bytes(2, "little")
+    return robot + crc32_words(robot).to_bytes(4, "little")
 
 
 def _motors_answer(bus: MotorBus, now: float) -> None:
@@ -364,9 +364,9 @@ def _hand_frame(case: _Case) -> bytes:
     for _ in range(N_BUSES):
         packets = b""
         for _ in range(rnd.choice((0, 1, 2, 3, 7))):
-            body = MOTOR_CMD.head + bytes((rnd.randrange(256), rnd.randrange(256)))
-            body += b"".join(case.number_of(n).to_bytes(n, "little") for n in (2, 2, 4, 2, 2))
-            packets += case.spoil(body + crc32_words(body).to_bytes(4, "little"))
+            robot = MOTOR_CMD.head + bytes((rnd.randrange(256), rnd.randrange(256)))
+            robot += b"".join(case.number_of(n).to_bytes(n, "little") for n in (2, 2, 4, 2, 2))
+            packets += case.spoil(robot + crc32_words(robot).to_bytes(4, "little"))
         packets = packets[: layout.bus_size]
         sizes.append(len(packets) if rnd.random() < 0.9 else case.number_of(4))
         buses.append(packets.ljust(layout.bus_size, b"\0"))
@@ -382,19 +382,19 @@ def _transfer(usb: Dex3Usb, data: bytes) -> None:
     assert len(usb._held) <= 64
 
 
-# --- bodies
+# --- robots
 
 
-def bodies(seed: int, count: int) -> int:
+def robots(seed: int, count: int) -> int:
     """An H1 and a G1: samples of their command topics, most of them with a good CRC."""
-    case = _Case("bodies", seed)
+    case = _Case("robots", seed)
     now = 100.0
     for i in range(count):
         rnd = case.random
         if i % _BLOCK == 0:
-            model = rnd.choice(list(BODIES.values()))
-            body = Body(model, Settings(lenient=rnd.random() < 0.3), now=now)
-            image = _body_command(case, model)
+            model = rnd.choice(list(ROBOTS.values()))
+            robot = RobotMechanics(model, Settings(lenient=rnd.random() < 0.3), now=now)
+            image = _robot_command(case, model)
         data = bytearray(image)
         for _ in range(rnd.choice((0, 0, 3, 40, 400))):
             at = rnd.randrange(4, len(data) - 4)
@@ -407,10 +407,10 @@ def bodies(seed: int, count: int) -> int:
         payload = case.spoil(payload)
         now += rnd.choice((0.0, 1e-3, 2e-3, 0.01))
 
-        def act(body: Body = body, payload: bytes = payload, now: float = now) -> None:
-            (body.command if len(payload) % 3 else body.arm_command)(payload, now)
-            body.advance(now)
-            body.state(now)
+        def act(robot: RobotMechanics = robot, payload: bytes = payload, now: float = now) -> None:
+            (robot.command if len(payload) % 3 else robot.arm_command)(payload, now)
+            robot.advance(now)
+            robot.state(now)
 
         case.run(payload, act)
     return count
@@ -419,7 +419,7 @@ def bodies(seed: int, count: int) -> int:
 _FLOATS = (0.0, 1.0, -1.0, 1e3, 1e-30, 2.1e9, 3.4e38, -3.4e38, math.inf, math.nan, 16000.0)
 
 
-def _body_command(case: _Case, model: BodyModel) -> bytes:
+def _robot_command(case: _Case, model: RobotModel) -> bytes:
     """A command that is obeyed, of gains that may be monstrous."""
     rnd = case.random
     kind = message_type(model.cmd_type)
@@ -517,7 +517,7 @@ FUZZERS: dict[str, Callable[[int, int], int]] = {
     "mx64-line": mx64_line,
     "m4010-line": m4010_line,
     "dex3": dex3,
-    "bodies": bodies,
+    "robots": robots,
     "faults": faults,
     "usbip-server": usbip_server,
 }

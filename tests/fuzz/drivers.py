@@ -50,12 +50,12 @@ def _spoilt(rnd: random.Random, data: bytes, seal: Callable[[bytes], bytes]) -> 
     if chance < 0.3 or len(data) < 12:
         return data
     if chance < 0.7:
-        body = bytearray(data)
+        mechanics = bytearray(data)
         for _ in range(rnd.choice((1, 3, 30))):
-            body[rnd.randrange(2, len(body))] = rnd.choice(
+            mechanics[rnd.randrange(2, len(mechanics))] = rnd.choice(
                 (0, 0x7F, 0x80, 0xFF, rnd.randrange(256))
             )
-        return seal(bytes(body))
+        return seal(bytes(mechanics))
     if chance < 0.8:
         return data[: rnd.randrange(len(data))]
     if chance < 0.9:
@@ -196,8 +196,8 @@ def motor_line(seed: int, count: int) -> int:
     rnd = case.random
 
     def seal(data: bytes) -> bytes:
-        body = m4010.DATA.head + data[2:22]
-        return body + crc32_words(body[2:]).to_bytes(4, "little")
+        mechanics = m4010.DATA.head + data[2:22]
+        return mechanics + crc32_words(mechanics[2:]).to_bytes(4, "little")
 
     def reply(command: bytes) -> bytes:
         number = rnd.choice((0, 0, 0, 1, 15))
@@ -322,7 +322,9 @@ def dex3_usb(seed: int, count: int) -> int:
             clock.advance(2.0)
             mcu.advance()
             assert (
-                not mcu.body.mode.any() if hasattr(mcu.body.mode, "any") else not any(mcu.body.mode)
+                not mcu.mechanics.mode.any()
+                if hasattr(mcu.mechanics.mode, "any")
+                else not any(mcu.mechanics.mode)
             ), f"{case.name}, seed {seed}: a hand was left driven"
     return count
 

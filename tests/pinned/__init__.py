@@ -11,9 +11,9 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from dexkit.conformance.body import recording_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants.matrix import Outcome, Trial
+from dexkit.conformance.robot import recording_of
 from dexkit.traces import open_trace
 from dexkit.traces.samples import SAMPLES, sample_path
 

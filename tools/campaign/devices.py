@@ -133,7 +133,7 @@ class _Dex3(Bench):
         return Dex3Usb(SIDE, Dex3Settings(server=Server("127.0.0.1", self._port)))
 
     def position(self, device: Any) -> float:
-        return float(np.abs(device.device(SIDE).body.q).sum())
+        return float(np.abs(device.device(SIDE).mechanics.q).sum())
 
     def message(self, q: float) -> bytes:
         from dexkit.models import DEX3_1

@@ -23,7 +23,7 @@ from tools.campaign.case import Batch, Case
 from tools.campaign.fuzz.messages import announcements, filled
 from tools.campaign.mutate import mutator
 from tools.campaign.process import Program, traceback_in
-from tools.campaign.programs import SIDE, Client, Scene, Spec, bodies_and_hands
+from tools.campaign.programs import SIDE, Client, Scene, Spec, robots_and_hands
 from tools.campaign.rig import NotYet, until
 
 __all__ = ["cases"]
@@ -216,4 +216,4 @@ def cases() -> list[Case]:
     """Those that listen to the network."""
     spoken = {"serve-sim-dex1": "unitree_go", "serve-sim-dex3": "dex3", "serve-sim-dex5": "dex5"}
     _ = Client
-    return [PeerCase(spec, spoken.get(spec.name, "")) for spec in bodies_and_hands()]
+    return [PeerCase(spec, spoken.get(spec.name, "")) for spec in robots_and_hands()]

@@ -28,7 +28,7 @@ from tools.campaign.devices import Bench, bench_of
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.rig import NotYet, until
 
-__all__ = ["Client", "Scene", "Spec", "bodies_and_hands", "cases", "specs"]
+__all__ = ["Client", "Scene", "Spec", "cases", "robots_and_hands", "specs"]
 
 SIDE = Side.LEFT
 _SETTLED = 0.2
@@ -224,10 +224,10 @@ def _topic_flows(
     return works
 
 
-def _body_state(name: str) -> tuple[str, str]:
-    from dexkit.bodies import body
+def _robot_state(name: str) -> tuple[str, str]:
+    from dexkit.robots import robot
 
-    return "rt/lowstate", body(name).state_type
+    return "rt/lowstate", robot(name).state_type
 
 
 def _answers(name: str) -> Callable[[Scene, Program], None]:
@@ -396,11 +396,11 @@ def specs() -> list[Spec]:
             works=_usb_answers,
         ),
         Spec("emulate-h1", on_domain("emulate", "h1"), _nothing,
-             works=_topic_flows(lambda: _body_state("h1"))),
+             works=_topic_flows(lambda: _robot_state("h1"))),
         Spec("emulate-g1", on_domain("emulate", "g1"), _nothing,
-             works=_topic_flows(lambda: _body_state("g1"))),
+             works=_topic_flows(lambda: _robot_state("g1"))),
         Spec("emulate-all", on_domain("emulate", "all"), _nothing,
-             works=_topic_flows(lambda: _body_state("g1"))),
+             works=_topic_flows(lambda: _robot_state("g1"))),
         Spec(
             "doctor-watch",
             lambda s: ["dexkit", "doctor", "--watch", "--domain", s.domain, "--scan", "none",
@@ -673,7 +673,7 @@ def cases() -> list[Case]:
     return found
 
 
-def bodies_and_hands() -> list[Spec]:
+def robots_and_hands() -> list[Spec]:
     """The programs that listen to whoever is on a domain."""
     names: tuple[str, ...] = (
         "serve-sim-dex1",

@@ -1,4 +1,4 @@
-"""``dexkit emulate``: devices on the kind of port that the real ones have, bodies, whole robots."""
+"""``dexkit emulate``: devices on the kind of port that the real ones have, robots, whole robots."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _DEVICES = {
     "all": (
         "dexkit.cli.emulate.all",
         "emulate_all",
-        "Emulate a whole robot: a body and two hands.",
+        "Emulate a whole robot: a robot and two hands.",
     ),
     "dex1-motor": (
         "dexkit.cli.emulate.dex1_motor",
@@ -26,14 +26,14 @@ _DEVICES = {
         "Emulate a Dex3-1 hand on USB (USB/IP).",
     ),
     "g1": (
-        "dexkit.cli.emulate.body",
+        "dexkit.cli.emulate.robot",
         "emulate_g1",
-        "Emulate the body of a G1 (rt/lowcmd, rt/lowstate, unitree_hg).",
+        "Emulate the robot of a G1 (rt/lowcmd, rt/lowstate, unitree_hg).",
     ),
     "h1": (
-        "dexkit.cli.emulate.body",
+        "dexkit.cli.emulate.robot",
         "emulate_h1",
-        "Emulate the body of an H1 (rt/lowcmd, rt/lowstate, unitree_go).",
+        "Emulate the robot of an H1 (rt/lowcmd, rt/lowstate, unitree_go).",
     ),
     "mx64": (
         "dexkit.cli.emulate.mx64",

@@ -1,7 +1,7 @@
-"""``dexkit emulate all``: a whole robot, body and hands, for a teleoperation developer.
+"""``dexkit emulate all``: a robot with two hands, for a teleoperation developer.
 
-Body and hands are processes of their own. In one process they would share an interpreter lock:
-with a G1 body beside two Dex3-1 the hands fell from 1000 to 960 states a second, and the body
+Robot and hands are processes of their own. In one process they would share an interpreter lock:
+with a G1 beside two Dex3-1 the hands fell from 1000 to 960 states a second, and the robot
 missed one state in forty, at half the load of a processor.
 """
 
@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import click
 
-from dexkit.bodies import BODIES
 from dexkit.cli.common import (
     STATUS_LINES,
     Number,
@@ -25,6 +24,7 @@ from dexkit.cli.common import (
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1
 from dexkit.processes import READY_TIMEOUT, Tool
+from dexkit.robots import ROBOTS
 
 __all__ = ["emulate_all"]
 
@@ -33,12 +33,14 @@ _HANDS = {
     "dex1": ("sim-dex1", DEX1_1),
     "dex5": ("sim-dex5", DEX5_1),
 }
-_ARMS = {"g1": "G1_29", "h1": "H1"}  # names of the bodies in xr_teleoperate
+_ARMS = {"g1": "G1_29", "h1": "H1"}  # names of the robots in xr_teleoperate
 _POLL = 0.05  # seconds between looks whether all parts live
 
 
 @click.command("all", context_settings={"show_default": True})
-@click.option("--body", type=click.Choice(list(reversed(BODIES))), default="g1", help="Which body.")
+@click.option(
+    "--robot", type=click.Choice(list(reversed(ROBOTS))), default="g1", help="Which robot."
+)
 @click.option(
     "--hands", type=click.Choice([*_HANDS, "none"]), default="dex3", help="Which hands, both sides."
 )
@@ -62,7 +64,7 @@ _POLL = 0.05  # seconds between looks whether all parts live
 @click.option("--force", is_flag=True, help="Even if others publish the state topics.")
 @click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
 def emulate_all(
-    body: str,
+    robot: str,
     hands: str,
     dialect: str | None,
     settings: tuple[str, ...],
@@ -72,12 +74,12 @@ def emulate_all(
     force: bool,
     quiet: bool,
 ) -> None:
-    """Emulate a whole robot: a body and two hands on Unitree's topics.
+    """Emulate a robot with two hands on Unitree's topics.
 
     \b
     Examples:
       dexkit emulate all
-      dexkit emulate all --body h1 --hands dex1
+      dexkit emulate all --robot h1 --hands dex1
       dexkit emulate all --set right.object=40 --duration 60
 
     Prints "ready: ..." when all topics are up, and what to start next. Ctrl-C or SIGTERM ends
@@ -87,24 +89,24 @@ def emulate_all(
         raise click.UsageError("--dialect and --set are for hands, and there are none")
     common = ["--domain", str(domain), "--interface", interface]
     common += ["--force"] * force + ["--quiet"] * quiet
-    parts = {body: ("emulate", body, *common)}
+    parts = {robot: ("emulate", robot, *common)}
     if hands != "none":
         own = [option for text in settings for option in ("--set", text)]
         own += ["--dialect", dialect] if dialect else []
         parts["hands"] = ("serve", _HANDS[hands][0], "--side", "both", *own, *common)
-    with stop_on_signals() as stop, _Robot(parts, quiet) as robot:
-        robot.wait_ready(stop)
+    with stop_on_signals() as stop, _Processes(parts, quiet) as processes:
+        processes.wait_ready(stop)
         if not stop:
-            title = BODIES[body].title
+            title = ROBOTS[robot].title
             if hands != "none":
                 title += f" and two {_HANDS[hands][1].title}s"
             click.echo(f"ready: {title}, domain {domain}, {interface}")
-            click.echo("\n".join(_next(body, hands, domain, interface)))
+            click.echo("\n".join(_next(robot, hands, domain, interface)))
             sys.stdout.flush()
-            robot.watch(stop, duration)
+            processes.watch(stop, duration)
 
 
-def _next(body: str, hands: str, domain: int, interface: str) -> list[str]:
+def _next(robot: str, hands: str, domain: int, interface: str) -> list[str]:
     """What to start now."""
     end = "" if hands == "none" else f" --ee={hands}"
     lines = []
@@ -112,7 +114,7 @@ def _next(body: str, hands: str, domain: int, interface: str) -> list[str]:
         sim = " --sim" if domain == 1 else ""
         lines += [
             "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
-            f"  python teleop_hand_and_arm.py --arm={_ARMS[body]}{end}{sim}",
+            f"  python teleop_hand_and_arm.py --arm={_ARMS[robot]}{end}{sim}",
         ]
         if hands == "dex5":
             lines.append("  (--ee=dex5 is not in a release: pull request 321)")
@@ -169,7 +171,7 @@ class _Part:
         return error
 
 
-class _Robot:
+class _Processes:
     """All parts; a context manager. Leaving it ends them together."""
 
     def __init__(self, parts: dict[str, tuple[str, ...]], quiet: bool) -> None:
@@ -177,7 +179,7 @@ class _Robot:
         self._status = StatusLine(quiet)
         self.parts: list[_Part] = []
 
-    def __enter__(self) -> _Robot:
+    def __enter__(self) -> _Processes:
         try:
             for name, arguments in self._commands.items():
                 self.parts.append(_Part(name, arguments, self._status))

@@ -107,12 +107,12 @@ def emulate_mx64(
     link.
     """
     from dexkit.emulators.faults import parse_fault
-    from dexkit.emulators.mx64 import Bus, Firmware, GripperBody, Physics, Port, Servo
+    from dexkit.emulators.mx64 import Bus, Firmware, GripperMechanics, Physics, Port, Servo
     from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 
     plan = [parse_fault(spec) for spec in faults]
-    body = GripperBody(closed_at=closed_at, start=start, object_pct=object_pct)
-    physics = dataclasses.replace(Physics(), gripper=body)
+    mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
+    physics = dataclasses.replace(Physics(), gripper=mechanics)
     firmware = Firmware(fast_reads=fast_reads, backup=backup)
     store = _EepromFile(eeprom) if eeprom is not None else None
     with stop_on_signals() as request:

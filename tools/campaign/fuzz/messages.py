@@ -16,8 +16,8 @@ from dexkit.doctor import dds as doctor_dds
 from dexkit.doctor import rtps
 from dexkit.doctor.observer import Observer
 from dexkit.doctor.rtps import Data, Locator
-from dexkit.emulators.body import Body
-from dexkit.emulators.body.settings import Remote
+from dexkit.emulators.robot import RobotMechanics
+from dexkit.emulators.robot.settings import Remote
 from dexkit.errors import WireError
 from dexkit.hand import JointMode, Side
 from dexkit.messages import layout, message_type, message_types
@@ -192,13 +192,13 @@ def _teleop(rng: random.Random, scratch: Path) -> Target:
     return Target(mutator(_samples(spoken.state_type, rng), rng), run, (WireError,))
 
 
-def _body(name: str) -> Callable[[random.Random, Path], Target]:
+def _robot(name: str) -> Callable[[random.Random, Path], Target]:
     def prepare(rng: random.Random, scratch: Path) -> Target:
-        from dexkit.bodies import body
+        from dexkit.robots import robot
         from dexkit.wire.low_level import encode_with_crc
 
-        chosen = body(name)
-        emulated = Body(chosen)
+        chosen = robot(name)
+        emulated = RobotMechanics(chosen)
         message = filled(chosen.cmd_type, rng)
         good = [encode_with_crc(message), encode_with_crc(message_type(chosen.cmd_type).cls())]
         now = [0.0]
@@ -377,8 +377,8 @@ def cases() -> list[FuzzCase]:
         FuzzCase("bridge", "both ways of the bridge", _bridge, size=8_000, aim=slow),
         FuzzCase("teleop.state", "a state as the teleoperation client reads it", _teleop,
                  size=40_000, aim=slow),
-        FuzzCase("body.h1", "a command to the emulated H1", _body("h1"), size=15_000, aim=slow),
-        FuzzCase("body.g1", "a command to the emulated G1", _body("g1"), size=15_000, aim=slow),
+        FuzzCase("robot.h1", "a command to the emulated H1", _robot("h1"), size=15_000, aim=slow),
+        FuzzCase("robot.g1", "a command to the emulated G1", _robot("g1"), size=15_000, aim=slow),
         FuzzCase("rtps.packet", "RTPS packets as the doctor reads them", _rtps_packet,
                  size=40_000, aim=4_000_000, weight=2.0),
         FuzzCase("rtps.announcement", "an announcement, and who it says it is",

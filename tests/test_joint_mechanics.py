@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.emulators.mechanics import FixedSteps, Joint, Wall
+from dexkit.emulators.joint_mechanics import FixedSteps, Joint, Wall
 from dexkit.errors import UsageError
 
 DT = 1e-3

@@ -10,9 +10,9 @@ from importlib.util import find_spec
 
 import pytest
 
-from dexkit.bodies import G1, H1, BodyModel
 from dexkit.dds import DdsNode
-from dexkit.emulators.body import EmulatedBody, Remote, Settings
+from dexkit.emulators.robot import EmulatedRobot, Remote, Settings
+from dexkit.robots import G1, H1, RobotModel
 from tests.cpp_sdk import CppSdk
 from tests.dds_helpers import dds_domain, wait_until
 
@@ -24,7 +24,7 @@ if find_spec("unitree_interface") is None:
 H1_MOTORS = 19  # of 20: the binding leaves out the last slot, the left elbow
 
 
-def positions(model: BodyModel, motors: int, by: float) -> list[float]:
+def positions(model: RobotModel, motors: int, by: float) -> list[float]:
     """The rest position of every joint, moved by so much toward the middle of its range."""
     q = []
     for slot in range(motors):
@@ -36,8 +36,8 @@ def positions(model: BodyModel, motors: int, by: float) -> list[float]:
 
 def test_h1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
     with DdsNode(dds_domain) as node, CppSdk("h1", dds_domain) as sdk:
-        with EmulatedBody(H1, node=node) as robot:
-            robot.body.remote = Remote.parse("A,L2,lx=0.5,ry=-0.25")
+        with EmulatedRobot(H1, node=node) as robot:
+            robot.robot.remote = Remote.parse("A,L2,lx=0.5,ry=-0.25")
             first = sdk.wait(lambda s: any(s["q"]))
             assert first["q"] == pytest.approx(H1.rest_q[:H1_MOTORS])
             assert first["quat"] == [1, 0, 0, 0]
@@ -56,9 +56,9 @@ def test_h1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
             assert [there["q"][i] for i in strong] == pytest.approx(
                 [H1.rest_q[i] for i in strong], abs=1e-6
             )
-            assert robot.body.counters.wrong_mode > 0
+            assert robot.robot.counters.wrong_mode > 0
 
-            held = robot.body.remote_message()
+            held = robot.robot.remote_message()
             remote = sdk.wait(lambda r: r["keys"], sdk.remote)
             assert remote == {n: getattr(held, n) for n in ("lx", "ly", "rx", "ry", "keys")}
             assert (remote["keys"], remote["lx"], remote["ry"]) == (1 << 8 | 1 << 5, 0.5, -0.25)
@@ -68,18 +68,18 @@ def test_h1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
             tau[12] = 20.0
             sdk.command(q=goal, tau=tau, **gains)
             sdk.wait(lambda s: s["q"][12] > goal[12] + 0.15)
-            counters = robot.body.counters
+            counters = robot.robot.counters
             assert (counters.bad_crc, counters.malformed, counters.bad_number) == (0, 0, 0)
 
-        # a body that takes any mode byte: all that the binding commands moves
-        with EmulatedBody(H1, node=node, settings=Settings(lenient=True)) as robot:
+        # a robot that takes any mode byte: all that the binding commands moves
+        with EmulatedRobot(H1, node=node, settings=Settings(lenient=True)) as robot:
             used = [*strong, *weak]
             sdk.command(q=goal, **gains)
             sdk.wait(lambda s: all(abs(s["q"][i] - goal[i]) < 0.02 for i in used))
-            assert robot.body.counters.wrong_mode == 0
+            assert robot.robot.counters.wrong_mode == 0
         # what it would have said of a wrong CRC
         assert "CRC Error" not in "".join(capfd.readouterr())
-        good = robot.body.state(0.0)
+        good = robot.robot.state(0.0)
         spoiled = good[:-1] + bytes([good[-1] ^ 1])
         with node.writer(H1.state_topic, H1.state_type) as writer:
             wait_until(
@@ -91,13 +91,13 @@ def test_g1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
     with (
         DdsNode(dds_domain) as node,
         CppSdk("g1", dds_domain) as sdk,
-        EmulatedBody(G1, node=node) as robot,
+        EmulatedRobot(G1, node=node) as robot,
     ):
         motors = len(G1.used)
         first = sdk.wait(lambda s: any(s["q"]))
         assert first["q"] == pytest.approx(G1.rest_q[:motors])
         assert first["mode_machine"] == G1.mode_machine
-        assert first["voltage"] == pytest.approx([robot.body.supply.voltage] * motors, rel=1e-3)
+        assert first["voltage"] == pytest.approx([robot.robot.supply.voltage] * motors, rel=1e-3)
 
         goal = positions(G1, motors, 0.2)
         sdk.command(q=goal)  # with the gains that the SDK has for a G1
@@ -116,7 +116,7 @@ def test_g1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
         state = sdk.wait(lambda s: s["q"][elbow] == pytest.approx(top) and s["dq"][elbow] == 0)
         assert state["tau_est"][elbow] == pytest.approx(3.0)
 
-        counters = robot.body.counters
+        counters = robot.robot.counters
         assert counters.commands > 100
         assert counters.bad_crc == counters.bad_machine == counters.wrong_mode == 0
     assert "CRC Error" not in "".join(capfd.readouterr())

@@ -1,7 +1,7 @@
-"""The body of a robot: commands in, states out, as samples on an injected clock.
+"""A robot: commands in, states out, as samples on an injected clock.
 
-No thread, no DDS: :class:`Body` is told the time and given bytes. :mod:`dexkit.emulators.body.run`
-puts it on the topics.
+No thread, no DDS: :class:`RobotMechanics` is told the time and given bytes.
+:mod:`dexkit.emulators.robot.run` puts it on the topics.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.bodies import DQ_STOP, Q_STOP, BodyModel
-from dexkit.emulators.body.image import Image
-from dexkit.emulators.body.joints import Joints, Law
-from dexkit.emulators.body.settings import STEP, Remote, Settings
-from dexkit.emulators.body.supply import PERIOD, Supply
-from dexkit.emulators.mechanics import FixedSteps
+from dexkit.emulators.joint_mechanics import FixedSteps
+from dexkit.emulators.robot.image import Image
+from dexkit.emulators.robot.joints import Joints, Law
+from dexkit.emulators.robot.settings import STEP, Remote, Settings
+from dexkit.emulators.robot.supply import PERIOD, Supply
 from dexkit.errors import WireError
 from dexkit.hand import MotorError
 from dexkit.messages.unitree_go import WirelessController_
+from dexkit.robots import DQ_STOP, Q_STOP, RobotModel
 
-__all__ = ["Body", "Counters"]
+__all__ = ["Counters", "RobotMechanics"]
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ _REMOTE = struct.Struct("<2xH5f16x")  # head, keys, lx rx ry L2 ly, idle
 
 @dataclass
 class Counters:
-    """What a body has seen and done.
+    """What a robot has seen and done.
 
     :ivar commands: obeyed.
     :ivar arm_commands: obeyed, on the arm topic.
@@ -52,8 +52,8 @@ class Counters:
     :ivar malformed: samples that are no such message at all.
     :ivar wrong_mode: commands obeyed that hold a mode byte which its motor does not know.
     :ivar stale: commands ignored because they were old, or may have been sent before a pause ended.
-    :ivar pauses: times that the program stood still; the body damps then until a new command.
-    :ivar timeouts: times the body began to damp because commands stopped.
+    :ivar pauses: times that the program stood still; the robot damps then until a new command.
+    :ivar timeouts: times the robot began to damp because commands stopped.
     :ivar states: published.
     """
 
@@ -93,8 +93,8 @@ def _law(numbers: Array, on: NDArray[np.bool_]) -> Law:
     return Law(on * tau + kp * q + kd * dq, kp, kd)
 
 
-class Body:
-    """An emulated H1 or G1: see docs/body.md for what is and what is not emulated.
+class RobotMechanics:
+    """An emulated H1 or G1: see docs/robots.md for what is and what is not emulated.
 
     :param now: seconds of any monotonic clock, the same as in the other calls.
     :param report: told, in a sentence, of each kind of trouble once.
@@ -104,7 +104,7 @@ class Body:
 
     def __init__(
         self,
-        model: BodyModel,
+        model: RobotModel,
         settings: Settings | None = None,
         *,
         now: float = 0.0,

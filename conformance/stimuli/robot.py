@@ -1,4 +1,4 @@
-"""What the kit does to a robot's body; see :mod:`dexkit.conformance.stimuli`.
+"""What the kit does to a robot; see :mod:`dexkit.conformance.stimuli`.
 
 Commands come at xr_teleoperate's rate with its gains; a joint is moved by a ramp, toward the
 middle of its range. All but the first two phases are about one joint, the right elbow.
@@ -15,7 +15,7 @@ off            mode 0, and a command that asks to move
 wrong-crc      commands that ask to move, with wrong CRCs; ``params["kind"]`` says which
 nan            commands that ask to move, with NaN or infinity somewhere; ``params["kind"]``
 unused         a slot without a motor is driven
-machine        commands for another machine (bodies whose messages have ``mode_machine``)
+machine        commands for another machine (robots whose messages have ``mode_machine``)
 foreign        commands of the other family's type
 recover        a step, after all that
 late-joiner    a new subscriber appears
@@ -33,9 +33,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from dexkit.bodies import body
-from dexkit.conformance.body import SPOILS, BodyWire
-from dexkit.conformance.phases import BODY, Phase
+from dexkit.conformance.phases import ROBOT, Phase
+from dexkit.conformance.robot import SPOILS, RobotWire
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -51,8 +50,9 @@ from dexkit.conformance.stimuli.script import (
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.freshness import PAUSE
 from dexkit.hand import Side
+from dexkit.robots import robot
 
-__all__ = ["STEP", "BodyScript"]
+__all__ = ["STEP", "RobotScript"]
 
 STEP = 0.2
 """rad by which a joint is moved."""
@@ -65,8 +65,8 @@ _JOINT = "right_elbow"
 _NOTHING = Motor(kp=0.0, kd=0.0)
 
 
-class BodyScript(Script):
-    """The stimulus for one body."""
+class RobotScript(Script):
+    """The stimulus for one robot."""
 
     motion = "joint"
 
@@ -74,22 +74,22 @@ class BodyScript(Script):
         self.plan = plan
         self.phases: list[Phase] = []
         self._say = say
-        self._body = body(plan.dialect.model)
-        self._coder = BodyWire(plan.dialect)
-        self._joints = {BODY: tuple(self._body.joint(slot) for slot in self._body.used)}
+        self._robot = robot(plan.dialect.model)
+        self._coder = RobotWire(plan.dialect)
+        self._joints = {ROBOT: tuple(self._robot.joint(slot) for slot in self._robot.used)}
         self._goal = {}
         self._next_ns = 0
         self._age_s = 0.0
-        self._period_ns = round(1e9 / self._body.teleop_rate)
+        self._period_ns = round(1e9 / self._robot.teleop_rate)
         self._obs = Observation(0)
-        self._slot = self._body.slot(_JOINT)
+        self._slot = self._robot.slot(_JOINT)
         self._start: dict[int, float] = {}
-        self._order: list[Motor] = [_NOTHING] * self._body.slots
+        self._order: list[Motor] = [_NOTHING] * self._robot.slots
         self._sent: tuple[object, bytes] = (None, b"")
         self._dry = False
 
     def length(self) -> float:
-        """Seconds that :meth:`run` takes with a body that is where it should at once."""
+        """Seconds that :meth:`run` takes with a robot that is where it should at once."""
         self._dry = True
         return super().length()
 
@@ -98,16 +98,16 @@ class BodyScript(Script):
         self._obs = yield Send([], 0)
         self._next_ns = self._obs.now_ns
         yield from self._listen()
-        if BODY not in self._obs.q:
+        if ROBOT not in self._obs.q:
             yield from self._wake()
-        if BODY not in self._obs.q:
-            self._say("no state: nothing more can be asked of this body")
+        if ROBOT not in self._obs.q:
+            self._say("no state: nothing more can be asked of this robot")
             return
-        self._start = dict(zip(self._body.used, self._obs.q[BODY], strict=True))
-        self._goal = {BODY: self._obs.q[BODY]}
+        self._start = dict(zip(self._robot.used, self._obs.q[ROBOT], strict=True))
+        self._goal = {ROBOT: self._obs.q[ROBOT]}
         for slot, q in self._start.items():
             self._order[slot] = self._holding(slot, q)
-        phase = self._begin("hold", (BODY,))
+        phase = self._begin("hold", (ROBOT,))
         yield from self._keep(0.4)
         self._end(phase)
         yield from self._provoke()
@@ -115,9 +115,9 @@ class BodyScript(Script):
 
     def _wake(self) -> Steps:
         """Commands that only damp: does it wait for some before it tells its state?"""
-        for slot in self._body.used:
-            _, kd = self._body.client_gains[slot]
-            self._order[slot] = Motor(kp=0.0, kd=kd, mode=self._body.enable[slot])
+        for slot in self._robot.used:
+            _, kd = self._robot.client_gains[slot]
+            self._order[slot] = Motor(kp=0.0, kd=kd, mode=self._robot.enable[slot])
         yield from self._keep(0.3)
 
     def _provoke(self) -> Steps:
@@ -136,7 +136,7 @@ class BodyScript(Script):
             ("recover", lambda: self._step("recover")),
             ("late-joiner", self._late_joiner),
             ("pause", lambda: self._silence("pause", 0.3)),
-            ("silence", lambda: self._silence("silence", self._body.command_timeout + 0.6)),
+            ("silence", lambda: self._silence("silence", self._robot.command_timeout + 0.6)),
             ("resume", self._resume),
             ("restart", self._restart),
         ]
@@ -151,35 +151,35 @@ class BodyScript(Script):
         return tuple(self._start.values())
 
     def _other_place(self) -> dict[Side, Pose]:
-        return {BODY: self._home(BODY)}
+        return {ROBOT: self._home(ROBOT)}
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
         return self._order
 
     def _holding(self, slot: int, q: float) -> Motor:
-        kp, kd = self._body.client_gains[slot]
-        return Motor(q=q, kp=kp, kd=kd, mode=self._body.enable[slot])
+        kp, kd = self._robot.client_gains[slot]
+        return Motor(q=q, kp=kp, kd=kd, mode=self._robot.enable[slot])
 
     def _here(self, slot: int) -> float:
         """Where the joint is."""
-        pose = self._obs.q.get(BODY, tuple(self._start.values()))
-        return pose[self._body.used.index(slot)]
+        pose = self._obs.q.get(ROBOT, tuple(self._start.values()))
+        return pose[self._robot.used.index(slot)]
 
     def _inward(self, slot: int, by: float) -> float:
         """``by``, with the sign that leads to the middle of the joint's range."""
-        joint = self._body.joint(slot)
+        joint = self._robot.joint(slot)
         return by if self._here(slot) < (joint.q_min + joint.q_max) / 2 else -by
 
     def _put(self, order: Motors, spoil: str = "", machine: int | None = None) -> Steps:
         if self._dry:
             yield from self._send([])
             return
-        own = self._obs.machine or self._body.mode_machine or 0
+        own = self._obs.machine or self._robot.mode_machine or 0
         told = own if machine is None else machine
         key = (tuple(order), told, spoil)
         if key != self._sent[0]:  # they are held for long, and encoded once
             self._sent = (key, self._coder.low_command(order, told, spoil))
-        yield from self._send([(self._body.cmd_topic, self._sent[1])])
+        yield from self._send([(self._robot.cmd_topic, self._sent[1])])
 
     def _keep(self, seconds: float) -> Steps:
         """Send the order as it is."""
@@ -223,32 +223,32 @@ class BodyScript(Script):
 
     def _fastest(self) -> float:
         """The speed of the joint that moves most."""
-        speeds = [abs(v) for v in self._obs.dq.get(BODY, ()) if math.isfinite(v)]
+        speeds = [abs(v) for v in self._obs.dq.get(ROBOT, ()) if math.isfinite(v)]
         return max(speeds, default=0.0)
 
     def _phase(self, name: str, **params: str) -> Phase:
-        return self._begin(name, (BODY,), targets=None, slot=str(self._slot), **params)
+        return self._begin(name, (ROBOT,), targets=None, slot=str(self._slot), **params)
 
     # -- motion -----------------------------------------------------------------------------
 
     def _step(self, name: str, slot: int | None = None, **params: str) -> Steps:
         slot = self._slot if slot is None else slot
         goal = self._order[slot].q + self._inward(slot, STEP)
-        index = self._body.used.index(slot)
-        targets = {BODY: {index: goal}}
-        phase = self._begin(name, (BODY,), targets=targets, slot=str(slot), **params)
+        index = self._robot.used.index(slot)
+        targets = {ROBOT: {index: goal}}
+        phase = self._begin(name, (ROBOT,), targets=targets, slot=str(slot), **params)
         yield from self._ramp({slot: goal}, _RAMP)
         yield from self._keep(_STAND)
         self._end(phase)
 
     def _every_joint(self) -> Steps:
         self._say("moving one joint at a time by 0.2 rad")
-        for slot in self._body.used:
+        for slot in self._robot.used:
             yield from self._step("joint", slot)
 
     def _stiffness(self) -> Steps:
         self._say("a soft joint, a speed, a torque")
-        kp, _ = self._body.client_gains[self._slot]
+        kp, _ = self._robot.client_gains[self._slot]
         soft = kp / 4
         self._order = self._with(kp=soft)
         yield from self._keep(0.2)
@@ -270,7 +270,7 @@ class BodyScript(Script):
         self._catch()
 
     def _torque(self) -> Steps:
-        torque = self._inward(self._slot, _TORQUE_PART * self._body.joint(self._slot).tau_max)
+        torque = self._inward(self._slot, _TORQUE_PART * self._robot.joint(self._slot).tau_max)
         phase = self._phase("torque", torque=repr(torque))
         begin = self._here(self._slot)
         self._order = self._with(kp=0.0, kd=0.0, tau=torque)
@@ -318,7 +318,7 @@ class BodyScript(Script):
 
     def _unused(self) -> Steps:
         order = list(self._order)
-        for slot in set(range(self._body.slots)) - set(self._body.used):
+        for slot in set(range(self._robot.slots)) - set(self._robot.used):
             order[slot] = Motor(q=1.0, dq=0.0, tau=5.0, kp=100.0, kd=3.0, mode=1)
         yield from self._bad("unused", lambda: self._put(order), 0.3)
 
@@ -330,14 +330,14 @@ class BodyScript(Script):
     def _foreign(self) -> Steps:
         yield Join(Role.STRANGER)
         wish = list(self._order)  # of every joint: the families' slots are not the same
-        for slot in self._body.used:
+        for slot in self._robot.used:
             wish[slot] = replace(wish[slot], q=wish[slot].q + self._inward(slot, STEP))
         payload = self._coder.foreign_command(wish)
 
         def send() -> Steps:
             self._next_ns += self._period_ns
             self._obs = yield Send(
-                [(self._body.cmd_topic, payload)], self._next_ns, by=Role.STRANGER
+                [(self._robot.cmd_topic, payload)], self._next_ns, by=Role.STRANGER
             )
 
         yield from self._keep(0.1)
@@ -371,9 +371,9 @@ class BodyScript(Script):
     def _late_joiner(self) -> Steps:
         phase = self._phase("late-joiner")
         yield Join()
-        while self._elapsed(phase) < 2.0 and BODY not in self._obs.joined:
+        while self._elapsed(phase) < 2.0 and ROBOT not in self._obs.joined:
             yield from self._put(self._order)
-        phase.observed[f"first_state_s_{BODY}"] = self._obs.joined.get(BODY)
+        phase.observed[f"first_state_s_{ROBOT}"] = self._obs.joined.get(ROBOT)
         self._end(phase)
         yield Leave()
 

@@ -1,4 +1,4 @@
-"""What an emulated body is made of, and what it forgives. Invented unless a source is named."""
+"""What an emulated robot is made of, and what it forgives. Invented unless a source is named."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ STEP = 0.002  # seconds of a step of the mechanics: one state
 
 @dataclass(frozen=True)
 class Settings:
-    """Parameters of an emulated body.
+    """Parameters of an emulated robot.
 
-    The joints of Unitree's bodies range from 5 to 300 N·m. Inertia and friction are taken in
+    The joints of Unitree's robots range from 5 to 300 N·m. Inertia and friction are taken in
     proportion to that, so that all of them accelerate alike.
 
     :param acceleration: of a joint under its full torque, rad/s².
     :param coulomb: friction torque, part of the joint's full torque.
     :param viscous: friction torque per rad/s, part of the joint's full torque.
-    :param command_timeout: seconds without a command after which the body damps; None takes the
+    :param command_timeout: seconds without a command after which the robot damps; None takes the
         model's.
     :param lenient: obey any mode byte but 0, and commands whose ``mode_machine`` is another
         robot's.
@@ -52,7 +52,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not (self.acceleration > 0 and self.coulomb >= 0 and self.viscous >= 0):
-            raise UsageError("a body needs acceleration, and friction that is not negative")
+            raise UsageError("a robot needs acceleration, and friction that is not negative")
         if self.command_timeout is not None and not self.command_timeout > 0:
             raise UsageError(f"a time-out must be positive, not {self.command_timeout}")
         if self.noise < 0:

@@ -1,4 +1,4 @@
-"""Emulated bodies on a clock that the tests move."""
+"""Emulated robots on a clock that the tests move."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.bodies import BODIES, DQ_STOP, G1, H1, Q_STOP, BodyModel, body
-from dexkit.emulators.body import Body, Remote, Settings
+from dexkit.emulators.robot import Remote, RobotMechanics, Settings
 from dexkit.errors import UsageError
 from dexkit.hand import MotorError
 from dexkit.messages import encode, message_type
+from dexkit.robots import DQ_STOP, G1, H1, Q_STOP, ROBOTS, RobotModel, robot
 from dexkit.wire.low_level import (
     LOW_LEVEL_TYPES,
     encode_with_crc,
@@ -24,9 +24,9 @@ from dexkit.wire.low_level import (
     struct_of_payload,
     verify_payload,
 )
-from tests.body_helpers import Bench, low_cmd
+from tests.robot_helpers import Bench, low_cmd
 
-both = pytest.mark.parametrize("model", list(BODIES.values()), ids=list(BODIES))
+both = pytest.mark.parametrize("model", list(ROBOTS.values()), ids=list(ROBOTS))
 ARM = {"h1": "left_elbow", "g1": "left_elbow"}
 FIELDS = ("q", "dq", "tau", "kp", "kd")
 
@@ -49,7 +49,7 @@ def test_slots() -> None:
 
 
 @both
-def test_joints_make_sense(model: BodyModel) -> None:
+def test_joints_make_sense(model: RobotModel) -> None:
     for slot in model.used:
         joint = model.joint(slot)
         assert joint.q_min < model.rest_q[slot] < joint.q_max
@@ -61,8 +61,8 @@ def test_joints_make_sense(model: BodyModel) -> None:
 
 
 def test_no_such() -> None:
-    with pytest.raises(UsageError, match="no body 'h3'"):
-        body("h3")
+    with pytest.raises(UsageError, match="no robot 'h3'"):
+        robot("h3")
     with pytest.raises(UsageError, match="slot 9 of the h1 has no joint"):
         H1.joint(9)
     with pytest.raises(UsageError, match="no joint 'tail'"):
@@ -73,7 +73,7 @@ def test_no_such() -> None:
 
 
 @both
-def test_joints_go_where_they_are_told(model: BodyModel) -> None:
+def test_joints_go_where_they_are_told(model: RobotModel) -> None:
     bench = Bench(model)
     goal = {}
     for slot in model.used:
@@ -89,7 +89,7 @@ def test_joints_go_where_they_are_told(model: BodyModel) -> None:
 
 
 @both
-def test_state_before_any_command(model: BodyModel) -> None:
+def test_state_before_any_command(model: RobotModel) -> None:
     bench = Bench(model)
     state = bench.run(0.5)
     assert [m.q for m in state.motor_state] == pytest.approx(model.rest_q)
@@ -107,7 +107,7 @@ def test_state_before_any_command(model: BodyModel) -> None:
 
 
 @both
-def test_torque_law(model: BodyModel) -> None:
+def test_torque_law(model: RobotModel) -> None:
     """tau = tau_ff + kp (q_des - q) + kd (dq_des - dq), reported at the end of the step."""
     bench = Bench(model)
     slot = model.slot("left_elbow")
@@ -119,7 +119,7 @@ def test_torque_law(model: BodyModel) -> None:
 
 
 @both
-def test_limits_of_torque_speed_and_travel(model: BodyModel) -> None:
+def test_limits_of_torque_speed_and_travel(model: RobotModel) -> None:
     bench = Bench(model)
     slot = model.slot("right_elbow")
     joint = model.joint(slot)
@@ -139,7 +139,7 @@ def test_limits_of_torque_speed_and_travel(model: BodyModel) -> None:
 
 
 @both
-def test_off_is_limp(model: BodyModel) -> None:
+def test_off_is_limp(model: RobotModel) -> None:
     slot, other = model.slot("left_knee"), model.slot("right_knee")
     mode = [0 if i == slot else m for i, m in enumerate(model.enable)]
     bench = Bench(model)
@@ -153,7 +153,7 @@ def test_off_is_limp(model: BodyModel) -> None:
 
 
 @both
-def test_turning_off_lets_it_coast(model: BodyModel) -> None:
+def test_turning_off_lets_it_coast(model: RobotModel) -> None:
     slot = model.slot("waist_yaw")
     bench = Bench(model)
     spin = {slot: {"kp": 0.0, "kd": 5.0, "dq": 3.0}}
@@ -172,7 +172,7 @@ def test_mode_of_another_kind_of_motor() -> None:
     state = bench.run(1.0, order)
     assert state.motor_state[hip].q == pytest.approx(H1.rest_q[hip])
     assert state.motor_state[elbow].q == pytest.approx(0.8, abs=0.01)
-    assert bench.body.counters.wrong_mode == bench.body.counters.commands == 250
+    assert bench.robot.counters.wrong_mode == bench.robot.counters.commands == 250
     assert len(bench.reports) == 1
     assert "mode 0x01 for motor 0 (right_hip_roll), which takes 0x0A" in bench.reports[0]
     lenient = Bench(H1, Settings(lenient=True))
@@ -183,7 +183,7 @@ def test_mode_of_another_kind_of_motor() -> None:
 
 
 @both
-def test_stop_constants(model: BodyModel) -> None:
+def test_stop_constants(model: RobotModel) -> None:
     """Position and velocity terms can be left out with kp and kd set
     (docs/sources/unitree-dex.md#a8).
     """
@@ -201,54 +201,54 @@ def test_stop_constants(model: BodyModel) -> None:
 @both
 @settings(max_examples=60)
 @given(st.data(), st.sampled_from(FIELDS), st.sampled_from([math.nan, math.inf, -math.inf]))
-def test_one_number_that_is_none(model: BodyModel, data: Any, field: str, value: float) -> None:
+def test_one_number_that_is_none(model: RobotModel, data: Any, field: str, value: float) -> None:
     bench = Bench(model)
     slot = data.draw(st.sampled_from(model.used))
     assert not bench.send(low_cmd(model, change={slot: {field: value}}))
-    assert bench.body.counters.bad_number == 1
-    assert not bench.body.driven
+    assert bench.robot.counters.bad_number == 1
+    assert not bench.robot.driven
     assert "NaN or infinity" in bench.reports[0]
 
 
 @both
 @settings(max_examples=100)
 @given(st.data())
-def test_no_flipped_bit_is_obeyed(model: BodyModel, data: Any) -> None:
+def test_no_flipped_bit_is_obeyed(model: RobotModel, data: Any) -> None:
     bench = Bench(model)
     good = encode_with_crc(low_cmd(model))
     image = bytearray(struct_of_payload(model.cmd_type, good))
     bit = data.draw(st.integers(0, 8 * len(image) - 1))
     image[bit // 8] ^= 1 << bit % 8
     bad = payload_of_struct(model.cmd_type, bytes(image))
-    obeyed = bench.body.command(bad, 0.0)
+    obeyed = bench.robot.command(bad, 0.0)
     assert obeyed == (bad == good)  # the gaps of the struct are not sent
     if not obeyed:
-        assert bench.body.counters.bad_crc == 1
+        assert bench.robot.counters.bad_crc == 1
         assert "the CRC is 0x" in bench.reports[0]
 
 
 @both
 @settings(max_examples=50)
 @given(st.binary(max_size=1100))
-def test_garbage(model: BodyModel, data: bytes) -> None:
+def test_garbage(model: RobotModel, data: bytes) -> None:
     bench = Bench(model)
-    assert not bench.body.command(data, 0.0)
-    assert bench.body.counters.malformed == 1
+    assert not bench.robot.command(data, 0.0)
+    assert bench.robot.counters.malformed == 1
 
 
 @both
-def test_either_byte_order_and_an_unset_crc(model: BodyModel) -> None:
+def test_either_byte_order_and_an_unset_crc(model: RobotModel) -> None:
     bench = Bench(model)
-    assert not bench.body.command(encode(low_cmd(model)), 0.0)
+    assert not bench.robot.command(encode(low_cmd(model)), 0.0)
     assert "(it was never set)" in bench.reports[0]
-    assert bench.body.command(encode_with_crc(low_cmd(model)), 0.0)
+    assert bench.robot.command(encode_with_crc(low_cmd(model)), 0.0)
 
 
 def test_mode_machine() -> None:
     order = low_cmd(G1, mode_machine=0)
     bench = Bench(G1)
     assert not bench.send(order)
-    assert bench.body.counters.bad_machine == 1
+    assert bench.robot.counters.bad_machine == 1
     assert "mode_machine is 0 and should be 5" in bench.reports[0]
     assert Bench(G1, Settings(lenient=True)).send(order)
     other = Bench(dataclasses.replace(G1, mode_machine=13))
@@ -270,7 +270,7 @@ def test_head_of_a_go_command() -> None:
 
 
 @both
-def test_silence_damps(model: BodyModel) -> None:
+def test_silence_damps(model: RobotModel) -> None:
     slot = model.slot("waist_yaw")
     bench = Bench(model)
     spin = {slot: {"kp": 0.0, "kd": 50.0, "dq": 1.0, "q": 0.0}}
@@ -280,7 +280,7 @@ def test_silence_damps(model: BodyModel) -> None:
     state = bench.run(1.0)
     assert state.motor_state[slot].dq == pytest.approx(0.0, abs=1e-3)
     assert {m.mode for m in state.motor_state} == {0}
-    assert bench.body.counters.timeouts == 1
+    assert bench.robot.counters.timeouts == 1
     assert "no command for 1 s" in bench.reports[0]
     rested = state.motor_state[slot].q
     assert bench.run(1.0).motor_state[slot].q == pytest.approx(rested, abs=1e-3)
@@ -296,7 +296,7 @@ def test_silence_damps(model: BodyModel) -> None:
 
 
 @both
-def test_arm_topic(model: BodyModel) -> None:
+def test_arm_topic(model: RobotModel) -> None:
     """As Unitree's examples send it: no CRC, no mode bytes, a weight in a slot not used."""
     arm, leg = model.slot("left_elbow"), model.slot("left_knee")
     bench = Bench(model)
@@ -308,7 +308,7 @@ def test_arm_topic(model: BodyModel) -> None:
             mode=[0] * model.slots,
             change={model.weight_slot: {"mode": 0, "q": weight}},
         )
-        assert bench.body.arm_command(encode(order), bench.now)
+        assert bench.robot.arm_command(encode(order), bench.now)
 
     def run(weight: float) -> Any:
         for _ in range(200):
@@ -328,22 +328,22 @@ def test_arm_topic(model: BodyModel) -> None:
     assert bench.send(low_cmd(model, {arm: 0.0}))
     state = run(0.5)
     assert state.motor_state[arm].q == pytest.approx(0.5, abs=0.02)
-    assert bench.body.counters.arm_commands == 600
+    assert bench.robot.counters.arm_commands == 600
     assert bench.run(1.5).motor_state[arm].mode == 0  # both have been silent
-    assert bench.body.counters.timeouts == 2
+    assert bench.robot.counters.timeouts == 2
 
 
 @both
-def test_arm_topic_refuses_what_is_wrong(model: BodyModel) -> None:
+def test_arm_topic_refuses_what_is_wrong(model: RobotModel) -> None:
     bench = Bench(model)
     order = encode_with_crc(low_cmd(model))
     wrong = order[:-4] + struct.pack("<I", 12345)
-    assert not bench.body.arm_command(wrong, 0.0)
-    assert not bench.body.arm_command(
+    assert not bench.robot.arm_command(wrong, 0.0)
+    assert not bench.robot.arm_command(
         encode(low_cmd(model, change={model.weight_slot: {"q": math.nan}})), 0.0
     )
-    assert bench.body.counters.summary() == "bad crc 1, bad number 1"
-    assert bench.body.arm_command(order, 0.0)
+    assert bench.robot.counters.summary() == "bad crc 1, bad number 1"
+    assert bench.robot.arm_command(order, 0.0)
 
 
 # ----------------------------------------------------------------------------------- states
@@ -352,7 +352,7 @@ def test_arm_topic_refuses_what_is_wrong(model: BodyModel) -> None:
 @both
 @settings(max_examples=20, deadline=None)
 @given(st.data())
-def test_nothing_that_is_sent_breaks_it(model: BodyModel, data: Any) -> None:
+def test_nothing_that_is_sent_breaks_it(model: RobotModel, data: Any) -> None:
     """States stay finite, within the limits, with a right CRC, whatever finite is commanded."""
     bench = Bench(model)
     number = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -363,7 +363,7 @@ def test_nothing_that_is_sent_breaks_it(model: BodyModel, data: Any) -> None:
         }
         assert bench.send(low_cmd(model, change=change))
         bench.run(0.05)
-        sample = bench.body.state(bench.now)
+        sample = bench.robot.state(bench.now)
         assert verify_payload(model.state_type, sample)
         state = message_type(model.state_type).decode(sample)
         for slot in model.used:
@@ -375,13 +375,13 @@ def test_nothing_that_is_sent_breaks_it(model: BodyModel, data: Any) -> None:
 
 
 @both
-def test_the_same_commands_give_the_same_states(model: BodyModel) -> None:
+def test_the_same_commands_give_the_same_states(model: RobotModel) -> None:
     def run() -> list[bytes]:
         bench = Bench(model, Settings(noise=1.0, seed=3))
         out = []
         for _ in range(20):
             bench.run(0.02, low_cmd(model, {model.used[3]: 0.7}))
-            out.append(bench.body.state(bench.now))
+            out.append(bench.robot.state(bench.now))
         return out
 
     assert run() == run()
@@ -396,7 +396,7 @@ def test_noise_of_the_imu() -> None:
 
 
 @both
-def test_work_warms_and_drains(model: BodyModel) -> None:
+def test_work_warms_and_drains(model: RobotModel) -> None:
     slot = model.slot("left_knee")
     bench = Bench(model, Settings(warm_up=5.0, capacity=1.0))
     before = bench.state()
@@ -419,26 +419,26 @@ def test_settings_keep_temperatures_in_range() -> None:
 
 
 @both
-def test_a_long_pause_is_not_lived_through(model: BodyModel) -> None:
+def test_a_long_pause_is_not_lived_through(model: RobotModel) -> None:
     bench = Bench(model)
     slot = model.slot("waist_yaw")
     bench.run(0.2, low_cmd(model, change={slot: {"kp": 0.0, "kd": 50.0, "dq": 1.0}}))
-    before = bench.body.position(slot)
-    bench.body.advance(bench.now + 0.9)
-    assert bench.body.position(slot) - before == pytest.approx(0.1, abs=0.02)
+    before = bench.robot.position(slot)
+    bench.robot.advance(bench.now + 0.9)
+    assert bench.robot.position(slot) - before == pytest.approx(0.1, abs=0.02)
 
 
 @both
-def test_remote(model: BodyModel) -> None:
+def test_remote(model: RobotModel) -> None:
     bench = Bench(model)
-    bench.body.remote = Remote.parse("A, R1,lx=0.5,ry=-1")
+    bench.robot.remote = Remote.parse("A, R1,lx=0.5,ry=-1")
     sent = bytes(bench.state().wireless_remote)
     keys, lx, rx, ry, l2, ly = struct.unpack_from("<2xH5f", sent)
     assert keys == 1 << 8 | 1
     assert (lx, rx, ry, l2, ly) == (0.5, 0, -1, 0, 0)
-    message = bench.body.remote_message()
+    message = bench.robot.remote_message()
     assert (message.keys, message.lx, message.ry, message.ly) == (keys, 0.5, -1, 0)
-    bench.body.remote = Remote.parse("")
+    bench.robot.remote = Remote.parse("")
     assert not any(bytes(bench.state().wireless_remote))
 
 
@@ -461,6 +461,6 @@ def test_structs_and_samples(name: str, noise: bytes) -> None:
         payload_of_struct(name, image[:-1])
 
 
-def test_body_without_settings() -> None:
-    assert Body(H1).timeout == H1.command_timeout
-    assert Body(H1, Settings(command_timeout=0.2)).timeout == 0.2
+def test_robot_without_settings() -> None:
+    assert RobotMechanics(H1).timeout == H1.command_timeout
+    assert RobotMechanics(H1, Settings(command_timeout=0.2)).timeout == 0.2

@@ -1,7 +1,7 @@
-"""A robot's body as the kit sees it: its dialect, its messages, and a recording of it.
+"""A robot as the kit sees it: its dialect, its messages, and a recording of it.
 
-A body is judged like a hand that has no sides: where a hand has a side, it has
-:data:`~dexkit.conformance.phases.BODY`. Its joints are those of the used motor slots, in their
+A robot is judged like a hand that has no sides: where a hand has a side, it has
+:data:`~dexkit.conformance.phases.ROBOT`. Its joints are those of the used motor slots, in their
 order. What is its own: a CRC in each message, and slots that are not used.
 """
 
@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.bodies import BODIES, H1, BodyModel, body
-from dexkit.conformance.phases import BODY, RECORD, Stimulus
+from dexkit.conformance.phases import RECORD, ROBOT, Stimulus
 from dexkit.conformance.view import Commands, Recording, SideView, States, TraceLike
 from dexkit.conformance.wire import Motor, Motors, Wire
 from dexkit.errors import ConformanceError, UsageError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import Dialect
+from dexkit.robots import H1, ROBOTS, RobotModel, robot
 from dexkit.topics import HAND_TOPICS
 from dexkit.traces import SampleArray
 from dexkit.wire.crc32 import crc32_words
@@ -31,12 +31,12 @@ from dexkit.wire.low_level import encode_with_crc, verify_payload
 
 __all__ = [
     "SPOILS",
-    "BodyRecording",
-    "BodyWire",
-    "body_dialect",
-    "body_in",
-    "body_recording",
+    "RobotRecording",
+    "RobotWire",
     "recording_of",
+    "robot_dialect",
+    "robot_in",
+    "robot_recording",
     "wire_for",
 ]
 
@@ -44,12 +44,12 @@ Flags = NDArray[np.bool_]
 
 
 @cache
-def body_dialect(name: str) -> Dialect:
-    """How a body speaks, in the form that hands have.
+def robot_dialect(name: str) -> Dialect:
+    """How a robot speaks, in the form that hands have.
 
-    :raises UsageError: there is no such body.
+    :raises UsageError: there is no such robot.
     """
-    model = body(name)
+    model = robot(name)
     return Dialect(
         name=model.name,
         model=model.name,
@@ -57,7 +57,7 @@ def body_dialect(name: str) -> Dialect:
         state_topic=model.state_topic,
         cmd_type=model.cmd_type,
         state_type=model.state_type,
-        index={BODY: 0},
+        index={ROBOT: 0},
         length=model.slots,
         q_open=math.nan,
         summary=f"{model.title} on Unitree's low-level topics",
@@ -72,22 +72,22 @@ SPOILS = {
 """Wrong CRCs of commands."""
 
 
-class BodyWire(Wire):
-    """Encodes commands and reads states of a body.
+class RobotWire(Wire):
+    """Encodes commands and reads states of a robot.
 
     :ivar machine: ``mode_machine`` of the last state that was read; commands repeat it.
     """
 
     def __init__(self, dialect: Dialect) -> None:
         self.dialect = dialect
-        self.body: BodyModel = body(dialect.model)
-        self.joints = len(self.body.used)
+        self.robot: RobotModel = robot(dialect.model)
+        self.joints = len(self.robot.used)
         self.command = message_type(dialect.cmd_type)
         self.state = message_type(dialect.state_type)
-        other = next(b for b in BODIES.values() if b.family != self.body.family)
+        other = next(b for b in ROBOTS.values() if b.family != self.robot.family)
         self.foreign = message_type(other.cmd_type)
-        self.command_topics = {BODY: dialect.cmd_topic}
-        self.state_topics = {BODY: dialect.state_topic}
+        self.command_topics = {ROBOT: dialect.cmd_topic}
+        self.state_topics = {ROBOT: dialect.state_topic}
         self.shared = False
         self.machine = 0
 
@@ -96,11 +96,11 @@ class BodyWire(Wire):
     ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """(q, dq) of the used slots.
 
-        :raises WireError: the payload is not of the body's state type.
+        :raises WireError: the payload is not of the robot's state type.
         """
         message = self.state.decode(data)
         self.machine = getattr(message, "mode_machine", 0)
-        motors = [message.motor_state[slot] for slot in self.body.used]
+        motors = [message.motor_state[slot] for slot in self.robot.used]
         return tuple(m.q for m in motors), tuple(m.dq for m in motors)
 
     def low_command(self, motors: Motors, machine: int, spoil: str = "") -> bytes:
@@ -133,39 +133,39 @@ class BodyWire(Wire):
 
 
 def wire_for(dialect: Dialect) -> Wire:
-    """The messages of a hand's or a body's dialect."""
-    return BodyWire(dialect) if dialect.model in BODIES else Wire(dialect)
+    """The messages of a hand's or a robot's dialect."""
+    return RobotWire(dialect) if dialect.model in ROBOTS else Wire(dialect)
 
 
 @dataclass(frozen=True, eq=False)
-class BodyRecording(Recording):
-    """A recording of a body, decoded.
+class RobotRecording(Recording):
+    """A recording of a robot, decoded.
 
     :param low: its states, all members; None without any.
     :param payloads: of the states, likewise of the commands.
     """
 
-    body: BodyModel = H1
+    robot: RobotModel = H1
     low: Columns | None = None
     payloads: Sequence[bytes] = field(default=(), repr=False)
     command_payloads: Sequence[bytes] = field(default=(), repr=False)
 
-    layer = "body"
+    layer = "robot"
 
     @property
     def model(self) -> Any:
-        """The body: it has a model's name, title and rates."""
-        return self.body
+        """The robot: it has a model's name, title and rates."""
+        return self.robot
 
     @cached_property
     def intact(self) -> Flags:
         """Which states decode and carry the right CRC."""
-        return _intact(self.body.state_type, self.payloads)
+        return _intact(self.robot.state_type, self.payloads)
 
     @cached_property
     def commands_intact(self) -> Flags:
         """Which commands do."""
-        return _intact(self.body.cmd_type, self.command_payloads)
+        return _intact(self.robot.cmd_type, self.command_payloads)
 
 
 def _intact(type_name: str, payloads: Sequence[bytes]) -> Flags:
@@ -178,25 +178,25 @@ def _intact(type_name: str, payloads: Sequence[bytes]) -> Flags:
     return np.fromiter(map(good, payloads), dtype=np.bool_, count=len(payloads))
 
 
-def body_in(trace: TraceLike) -> BodyModel | None:
-    """The body whose topics, of its types, are in a recording; None without any."""
+def robot_in(trace: TraceLike) -> RobotModel | None:
+    """The robot whose topics, of its types, are in a recording; None without any."""
     seen = {(c.topic, c.type_name) for c in trace.channels}
     seen |= {(e.topic, e.type_name) for e in trace.endpoints}
-    # the state first: a client of the other robot, the kit among them, is no body
+    # the state first: a client of the other robot, the kit among them, is no robot
     for topic in ("state", "cmd"):
-        for model in BODIES.values():
+        for model in ROBOTS.values():
             if (getattr(model, f"{topic}_topic"), getattr(model, f"{topic}_type")) in seen:
                 return model
     return None
 
 
-def body_recording(trace: TraceLike, name: str) -> BodyRecording:
-    """Decode the part of ``trace`` that is about a body.
+def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
+    """Decode the part of ``trace`` that is about a robot.
 
-    :raises ConformanceError: it has none of the body's topics.
+    :raises ConformanceError: it has none of the robot's topics.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
-    model, dialect = body(name), body_dialect(name)
+    model, dialect = robot(name), robot_dialect(name)
     stimulus = Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
     present = {c.topic for c in trace.channels if c.message_count}
     topics = {model.cmd_topic, model.state_topic}
@@ -215,7 +215,7 @@ def body_recording(trace: TraceLike, name: str) -> BodyRecording:
     low = states.columns() if states is not None else None
     with np.errstate(invalid="ignore"):
         hand = SideView(
-            BODY,
+            ROBOT,
             _states(model, states, low, origin),
             _commands(model, commands, origin),
             tuple(model.joint(slot) for slot in model.used),
@@ -223,17 +223,17 @@ def body_recording(trace: TraceLike, name: str) -> BodyRecording:
     notes = [text for text in trace.warnings if not text.startswith(f"{model.cmd_topic} carries ")]
     if trace.truncated:
         notes.append("the recording is unfinished; it is judged as far as it goes")
-    return BodyRecording(
+    return RobotRecording(
         dialect=dialect,
         origin_ns=origin,
         duration=(end - origin) / 1e9,
-        sides={BODY: hand},
+        sides={ROBOT: hand},
         channels=trace.channels,
         endpoints=trace.endpoints,
         stimulus=stimulus,
-        judged=(BODY,),
+        judged=(ROBOT,),
         notes=notes,
-        body=model,
+        robot=model,
         low=low,
         payloads=states.payloads if states is not None else (),
         command_payloads=commands.payloads if commands is not None else (),
@@ -241,22 +241,22 @@ def body_recording(trace: TraceLike, name: str) -> BodyRecording:
 
 
 def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
-    """Decode a recording of hands or of a body.
+    """Decode a recording of hands or of a robot.
 
     :param dialect_name: None to take what the topics show: hands, if there are any.
     :raises ConformanceError: it has none of their topics.
-    :raises UsageError: sides of a body.
+    :raises UsageError: sides of a robot.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
     name = dialect_name
     if name is None:
         topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
-        found = None if topics & HAND_TOPICS else body_in(trace)
+        found = None if topics & HAND_TOPICS else robot_in(trace)
         name = found.name if found else None
-    if name in BODIES:
-        if sides not in ((), (BODY,)):
-            raise UsageError("a body has no sides", hint="leave --side out")
-        return body_recording(trace, name)
+    if name in ROBOTS:
+        if sides not in ((), (ROBOT,)):
+            raise UsageError("a robot has no sides", hint="leave --side out")
+        return robot_recording(trace, name)
     return Recording.of(trace, dialect_name=name, sides=sides)
 
 
@@ -272,12 +272,12 @@ def _times(samples: SampleArray, origin: int) -> tuple[Floats, Floats]:
     return (samples.log_time_ns - origin) / 1e9, sent
 
 
-def _used(columns: Columns, model: BodyModel, member: str) -> Floats:
+def _used(columns: Columns, model: RobotModel, member: str) -> Floats:
     return np.ascontiguousarray(columns[member].T[list(model.used)]).T
 
 
 def _states(
-    model: BodyModel, samples: SampleArray | None, columns: Columns | None, origin: int
+    model: RobotModel, samples: SampleArray | None, columns: Columns | None, origin: int
 ) -> States:
     if samples is None or columns is None:
         never, none = np.empty(0), np.empty((0, len(model.used)))
@@ -299,7 +299,7 @@ def _states(
     )
 
 
-def _commands(model: BodyModel, samples: SampleArray | None, origin: int) -> Commands:
+def _commands(model: RobotModel, samples: SampleArray | None, origin: int) -> Commands:
     if samples is None:
         none = np.empty((0, len(model.used)))
         return Commands(

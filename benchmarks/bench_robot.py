@@ -1,4 +1,4 @@
-"""The 500 Hz loop of an emulated body: command in, step of the mechanics, state out."""
+"""The 500 Hz loop of an emulated robot: command in, step of the mechanics, state out."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import timeit
 from collections.abc import Callable
 
 from benchmarks import Result
-from dexkit.bodies import BODIES, BodyModel
 from dexkit.dds import cyclone_type
-from dexkit.emulators.body import Body
+from dexkit.emulators.robot import RobotMechanics
 from dexkit.messages import message_type
+from dexkit.robots import ROBOTS, RobotModel
 from dexkit.wire.low_level import encode_with_crc
 
 ROUNDS = 40
@@ -25,7 +25,7 @@ def _best(function: Callable[[], object], number: int = TICKS) -> float:
     return min(runs) / number * 1e6
 
 
-def _order(model: BodyModel) -> bytes:
+def _order(model: RobotModel) -> bytes:
     """The rest position, held."""
     kind = message_type(model.cmd_type)
     message = kind.decode(kind.encode(kind.cls()))
@@ -41,20 +41,20 @@ def _order(model: BodyModel) -> bytes:
 def run() -> list[Result]:
     """Times of the loop and of its state alone."""
     results = []
-    for model in BODIES.values():
-        body = Body(model)
+    for model in ROBOTS.values():
+        robot = RobotMechanics(model)
         order = _order(model)
         now = 0.0
 
-        def tick(body: Body = body, order: bytes = order) -> None:
+        def tick(robot: RobotMechanics = robot, order: bytes = order) -> None:
             nonlocal now
-            now += 1.0 / body.model.state_rate
-            body.command(order, now)
-            body.advance(now)
-            body.state(now)
+            now += 1.0 / robot.model.state_rate
+            robot.command(order, now)
+            robot.advance(now)
+            robot.state(now)
 
         spent = _best(tick)
-        assert body.counters.commands == body.counters.states == ROUNDS * TICKS
+        assert robot.counters.commands == robot.counters.states == ROUNDS * TICKS
         period = 1e6 / model.state_rate
         results.append(
             Result(
@@ -70,8 +70,8 @@ def run() -> list[Result]:
             )
         )
         cls = cyclone_type(model.state_type)
-        peer = cls.deserialize(body.state(now))
-        ours = _best(lambda body=body: body.state(now))  # type: ignore[misc]  # noqa: B023
+        peer = cls.deserialize(robot.state(now))
+        ours = _best(lambda robot=robot: robot.state(now))  # type: ignore[misc]  # noqa: B023
         theirs = _best(peer.serialize, 10)
         results.append(
             Result(

@@ -1,4 +1,4 @@
-"""``dexkit emulate h1`` and ``dexkit emulate g1``: an emulated robot body on Unitree's topics."""
+"""``dexkit emulate h1`` and ``dexkit emulate g1``: an emulated robot robot on Unitree's topics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.bodies import G1, H1, BodyModel
 from dexkit.cli.common import (
     MOST_REMARKS,
     SEED,
@@ -25,20 +24,21 @@ from dexkit.cli.common import (
 )
 from dexkit.cli.emulate.stdin import read_faults
 from dexkit.errors import DdsError, TopicConflict
+from dexkit.robots import G1, H1, RobotModel
 
 if TYPE_CHECKING:
-    from dexkit.emulators.body import EmulatedBody
+    from dexkit.emulators.robot import EmulatedRobot
 
 __all__ = ["emulate_g1", "emulate_h1"]
 
-log = logging.getLogger("dexkit.body")
+log = logging.getLogger("dexkit.robot")
 
 _STATUS_PERIOD = 0.5  # seconds
 _JSON_PERIOD = 1.0
 
 
-def _command(model: BodyModel) -> click.Command:
-    """The command of one body."""
+def _command(model: RobotModel) -> click.Command:
+    """The command of one robot."""
 
     def emulate(
         domain: int,
@@ -55,7 +55,7 @@ def _command(model: BodyModel) -> click.Command:
         quiet: bool,
         mode_machine: int | None = None,
     ) -> None:
-        from dexkit.emulators.body import EmulatedBody, Remote, Settings
+        from dexkit.emulators.robot import EmulatedRobot, Remote, Settings
         from dexkit.service.realtime import prepare_process
         from dexkit.service.realtime import real_time as real_time_priority
 
@@ -64,10 +64,10 @@ def _command(model: BodyModel) -> click.Command:
         settings = Settings(lenient=lenient, noise=noise, seed=seed)
         status = StatusLine(quiet)
         log_to_stderr(quiet=True, status=status.on_terminal, always=log.name)
-        robot = EmulatedBody(
+        robot = EmulatedRobot(
             chosen, domain=domain, interface=interface, settings=settings, force=force
         )
-        robot.body.remote = held
+        robot.robot.remote = held
         with (
             # before its thread is started, which inherits it
             real_time_priority() if real_time else nullcontext(True),
@@ -78,7 +78,7 @@ def _command(model: BodyModel) -> click.Command:
             if remote_from_stdin:
 
                 def press(text: str) -> None:
-                    robot.body.remote = Remote.parse("" if text == "release" else text)
+                    robot.robot.remote = Remote.parse("" if text == "release" else text)
 
                 read_faults(press, stop)
             click.echo(
@@ -93,10 +93,10 @@ def _command(model: BodyModel) -> click.Command:
         if robot.failure is not None:
             raise DdsError(f"the {chosen.name} died: {robot.failure}") from robot.failure
         if not as_json:
-            click.echo(f"stopped: {robot.body.counters.summary() or 'no state was published'}")
+            click.echo(f"stopped: {robot.robot.counters.summary() or 'no state was published'}")
 
     machine = f"\n    mode_machine is {model.mode_machine}, and commands must repeat it."
-    emulate.__doc__ = f"""Emulate the body of an {model.name.upper()} on Unitree's low-level topics.
+    emulate.__doc__ = f"""Emulate an {model.name.upper()} on Unitree's low-level topics.
 
     {model.cmd_topic}, {model.arm_topic} and {model.state_topic} with {model.family} messages:
     {len(model.used)} joints in {model.slots} motor slots on a fixed base, IMU, battery and remote.
@@ -164,7 +164,7 @@ _OPTIONS = [
 
 
 def _watch(
-    robot: EmulatedBody,
+    robot: EmulatedRobot,
     stop: StopRequest,
     duration: float | None,
     *,
@@ -174,7 +174,7 @@ def _watch(
     """Until told to stop: tell how it is doing."""
     period = _JSON_PERIOD if as_json else _STATUS_PERIOD
     end = None if duration is None else time.monotonic() + duration
-    counters = robot.body.counters
+    counters = robot.robot.counters
     then, states, orders = time.monotonic(), counters.states, counters.commands
     state_rate = command_rate = 0.0
     said: set[str] = set()
@@ -192,10 +192,10 @@ def _watch(
             then, states, orders = now, counters.states, counters.commands
         if as_json:
             line = {
-                "body": robot.model.name,
+                "robot": robot.model.name,
                 "state_hz": round(state_rate, 1),
                 "command_hz": round(command_rate, 1),
-                "driven": robot.body.driven,
+                "driven": robot.robot.driven,
                 "readers": robot.clients,
                 "commanders": robot.commanders,
                 "missed": robot.missed,
@@ -204,7 +204,7 @@ def _watch(
             click.echo(json.dumps(line))
             sys.stdout.flush()
         elif status:
-            what = "driven" if robot.body.driven else "damping"
+            what = "driven" if robot.robot.driven else "damping"
             ignored = counters.bad_crc + counters.bad_number + counters.bad_machine
             text = (
                 f"{robot.model.name} {what}; state {state_rate:.0f} Hz, {robot.clients} readers; "

@@ -1,20 +1,20 @@
-"""Commands for emulated bodies, and a body that is driven by hand."""
+"""Commands for emulated robots, and a robot that is driven by hand."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dexkit.bodies import BodyModel
-from dexkit.emulators.body import Body, Settings
+from dexkit.emulators.robot import RobotMechanics, Settings
 from dexkit.messages import message_type, unitree_go, unitree_hg
+from dexkit.robots import RobotModel
 from dexkit.wire.low_level import encode_with_crc
 
 __all__ = ["Bench", "low_cmd"]
 
 
 def low_cmd(
-    model: BodyModel,
+    model: RobotModel,
     q: Mapping[int, float] | None = None,
     *,
     mode: Sequence[int] | None = None,
@@ -47,28 +47,28 @@ def low_cmd(
 
 
 class Bench:
-    """A body on a clock that only the test moves."""
+    """A robot on a clock that only the test moves."""
 
-    def __init__(self, model: BodyModel, settings: Settings | None = None) -> None:
+    def __init__(self, model: RobotModel, settings: Settings | None = None) -> None:
         self.model = model
         self.reports: list[str] = []
-        self.body = Body(model, settings, report=self.reports.append)
+        self.robot = RobotMechanics(model, settings, report=self.reports.append)
         self.now = 0.0
 
     def send(self, message: Any) -> bool:
         """Give it a command with the right CRC; whether it is obeyed."""
-        return self.body.command(encode_with_crc(message), self.now)
+        return self.robot.command(encode_with_crc(message), self.now)
 
     def run(self, seconds: float, message: Any = None, hz: float = 250.0) -> Any:
         """Let time pass, a command repeated meanwhile; the state at the end, decoded."""
         data = None if message is None else encode_with_crc(message)
         for _ in range(round(seconds * hz)):
             if data is not None:
-                assert self.body.command(data, self.now)
+                assert self.robot.command(data, self.now)
             self.now += 1.0 / hz
-            self.body.advance(self.now)
+            self.robot.advance(self.now)
         return self.state()
 
     def state(self) -> Any:
         """The state, decoded."""
-        return message_type(self.model.state_type).decode(self.body.state(self.now))
+        return message_type(self.model.state_type).decode(self.robot.state(self.now))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.bodies import BodyModel
-from dexkit.emulators.body.joints import Joints
-from dexkit.emulators.body.settings import Settings
+from dexkit.emulators.robot.joints import Joints
+from dexkit.emulators.robot.settings import Settings
+from dexkit.robots import RobotModel
 
 __all__ = ["Supply"]
 
@@ -31,7 +31,7 @@ class Supply:
     :ivar power: W drawn at the last look.
     """
 
-    def __init__(self, model: BodyModel, joints: Joints, settings: Settings) -> None:
+    def __init__(self, model: RobotModel, joints: Joints, settings: Settings) -> None:
         self.cells = _CELLS[model.family]
         self._joints = joints
         self._settings = settings

@@ -1,6 +1,6 @@
-"""The body of a Dex5-1: 20 joints, each moved alone.
+"""The mechanics of a Dex5-1: 20 joints, each moved alone.
 
-:mod:`dexkit.emulators.finger_body` has the mechanics. From Unitree's URDF: the joints' limits,
+:mod:`dexkit.emulators.finger_mechanics` has the mechanics. From Unitree's URDF: the joints' limits,
 speeds and torques, which look like place-holders in part (docs/sources/unitree-dex.md#b5). The rest
 is assumed, so that the joints follow xr_teleoperate's gains without swinging: inertia, friction,
 brake, heat.
@@ -11,11 +11,11 @@ source says what a Dex5-1 publishes.
 
 from __future__ import annotations
 
-from dexkit.emulators.finger_body import FingerBody, MotorModel
+from dexkit.emulators.finger_mechanics import FingerMechanics, MotorModel
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX5_1
 
-__all__ = ["Dex5Body"]
+__all__ = ["Dex5Mechanics"]
 
 
 def _motor(spec: JointSpec, *, inertia: float, brake: float, coulomb: float) -> MotorModel:
@@ -34,11 +34,11 @@ def _motor(spec: JointSpec, *, inertia: float, brake: float, coulomb: float) -> 
     )
 
 
-class Dex5Body(FingerBody):
+class Dex5Mechanics(FingerMechanics):
     """A Dex5-1 hand without its electronics.
 
     :param object_at: how far the flexing joints close before they touch an object; see
-        :class:`~dexkit.emulators.finger_body.FingerBody`.
+        :class:`~dexkit.emulators.finger_mechanics.FingerMechanics`.
     :raises UsageError: a parameter is out of range.
     """
 

@@ -1,8 +1,8 @@
-"""The body of a hand of several joints: a motor for each, and what it runs into.
+"""The mechanics of a hand of several joints: a motor for each, and what it runs into.
 
-Pure: no clock, no wire, no DDS. Whoever owns it calls :meth:`FingerBody.step` as time passes.
-:mod:`dexkit.emulators.dex3_body` and :mod:`dexkit.emulators.dex5_body` say which motors a hand
-has, and what else there is of it.
+Pure: no clock, no wire, no DDS. Whoever owns it calls :meth:`FingerMechanics.step` as time passes.
+:mod:`dexkit.emulators.dex3_mechanics` and :mod:`dexkit.emulators.dex5_mechanics` say which motors
+a hand has, and what else there is of it.
 
 Stops, objects and heat are assumed. Not modelled: gravity on the fingers, links and their
 collisions (every joint moves alone), the coupling of a finger's joints through an object,
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.emulators.mechanics import Joint, Wall
+from dexkit.emulators.joint_mechanics import Joint, Wall
 from dexkit.errors import UsageError
 from dexkit.hand import (
     Floats,
@@ -31,7 +31,7 @@ from dexkit.hand import (
 )
 from dexkit.models import HandModel
 
-__all__ = ["AMBIENT", "SETTINGS", "STEP", "FingerBody", "MotorModel"]
+__all__ = ["AMBIENT", "SETTINGS", "STEP", "FingerMechanics", "MotorModel"]
 
 STEP = 0.5e-3
 """Integration step, seconds."""
@@ -39,7 +39,7 @@ SETTINGS = {
     "object": "percent of closing at which the fingers touch an object (default: no object)",
     "start": "percent of closing at first (default: relaxed, about 20)",
 }
-"""Settings of a backend that is such a body."""
+"""Settings of a backend made of such mechanics."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class _Motor:
         self.error = 0
         self.case = self.winding = AMBIENT
         self.torque = 0.0
-        self.before = 0.0  # rad/s, before the last call of FingerBody.step
+        self.before = 0.0  # rad/s, before the last call of FingerMechanics.step
         self.brake()
 
     def power(self, on: bool) -> None:
@@ -197,7 +197,7 @@ def _closed_by(spec: JointSpec, percent: float) -> float:
     return percent / 100.0 * (spec.q_max if spec.closing > 0 else spec.q_min)
 
 
-class FingerBody:
+class FingerMechanics:
     """A hand without its electronics.
 
     :param model: which hand.

@@ -1,6 +1,6 @@
 """The robots that carry the hands, as data: joints by motor slot, topics, types, rates.
 
-The body of a robot is not a hand: one message commands and reports all of its motors. Sources are
+A robot is not a hand: one message commands and reports all of its motors. Sources are
 sections of docs/sources/unitree-dex.md, and Unitree's URDFs in unitree_ros (revision
 d6f13aad): ``h1_description/urdf/h1.urdf`` and ``g1_description/g1_29dof_rev_1_0.urdf``, the G1
 whose ``mode_machine`` is 5.
@@ -14,7 +14,7 @@ from functools import cached_property
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec
 
-__all__ = ["BODIES", "DQ_STOP", "G1", "H1", "Q_STOP", "BodyModel", "body"]
+__all__ = ["DQ_STOP", "G1", "H1", "Q_STOP", "ROBOTS", "RobotModel", "robot"]
 
 Q_STOP = 2.146e9
 """A ``q`` that means "no position" (docs/sources/unitree-dex.md#a8); what is sent is the nearest
@@ -24,14 +24,14 @@ DQ_STOP = 16000.0
 
 
 @dataclass(frozen=True)
-class BodyModel:
-    """One robot body.
+class RobotModel:
+    """One robot robot.
 
     :param family: message family, ``"unitree_go"`` or ``"unitree_hg"``.
     :param joints: by motor slot; None where the slot is not used.
     :param enable: mode byte that lets the motor of a slot follow commands; 0 turns it off.
     :param client_gains: by slot, kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends.
-    :param rest_q: by slot, where an emulated body rests at first, rad.
+    :param rest_q: by slot, where an emulated robot rests at first, rad.
     :param mode_machine: kind of machine in every state, which commands must repeat; None where the
         messages have no such field.
     :param weight_slot: unused slot whose ``q`` on the arm topic is the arm's weight, 0 to 1.
@@ -41,7 +41,7 @@ class BodyModel:
         (docs/sources/unitree-dex.md#b1: 2 ms).
     :param teleop_rate: commands a second of xr_teleoperate (docs/sources/unitree-dex.md#b1).
     :param remote_rate: messages of the wireless remote a second.
-    :param command_timeout: seconds without a command after which the body damps.
+    :param command_timeout: seconds without a command after which the robot damps.
     """
 
     name: str
@@ -149,7 +149,7 @@ def _joints(
     return tuple(joints), tuple(rest)
 
 
-# Slots: docs/sources/unitree-dex.md#a8. Rest positions of both bodies are invented: knees slightly
+# Slots: docs/sources/unitree-dex.md#a8. Rest positions of both robots are invented: knees slightly
 # bent, arms off the sides.
 _H1_ORDER = (
     *("right_hip_roll", "right_hip_pitch", "right_knee"),
@@ -176,9 +176,9 @@ _H1_KINDS = {
 _h1_joints, _h1_rest = _joints(_H1_ORDER, _H1_KINDS, {"waist_yaw": "torso_joint"})
 _H1_WEAK = {i for i, n in enumerate(_H1_ORDER) if i >= 12 or (n or "").endswith("ankle")}
 
-H1 = BodyModel(
+H1 = RobotModel(
     name="h1",
-    title="H1 body",
+    title="H1 robot",
     family="unitree_go",
     joints=_h1_joints,
     # docs/sources/unitree-dex.md#a8: 0x01 for weak motors (ankles, arms), 0x0A for the others
@@ -238,9 +238,9 @@ def _g1_gains(name: str | None) -> tuple[float, float]:
     return (300.0, 3.0) if name else (0.0, 0.0)
 
 
-G1 = BodyModel(
+G1 = RobotModel(
     name="g1",
-    title="G1 body (29 joints)",
+    title="G1 robot (29 joints)",
     family="unitree_hg",
     joints=_g1_joints,
     enable=(1,) * len(_G1_ORDER),  # docs/sources/unitree-dex.md#a8: 1 enable, 0 disable
@@ -252,15 +252,15 @@ G1 = BodyModel(
     arm_slots=tuple(range(12, 29)),
 )
 
-BODIES: dict[str, BodyModel] = {b.name: b for b in (H1, G1)}
+ROBOTS: dict[str, RobotModel] = {b.name: b for b in (H1, G1)}
 
 
-def body(name: str) -> BodyModel:
-    """The body called ``name``.
+def robot(name: str) -> RobotModel:
+    """The robot called ``name``.
 
     :raises UsageError: there is none.
     """
     try:
-        return BODIES[name]
+        return ROBOTS[name]
     except KeyError:
-        raise UsageError(f"no body {name!r}", hint=f"known: {', '.join(BODIES)}") from None
+        raise UsageError(f"no robot {name!r}", hint=f"known: {', '.join(ROBOTS)}") from None

@@ -1,7 +1,7 @@
-"""The body of a Dex3-1: its motors, its supply, and what it feels of what it runs into.
+"""The mechanics of a Dex3-1: its motors, its supply, and what it feels of what it runs into.
 
-:mod:`dexkit.emulators.finger_body` has the mechanics. Whoever owns a body calls its ``step`` as
-time passes: ``sim-dex3`` does that directly, the emulated USB device behind its protocol.
+:mod:`dexkit.emulators.finger_mechanics` has the joints. Whoever owns a hand's mechanics calls
+``step`` as time passes: ``sim-dex3`` directly, the emulated USB device behind its protocol.
 
 largest current, the sensors' number and range, the joints' angles. Everything else here is
 tuned or assumed and says so: inertia, friction, heat, the geometry of a grip.
@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.emulators.finger_body import AMBIENT, FingerBody, MotorModel
+from dexkit.emulators.finger_mechanics import AMBIENT, FingerMechanics, MotorModel
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, ImuState, Side, SupplyState
 from dexkit.models import DEX3_1
 
-__all__ = ["F_1515_108", "F_1515_214", "Dex3Body"]
+__all__ = ["F_1515_108", "F_1515_214", "Dex3Mechanics"]
 
 # Tuned, not measured. With kp 1.5 and kd 0.2 the joints follow the commands of the recording
 # dex3_pinch within 0.03 rad of the hands in it, which are simulated as well.
@@ -96,11 +96,11 @@ _NO_PRESSURE = 0.0 * _SHARES
 _SENSOR_TEMPERATURE = AMBIENT + _NO_PRESSURE
 
 
-class Dex3Body(FingerBody):
+class Dex3Mechanics(FingerMechanics):
     """A Dex3-1 hand without its electronics.
 
     :param object_at: how far the six flexing joints close before they touch an object; see
-        :class:`~dexkit.emulators.finger_body.FingerBody`.
+        :class:`~dexkit.emulators.finger_mechanics.FingerMechanics`.
     :param supply_v: voltage of the supply, V.
     :raises UsageError: a parameter is out of range.
     """

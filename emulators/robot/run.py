@@ -1,11 +1,11 @@
-"""A body on Unitree's topics: state at a fixed rate, commands as they come.
+"""A robot on Unitree's topics: state at a fixed rate, commands as they come.
 
-with EmulatedBody(G1, domain=1) as robot:   # a thread of this process
+with EmulatedRobot(G1, domain=1) as robot:   # a thread of this process
     ...
-    robot.body.position(18)
+    robot.robot.position(18)
 
 stop = threading.Event()
-run_body(H1, domain=1, stop=stop)           # in a thread or process of the caller's
+run_robot(H1, domain=1, stop=stop)           # in a thread or process of the caller's
 """
 
 from __future__ import annotations
@@ -13,40 +13,40 @@ from __future__ import annotations
 import logging
 import threading
 
-from dexkit.bodies import BODIES, BodyModel
 from dexkit.clock import Clock, RealClock
 from dexkit.dds import DdsNode, Endpoint, Reader, Writer
-from dexkit.emulators.body.body import Body
-from dexkit.emulators.body.settings import Settings
+from dexkit.emulators.robot.mechanics import RobotMechanics
+from dexkit.emulators.robot.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
 from dexkit.freshness import PAUSE, Ages, PauseWatch
+from dexkit.robots import ROBOTS, RobotModel
 from dexkit.service import Publisher
 from dexkit.sole import Place, SolePublisher
 
-__all__ = ["EmulatedBody", "run_body"]
+__all__ = ["EmulatedRobot", "run_robot"]
 
-log = logging.getLogger("dexkit.body")
+log = logging.getLogger("dexkit.robot")
 
 _DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
 _WATCH = 0.2  # seconds between looks whether it still lives
 
 
-class EmulatedBody:
-    """A body that lives in a thread of this process, on one domain.
+class EmulatedRobot:
+    """A robot that lives in a thread of this process, on one domain.
 
     :param node: where its topics are; without one, it makes one on ``domain`` and ``interface``.
     :param publisher: whose thread it lives in, at the model's state rate; without one, its own.
     :param force: start even if somebody else publishes the state.
 
-    :ivar body: the body itself. It belongs to that thread: read it, and assign ``body.remote``.
+    :ivar robot: the robot itself. It belongs to that thread: read it, and assign ``robot.remote``.
 
-    Troubles of clients are logged once each, as warnings of the logger ``dexkit.body``, and
-    counted in ``body.counters``.
+    Troubles of clients are logged once each, as warnings of the logger ``dexkit.robot``, and
+    counted in ``robot.counters``.
     """
 
     def __init__(
         self,
-        model: BodyModel,
+        model: RobotModel,
         *,
         node: DdsNode | None = None,
         domain: int = 1,
@@ -60,7 +60,7 @@ class EmulatedBody:
         self.domain = node.domain if node is not None else domain
         self.interface = node.interface if node is not None else interface
         self._clock: Clock = clock or RealClock()
-        self.body = Body(model, settings, now=self._clock.now(), report=log.warning)
+        self.robot = RobotMechanics(model, settings, now=self._clock.now(), report=log.warning)
         self._failure: Exception | None = None
         self.missed = 0
         self._node = node
@@ -104,14 +104,14 @@ class EmulatedBody:
         found = []
         for topic, kind in sorted({(e.topic, e.type_name) for e in node.endpoints() if not e.own}):
             if topic in ours and kind != ours[topic]:
-                others = [b for b in BODIES.values() if kind in (b.cmd_type, b.state_type)]
+                others = [b for b in ROBOTS.values() if kind in (b.cmd_type, b.state_type)]
                 found.append(
                     f"{topic}: a peer uses {kind}, the {model.name} {ours[topic]}; they never match"
                     + "".join(f". Try dexkit emulate {b.name}" for b in others)
                 )
         return found
 
-    def start(self) -> EmulatedBody:
+    def start(self) -> EmulatedRobot:
         """Publish states and obey commands from now on.
 
         :raises TopicConflict: somebody else publishes the state (unless ``force``).
@@ -148,7 +148,7 @@ class EmulatedBody:
         self._publisher.remove(self._tick)
         self._close()
 
-    def __enter__(self) -> EmulatedBody:
+    def __enter__(self) -> EmulatedRobot:
         return self.start()
 
     def __exit__(self, *exc: object) -> None:
@@ -198,7 +198,7 @@ class EmulatedBody:
             log.error("the %s died: %s: %s", self.model.name, type(error).__name__, error)
 
     def _live(self, missed: int) -> None:
-        body, now = self.body, self._clock.now()
+        robot, now = self.robot, self._clock.now()
         assert self._writer is not None
         assert self._remote is not None
         assert self._commands is not None
@@ -206,26 +206,26 @@ class EmulatedBody:
         self.missed += missed
         if self._watch.look(PAUSE + 1.0 / self._publisher.hz):
             self._ages.resumed(self._clock.since_boot())
-            body.paused()
+            robot.paused()
         for reader, obey in (
-            (self._commands, body.command),
-            (self._arm_commands, body.arm_command),
+            (self._commands, robot.command),
+            (self._arm_commands, robot.arm_command),
         ):
             for sample in reader.take():
                 received = self._clock.since_boot()
                 age = self._ages.age(sample.writer, sample.source_timestamp_ns, received)
                 if age > PAUSE:
-                    body.counters.stale += 1
+                    robot.counters.stale += 1
                 else:
                     obey(sample.data, now - age)
-        body.advance(now)
-        self._writer.write_raw(body.state(now))
-        if body.counters.states % self._remote_every == 0:
-            self._remote.write(body.remote_message())
+        robot.advance(now)
+        self._writer.write_raw(robot.state(now))
+        if robot.counters.states % self._remote_every == 0:
+            self._remote.write(robot.remote_message())
 
 
-def run_body(
-    model: BodyModel,
+def run_robot(
+    model: RobotModel,
     *,
     domain: int = 1,
     interface: str = "lo",
@@ -234,13 +234,13 @@ def run_body(
     settings: Settings | None = None,
     force: bool = False,
 ) -> None:
-    """Be a body until ``stop`` is set.
+    """Be a robot until ``stop`` is set.
 
     :param ready: set when its topics are up.
     :raises TopicConflict: somebody else publishes the state (unless ``force``).
     :raises DdsError: the topics cannot be made, or writing to them failed.
     """
-    with EmulatedBody(
+    with EmulatedRobot(
         model, domain=domain, interface=interface, settings=settings, force=force
     ) as robot:
         if ready is not None:

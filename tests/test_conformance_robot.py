@@ -1,4 +1,4 @@
-"""The conformance of bodies: a good one passes, wrong ones are caught, and a run on DDS."""
+"""The conformance of robots: a good one passes, wrong ones are caught, and a run on DDS."""
 
 from __future__ import annotations
 
@@ -12,74 +12,74 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dexkit.bodies import BODIES, G1, H1, BodyModel
 from dexkit.cli.check import command
-from dexkit.conformance.body import (
-    SPOILS,
-    BodyWire,
-    body_dialect,
-    body_in,
-    body_recording,
-    recording_of,
-)
-from dexkit.conformance.checks.body import body_checks
+from dexkit.conformance.checks.robot import robot_checks
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, free_domain, record_run
-from dexkit.conformance.mutants.body import (
+from dexkit.conformance.mutants.robot import (
     MUTANTS,
-    BodyMutant,
     CdrCrc,
     NoCrc,
+    RobotMutant,
     WaitsForCommands,
-    run_body_mutant,
+    run_robot_mutant,
 )
-from dexkit.conformance.phases import BODY, Stimulus
+from dexkit.conformance.phases import ROBOT, Stimulus
 from dexkit.conformance.processes import RigOptions
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
+from dexkit.conformance.robot import (
+    SPOILS,
+    RobotWire,
+    recording_of,
+    robot_dialect,
+    robot_in,
+    robot_recording,
+)
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
-from dexkit.conformance.virtual.body import Orders, ReferenceBody
+from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import decode
+from dexkit.robots import G1, H1, ROBOTS, RobotModel
 from dexkit.traces import Recorder, TraceEndpoint, open_trace
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import crc_of, verify_payload
 from tests.conformance_helpers import copy_of, short_run
 from tests.test_conformance_schema import validate
 
-NAMES = list(BODIES)
-DOCS = Path(__file__).parent.parent / "docs" / "conformance-body.md"
+NAMES = list(ROBOTS)
+DOCS = Path(__file__).parent.parent / "docs" / "conformance-robots.md"
 
 
 def plan(name: str, phases: Iterable[str]) -> Plan:
-    return Plan(body_dialect(name), (BODY,), phases=frozenset(phases))
+    return Plan(robot_dialect(name), (ROBOT,), phases=frozenset(phases))
 
 
 def everything(name: str) -> frozenset[str]:
-    return phases_for(catalogue(name, "body"))
+    return phases_for(catalogue(name, "robot"))
 
 
 @cache
-def listened(name: str, service: type[ReferenceBody] = ReferenceBody) -> MemoryTrace:
-    """A body that is listened to, and told to hold."""
+def listened(name: str, service: type[ReferenceRobot] = ReferenceRobot) -> MemoryTrace:
+    """A robot that is listened to, and told to hold."""
     return run_virtual(plan(name, ()), service)
 
 
 def judged(trace: MemoryTrace, name: str) -> RunResult:
-    return judge(body_recording(trace, name))
+    return judge(robot_recording(trace, name))
 
 
 # ----------------------------------------------------------------------------------- the wire
 
 
-@pytest.mark.parametrize("model", BODIES.values(), ids=NAMES)
-def test_commands_are_what_the_codec_reads(model: BodyModel) -> None:
-    wire = BodyWire(body_dialect(model.name))
+@pytest.mark.parametrize("model", ROBOTS.values(), ids=NAMES)
+def test_commands_are_what_the_codec_reads(model: RobotModel) -> None:
+    wire = RobotWire(robot_dialect(model.name))
     motors = [Motor(0.1 * i, 0.2, 0.3, 4.0, 0.5, i % 3) for i in range(model.slots)]
     payload = wire.low_command(motors, 7)
     assert verify_payload(model.cmd_type, payload)
@@ -95,7 +95,7 @@ def test_commands_are_what_the_codec_reads(model: BodyModel) -> None:
 
 @pytest.mark.parametrize("kind", SPOILS)
 def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
-    wire = BodyWire(body_dialect("h1"))
+    wire = RobotWire(robot_dialect("h1"))
     motors = [Motor(q=0.5)] * 20
     good, bad = wire.low_command(motors, 0), wire.low_command(motors, 0, kind)
     assert good[:-4] == bad[:-4]
@@ -109,19 +109,19 @@ def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["h1", pytest.param("g1", marks=pytest.mark.soak)])
-def test_a_good_body_passes_everything(name: str) -> None:
-    result = judged(run_virtual(plan(name, everything(name)), ReferenceBody), name)
+def test_a_good_robot_passes_everything(name: str) -> None:
+    result = judged(run_virtual(plan(name, everything(name)), ReferenceRobot), name)
     bad = [r.explain() for r in result.results if r.verdict is not Verdict.PASS]
     assert not bad, "\n".join(bad)
     assert result.overall is Overall.PASS
-    assert [r.requirement.id for r in result.results] == [r.id for r in catalogue(name, "body")]
-    assert result.stage == {"body": Stage.MOVING}
+    assert [r.requirement.id for r in result.results] == [r.id for r in catalogue(name, "robot")]
+    assert result.stage == {"robot": Stage.MOVING}
 
 
-def _one_of_each() -> list[BodyMutant]:
-    """A wrong body for each check of a MUST, and what only a G1 has."""
-    checks, level = body_checks(), {r.id: r.level for r in catalogue(None, "body")}
-    found: dict[object, BodyMutant] = {}
+def _one_of_each() -> list[RobotMutant]:
+    """A wrong robot for each check of a MUST, and what only a G1 has."""
+    checks, level = robot_checks(), {r.id: r.level for r in catalogue(None, "robot")}
+    found: dict[object, RobotMutant] = {}
     for mutant in MUTANTS:
         if level[mutant.kills] is Level.MUST and mutant.model == "h1":
             found.setdefault(checks[mutant.kills], mutant)
@@ -130,15 +130,15 @@ def _one_of_each() -> list[BodyMutant]:
 
 
 @pytest.mark.parametrize("mutant", _one_of_each(), ids=lambda m: f"{m.model}-{m.name}")
-def test_a_wrong_body_is_caught(mutant: BodyMutant) -> None:
+def test_a_wrong_robot_is_caught(mutant: RobotMutant) -> None:
     assert mutant.blamed(short=True) == {mutant.kills, *mutant.also}, mutant.summary
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_requirement_has_a_check_and_a_body_that_breaks_it(name: str) -> None:
-    every = catalogue(name, "body")
+def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> None:
+    every = catalogue(name, "robot")
     assert {m.kills for m in MUTANTS if m.model == name} == {r.id for r in every}
-    assert {r.id for r in every} <= set(body_checks())
+    assert {r.id for r in every} <= set(robot_checks())
     negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
     negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
     found = [r for r in every if r.id.partition("-")[2].startswith(negative)]
@@ -155,8 +155,8 @@ def test_every_stimulus_that_is_needed_exists(name: str) -> None:
 def test_the_documented_catalogue_is_the_current_one() -> None:
     text = DOCS.read_text(encoding="utf-8")
     page = text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip()
-    assert page == catalogue_page("body").strip(), (
-        "docs/conformance-body.md is out of date: python -m dexkit.conformance.requirements.page"
+    assert page == catalogue_page("robot").strip(), (
+        "docs/conformance-robots.md is out of date: python -m dexkit.conformance.requirements.page"
     )
 
 
@@ -164,7 +164,7 @@ def test_the_documented_catalogue_is_the_current_one() -> None:
 
 
 def test_a_crc_that_was_never_set_is_told_from_a_wrong_one() -> None:
-    def cause(service: type[ReferenceBody]) -> str:
+    def cause(service: type[ReferenceRobot]) -> str:
         results = judged(listened("h1", service), "h1").results
         return next(r.cause for r in results if r.requirement.id == "H1-CRC-01")
 
@@ -172,13 +172,13 @@ def test_a_crc_that_was_never_set_is_told_from_a_wrong_one() -> None:
     assert "CDR" in cause(CdrCrc)
 
 
-def test_a_body_that_waits_is_woken() -> None:
-    blamed = run_body_mutant(WaitsForCommands, "g1", frozenset())
+def test_a_robot_that_waits_is_woken() -> None:
+    blamed = run_robot_mutant(WaitsForCommands, "g1", frozenset())
     assert blamed == {"G1-START-01"}
 
 
-def test_a_body_that_says_nothing_is_not_commanded_for_long() -> None:
-    class Mute(ReferenceBody):
+def test_a_robot_that_says_nothing_is_not_commanded_for_long() -> None:
+    class Mute(ReferenceRobot):
         """Nothing at all."""
 
         def publish(self) -> list[object]:  # type: ignore[override]
@@ -188,12 +188,12 @@ def test_a_body_that_says_nothing_is_not_commanded_for_long() -> None:
     assert Stimulus.from_metadata(trace.metadata["dexkit.stimulus"]).phases[-1].name == "listen"
     result = judged(trace, "h1")
     assert result.overall is Overall.FAIL
-    assert result.stage == {"body": Stage.TYPE_MATCHED}
+    assert result.stage == {"robot": Stage.TYPE_MATCHED}
     failed = {r.requirement.id for r in result.results if r.verdict is Verdict.FAIL}
     assert failed == {"H1-TOPIC-01"}
 
 
-def test_a_machine_that_was_busy_is_not_the_bodys_fault() -> None:
+def test_a_machine_that_was_busy_is_not_the_robots_fault() -> None:
     """The gap of a tenth of a second is blocked where the kit's own timer stood still as long."""
     trace = listened("h1")
     ((key, rows),) = ((k, r) for k, r in trace.rows.items() if k[0] == "rt/lowstate")
@@ -214,7 +214,7 @@ def test_a_machine_that_was_busy_is_not_the_bodys_fault() -> None:
     assert verdict() is Verdict.BLOCKED
 
 
-class DiesOfNaN(ReferenceBody):
+class DiesOfNaN(ReferenceRobot):
     """Ends with the first NaN."""
 
     dead = False
@@ -227,7 +227,7 @@ class DiesOfNaN(ReferenceBody):
         return [] if self.dead else super().publish()
 
 
-class Hiccup(ReferenceBody):
+class Hiccup(ReferenceRobot):
     """Is kept from publishing for a fifth of a second, when NaNs come."""
 
     since = math.inf
@@ -241,9 +241,9 @@ class Hiccup(ReferenceBody):
         return [] if self.since <= self.now < self.since + 0.25 else super().publish()
 
 
-def test_a_body_that_dies_of_a_command_is_told_from_a_late_one() -> None:
-    assert "H1-SAFE-01" in run_body_mutant(DiesOfNaN, "h1", frozenset({"nan"}))
-    assert run_body_mutant(Hiccup, "h1", frozenset({"nan"})) == set()
+def test_a_robot_that_dies_of_a_command_is_told_from_a_late_one() -> None:
+    assert "H1-SAFE-01" in run_robot_mutant(DiesOfNaN, "h1", frozenset({"nan"}))
+    assert run_robot_mutant(Hiccup, "h1", frozenset({"nan"})) == set()
 
 
 # --------------------------------------------------------------------------------- recordings
@@ -273,8 +273,8 @@ def test_a_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
     assert found["overall"] == "pass"
     assert found["counts"]["pass"] >= 20
     page = (tmp_path / "report.html").read_text()
-    assert f"{BODIES[name].title}" in page
-    assert f"{name.upper()}-CRC-01-body" in (tmp_path / "junit.xml").read_text()
+    assert f"{ROBOTS[name].title}" in page
+    assert f"{name.upper()}-CRC-01-robot" in (tmp_path / "junit.xml").read_text()
 
 
 FILES = {"--json": "result.json", "--html": "report.html", "--junit": "junit.xml"}
@@ -288,30 +288,30 @@ def test_somebody_elses_recording_shows_what_needs_no_stimulus(tmp_path: Path) -
     (failed,) = [line for line in result.output.splitlines() if " FAIL " in line]
     assert failed.startswith("G1-CRC-01")
     trace = open_trace(path)
-    assert body_in(trace) is G1
+    assert robot_in(trace) is G1
     memory = MemoryTrace(rows={("rt/lowcmd", H1.cmd_type): [(0, 0, b"")]})
-    assert body_in(memory) is H1
+    assert robot_in(memory) is H1
     memory.endpoints.append(TraceEndpoint("rt/lowstate", "writer", "", type_name=G1.state_type))
-    assert body_in(memory) is G1
+    assert robot_in(memory) is G1
     assert recording_of(trace, None, ()).dialect.name == "g1"
     other = CliRunner().invoke(command, [str(path), "--dialect", "h1"])
     assert other.exit_code == 1
     assert "wrong type" in other.output
-    with pytest.raises(ConformanceError, match="no topic of the H1 body"):
-        body_recording(MemoryTrace(), "h1")
+    with pytest.raises(ConformanceError, match="no topic of the H1 robot"):
+        robot_recording(MemoryTrace(), "h1")
 
 
-def test_hands_come_first_and_the_body_is_mentioned(tmp_path: Path) -> None:
+def test_hands_come_first_and_the_robot_is_mentioned(tmp_path: Path) -> None:
     whole = copy_of(short_run())
     whole.rows.update(listened("g1").rows)
     path = write(whole, tmp_path / "robot.mcap", bare=True)
     hands = CliRunner().invoke(command, [str(path)])
     assert "DEX1-RATE-01" in hands.output
-    assert "there is a body, too: judge it with --dialect g1" in hands.output
-    body = CliRunner().invoke(command, [str(path), "--dialect", "g1"])
-    assert body.exit_code == 0
-    assert "G1-CRC-01" in body.output
-    assert "DEX1" not in body.output
+    assert "there is a robot, too: judge it with --dialect g1" in hands.output
+    robot = CliRunner().invoke(command, [str(path), "--dialect", "g1"])
+    assert robot.exit_code == 0
+    assert "G1-CRC-01" in robot.output
+    assert "DEX1" not in robot.output
     with pytest.raises(UsageError, match="no sides"):
         recording_of(open_trace(path), "g1", (Side.LEFT,))
 
@@ -319,7 +319,7 @@ def test_hands_come_first_and_the_body_is_mentioned(tmp_path: Path) -> None:
 def test_the_requirements_are_listed_without_a_recording() -> None:
     result = CliRunner().invoke(command, ["--list", "--dialect", "h1", "--level", "must"])
     assert result.exit_code == 0
-    musts = [r for r in catalogue("h1", "body") if r.level is Level.MUST]
+    musts = [r for r in catalogue("h1", "robot") if r.level is Level.MUST]
     assert f"{len(musts)} requirements" in result.output
 
 
@@ -328,8 +328,8 @@ def test_the_requirements_are_listed_without_a_recording() -> None:
 
 def test_what_is_about_hands_is_refused() -> None:
     options = SuiteOptions.make(backend="sim-g1")
-    assert (options.sides, options.dialect.name) == ((BODY,), "g1")
-    assert {r.layer for r in options.requirements} == {"body"}
+    assert (options.sides, options.dialect.name) == ((ROBOT,), "g1")
+    assert {r.layer for r in options.requirements} == {"robot"}
     quick = SuiteOptions.make(backend="sim-h1", quick=True).requirements
     assert {r.level for r in quick} == {Level.MUST}
     assert 10 < len(quick) < len(options.requirements)
@@ -343,11 +343,11 @@ def test_what_is_about_hands_is_refused() -> None:
     assert SuiteOptions.make(backend="external", dialect_name="h1").domain == 0
 
 
-def test_an_emulated_body_passes_on_dds(tmp_path: Path) -> None:
-    wanted = select(catalogue("g1", "body"), prefixes=["G1-LIFE-01", "G1-CRC-01", "G1-TOPIC"])
-    rig = RigOptions("sim-g1", (BODY,), body_dialect("g1"), free_domain())
+def test_an_emulated_robot_passes_on_dds(tmp_path: Path) -> None:
+    wanted = select(catalogue("g1", "robot"), prefixes=["G1-LIFE-01", "G1-CRC-01", "G1-TOPIC"])
+    rig = RigOptions("sim-g1", (ROBOT,), robot_dialect("g1"), free_domain())
     path = tmp_path / "run.mcap"
     assert record_run(LiveOptions(rig, phases_for(wanted)), path)
-    result = judge(body_recording(open_trace(path), "g1"), requirements=wanted)
+    result = judge(robot_recording(open_trace(path), "g1"), requirements=wanted)
     bad = [r.explain() for r in result.results if r.verdict not in (Verdict.PASS, Verdict.BLOCKED)]
     assert not bad, "\n".join(bad)

@@ -1,4 +1,4 @@
-"""The checks of a robot's body; what it has in common with a hand is judged by the hands'."""
+"""The checks of a robot; what it has in common with a hand is judged by the hands'."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dexkit.conformance.body import BodyRecording
 from dexkit.conformance.checks import (
     STROKE_S,
     Check,
@@ -24,11 +23,12 @@ from dexkit.conformance.checks import (
 )
 from dexkit.conformance.phases import Phase
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.stimuli.body import STEP
+from dexkit.conformance.robot import RobotRecording
+from dexkit.conformance.stimuli.robot import STEP
 from dexkit.hand import Floats
 from dexkit.messages import Columns
 
-__all__ = ["body_checks"]
+__all__ = ["robot_checks"]
 
 _SOME = 20  # states at the end of a phase, or before it, over which is averaged
 _END = 0.06  # s after a phase in which its last command may still have an effect
@@ -36,8 +36,8 @@ _LATE = 1.0  # s by which a state may be late on a busy machine
 _STICKS = struct.Struct("<4x5f")  # in wireless_remote: behind head and keys
 
 
-def _recording(ctx: Context) -> BodyRecording:
-    return cast(BodyRecording, ctx.recording)
+def _recording(ctx: Context) -> RobotRecording:
+    return cast(RobotRecording, ctx.recording)
 
 
 def _low(ctx: Context) -> Columns:
@@ -201,8 +201,8 @@ def speed_of_q(ctx: Context) -> Outcome:
 
 def unused_still(ctx: Context) -> Outcome:
     """q, dq and tau_est of the slots without a motor."""
-    low, body = _low(ctx), _recording(ctx).body
-    unused = [slot for slot in range(body.slots) if slot not in body.used]
+    low, robot = _low(ctx), _recording(ctx).robot
+    unused = [slot for slot in range(robot.slots) if slot not in robot.used]
     for member in ("q", "dq", "tau_est"):
         values = low[f"motor_state[].{member}"][:, unused]
         bad = (np.nan_to_num(values) != 0).any(axis=1)
@@ -233,9 +233,9 @@ def byte_temperatures(ctx: Context) -> Outcome:
 
 def motor_temperatures(ctx: Context) -> Outcome:
     """Temperatures of the used motors."""
-    body = _recording(ctx).body
-    path = "temperature" if body.family == "unitree_go" else "temperature[0]"
-    values = _low(ctx)[f"motor_state[].{path}"][:, list(body.used)]
+    robot = _recording(ctx).robot
+    path = "temperature" if robot.family == "unitree_go" else "temperature[0]"
+    values = _low(ctx)[f"motor_state[].{path}"][:, list(robot.used)]
     bad = ~((values >= ctx.tolerance("min_c")) & (values <= ctx.tolerance("max_c")))
     if not bad.any():
         return ctx.passed(f"{values.min():.0f} to {values.max():.0f}")
@@ -352,13 +352,13 @@ def machine_told(ctx: Context) -> Outcome:
 
 def mode_told(ctx: Context) -> Outcome:
     """The mode bytes while motors are held, and of the one that was turned off."""
-    body = _recording(ctx).body
+    robot = _recording(ctx).robot
     for phase in (*ctx.phases("hold"), *ctx.phases()):
         begin, end = ctx.span(phase)
         modes = ctx.states.mode[ctx.states.between(begin + (end - begin) / 2, end)]
         if not len(modes):
             return ctx.skipped(f"no state during '{phase.name}'")
-        wanted = np.array([body.enable[slot] for slot in body.used])
+        wanted = np.array([robot.enable[slot] for slot in robot.used])
         if phase.name == "off":
             wanted[_index(ctx, phase)] = 0
         wrong = np.flatnonzero((modes != wanted).any(axis=0))
@@ -379,11 +379,11 @@ def mode_told(ctx: Context) -> Outcome:
 
 def _index(ctx: Context, phase: Phase) -> int:
     """The joint that a phase is about."""
-    return _recording(ctx).body.used.index(int(phase.params["slot"]))
+    return _recording(ctx).robot.used.index(int(phase.params["slot"]))
 
 
 def _silent(ctx: Context, phase: Phase) -> Outcome:
-    """No state where one is needed: a body that has died of it, or one that was late."""
+    """No state where one is needed: a robot that has died of it, or one that was late."""
     begin, end = ctx.span(phase)
     if len(_q(ctx, end, end + _LATE)):
         return ctx.skipped(f"no state came at the right moment of '{phase.name}', only later")
@@ -646,10 +646,10 @@ _CHECKS: Mapping[str, Check] = {
     "CLIENT-01": client_crc,
     "CLIENT-02": client_rate,
 }
-"""By what follows the body's name in a requirement's id."""
+"""By what follows the robot's name in a requirement's id."""
 
 
 @cache
-def body_checks() -> Mapping[str, Check]:
-    """Every check of bodies, by requirement id."""
-    return {r.id: _CHECKS[r.id.partition("-")[2]] for r in catalogue(None, "body")}
+def robot_checks() -> Mapping[str, Check]:
+    """Every check of robots, by requirement id."""
+    return {r.id: _CHECKS[r.id.partition("-")[2]] for r in catalogue(None, "robot")}

@@ -1,9 +1,9 @@
-"""All joints of a body, moved at once.
+"""All joints of a robot, moved at once.
 
-A body has up to 29 joints and lives 500 steps a second, so they are numpy arrays here, where
-:class:`~dexkit.emulators.mechanics.Joint` is one joint with a richer mechanism. Each is an inertia
-with Coulomb and viscous friction between two hard stops. Joints do not act upon each other, and
-there is no gravity: the robot hangs in a rig, and its links weigh nothing.
+A robot has up to 29 joints and lives 500 steps a second, so they are numpy arrays here, where
+:class:`~dexkit.emulators.joint_mechanics.Joint` is one joint with a richer mechanism. Each is an
+inertia with Coulomb and viscous friction between two hard stops. Joints do not act upon
+each other, and there is no gravity: the robot hangs in a rig, and its links weigh nothing.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.bodies import BodyModel
-from dexkit.emulators.body.settings import STEP, Settings
+from dexkit.emulators.robot.settings import STEP, Settings
+from dexkit.robots import RobotModel
 
 __all__ = ["Joints", "Law"]
 
@@ -52,7 +52,7 @@ class Law:
 
 
 class Joints:
-    """The used joints of a body, in the order of their slots; SI units, arrays of shape (n,).
+    """The used joints of a robot, in the order of their slots; SI units, arrays of shape (n,).
 
     :ivar q: rad.
     :ivar dq: rad/s.
@@ -60,7 +60,7 @@ class Joints:
     :ivar tau: torque of the motors in the last step, N·m.
     """
 
-    def __init__(self, model: BodyModel, settings: Settings) -> None:
+    def __init__(self, model: RobotModel, settings: Settings) -> None:
         joints = [model.joint(slot) for slot in model.used]
         self.q_min = np.array([j.q_min for j in joints])
         self.q_max = np.array([j.q_max for j in joints])
@@ -78,7 +78,7 @@ class Joints:
         self._drag = 1.0 + self._rate * self.viscous
 
     def step(self, law: Law) -> None:
-        """Live one step of :data:`~dexkit.emulators.body.settings.STEP` seconds.
+        """Live one step of :data:`~dexkit.emulators.robot.settings.STEP` seconds.
 
         Position and speed are taken at the end of the step in the motors' law, so that no gain is
         too high for it. A motor gives up to ``tau_max``; a joint turns at up to ``dq_max``, where

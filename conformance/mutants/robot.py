@@ -13,33 +13,33 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.bodies import BODIES
-from dexkit.conformance.body import body_dialect, body_recording
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import BODY
+from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Verdict
+from dexkit.conformance.robot import robot_dialect, robot_recording
 from dexkit.conformance.stimuli import Plan, phases_for
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
-from dexkit.conformance.virtual.body import Orders, ReferenceBody
+from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.hand import Floats, Side
 from dexkit.messages import decode, message_type
 from dexkit.models import Dialect
+from dexkit.robots import ROBOTS
 from dexkit.traces import TraceEndpoint
 from dexkit.wire.crc32 import crc32_words
 
-__all__ = ["MUTANTS", "BodyMutant", "run_body_mutant"]
+__all__ = ["MUTANTS", "RobotMutant", "run_robot_mutant"]
 
 _EARLY = 0.8  # s: while the kit only listens
 
 # ------------------------------------------------------------------------------------ discovery
 
 
-class _OtherFamily(ReferenceBody):
+class _OtherFamily(ReferenceRobot):
     @property
     def others(self) -> tuple[str, str]:
         """Command and state type of the other family."""
-        other = next(b for b in BODIES.values() if b.family != self.body.family)
+        other = next(b for b in ROBOTS.values() if b.family != self.robot.family)
         return other.cmd_type, other.state_type
 
 
@@ -67,7 +67,7 @@ class OtherCommands(_OtherFamily):
         self.command_type = self.others[0]
 
 
-class Twins(ReferenceBody):
+class Twins(ReferenceRobot):
     """Two of them publish."""
 
     def endpoints(self) -> list[TraceEndpoint]:
@@ -75,19 +75,19 @@ class Twins(ReferenceBody):
         return every + [e for e in every if e.kind == "writer"]
 
 
-class AsksForMore(ReferenceBody):
+class AsksForMore(ReferenceRobot):
     """Asks for the commands from before it came."""
 
     reader_durability = "TransientLocal"
 
 
-class BestEffort(ReferenceBody):
+class BestEffort(ReferenceRobot):
     """Offers its state without reliability."""
 
     writer_reliability = "best_effort"
 
 
-class WaitsForCommands(ReferenceBody):
+class WaitsForCommands(ReferenceRobot):
     """Says nothing until it is commanded."""
 
     def publish(self) -> list[Sample]:
@@ -97,7 +97,7 @@ class WaitsForCommands(ReferenceBody):
 # ------------------------------------------------------------------------------------ integrity
 
 
-class CutShort(ReferenceBody):
+class CutShort(ReferenceRobot):
     """Its first states lack the last word."""
 
     def sealed(self) -> bytes:
@@ -105,7 +105,7 @@ class CutShort(ReferenceBody):
         return payload[:-4] if self.now < _EARLY else payload
 
 
-class NotANumber(ReferenceBody):
+class NotANumber(ReferenceRobot):
     """Divides by a time of zero at first."""
 
     def message(self) -> Any:
@@ -114,7 +114,7 @@ class NotANumber(ReferenceBody):
         return state
 
 
-class CdrCrc(ReferenceBody):
+class CdrCrc(ReferenceRobot):
     """Computes the CRC over the CDR bytes."""
 
     def sealed(self) -> bytes:
@@ -122,7 +122,7 @@ class CdrCrc(ReferenceBody):
         return payload[:-4] + crc32_words(payload[4:-4]).to_bytes(4, "little")
 
 
-class NoCrc(ReferenceBody):
+class NoCrc(ReferenceRobot):
     """Leaves the CRC 0."""
 
     def sealed(self) -> bytes:
@@ -132,26 +132,26 @@ class NoCrc(ReferenceBody):
 # ----------------------------------------------------------------------------------------- rate
 
 
-class Slow(ReferenceBody):
+class Slow(ReferenceRobot):
     """Publishes 100 times a second."""
 
     period = 0.01
 
 
-class Leisurely(ReferenceBody):
+class Leisurely(ReferenceRobot):
     """Publishes 333 times a second."""
 
     period = 0.003
 
 
-class Stumbles(ReferenceBody):
+class Stumbles(ReferenceRobot):
     """Says nothing for a fifth of a second."""
 
     def publish(self) -> list[Sample]:
         return [] if 0.5 < self.now < 0.7 else super().publish()
 
 
-class Repeats(ReferenceBody):
+class Repeats(ReferenceRobot):
     """Sends some states twice."""
 
     def publish(self) -> list[Sample]:
@@ -159,14 +159,14 @@ class Repeats(ReferenceBody):
         return found * 2 if self.now < _EARLY and self.ticks() % 50 == 0 else found
 
 
-class NoTick(ReferenceBody):
+class NoTick(ReferenceRobot):
     """Leaves tick 0."""
 
     def ticks(self) -> int:
         return 0
 
 
-class CountsStates(ReferenceBody):
+class CountsStates(ReferenceRobot):
     """Counts states instead of milliseconds."""
 
     def ticks(self) -> int:
@@ -176,19 +176,19 @@ class CountsStates(ReferenceBody):
 # --------------------------------------------------------------------------------------- fields
 
 
-class TurnedOnce(ReferenceBody):
+class TurnedOnce(ReferenceRobot):
     """One encoder counts from a turn further."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
-        slot = self.body.slot("right_knee")
+        slot = self.robot.slot("right_knee")
         for values in (self.q, self.low, self.high):
             values[slot] += 2 * math.pi
 
 
-class NoSpeed(ReferenceBody):
+class NoSpeed(ReferenceRobot):
     """Leaves dq 0."""
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
@@ -196,38 +196,38 @@ class NoSpeed(ReferenceBody):
         return q, np.zeros_like(dq), tau
 
 
-class Ghost(ReferenceBody):
+class Ghost(ReferenceRobot):
     """Tells of a motor where none is."""
 
     def message(self) -> Any:
         state = super().message()
-        unused = next(s for s in range(self.body.slots) if s not in self.body.used)
+        unused = next(s for s in range(self.robot.slots) if s not in self.robot.used)
         state.motor_state[unused].q = 0.5
         return state
 
 
-class NoSensor(ReferenceBody):
+class NoSensor(ReferenceRobot):
     """Takes 255 for "no temperature"."""
 
     def warmth(self) -> Any:
         return 255
 
 
-class Frozen(ReferenceBody):
+class Frozen(ReferenceRobot):
     """Leaves the motors' temperatures 0."""
 
     def warmth(self) -> Any:
-        return 0 if self.body.family == "unitree_go" else (0, 0)
+        return 0 if self.robot.family == "unitree_go" else (0, 0)
 
 
-class NoAttitude(ReferenceBody):
+class NoAttitude(ReferenceRobot):
     """Leaves the quaternion 0."""
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         return (0.0,) * 4, (0.0,) * 3
 
 
-class WLast(ReferenceBody):
+class WLast(ReferenceRobot):
     """Writes the quaternion with w last."""
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -235,14 +235,14 @@ class WLast(ReferenceBody):
         return (x, y, z, w), rpy
 
 
-class InG(ReferenceBody):
+class InG(ReferenceRobot):
     """Tells accelerations in g."""
 
     def gravity(self) -> tuple[float, float, float]:
         return (0.0, 0.0, 1.0)
 
 
-class NoHead(ReferenceBody):
+class NoHead(ReferenceRobot):
     """Leaves the head 0."""
 
     def message(self) -> Any:
@@ -251,7 +251,7 @@ class NoHead(ReferenceBody):
         return state
 
 
-class Empty(ReferenceBody):
+class Empty(ReferenceRobot):
     """Has an empty battery."""
 
     def message(self) -> Any:
@@ -260,7 +260,7 @@ class Empty(ReferenceBody):
         return state
 
 
-class Hangs(ReferenceBody):
+class Hangs(ReferenceRobot):
     """Its feet pull."""
 
     def message(self) -> Any:
@@ -269,21 +269,21 @@ class Hangs(ReferenceBody):
         return state
 
 
-class RemoteRubbish(ReferenceBody):
+class RemoteRubbish(ReferenceRobot):
     """Does not clear the remote's bytes."""
 
     def remote(self) -> bytes:
         return b"\xaa\x55" * 20
 
 
-class ShiftedRemote(ReferenceBody):
+class ShiftedRemote(ReferenceRobot):
     """Writes the sticks without the two bytes before them."""
 
     def remote(self) -> bytes:
         return struct.pack("<H5f18x", 0, 0.5, 0.7, -0.3, 0.9, -0.25)
 
 
-class NoMachine(ReferenceBody):
+class NoMachine(ReferenceRobot):
     """Leaves mode_machine 0."""
 
     def message(self) -> Any:
@@ -292,47 +292,47 @@ class NoMachine(ReferenceBody):
         return state
 
 
-class NoMode(ReferenceBody):
+class NoMode(ReferenceRobot):
     """Leaves the mode bytes 0."""
 
     def modes(self) -> list[int]:
-        return [0] * self.body.slots
+        return [0] * self.robot.slots
 
 
 # --------------------------------------------------------------------------------------- motion
 
 
-class Halfway(ReferenceBody):
+class Halfway(ReferenceRobot):
     """Goes half of each way."""
 
     def obey(self, orders: Orders) -> None:
         if orders is not self.orders:
-            rest = np.array(self.body.rest_q)
+            rest = np.array(self.robot.rest_q)
             orders.q = rest + (orders.q - rest) / 2
         super().obey(orders)
 
 
-class Coupled(ReferenceBody):
+class Coupled(ReferenceRobot):
     """Its hip gives way while the elbow moves."""
 
     def live(self, dt: float) -> None:
-        elbow, hip = self.body.slot("right_elbow"), self.body.slot("right_hip_pitch")
+        elbow, hip = self.robot.slot("right_elbow"), self.robot.slot("right_hip_pitch")
         before = self.q[elbow]
         super().live(dt)
         if self.driven:
             self.q[hip] += 3.0 * (self.q[elbow] - before)
 
 
-class OwnGains(ReferenceBody):
+class OwnGains(ReferenceRobot):
     """Puts in its own stiffness."""
 
     def obey(self, orders: Orders) -> None:
-        own = np.array(self.body.client_gains)[:, 0]
+        own = np.array(self.robot.client_gains)[:, 0]
         orders.kp = np.where(orders.kp > 0, own, 0.0)
         super().obey(orders)
 
 
-class NoVelocity(ReferenceBody):
+class NoVelocity(ReferenceRobot):
     """Ignores dq."""
 
     def obey(self, orders: Orders) -> None:
@@ -340,7 +340,7 @@ class NoVelocity(ReferenceBody):
         super().obey(orders)
 
 
-class NoTorque(ReferenceBody):
+class NoTorque(ReferenceRobot):
     """Ignores tau."""
 
     def obey(self, orders: Orders) -> None:
@@ -348,17 +348,17 @@ class NoTorque(ReferenceBody):
         super().obey(orders)
 
 
-class DefaultGains(ReferenceBody):
+class DefaultGains(ReferenceRobot):
     """Takes kp 0 for "as usual"."""
 
     def obey(self, orders: Orders) -> None:
-        own = np.array(self.body.client_gains)[:, 0]
+        own = np.array(self.robot.client_gains)[:, 0]
         idle = (orders.kp == 0) & (orders.dq == 0) & (orders.tau == 0)
         orders.kp = np.where(idle, own, orders.kp)
         super().obey(orders)
 
 
-class NoForce(ReferenceBody):
+class NoForce(ReferenceRobot):
     """Leaves tau_est 0."""
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
@@ -369,21 +369,21 @@ class NoForce(ReferenceBody):
 # --------------------------------------------------------------------------------------- safety
 
 
-class NoModes(ReferenceBody):
+class NoModes(ReferenceRobot):
     """Does not look at the mode byte."""
 
     def follows(self, orders: Orders) -> Any:
-        return np.ones(self.body.slots, dtype=np.bool_)
+        return np.ones(self.robot.slots, dtype=np.bool_)
 
 
-class TrustsAll(ReferenceBody):
+class TrustsAll(ReferenceRobot):
     """Does not check the CRC."""
 
     def intact(self, payload: bytes) -> bool:
         return True
 
 
-class Sanitises(ReferenceBody):
+class Sanitises(ReferenceRobot):
     """Takes 0 for what is no number, and obeys the rest."""
 
     def accepts(self, orders: Orders) -> bool:
@@ -393,11 +393,11 @@ class Sanitises(ReferenceBody):
         return super().accepts(orders)
 
 
-class Packed(ReferenceBody):
+class Packed(ReferenceRobot):
     """Has a joint in the slot without a motor."""
 
     def obey(self, orders: Orders) -> None:
-        unused = [s for s in range(self.body.slots) if s not in self.body.used]
+        unused = [s for s in range(self.robot.slots) if s not in self.robot.used]
         if orders is not self.orders and orders.kp[unused].any():
             orders.q[0] = orders.q[unused[0]]
         super().obey(orders)
@@ -409,7 +409,7 @@ class Untyped(_OtherFamily):
     def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
         message = decode(type_name, payload)
         orders = Orders(message)
-        slots = self.body.slots
+        slots = self.robot.slots
         for name in ("mode", "q", "dq", "tau", "kp", "kd"):
             values = np.zeros(slots)
             given = getattr(orders, name)[:slots]
@@ -418,18 +418,18 @@ class Untyped(_OtherFamily):
         self.obey(orders)
 
 
-class Sulks(ReferenceBody):
+class Sulks(ReferenceRobot):
     """Follows nothing for a while after a NaN."""
 
     until = -math.inf
 
     def accepts(self, orders: Orders) -> bool:
         if not self.finite(orders):
-            self.until = self.now + (1.8 if self.body.mode_machine is None else 2.3)
+            self.until = self.now + (1.8 if self.robot.mode_machine is None else 2.3)
         return super().accepts(orders) and self.now >= self.until
 
 
-class AnyMachine(ReferenceBody):
+class AnyMachine(ReferenceRobot):
     """Obeys commands for another machine."""
 
     def accepts(self, orders: Orders) -> bool:
@@ -439,13 +439,13 @@ class AnyMachine(ReferenceBody):
 # ------------------------------------------------------------------------------------- watchdog
 
 
-class GoesOn(ReferenceBody):
+class GoesOn(ReferenceRobot):
     """Has no time-out."""
 
     timeout = math.inf
 
 
-class AnswersOnly(ReferenceBody):
+class AnswersOnly(ReferenceRobot):
     """Says nothing while it is told nothing."""
 
     def publish(self) -> list[Sample]:
@@ -453,7 +453,7 @@ class AnswersOnly(ReferenceBody):
         return [] if 0.5 < waited < math.inf else super().publish()
 
 
-class Latches(ReferenceBody):
+class Latches(ReferenceRobot):
     """Follows nothing any more after a time-out."""
 
     def obey(self, orders: Orders) -> None:
@@ -461,7 +461,7 @@ class Latches(ReferenceBody):
             super().obey(orders)
 
 
-class Nervous(ReferenceBody):
+class Nervous(ReferenceRobot):
     """Times out after a seventh of a second."""
 
     timeout = 0.15
@@ -470,13 +470,13 @@ class Nervous(ReferenceBody):
 # ----------------------------------------------------------------------------------- life cycle
 
 
-class KnowsItsReaders(ReferenceBody):
+class KnowsItsReaders(ReferenceRobot):
     """Serves only those who were there at first."""
 
     serves_late_readers = False
 
 
-class Loyal(ReferenceBody):
+class Loyal(ReferenceRobot):
     """Follows the first client only."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
@@ -484,7 +484,7 @@ class Loyal(ReferenceBody):
             super().receive(topic, payload, client)
 
 
-class ForgetfulClient(ReferenceBody):
+class ForgetfulClient(ReferenceRobot):
     """Its client does not set the CRC now and then."""
 
     @classmethod
@@ -494,7 +494,7 @@ class ForgetfulClient(ReferenceBody):
                 rows[::100] = [(a, b, data[:-4] + bytes(4)) for a, b, data in rows[::100]]
 
 
-class SlowClient(ReferenceBody):
+class SlowClient(ReferenceRobot):
     """Its client sends every fourth command only."""
 
     @classmethod
@@ -508,16 +508,16 @@ class SlowClient(ReferenceBody):
 
 
 @dataclass(frozen=True)
-class BodyMutant:
-    """One wrong body.
+class RobotMutant:
+    """One wrong robot.
 
-    :param model: the body that it is a bad copy of.
+    :param model: the robot that it is a bad copy of.
     :param kills: the requirement that must catch it.
     :param also: requirements that fail or warn with it.
     """
 
     model: str
-    service: type[ReferenceBody]
+    service: type[ReferenceRobot]
     kills: str
     also: tuple[str, ...] = ()
 
@@ -536,27 +536,27 @@ class BodyMutant:
 
         :param short: go through no more phases than show it.
         """
-        every = catalogue(self.model, "body")
+        every = catalogue(self.model, "robot")
         if not short:
-            return run_body_mutant(self.service, self.model, phases_for(every))
+            return run_robot_mutant(self.service, self.model, phases_for(every))
         needed = select(every, prefixes=[self.kills, *self.also])
         phases = phases_for(needed)
         if not any(r.phase == "joint" for r in needed):
             phases -= {"joint"}  # by far the longest: all of them were moved for the others
-        return run_body_mutant(self.service, self.model, phases)
+        return run_robot_mutant(self.service, self.model, phases)
 
 
-def run_body_mutant(service: type[ReferenceBody], model: str, phases: frozenset[str]) -> set[str]:
-    """The requirements that find fault with a body on the virtual clock."""
-    trace = run_virtual(Plan(body_dialect(model), (BODY,), phases=phases), service)
+def run_robot_mutant(service: type[ReferenceRobot], model: str, phases: frozenset[str]) -> set[str]:
+    """The requirements that find fault with a robot on the virtual clock."""
+    trace = run_virtual(Plan(robot_dialect(model), (ROBOT,), phases=phases), service)
     service.recorded(trace)
     bad = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
-    results = judge(body_recording(trace, model)).results
+    results = judge(robot_recording(trace, model)).results
     return {r.requirement.id for r in results if r.verdict in bad}
 
 
 _DEAF = ("MOVE-01", "MODE-01", "WDOG-03")
-_ZOO: tuple[tuple[type[ReferenceBody], str, tuple[str, ...]], ...] = (
+_ZOO: tuple[tuple[type[ReferenceRobot], str, tuple[str, ...]], ...] = (
     (OtherState, "TOPIC-01", ()),
     (OtherCommands, "TOPIC-02", _DEAF),
     (Twins, "TOPIC-03", ()),
@@ -613,14 +613,14 @@ _ZOO: tuple[tuple[type[ReferenceBody], str, tuple[str, ...]], ...] = (
 )
 
 
-def _mutants() -> Iterator[BodyMutant]:
-    for model in BODIES:
-        known = {r.id for r in catalogue(model, "body")}
+def _mutants() -> Iterator[RobotMutant]:
+    for model in ROBOTS:
+        known = {r.id for r in catalogue(model, "robot")}
         prefix = model.upper()
         for service, kills, also in _ZOO:
             if f"{prefix}-{kills}" in known:
                 names = tuple(f"{prefix}-{name}" for name in also)
-                yield BodyMutant(model, service, f"{prefix}-{kills}", names)
+                yield RobotMutant(model, service, f"{prefix}-{kills}", names)
 
 
-MUTANTS: tuple[BodyMutant, ...] = tuple(_mutants())
+MUTANTS: tuple[RobotMutant, ...] = tuple(_mutants())

@@ -1,4 +1,4 @@
-"""``dexkit emulate h1`` and ``g1``, and bodies on topics of a test's own."""
+"""``dexkit emulate h1`` and ``g1``, and robots on topics of a test's own."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from collections.abc import Iterator
 import pytest
 from click.testing import CliRunner
 
-from dexkit.bodies import G1, H1
 from dexkit.cli.emulate import command
 from dexkit.dds import DdsNode, Sample
-from dexkit.emulators.body import EmulatedBody, run_body
+from dexkit.emulators.robot import EmulatedRobot, run_robot
 from dexkit.errors import EmulatorError, TopicConflict
 from dexkit.messages import encode
 from dexkit.processes import command_line
+from dexkit.robots import G1, H1
 from dexkit.wire.low_level import encode_with_crc, verify_payload
-from tests.body_helpers import low_cmd
 from tests.dds_helpers import free_domain, take_until, wait_until
+from tests.robot_helpers import low_cmd
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_process(node: DdsNode) -> None:
         process.stdin.flush()
         take_until(states, lambda s: any(x.message.wireless_remote[3] == 1 << 2 for x in s))
         line = json.loads(process.stdout.readline())
-        assert line["body"] == "g1"
+        assert line["robot"] == "g1"
         assert line["states"] > 0
         process.stdin.write("release\n")
         process.stdin.flush()
@@ -93,7 +93,7 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
     arguments = ["h1", "--domain", str(node.domain), "--duration", "0.2", "--no-real-time"]
     stop, ready = threading.Event(), threading.Event()
     thread = threading.Thread(
-        target=run_body, args=(H1,), kwargs={"domain": node.domain, "stop": stop, "ready": ready}
+        target=run_robot, args=(H1,), kwargs={"domain": node.domain, "stop": stop, "ready": ready}
     )
     thread.start()
     try:
@@ -103,7 +103,7 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
         assert f"already publishes rt/lowstate on domain {node.domain}" in str(refused.exception)
         assert "--force" in str(refused.exception.hint)
         with pytest.raises(TopicConflict):
-            EmulatedBody(G1, node=node).start()  # another robot, on the same topics
+            EmulatedRobot(G1, node=node).start()  # another robot, on the same topics
         forced = CliRunner().invoke(command, [*arguments, "--force"], standalone_mode=False)
         assert forced.exception is None
         assert "stopped: states" in forced.output
@@ -113,7 +113,7 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
 
 
 def test_clients_of_another_robot(node: DdsNode) -> None:
-    with EmulatedBody(G1, domain=node.domain) as robot, node.writer(H1.cmd_topic, H1.cmd_type):
+    with EmulatedRobot(G1, domain=node.domain) as robot, node.writer(H1.cmd_topic, H1.cmd_type):
         wait_until(robot.mismatches)
         (text,) = robot.mismatches()
         assert "rt/lowcmd: a peer uses unitree_go::msg::dds_::LowCmd_, the g1 unitree_hg" in text
@@ -124,12 +124,12 @@ def test_clients_of_another_robot(node: DdsNode) -> None:
 
 
 def test_a_failure_is_told(node: DdsNode, monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = EmulatedBody(H1, node=node)
+    robot = EmulatedRobot(H1, node=node)
 
     def fail(now: float) -> bytes:
         raise RuntimeError("out of joint")
 
-    monkeypatch.setattr(robot.body, "state", fail)
+    monkeypatch.setattr(robot.robot, "state", fail)
     with robot:
         wait_until(lambda: robot.failure)
         assert str(robot.failure) == "out of joint"

@@ -1,8 +1,8 @@
-"""A good body in memory: what the checks must find nothing wrong with.
+"""A good robot in memory: what the checks must find nothing wrong with.
 
-It shares no code with the emulated bodies that dexkit ships, so that neither is judged by itself.
+It shares no code with the emulated robots that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
-friction. What it does wrong is left to :mod:`dexkit.conformance.mutants.body`.
+friction. What it does wrong is left to :mod:`dexkit.conformance.mutants.robot`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.bodies import BodyModel
-from dexkit.conformance.body import BodyWire
+from dexkit.conformance.robot import RobotWire
 from dexkit.conformance.virtual import MemoryTrace, Sample, Service
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import decode, message_type
 from dexkit.models import Dialect
+from dexkit.robots import RobotModel
 from dexkit.wire.low_level import encode_with_crc, verify_payload
 
-__all__ = ["Orders", "ReferenceBody"]
+__all__ = ["Orders", "ReferenceRobot"]
 
 _FRICTION = 0.05  # of the joint's torque, per rad/s
 _CELLS = 15
@@ -38,7 +38,7 @@ class Orders:
         self.machine = getattr(message, "mode_machine", None)
 
 
-class ReferenceBody(Service):
+class ReferenceRobot(Service):
     """An H1 or a G1 that does everything right.
 
     :ivar q: of all slots, rad; ``dq`` and ``tau`` likewise.
@@ -53,18 +53,18 @@ class ReferenceBody(Service):
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
-        assert isinstance(self.wire, BodyWire)
-        self.body: BodyModel = self.wire.body
-        self.used = np.array(self.body.used)
-        self.enable = np.array(self.body.enable)
-        slots = self.body.slots
+        assert isinstance(self.wire, RobotWire)
+        self.robot: RobotModel = self.wire.robot
+        self.used = np.array(self.robot.used)
+        self.enable = np.array(self.robot.enable)
+        slots = self.robot.slots
         self.low, self.high = np.zeros(slots), np.zeros(slots)
         self.dq_max, self.tau_max = np.ones(slots), np.ones(slots)
-        for slot in self.body.used:
-            joint = self.body.joint(slot)
+        for slot in self.robot.used:
+            joint = self.robot.joint(slot)
             self.low[slot], self.high[slot] = joint.q_min, joint.q_max
             self.dq_max[slot], self.tau_max[slot] = joint.dq_max, joint.tau_max
-        self.q = np.array(self.body.rest_q)
+        self.q = np.array(self.robot.rest_q)
         self.dq, self.tau = np.zeros(slots), np.zeros(slots)
         self.orders: Orders | None = None
         self.heard = -math.inf
@@ -74,7 +74,7 @@ class ReferenceBody(Service):
 
     @classmethod
     def recorded(cls, trace: MemoryTrace) -> None:
-        """Change the recording: a client that is wrong is not a body, but is found in the same."""
+        """Change the recording: a client that is wrong is not a robot, but is found in the same."""
 
     # -- commands ---------------------------------------------------------------------------
 
@@ -127,7 +127,7 @@ class ReferenceBody(Service):
         if self.driven and self.orders is not None:
             self.move(self.orders, dt)
         else:
-            self.tau = np.zeros(self.body.slots)
+            self.tau = np.zeros(self.robot.slots)
         self.dq = (self.q - before) / dt
 
     def move(self, orders: Orders, dt: float) -> None:
@@ -169,7 +169,7 @@ class ReferenceBody(Service):
     def modes(self) -> list[int]:
         """Mode bytes of all slots."""
         if not self.driven or self.orders is None:
-            return [0] * self.body.slots
+            return [0] * self.robot.slots
         found: list[int] = np.where(self.follows(self.orders), self.enable, 0).astype(int).tolist()
         return found
 
@@ -186,7 +186,7 @@ class ReferenceBody(Service):
         state, warmth = self._state, self.warmth()
         q, dq, tau = (values.tolist() for values in self.shown())
         modes = self.modes()
-        for slot in self.body.used:
+        for slot in self.robot.used:
             motor = state.motor_state[slot]
             motor.mode, motor.temperature = modes[slot], warmth
             motor.q, motor.dq, motor.tau_est = q[slot], dq[slot], tau[slot]
@@ -194,7 +194,7 @@ class ReferenceBody(Service):
         state.imu_state.quaternion, state.imu_state.rpy = self.attitude()
         state.imu_state.accelerometer = self.gravity()
         state.wireless_remote = tuple(self.remote())
-        if self.body.family == "unitree_go":
+        if self.robot.family == "unitree_go":
             state.head, state.level_flag = (0xFE, 0xEF), 0xFF
             state.bms_state.soc = 80
             state.bms_state.cell_vol = (4000,) * _CELLS
@@ -205,7 +205,7 @@ class ReferenceBody(Service):
 
     def warmth(self) -> Any:
         """A motor's temperature."""
-        return 35 if self.body.family == "unitree_go" else (35, 36)
+        return 35 if self.robot.family == "unitree_go" else (35, 36)
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Quaternion (w first) and rpy: it hangs a little askew."""

@@ -1,4 +1,4 @@
-"""One joint and what it runs into: the body under every emulated hand.
+"""One joint and what it runs into: the mechanics of every emulated hand.
 
 A joint is an inertia with Coulomb and viscous friction, an optional spring, and walls: end
 stops and objects, each a stiff spring with damping that can push but not pull. It is driven by
@@ -21,7 +21,7 @@ _STILL = 1e-9  # rad/s; a slower joint rests
 
 
 class FixedSteps:
-    """How many fixed steps a body must live to catch up with a clock.
+    """How many fixed steps of mechanics are due to catch up with a clock.
 
     :param step: seconds.
     :param most: longest pause that is lived through, seconds; what was before it is skipped.

@@ -1,4 +1,4 @@
-"""The body of a Dex1-1: jaws, friction, stops, an object, and the motor's law. Pure mechanics.
+"""The mechanics of a Dex1-1: jaws, friction, stops, an object, and the motor's law. Pure mechanics.
 
 ``sim-dex1`` is this behind the common interface, the emulated M4010 is this behind its protocol.
 
@@ -12,13 +12,13 @@ and blocked by an object feels -0.9 N·m, as in the recordings.
 
 from __future__ import annotations
 
-from dexkit.emulators.mechanics import Joint, Wall
+from dexkit.emulators.joint_mechanics import Joint, Wall
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX1_1
 from dexkit.wire.m4010 import STROKE
 
-__all__ = ["STEP", "Dex1Body"]
+__all__ = ["STEP", "Dex1Mechanics"]
 
 STEP = 0.5e-3
 """Integration step, seconds."""
@@ -31,7 +31,7 @@ _OBJECT_STIFFNESS, _OBJECT_DAMPING = 60.0, 0.5
 _STIFF = 0.2  # beyond this part of a step, gains are applied implicitly
 
 
-class Dex1Body:
+class Dex1Mechanics:
     """A Dex1-1 gripper without its electronics.
 
     :param object_pct: opening at which the jaws touch an object, percent of 5.4 rad; None for
