@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.clock import RealClock
+from dexkit.command_age import PauseWatch
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
@@ -37,7 +38,6 @@ from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.wire import Wire
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
-from dexkit.freshness import PauseWatch
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.sole import Place, SolePublisher

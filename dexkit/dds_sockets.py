@@ -2,7 +2,8 @@
 
 CycloneDDS 0.10 binds them to all addresses, tells nobody which they are, and asks for the index
 of its interface once. So they are found among the sockets of the process, get a filter
-(:mod:`dexkit.ingress`), and follow an interface that is unplugged and comes back as another one.
+(:mod:`dexkit.ingress`), and follow an interface that is unplugged and comes back as
+another one.
 """
 
 from __future__ import annotations

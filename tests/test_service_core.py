@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
+from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
-from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import Backoff, Estimation, HandCore

@@ -15,10 +15,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from dexkit.cli import cli
+from dexkit.command_age import PAUSE
 from dexkit.conformance.view import Recording
 from dexkit.dds import DdsNode
 from dexkit.errors import DexkitError, UsageError
-from dexkit.freshness import PAUSE
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_

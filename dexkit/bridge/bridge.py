@@ -16,9 +16,9 @@ from typing import Any
 
 from dexkit.bridge.core import Commands, Direction, Outgoing, States
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import PAUSE, Ages, PauseWatch
 from dexkit.dds import DdsNode, Endpoint, Reader, Sample, Writer
 from dexkit.errors import DexkitError, TopicConflict, UsageError
-from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers

@@ -11,8 +11,8 @@ Three activities, each with its own clock:
 All three share one interpreter lock, so the publishing thread does little: it writes bytes that
 were encoded once for each new state.
 
-Each of them notices when it stood still (:class:`~dexkit.freshness.PauseWatch`): whoever does tells
-the cores, which brake until a command comes that was sent later.
+Each of them notices when it stood still (:class:`~dexkit.command_age.PauseWatch`): whoever does
+tells the cores, which brake until a command comes that was sent later.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from dexkit.clock import Clock, Rate, RealClock
+from dexkit.command_age import PAUSE, Ages, PauseWatch
 from dexkit.errors import (
     BackendBroken,
     DexkitError,
@@ -36,7 +37,6 @@ from dexkit.errors import (
     UsageError,
     WireError,
 )
-from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model

@@ -6,7 +6,7 @@ the genuine one would be a nuisance: it waits until the hand listens before its 
 it leaves the hand at rest (:meth:`LiveClient.leave`).
 
 It differs after a pause of its own, too (stopped, suspended, starved; more than
-:data:`~dexkit.freshness.PAUSE`). The genuine client would go on by what it last read, or by where
+:data:`~dexkit.command_age.PAUSE`). The genuine client would go on by what it last read, or by where
 the operator is by now. This one is silent until each hand has told where it is *now*, forgets what
 it smoothed, and lets the operator go on where he was.
 """
@@ -22,9 +22,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.clock import RealClock
+from dexkit.command_age import PAUSE, SETTLE, PauseWatch
 from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
-from dexkit.freshness import PAUSE, SETTLE, PauseWatch
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
 from dexkit.sole import Place, SolePublisher

@@ -14,11 +14,11 @@ import logging
 import threading
 
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import PAUSE, Ages, PauseWatch
 from dexkit.dds import DdsNode, Endpoint, Reader, Writer
 from dexkit.emulators.robot.mechanics import RobotMechanics
 from dexkit.emulators.robot.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
-from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.service import Publisher
 from dexkit.sole import Place, SolePublisher

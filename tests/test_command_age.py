@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, RealClock
-from dexkit.errors import HandTimeout
-from dexkit.freshness import (
+from dexkit.command_age import (
     DRIFT,
     FORGET,
     PAUSE,
@@ -22,6 +21,7 @@ from dexkit.freshness import (
     PauseWatch,
     Promptly,
 )
+from dexkit.errors import HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import HandCore
