@@ -22,7 +22,7 @@ from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
-from dexkit.sole import LOOK, Place, SolePublisher
+from dexkit.single_publisher import LOOK, Place, SolePublisher
 from dexkit.threads import Worker
 
 __all__ = ["Bridge", "End"]

@@ -14,7 +14,7 @@ import click
 
 from dexkit.cli.common import Number, StopRequest, dds_options, stop_on_signals
 from dexkit.errors import DdsError, TraceUnsupported
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 from dexkit.threads import Worker
 from dexkit.untrusted import REMARK, one_line
 

@@ -45,7 +45,7 @@ from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
 from dexkit.service.publisher import Publisher, align
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 from dexkit.threads import Worker
 
 __all__ = ["HandService", "Node"]
@@ -112,8 +112,8 @@ class HandService:
     :param force: start, and go on, even if somebody else publishes the state topic.
     :raises UsageError: hands and dialect do not fit.
 
-    A service that is to give way to another one after its start (:mod:`dexkit.sole`) brakes and
-    releases its hands; :attr:`failure` then is a :class:`~dexkit.errors.TopicConflict`.
+    A service that is to give way to another one after its start (:mod:`dexkit.single_publisher`)
+    brakes and releases its hands; :attr:`failure` then is a :class:`~dexkit.errors.TopicConflict`.
 
     A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
     and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.

@@ -27,7 +27,7 @@ from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator

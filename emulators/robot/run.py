@@ -21,7 +21,7 @@ from dexkit.emulators.robot.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.service import Publisher
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 
 __all__ = ["EmulatedRobot", "run_robot"]
 

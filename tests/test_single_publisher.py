@@ -19,7 +19,7 @@ from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.robots import G1
 from dexkit.service import HandService
-from dexkit.sole import LOOK, SETTLE, Claim, Place, SolePublisher
+from dexkit.single_publisher import LOOK, SETTLE, Claim, Place, SolePublisher
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.live import LiveClient
 from dexkit.traces import sample_path

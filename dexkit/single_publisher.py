@@ -30,7 +30,7 @@ from dexkit.errors import TopicConflict
 
 __all__ = ["LOOK", "SETTLE", "Claim", "Place", "SolePublisher"]
 
-log = logging.getLogger("dexkit.sole")
+log = logging.getLogger("dexkit.single_publisher")
 
 LOOK = 0.3
 """Seconds to look for others before the own writers are announced: participants find each other
