@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from dexkit import ingress
+from dexkit import interface_filter
 from dexkit.doctor import rtps
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
@@ -154,12 +154,12 @@ class _Window:
     def _restrict(self) -> None:
         """See what comes by this interface only: an address is reached by the others, too."""
         try:
-            ingress.restrict(self.socket, self.interface)
+            interface_filter.restrict(self.socket, self.interface)
         except OSError as error:
-            if not ingress.all_interfaces_allowed():
+            if not interface_filter.all_interfaces_allowed():
                 raise DdsSetupError(
                     f"other networks than {self.interface} cannot be kept out: {error.strerror}",
-                    hint=ingress.HINT,
+                    hint=interface_filter.HINT,
                 ) from error
 
     def sample(self, writer: EndpointData, sequence: int, data: bytes, now: float) -> None:
