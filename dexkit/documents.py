@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.errors import DexkitError, UsageError
-from dexkit.untrusted import one_line, output_error
+from dexkit.escaping import one_line, output_error
 
 if sys.version_info >= (3, 11):
     import tomllib

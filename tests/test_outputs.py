@@ -157,7 +157,7 @@ def test_without_standard_streams_nothing_is_written_into_what_is_opened_next(
 
 _OPENED_NEXT = """
 import os, subprocess, sys
-from dexkit.untrusted import guarded
+from dexkit.escaping import guarded
 with guarded():
     assert os.open(sys.argv[1], os.O_RDWR) > 2
     assert [s.fileno() for s in (sys.stdin, sys.stdout, sys.stderr)] == [0, 1, 2]

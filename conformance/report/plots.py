@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from dexkit.escaping import html as escape
 from dexkit.hand import Floats
-from dexkit.untrusted import html as escape
 
 __all__ = [
     "Band",

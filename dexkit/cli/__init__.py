@@ -17,7 +17,7 @@ import click
 
 from dexkit import __version__, threads
 from dexkit.errors import DexkitError, OutputError
-from dexkit.untrusted import REMARK, guarded, one_line
+from dexkit.escaping import REMARK, guarded, one_line
 
 __all__ = ["cli", "main"]
 

@@ -20,7 +20,7 @@ from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.scaling import amperes
 from dexkit.drivers.ezgripper.servo import Servo
 from dexkit.errors import UsageError
-from dexkit.untrusted import one_line
+from dexkit.escaping import one_line
 from dexkit.wire import mx64
 
 __all__ = ["command"]

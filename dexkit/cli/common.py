@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 import click
 
+from dexkit.escaping import REMARK, one_line
 from dexkit.stopping import StopRequest, stop_on_signals
-from dexkit.untrusted import REMARK, one_line
 
 F = TypeVar("F", bound=Callable[..., Any])
 

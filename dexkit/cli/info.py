@@ -95,7 +95,7 @@ def _print(data: dict[str, Any]) -> None:
 
     from dexkit.console import Console
     from dexkit.console import markup as escape
-    from dexkit.untrusted import LONGEST
+    from dexkit.escaping import LONGEST
 
     # wide enough for the table: in a pipe rich would cut topics to 80 columns
     console = Console(width=max(Console().width, 120))

@@ -13,7 +13,7 @@ import click
 from dexkit import threads
 from dexkit.cli.common import Number, dds_options, stop_on_signals
 from dexkit.errors import TraceError, UsageError
-from dexkit.untrusted import REMARK, one_line
+from dexkit.escaping import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode

@@ -14,9 +14,9 @@ import click
 
 from dexkit.cli.common import Number, StopRequest, dds_options, stop_on_signals
 from dexkit.errors import DdsError, TraceUnsupported
+from dexkit.escaping import REMARK, one_line
 from dexkit.single_publisher import Place, SolePublisher
 from dexkit.threads import Worker
-from dexkit.untrusted import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer

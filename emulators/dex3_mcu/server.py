@@ -39,8 +39,8 @@ from usbip.device import USBDevice
 from dexkit import interface_filter
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
+from dexkit.escaping import one_line
 from dexkit.threads import Worker
-from dexkit.untrusted import one_line
 
 __all__ = [
     "DEAD",

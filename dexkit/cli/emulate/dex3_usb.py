@@ -11,8 +11,8 @@ import click
 from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.errors import EmulatorError
+from dexkit.escaping import one_line
 from dexkit.hand import Side
-from dexkit.untrusted import one_line
 
 __all__ = ["emulate_dex3_usb"]
 
