@@ -54,7 +54,7 @@ from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 from dexkit import interface_filter
-from dexkit.dds_sockets import DomainSockets, open_sockets
+from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
 from dexkit.limits import room_for_files
 from dexkit.messages import MessageType, layout, message_type
