@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode
-from dexkit.sockets import DdsSockets
+from dexkit.socket_losses import DdsSockets
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.losses import PAUSE, Losses
@@ -156,7 +156,7 @@ CHILD = textwrap.dedent(
     """
     import socket, sys
     from dexkit.cli import main
-    from dexkit.sockets import DdsSockets
+    from dexkit.socket_losses import DdsSockets
     def shrink(self, size):
         for sock in self._sockets():
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)

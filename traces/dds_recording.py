@@ -19,7 +19,7 @@ from dexkit.errors import DdsError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS
-from dexkit.sockets import DdsSockets
+from dexkit.socket_losses import DdsSockets
 from dexkit.threads import Worker
 from dexkit.topics import HAND_TOPICS
 from dexkit.traces.losses import Losses
