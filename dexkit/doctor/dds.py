@@ -17,7 +17,7 @@ from dexkit.doctor import rtps
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
-from dexkit.doctor.processes import command_line, environment_of, start_time
+from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
 from dexkit.doctor.topics import is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError

@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 from dexkit.doctor.observations import DdsSocket, Interface
-from dexkit.doctor.processes import command_line, open_sockets
+from dexkit.doctor.proc_files import command_line, open_sockets
 from dexkit.errors import DdsSetupError
 from dexkit.interface_filter import interface_address, interface_flags
 
