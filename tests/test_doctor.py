@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.dds import DdsNode, Qos, Writer, type_hash
 from dexkit.doctor import Finding, Observations, Wish, diagnose, readiness
@@ -30,7 +31,6 @@ from dexkit.doctor.rtps import parse_message, unicast_port
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.models import DIALECTS
-from dexkit.processes import command_line
 from tests import doctor_packets as packets
 from tests.dds_helpers import free_domain
 

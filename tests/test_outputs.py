@@ -13,8 +13,8 @@ from pathlib import Path
 import click
 import pytest
 
+from dexkit.child_processes import command_line
 from dexkit.cli import main
-from dexkit.processes import command_line
 from tests import hostile
 
 _SAMPLE = "<sample>"

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from dexkit.child_processes import END_WITH_PARENT, Tool, command_line
 from dexkit.emulators.mx64 import EmulatedProcess
 from dexkit.errors import DexkitError
 from dexkit.limits import room_for_files
-from dexkit.processes import END_WITH_PARENT, Tool, command_line
 from dexkit.scratch import PREFIX, Scratch, sweep
 
 _HOSTILE = """
@@ -100,7 +100,7 @@ def _ended(pid: int) -> bool:
 
 _PARENT = """
 import os, sys, threading
-from dexkit.processes import Tool
+from dexkit.child_processes import Tool
 tool = Tool("emulate", "mx64", "--link", sys.argv[1])
 if sys.argv[2] == "ready":
     tool.wait_ready(threading.Event())
@@ -132,7 +132,7 @@ def test_a_process_ends_with_its_parent_however_that_ends(when: str, tmp_path: P
 
 def test_a_process_that_does_not_end_when_told_is_killed(tmp_path: Path) -> None:
     code = (
-        "import signal, time, dexkit.processes as p\n"
+        "import signal, time, dexkit.child_processes as p\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
         "p.STOP_TIMEOUT = 0.05\n"
         "p.end_with_parent()\n"

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from dexkit import interface_filter
+from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
@@ -22,7 +23,6 @@ from dexkit.doctor.rtps import EndpointData, Locator
 from dexkit.doctor.topics import is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
-from dexkit.processes import process_id
 
 __all__ = ["DISCOVERY_SECONDS", "look"]
 

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import click
 
+from dexkit.child_processes import READY_TIMEOUT, Tool
 from dexkit.cli.common import (
     STATUS_LINES,
     Number,
@@ -23,7 +24,6 @@ from dexkit.cli.common import (
 )
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1
-from dexkit.processes import READY_TIMEOUT, Tool
 from dexkit.robots import ROBOTS
 
 __all__ = ["emulate_all"]
