@@ -19,7 +19,7 @@ from dexkit.emulators.serial_port import Port
 from dexkit.errors import DexkitError, HandLost
 from dexkit.service import HandService
 from dexkit.service.publisher import Publisher
-from dexkit.stopping import stop_on_signals
+from dexkit.stop_signals import stop_on_signals
 from dexkit.threads import Worker
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording

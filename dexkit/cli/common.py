@@ -1,4 +1,4 @@
-"""What the sub-commands share: options, and stopping (:mod:`dexkit.stopping`)."""
+"""What the sub-commands share: options, and stopping (:mod:`dexkit.stop_signals`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import click
 
 from dexkit.escaping import REMARK, one_line
-from dexkit.stopping import StopRequest, stop_on_signals
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 F = TypeVar("F", bound=Callable[..., Any])
 
