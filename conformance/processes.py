@@ -17,7 +17,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import Scratch
 
 __all__ = [
     "BODY_EMULATORS",

@@ -35,7 +35,7 @@ from dexkit.hand import Side
 from dexkit.limits import room_for_files
 from dexkit.models import DEX1_1, Dialect, dialect, model
 from dexkit.robots import ROBOTS
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import Scratch
 
 if TYPE_CHECKING:
     import pytest

@@ -22,7 +22,7 @@ from dexkit.clock import Clock, RealClock
 from dexkit.emulators.faults import Fault
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import Scratch
 from dexkit.threads import Worker
 
 __all__ = ["Port", "client_baudrate"]

@@ -19,7 +19,7 @@ from dexkit.child_processes import END_WITH_PARENT, Tool, command_line
 from dexkit.emulators.mx64 import EmulatedProcess
 from dexkit.errors import DexkitError
 from dexkit.limits import room_for_files
-from dexkit.scratch import PREFIX, Scratch, sweep
+from dexkit.temporary_folder import PREFIX, Scratch, sweep
 
 _HOSTILE = """
 import os
@@ -158,7 +158,7 @@ def test_a_process_that_does_not_end_when_told_is_killed(tmp_path: Path) -> None
 
 _RUN = """
 import sys
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import Scratch
 folder = Scratch("run")
 (folder.path / "run.mcap").write_bytes(bytes(1000))
 print(folder.path, flush=True)

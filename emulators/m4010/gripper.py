@@ -17,7 +17,7 @@ from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import Scratch
 
 __all__ = ["Dex1Motors", "Dex1Process", "emulated_dex1"]
 

@@ -15,7 +15,7 @@ from dexkit.emulators.mx64.settings import Firmware, Physics
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import Scratch
 
 __all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
 
