@@ -32,8 +32,8 @@ from dexkit.conformance.view import Recording, sides_of
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
-from dexkit.limits import room_for_files
 from dexkit.models import DEX1_1, Dialect, dialect, model
+from dexkit.open_file_limit import room_for_files
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import Scratch
 

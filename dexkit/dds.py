@@ -57,8 +57,8 @@ from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
-from dexkit.limits import room_for_files
 from dexkit.messages import MessageType, layout, message_type
+from dexkit.open_file_limit import room_for_files
 from dexkit.threads import Worker
 
 __all__ = [

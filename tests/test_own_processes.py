@@ -18,7 +18,7 @@ import pytest
 from dexkit.child_processes import END_WITH_PARENT, Tool, command_line
 from dexkit.emulators.mx64 import EmulatedProcess
 from dexkit.errors import DexkitError
-from dexkit.limits import room_for_files
+from dexkit.open_file_limit import room_for_files
 from dexkit.temporary_folder import PREFIX, Scratch, sweep
 
 _HOSTILE = """

@@ -14,8 +14,8 @@ import click
 
 from dexkit.cli.common import Number, StopRequest, stop_on_signals
 from dexkit.errors import UsageError
-from dexkit.limits import room_for_files
 from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.open_file_limit import room_for_files
 
 if TYPE_CHECKING:
     from dexkit.doctor import Finding, Observations, Readiness, Verdict
