@@ -33,7 +33,7 @@ from dexkit.teleop import (
     recorded,
 )
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
-from dexkit.teleop.wire import ClientWire
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces import open_trace, sample_path
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT

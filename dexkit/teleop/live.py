@@ -29,9 +29,9 @@ from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
 from dexkit.single_publisher import Place, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator
-from dexkit.teleop.wire import ClientWire
 
 __all__ = ["LiveClient", "Session"]
 
