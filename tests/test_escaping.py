@@ -250,10 +250,6 @@ _ALONE = {
     r"\brich\.console\b": {"dexkit/console.py"},
     r"^from html import|^import html": {
         "dexkit/escaping.py",
-        # drawings of dexkit's own models
-        "dexkit/family/drawing.py",
-        "dexkit/family/page.py",
-        "dexkit/family/svg.py",
     },
     r"sys\.std(out|err)\.buffer|sys\.__std": set(),
 }
