@@ -19,7 +19,7 @@ from mcap.writer import Writer
 from rich.table import Table
 from rich.text import Text
 
-from dexkit.cli.common import log_to_stderr
+from dexkit.cli.status_line import log_to_stderr
 from dexkit.console import Console, markup
 from dexkit.errors import DdsUnavailable, OutputError, UsageError
 from dexkit.escaping import Guard, guarded, html, one_line, visible

@@ -11,7 +11,7 @@ import click
 import pytest
 
 from dexkit import stop_signals
-from dexkit.cli.common import Number
+from dexkit.cli.options import Number
 from dexkit.emulators.faults import (
     DEX3_FAULTS,
     M4010_FAULTS,
@@ -59,7 +59,7 @@ def test_every_number_on_the_command_line_is_finite_and_bounded() -> None:
         kind = option.type
         where = f"dexkit {' '.join(name)} {option.opts[0]}"
         if isinstance(kind, click.types.FloatParamType):
-            assert isinstance(kind, Number), f"{where}: take dexkit.cli.common.Number"
+            assert isinstance(kind, Number), f"{where}: take dexkit.cli.options.Number"
             seen += 1
             for text in ("nan", "-nan", "inf", "-inf", "1e400", "1e300", "", "²", "1e"):
                 with pytest.raises(click.BadParameter):

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.common import Number, StopRequest, stop_on_signals
+from dexkit.cli.options import Number
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
@@ -21,6 +21,7 @@ from dexkit.drivers.ezgripper.scaling import amperes
 from dexkit.drivers.ezgripper.servo import Servo
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
+from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.wire import mx64
 
 __all__ = ["command"]

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.common import stop_on_signals
+from dexkit.cli.options import DOMAIN
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
+from dexkit.stop_signals import stop_on_signals
 
 __all__ = ["command"]
 
@@ -40,7 +41,7 @@ _INTRO = (
     show_default=True,
     help="Hand to show; its device is emulated.",
 )
-@click.option("--domain", type=click.IntRange(0, 230), help="DDS domain.  [default: a free one]")
+@click.option("--domain", type=DOMAIN, help="DDS domain.  [default: a free one]")
 def command(out: Path, backend: str, domain: int | None) -> None:
     """Two emulated EZGrippers prove themselves as Dex1 drop-ins, in some 75 seconds.
 

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import Number, StopRequest, stop_on_signals
+from dexkit.cli.options import DIALECT, DOMAIN, Number, json_option
 from dexkit.errors import UsageError
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.open_file_limit import room_for_files
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.doctor import Finding, Observations, Readiness, Verdict
@@ -48,8 +49,8 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 @click.command("doctor")
 @click.option(
     "--domain",
-    type=click.IntRange(0, 230),
-    help="Domain that the client uses: 0 is the robot, 1 xr_teleoperate --sim.  [default: any]",
+    type=DOMAIN,
+    help="Domain of the client: 0 is the robot, 1 xr_teleoperate's simulation.  [default: any]",
 )
 @click.option(
     "--scan",
@@ -69,7 +70,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 @click.option(
     "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand counts.  [default: any]"
 )
-@click.option("--dialect", type=click.Choice(list(DIALECTS)), help="Only this dialect counts.")
+@click.option("--dialect", type=DIALECT, help="Only this dialect counts.")
 @click.option(
     "--device",
     "devices",
@@ -77,7 +78,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     metavar="PATH",
     help="Also look at a serial port and ask for servos on it, at 'usb', or at usbip://HOST:PORT.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON (docs/doctor.md).")
+@json_option("Print JSON (docs/doctor.md).")
 @click.option("--watch", is_flag=True, help="Look again and again until Ctrl-C.")
 @click.option(
     "--seconds",

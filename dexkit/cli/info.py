@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from dexkit.cli.options import json_option
+
 if TYPE_CHECKING:
     from dexkit.traces import Trace
 
@@ -69,7 +71,7 @@ def summary(trace: Trace) -> dict[str, Any]:
 
 @click.command("info")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option("Print JSON.")
 def command(file: Path, as_json: bool) -> int:
     """Say what is in a recording: topics, types, rates, gaps, and what is odd about it.
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.options import json_option
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -23,7 +25,7 @@ _SIDES = ("left", "right")
 @click.command("models")
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="All of every model.")
-@click.option("--json", "as_json", is_flag=True, help="The same as JSON, always all of it.")
+@json_option("Print JSON, always with everything.")
 def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     """Print the models: joints, limits, topics, types, rates, gains, who implements them.
 
