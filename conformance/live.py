@@ -128,7 +128,7 @@ def record_run(
             force=options.force,
             yields=True,
         )
-        sole.look()
+        sole.search()
         plan = options.plan()
         script = script_for(plan, say)
         heart = stack.enter_context(Heartbeat())
@@ -277,7 +277,7 @@ class _Driver:
         sender = self._client if action.by is None else self._others[action.by]
         assert isinstance(sender, _Client)
         stamp = None if not action.age_s else time.time_ns() - round(action.age_s * 1e9)
-        if not self._watch.look():  # or the kit stood still since it made up its mind
+        if not self._watch.measure_pause():  # or the kit stood still since it made up its mind
             for topic, payload in action.payloads:
                 sender.send(topic, payload, stamp)
         self._clock.sleep_until((action.until_ns - self._offset) / 1e9)

@@ -81,12 +81,12 @@ class PauseWatch:
         self._last = self._clock.since_boot()
 
     def away(self) -> float:
-        """Seconds since the last look or restart, for another thread; 0 before the first."""
+        """Seconds since the last measurement or restart, for another thread; 0 before the first."""
         last = self._last
         return 0.0 if last is None else self._clock.since_boot() - last
 
-    def look(self, allowed: float = PAUSE) -> float:
-        """Seconds since the last look if they are more than ``allowed``; else 0."""
+    def measure_pause(self, allowed: float = PAUSE) -> float:
+        """Seconds since the last call if they are more than ``allowed``; else 0."""
         now = self._clock.since_boot()
         last, self._last = self._last, now
         if last is None or now - last <= allowed:

@@ -134,8 +134,8 @@ class SolePublisher:
 
     # -- life
 
-    def look(self) -> None:
-        """Before the own writers are made.
+    def search(self) -> None:
+        """Look for other publishers, before the own writers are made.
 
         :raises TopicConflict: somebody else publishes there.
         """

@@ -37,7 +37,7 @@ class DdsSockets:
         self._seen = self._drops()
         self._errors = _receive_buffer_errors()
         self.dropped = 0
-        """Datagrams with samples that found no room since this was made, as of :meth:`look`."""
+        """Datagrams with samples that the kernel dropped since this was made, as last counted."""
 
     @property
     def known(self) -> bool:
@@ -69,8 +69,8 @@ class DdsSockets:
                 found[os.fstat(sock.fileno()).st_ino] = _MEMINFO.unpack(info)[_DROPS]
         return found
 
-    def look(self) -> int:
-        """Datagrams that found no room since the last look.
+    def count_new_drops(self) -> int:
+        """Datagrams that the kernel dropped since the last call, for want of buffer space.
 
         The socket's counter includes what a filter kept out, so it is believed only as far as
         the system counted errors of receive buffers meanwhile.

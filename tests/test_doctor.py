@@ -178,7 +178,7 @@ def looked() -> _Looked:
         world = _World(stack)
         _build(world)
         world.start()
-        views = doctor_dds.look(sorted(world.domains.values()), seconds=1.0)
+        views = doctor_dds.observe_domains(sorted(world.domains.values()), seconds=1.0)
     return _Looked(world.domains, Observations(domains=views))
 
 
@@ -282,7 +282,7 @@ def test_a_participant_of_cyclonedds_11() -> None:
     thread.start()
     try:
         assert ready.wait(60)
-        views = doctor_dds.look([domain], seconds=0.2)
+        views = doctor_dds.observe_domains([domain], seconds=0.2)
     finally:
         stop.set()
         thread.join()
@@ -303,7 +303,7 @@ def test_a_look_leaves_nothing_behind() -> None:
 
         thread = threading.Thread(target=watch)
         thread.start()
-        (view,) = doctor_dds.look([domain], seconds=0.3)
+        (view,) = doctor_dds.observe_domains([domain], seconds=0.3)
         thread.join()
         assert view.streams[0].samples == 0
         assert matched.is_set()  # it was a reader while it looked

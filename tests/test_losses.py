@@ -287,6 +287,6 @@ def test_sockets_are_found_and_count_for_their_domain_only() -> None:
         sockets = DdsSockets(domain)
         assert sockets.known
         assert sockets.enlarge(100_000) >= 100_000
-        assert sockets.look() == 0
+        assert sockets.count_new_drops() == 0
         assert not DdsSockets(other).known
         assert DdsSockets(other).enlarge(100_000) == 0

@@ -195,7 +195,7 @@ class DdsRecording:
         for (topic, _), reader in self._readers.items():
             if count := reader.refused:
                 refused[topic] = refused.get(topic, 0) + count
-        return self.losses.look(now, self._sockets.look(), refused)
+        return self.losses.look(now, self._sockets.count_new_drops(), refused)
 
     def _discover(self) -> bool:
         with self._fresh_lock:

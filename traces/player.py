@@ -215,7 +215,7 @@ class _TimeLine:
 
     def _look(self) -> None:
         """Notice a pause, and move what is still to come behind it."""
-        away = self._watch.look()
+        away = self._watch.measure_pause()
         if away:
             self.pauses += 1
             self._paused(away)

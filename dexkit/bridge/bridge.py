@@ -116,7 +116,7 @@ class Bridge:
         sole = self._sole
         if not self._force:
             self._refuse_loop()
-        sole.look()
+        sole.search()
         claim = sole.announce()
         try:
             for direction, source, target in (
@@ -292,7 +292,7 @@ class _Way:
 
     def _stood_still(self) -> bool:
         """Whether this thread did; then what came before counts no more."""
-        away = self._watch.look()
+        away = self._watch.measure_pause()
         if not away:
             return False
         self._ages.resumed(self._bridge._clock.since_boot())

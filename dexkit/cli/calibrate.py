@@ -151,7 +151,7 @@ def command(
     )
     hand = EZGripper(device, configuration=configuration)
     if dry_run:
-        _look(hand, console, store)
+        _print_servo(hand, console, store)
         return
     if not yes and not sys.stdin.isatty():
         raise UsageError("nobody can be asked whether the gripper is empty", hint="give --yes")
@@ -268,7 +268,7 @@ def _change_baudrate(servo: Servo, baudrate: int) -> None:
     servo.bus.ping(servo.id)
 
 
-def _look(hand: EZGripper, console: Console, store: Store) -> None:
+def _print_servo(hand: EZGripper, console: Console, store: Store) -> None:
     device = discovery.find_device(hand.device_name)
     configuration = hand.configuration
     warning = discovery.latency_warning(device.path)

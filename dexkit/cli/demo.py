@@ -65,13 +65,13 @@ def command(out: Path, backend: str, domain: int | None) -> None:
     begin = time.monotonic()
     lock = threading.Lock()
 
-    def say(text: str) -> None:
+    def print_progress(text: str) -> None:
         with lock:
             console.print(f"[dim]{time.monotonic() - begin:5.1f} s[/dim]  {text}")
 
     with stop_on_signals() as stop:
         try:
-            result = run_suite(options, say, stop.event)
+            result = run_suite(options, print_progress, stop.event)
         except ConformanceError:
             if not stop:
                 raise

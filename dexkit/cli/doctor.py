@@ -121,7 +121,7 @@ def command(
         last: int | None = None
         before = ""
         while True:
-            seen = _look(
+            seen = _observe(
                 sorted({*scan, *([] if domain is None else [domain])}),
                 tuple(dict.fromkeys(("lo", *interfaces))),
                 devices,
@@ -163,7 +163,7 @@ def _dialects(model: str | None, dialect: str | None) -> tuple[Dialect, ...]:
     return MODELS[_MODEL_NAMES[model]].dialects if model is not None else ()
 
 
-def _look(
+def _observe(
     domains: list[int],
     interfaces: tuple[str, ...],
     devices: tuple[str, ...],
@@ -185,7 +185,9 @@ def _look(
             hands += doctor_devices.on_server(device)
         else:
             ports.append(doctor_devices.look_at(device, progress=progress))
-    views = dds.look(domains, interfaces, seconds=seconds, stop=stop.event, progress=progress)
+    views = dds.observe_domains(
+        domains, interfaces, seconds=seconds, stop=stop.event, progress=progress
+    )
     progress("")
     return Observations(
         domains=views,

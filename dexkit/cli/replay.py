@@ -105,7 +105,7 @@ def command(
             force=force,
             yields=True,
         )
-        sole.look()
+        sole.search()
         claim = sole.announce()
         writers = {
             topic: node.writer(topic, name, user_data=claim)

@@ -150,7 +150,9 @@ def command(
         waiting = _Waiting(node, spoken, patience)
         if not live.wait_ready(stop.event, waiting):
             return 130
-        _say(f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s")
+        _print_to_stderr(
+            f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s"
+        )
         show = _Progress(seconds)
         try:
             session = live.perform(operator, seconds, stop.event, show)
@@ -159,18 +161,20 @@ def command(
             live.leave()
         stopped = bool(stop)
     for at, seconds_away in session.pauses:
-        _say(
+        _print_to_stderr(
             f"this program stood still for {seconds_away:.2f} s, {at:.1f} s after the beginning; "
             "figures of then are not the hand's"
         )
     _report(session, operator, 1 / client.period, as_json=as_json)
     silent = [] if stopped else _silent(session, seconds)
     for side in silent:
-        _say(f"{side}: no state in the end; the genuine client goes on with what it last read")
+        _print_to_stderr(
+            f"{side}: no state in the end; the genuine client goes on with what it last read"
+        )
     return 130 if stopped else int(bool(silent))
 
 
-def _say(text: str) -> None:
+def _print_to_stderr(text: str) -> None:
     click.echo(text, err=True)
 
 
@@ -243,11 +247,11 @@ class _Waiting:
             error.exit_code = 1
             raise error
         if missing and missing != self._said:
-            _say(f"waiting for state of {what} ...")
+            _print_to_stderr(f"waiting for state of {what} ...")
             self._said = dict(missing)
         if seconds >= _HINT_AFTER and not self._helped:
             self._helped = True
-            _say(f"  {self._advice}")
+            _print_to_stderr(f"  {self._advice}")
 
     @property
     def _advice(self) -> str:

@@ -24,7 +24,7 @@ from dexkit.doctor.topics import is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
 
-__all__ = ["DISCOVERY_SECONDS", "look"]
+__all__ = ["DISCOVERY_SECONDS", "observe_domains"]
 
 DISCOVERY_SECONDS = 0.7
 """How long an empty domain is waited on; a participant on this machine answers within 10 ms."""
@@ -207,7 +207,7 @@ class _Window:
         )
 
 
-def look(
+def observe_domains(
     domains: Sequence[int],
     interfaces: Sequence[str] = ("lo",),
     *,

@@ -199,7 +199,7 @@ class HandCore:
         if not isinstance(given, HandState):
             raise HandError(
                 f"the backend returned a {type(given).__name__}, not a HandState",
-                hint="exchange ends with: return HandState.of(q, stamp=time.monotonic())",
+                hint="exchange ends with: return HandState.from_values(q, stamp=time.monotonic())",
             )
         if state.q.shape != (n,) or not all(map(math.isfinite, state.q.tolist())):
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")

@@ -235,7 +235,7 @@ class HandService:
         sole = self._sole = SolePublisher(
             [Place(node, topics)], hint=_CONFLICT_HINT, force=self._force
         )
-        sole.look()
+        sole.search()
         claim = sole.announce()
         self._writer = node.writer(self.state_topic, self.dialect.state_type, user_data=claim)
         if self.low_rate_topic:
@@ -430,7 +430,7 @@ class HandService:
         """Whether a loop of this service stood still; then these hands brake until a command comes
         that was sent later.
         """
-        away = watch.look(allowed)
+        away = watch.measure_pause(allowed)
         if not away:
             return False
         now = self._clock.since_boot()

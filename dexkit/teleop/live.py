@@ -116,7 +116,7 @@ class LiveClient:
             force=force,
             yields=True,
         )
-        self._sole.look()
+        self._sole.search()
         claim = self._sole.announce()
         self._writers = {
             topic: node.writer(topic, dialect.cmd_type, qos=Qos.writer_default(), user_data=claim)
@@ -178,7 +178,7 @@ class LiveClient:
         start = told = seen = time.monotonic()
         self._watch.restart()
         while not stop.is_set():
-            away = self._watch.look()
+            away = self._watch.measure_pause()
             if away:
                 session.pauses.append((seen - start, away))
                 self._come_back(stop)
@@ -240,7 +240,7 @@ class LiveClient:
         stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
         self._watch.restart()
         end = time.monotonic() + _LEAVING
-        while stay and time.monotonic() < end and not self._watch.look():
+        while stay and time.monotonic() < end and not self._watch.measure_pause():
             self._send(stay)
             time.sleep(self._client.period)
 

@@ -169,7 +169,7 @@ class EmulatedRobot:
         """States must arrive: some clients have a writer for them, which they never use."""
         model = self.model
         with node.reader(model.state_topic, model.state_type) as reader:
-            sole.look()
+            sole.search()
             if not reader.take() or self._force:
                 return
         self._heard = True
@@ -204,7 +204,7 @@ class EmulatedRobot:
         assert self._commands is not None
         assert self._arm_commands is not None
         self.missed += missed
-        if self._watch.look(PAUSE + 1.0 / self._publisher.hz):
+        if self._watch.measure_pause(PAUSE + 1.0 / self._publisher.hz):
             self._ages.resumed(self._clock.since_boot())
             robot.paused()
         for reader, obey in (
