@@ -353,7 +353,6 @@ class _Cyclone:
         self.data_available = int(core.DDSStatus.DataAvailable)
         self.publication_matched = int(core.DDSStatus.PublicationMatched)
         self.subscription_matched = int(core.DDSStatus.SubscriptionMatched)
-        self.sample_rejected = int(core.DDSStatus.SampleRejected)
 
     def __getattr__(self, name: str) -> Any:  # the C functions set above
         raise AttributeError(name)

@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any
 
 from dexkit.errors import TopicConflict
 
@@ -71,19 +71,13 @@ class Claim:
         return cls(int(found[1]), int(found[2], 16)) if found else None
 
 
-class _Node(Protocol):
-    """The part of :class:`dexkit.dds.DdsNode` that is needed; one without ``discovery`` is only
-    asked for its endpoints.
-    """
-
-    def endpoints(self) -> Sequence[Any]: ...
-
-
 @dataclass(frozen=True)
 class Place:
     """Topics on a node.
 
-    :param counts: which writers without a claim are company; by default all.
+    :param node: a :class:`dexkit.dds.DdsNode`; one without ``discovery`` is only asked for its
+        endpoints.
+    :param counts: which writers without a claim are rivals; by default all.
     """
 
     node: Any

@@ -244,10 +244,6 @@ def _figure(
     )
 
 
-def _inside(value: float, span: tuple[float, float]) -> bool:
-    return span[0] <= value <= span[1]
-
-
 def chart(
     title: str,
     lines: Sequence[Line],

@@ -138,7 +138,6 @@ class _Window:
             self.socket.close()
             raise DdsSetupError(f"cannot look at {interface}: {error.strerror}") from error
         self.watches: dict[bytes, _Watch] = {}
-        self.wanted_since: dict[bytes, float] = {}
         self.observer = Observer(
             os.urandom(12),
             Locator(self.address, self.socket.getsockname()[1]),
