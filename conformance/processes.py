@@ -17,7 +17,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
-from dexkit.temporary_folder import Scratch
+from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = [
     "BODY_EMULATORS",
@@ -174,7 +174,7 @@ class Rig:
         options = self.options
         if not options.emulated:
             return
-        folder = self._stack.enter_context(Scratch("hands"))
+        folder = self._stack.enter_context(TemporaryFolder("hands"))
         emulation = EMULATED[options.backend]
         emulators = {}
         for s in options.sides:

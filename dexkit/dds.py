@@ -58,7 +58,7 @@ from dexkit.child_processes import process_id
 from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
 from dexkit.messages import MessageType, layout, message_type
-from dexkit.open_file_limit import room_for_files
+from dexkit.open_file_limit import require_open_files
 from dexkit.threads import Worker
 
 __all__ = [
@@ -696,7 +696,7 @@ class Writer(_Handle):
         :param source_timestamp_ns: wall clock, ns since the epoch; None means now.
         :returns: False when it was given up after 100 ms because a reliable reader does not
             keep up (:attr:`timeouts` counts them).
-        :raises EncodeError: no room for a header.
+        :raises EncodeError: no space for a header.
         :raises DdsError: the writer is closed, or CycloneDDS refuses.
         """
         if self._entity is None:
@@ -911,7 +911,7 @@ class DdsNode:
     def __init__(self, domain: int = 1, interface: str = "lo") -> None:
         if not 0 <= domain <= 230:
             raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
-        room_for_files(_FILES, "DDS")
+        require_open_files(_FILES, "DDS")
         cyclone = _cyclone()
         self.domain = domain
         self.interface = interface

@@ -1,4 +1,4 @@
-"""The sockets that CycloneDDS opens for a domain of this process, and the interface they hear.
+"""Restrict the sockets that CycloneDDS opens for a domain to one network interface.
 
 CycloneDDS 0.10 binds them to all addresses, tells nobody which they are, and asks for the index
 of its interface once. So they are found among the sockets of the process, get a filter

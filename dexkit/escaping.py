@@ -1,4 +1,4 @@
-r"""Text from outside (topic and participant names, notes, result files) on its way to people.
+r"""Escape text from outside (topic names, notes, result files) before it is printed or written.
 
 A name can hold escape sequences that move a terminal's cursor or write its title, characters that
 turn the direction of what follows (U+202E), lines of its own, or markup. Nothing of that is to

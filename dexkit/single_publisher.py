@@ -1,9 +1,10 @@
-"""The only publisher of a topic: how programs that must not publish side by side agree on one.
+"""Single publisher of a topic: of several programs that would publish it, exactly one goes on.
 
-Two services of one side would make clients see two hands in one, two sources of commands would
-fight over a hand. Whoever must be alone on its topics uses a :class:`SolePublisher`:
+Two services of one side would mix the states of two hands on one topic; two sources of commands
+would alternate on one hand. A program that must be alone on its topics uses a
+:class:`SolePublisher`:
 
-1. *look*: for :data:`LOOK` seconds it looks for other publishers. If there is one, it gives way.
+1. *search*: for :data:`LOOK` seconds it searches for other publishers. If there is one, it stops.
 2. *settle*: it announces its writers with a claim (the time, and a random number) in their user
    data, and looks for :data:`SETTLE` seconds more. Of programs that announced at the same time the
    one with the smallest claim goes on and the others give way. A publisher without a claim (the

@@ -1,7 +1,7 @@
-"""UDP sockets of this process, as the kernel sees them: what they hold and what they dropped.
+"""Count the datagrams that the kernel dropped on DDS sockets, and enlarge their buffers.
 
-CycloneDDS tells nobody when a datagram is lost because its socket's receive buffer was full, so
-the kernel is asked. Linux only; elsewhere there are no sockets to be found.
+CycloneDDS does not report a datagram that is lost because its socket's receive buffer was full, so
+the kernel's counters are read. Linux only; elsewhere no sockets are found.
 """
 
 from __future__ import annotations

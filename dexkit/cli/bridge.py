@@ -41,8 +41,8 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
 
 
 @click.command("bridge")
-@click.option("--from", "source", type=_DIALECTS, required=True, help="What the client speaks.")
-@click.option("--to", "target", type=_DIALECTS, required=True, help="What the gripper speaks.")
+@click.option("--from", "source", type=_DIALECTS, required=True, help="Dialect of the client.")
+@click.option("--to", "target", type=_DIALECTS, required=True, help="Dialect of the gripper.")
 @side_option("Grippers to translate for.", default="both")
 @dds_options()
 @click.option(
@@ -72,16 +72,16 @@ def command(
     real_time: bool,
     quiet: bool,
 ) -> int:
-    """Carry a client's commands to a Dex1-1 of another dialect, and its states back.
+    """Translate between Dex1 dialects: commands of a client to a Dex1-1, and its states back.
 
     \b
-    xr_teleoperate v1.1 (--sim) drives a gripper of today:
+    client xr_teleoperate v1.1 (--sim), gripper with today's service:
       dexkit bridge --from unitree_actuator --to unitree_go
-    today's client on domain 1 drives a gripper of the DDS specification on the robot:
+    today's client on domain 1, gripper of the DDS specification on the robot:
       dexkit bridge --from unitree_go --to unitree_hg --to-domain 0 --to-interface eth0
 
-    Prints "ready: ..." when the topics are up. Nothing is repeated: when the client stops, the
-    gripper hears nothing and brakes (docs/bridge.md).
+    Prints "ready: ..." when the topics are up. No message is repeated: when the client stops, the
+    gripper gets no commands and brakes (docs/bridge.md).
     """  # noqa: D301 - click wants the character, not a backslash
     from dexkit.bridge import Bridge, End
     from dexkit.dds import DdsNode

@@ -1,4 +1,4 @@
-"""``dexkit calibrate``: find a gripper's zero and speed and store them."""
+"""``dexkit calibrate``: measure and store a gripper's zero and speed."""
 
 from __future__ import annotations
 
@@ -99,9 +99,13 @@ class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
     type=click.Path(dir_okay=False, path_type=Path),
     help="File to store in, instead of the user's.",
 )
-@click.option("--dry-run", is_flag=True, help="Only look: nothing moves, nothing is written.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Only print the servo's state: nothing moves, nothing is written.",
+)
 @click.option("--yes", is_flag=True, help="Do not ask whether the gripper is empty.")
-@click.option("--show", is_flag=True, help="Print what is stored, and stop.")
+@click.option("--show", is_flag=True, help="Print the stored values, and stop.")
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -120,14 +124,14 @@ def command(
     yes: bool,
     show: bool,
 ) -> None:
-    """Find a gripper's zero, and with --speed its speed, and store them.
+    """Measure and store a gripper's zero and, with --speed, its speed.
 
     The gripper MOVES: it closes until it is stopped, then opens. It must be empty and free. The
     result is stored under the adapter's USB serial number (or the path, where there is none), so
     that it is found again whatever port it is plugged into.
 
-    GRIPPER dex1-serial is another matter: you hold the jaws closed, nothing moves, and the motor
-    itself stores that as its zero. Of the options only --device, --side, --dry-run and --yes
+    With GRIPPER dex1-serial nothing moves: you hold the jaws closed, and the motor itself stores
+    that position as its zero. Of the options only --device, --side, --dry-run and --yes
     apply.
     """
     if gripper == "dex1-serial":

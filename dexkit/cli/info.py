@@ -1,4 +1,4 @@
-"""``dexkit info``: what is in a recording."""
+"""``dexkit info``: topics, rates, gaps and damage of a recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["command", "summary"]
 
 
 def summary(trace: Trace) -> dict[str, Any]:
-    """Everything that ``dexkit info`` tells, as JSON data."""
+    """Everything that ``dexkit info`` prints, as JSON data."""
     loaded = trace.load(payloads=False)
     topics = []
     for channel in trace.channels:
@@ -73,7 +73,7 @@ def summary(trace: Trace) -> dict[str, Any]:
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option("Print JSON.")
 def command(file: Path, as_json: bool) -> int:
-    """Say what is in a recording: topics, types, rates, gaps, and what is odd about it.
+    """Show the topics, types, rates, gaps and damage of a recording.
 
     FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
     read as far as it goes.

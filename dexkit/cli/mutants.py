@@ -1,4 +1,4 @@
-"""``dexkit mutants``: prove the checks on deliberately wrong hands."""
+"""``dexkit mutants``: test the conformance checks on deliberately wrong hands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dexkit replay``: publish a recording's commands again, with their timing."""
+"""``dexkit replay``: publish the commands of a recording with their timing."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def command(
     junit_path: Path | None,
     verbose: bool,
 ) -> None:
-    """Write the reports of a result file again.
+    """Write the reports of a result file.
 
     A result file comes from 'dexkit check --json FILE' or from the conformance suite with
     '--json FILE'. Without an option the result is printed as a table.

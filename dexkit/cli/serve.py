@@ -1,4 +1,4 @@
-"""``dexkit serve``: put a hand on Unitree's topics."""
+"""``dexkit serve``: publish and subscribe Unitree's topics for a hand."""
 
 from __future__ import annotations
 
@@ -98,7 +98,9 @@ _LONELY = 10.0  # seconds without a client before a hint
     show_default=True,
     help="Fields of a state: all that is known, or only those the vendor's service fills.",
 )
-@click.option("--wait-for-device", is_flag=True, help="Do not fail if it is not there yet.")
+@click.option(
+    "--wait-for-device", is_flag=True, help="Wait for a device that is not connected yet."
+)
 @force_option()
 @real_time_option()
 @quiet_option()
@@ -119,7 +121,7 @@ def command(
     real_time: bool,
     quiet: bool,
 ) -> int:
-    """Put a hand on Unitree's topics until Ctrl-C or SIGTERM.
+    """Serve a hand on Unitree's topics until Ctrl-C or SIGTERM.
 
     BACKEND is a name from 'dexkit backends' or package.module:Class. Prints "ready: ..." when
     the topics are up. SIGUSR1 logs the counters.

@@ -1,4 +1,4 @@
-"""``dexkit teleop``: drive a hand as xr_teleoperate does, and say what an operator would feel."""
+"""``dexkit teleop``: drive a hand as xr_teleoperate does, and measure its response."""
 
 from __future__ import annotations
 
@@ -110,12 +110,12 @@ def command(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Drive a hand as xr_teleoperate does, and say what an operator would feel.
+    """Drive a hand as xr_teleoperate does, and measure its response: delay, lag, overshoot.
 
     PROFILE is what the operator does ('dexkit teleop --list'), or a recording: FILE.mcap, whose
     commands are then what the operator wants. The client waits for the state of both hands,
     clips each Dex1-1 command to 0.18 rad of the last state and smooths it, as the genuine one
-    does; how the hand feels is measured meanwhile. The default domain is 1, the simulation's:
+    does. The default domain is 1, the simulation's:
     --domain 0 with a robot's interface moves real hands.
 
     At the end, on Ctrl-C too, the hands are told to stay where they are.
