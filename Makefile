@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
 	@$(UV) sync --frozen --quiet
 	@touch $@
 
-.PHONY: help setup demo test soak campaign campaign-sample lint format bench lock clean
+.PHONY: help setup demo test soak campaign campaign-sample lint format docs bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -55,6 +55,9 @@ lint: $(STAMP) ## ruff and mypy strict
 format: $(STAMP) ## put the code in ruff's format
 	$(RUN) ruff check --fix .
 	$(RUN) ruff format .
+
+docs: $(STAMP) ## write the generated pages, drawings and message modules (ARGS=--check compares)
+	$(RUN) python -m tools.generate $(ARGS)
 
 bench: $(STAMP) ## the benchmarks; prints ratios and saves benchmarks/results/*.json
 	$(RUN) python -m benchmarks $(ARGS)

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks import Result
+from dexkit.child_processes import Tool
 from dexkit.dds import DdsNode, Writer
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import encode
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
 from dexkit.models import dialect
-from dexkit.processes import Tool
 from dexkit.service.realtime import precise_timers, prepare_process, real_time
 
 _ACTUATOR, _GO = dialect("unitree_actuator"), dialect("unitree_go")

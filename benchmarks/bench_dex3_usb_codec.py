@@ -112,7 +112,7 @@ def run() -> list[Result]:
     pressure = np.full((9, 12), math.nan)
     for i, sensor in enumerate(DEX3_1.sensors):
         pressure[i, list(sensor.slots)] = 8.0 * rng.integers(0, 20000, len(sensor.slots))
-    state = HandState.of(
+    state = HandState.from_values(
         command.q,
         stamp=0.0,
         dq=rng.normal(0, 1, 7),

@@ -76,7 +76,7 @@ class VirtualGripper:
         q = self.q
         if not command.is_brake:
             self._write(mx64.GOAL_POSITION, _ZERO + ticks_of_joint(float(command.q[0])))
-        return HandState.of(q, stamp=self._clock.now())
+        return HandState.from_values(q, stamp=self._clock.now())
 
 
 class TeleopClient:

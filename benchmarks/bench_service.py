@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import Result
+from dexkit.child_processes import Tool
 from dexkit.clock import Rate
 from dexkit.dds import DdsNode, Qos
 from dexkit.drivers.ezgripper import EZGripper
@@ -38,7 +39,6 @@ from dexkit.emulators.mx64 import EmulatedProcess, emulated_ezgripper
 from dexkit.hand import Side
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
 from dexkit.models import DEX1_1, dialect
-from dexkit.processes import Tool
 from dexkit.service.realtime import precise_timers
 from dexkit.service.realtime import real_time as real_time_priority
 from dexkit.wire.dynamixel import Instruction, PacketParser

@@ -12,7 +12,7 @@ from dexkit.conformance.plugin import OPTIONS_KEY, RESULT_KEY, WHY_KEY
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.session import run_suite
 from dexkit.errors import DexkitError
-from dexkit.stopping import stop_on_signals
+from dexkit.stop_signals import stop_on_signals
 
 
 class Ended(Exit):

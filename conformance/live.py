@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.clock import RealClock
+from dexkit.command_age import PauseWatch
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
@@ -37,10 +38,9 @@ from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.wire import Wire
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
-from dexkit.freshness import PauseWatch
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
 
@@ -128,7 +128,7 @@ def record_run(
             force=options.force,
             yields=True,
         )
-        sole.look()
+        sole.search()
         plan = options.plan()
         script = script_for(plan, say)
         heart = stack.enter_context(Heartbeat())
@@ -277,7 +277,7 @@ class _Driver:
         sender = self._client if action.by is None else self._others[action.by]
         assert isinstance(sender, _Client)
         stamp = None if not action.age_s else time.time_ns() - round(action.age_s * 1e9)
-        if not self._watch.look():  # or the kit stood still since it made up its mind
+        if not self._watch.measure_pause():  # or the kit stood still since it made up its mind
             for topic, payload in action.payloads:
                 sender.send(topic, payload, stamp)
         self._clock.sleep_until((action.until_ns - self._offset) / 1e9)

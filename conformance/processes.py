@@ -12,12 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dexkit import processes
+from dexkit import child_processes
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = [
     "BODY_EMULATORS",
@@ -75,7 +75,7 @@ BODY_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
 """Backends that are emulated robots: the names of their emulators."""
 
 
-class Tool(processes.Tool):
+class Tool(child_processes.Tool):
     """A ``dexkit`` command in a process of its own; a context manager.
 
     :raises ConformanceError: it ends, or says nothing, before it is ready; its last words are
@@ -174,7 +174,7 @@ class Rig:
         options = self.options
         if not options.emulated:
             return
-        folder = self._stack.enter_context(Scratch("hands"))
+        folder = self._stack.enter_context(TemporaryFolder("hands"))
         emulation = EMULATED[options.backend]
         emulators = {}
         for s in options.sides:

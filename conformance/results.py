@@ -28,7 +28,7 @@ from typing import Any
 from dexkit import __version__, documents
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.errors import UsageError
-from dexkit.untrusted import REMARK, one_line
+from dexkit.escaping import REMARK, one_line
 
 __all__ = [
     "BUSY",

@@ -32,10 +32,10 @@ from dexkit.conformance.view import Recording, sides_of
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
-from dexkit.limits import room_for_files
 from dexkit.models import DEX1_1, Dialect, dialect, model
+from dexkit.open_file_limit import require_open_files
 from dexkit.robots import ROBOTS
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import TemporaryFolder
 
 if TYPE_CHECKING:
     import pytest
@@ -356,14 +356,14 @@ def run_suite(
     from dexkit.domains import reserve_free_domain
     from dexkit.traces import open_trace
 
-    room_for_files(_FILES, "a conformance run")
+    require_open_files(_FILES, "a conformance run")
     result: RunResult | None = None
     while result is None or (result.disturbed and attempts > 0):
         if result is not None:
             say("the machine was too busy to be fair to the hand; once more")
         attempts -= 1
         with contextlib.ExitStack() as stack:
-            folder = stack.enter_context(Scratch())
+            folder = stack.enter_context(TemporaryFolder())
             if (domain := options.domain) is None:
                 domain = stack.enter_context(reserve_free_domain(options.interface)).domain
             path = options.recording or folder / "run.mcap"

@@ -2,8 +2,8 @@
 
 import os
 
+from dexkit.child_processes import END_WITH_PARENT, end_with_parent
 from dexkit.cli import main
-from dexkit.processes import END_WITH_PARENT, end_with_parent
 
 __all__ = ["start"]
 

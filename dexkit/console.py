@@ -1,4 +1,4 @@
-"""Tables and coloured text on a terminal, clean whatever is in them (:mod:`dexkit.untrusted`)."""
+"""Tables and coloured text on a terminal, clean whatever is in them (:mod:`dexkit.escaping`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import rich.markup
 from rich.segment import Segment
 
 from dexkit.errors import OutputError
-from dexkit.untrusted import REMARK, Guard, one_line, visible
+from dexkit.escaping import REMARK, Guard, one_line, visible
 
 __all__ = ["Console", "markup"]
 

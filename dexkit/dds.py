@@ -23,9 +23,10 @@ announced together with it.
 On loopback a node finds every other process of the machine, whether or not ``lo`` carries the
 MULTICAST flag, without changing the system (docs/sources/unitree-dex.md#a6).
 
-Only what comes in by the node's interface, or from this machine, is seen (:mod:`dexkit.ingress`);
-CycloneDDS by itself would listen to every interface of the machine. Where the system has no
-filter for that, a node is refused, unless ``DEXKIT_ALL_INTERFACES=1`` says that it is meant.
+A node sees only what comes in by its interface or from this machine
+(:mod:`dexkit.interface_filter`). CycloneDDS by itself would listen to every interface of the
+machine. Where the system has no filter for that, a node is refused, unless
+``DEXKIT_ALL_INTERFACES=1`` allows it.
 
 ``DEXKIT_DDS_LOG=PATH`` appends CycloneDDS's own log to a file; otherwise its warnings only become
 part of a :class:`~dexkit.errors.DdsSetupError`.
@@ -52,12 +53,12 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
-from dexkit import ingress
-from dexkit.dds_sockets import DomainSockets, open_sockets
+from dexkit import interface_filter
+from dexkit.child_processes import process_id
+from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
-from dexkit.limits import room_for_files
 from dexkit.messages import MessageType, layout, message_type
-from dexkit.processes import process_id
+from dexkit.open_file_limit import require_open_files
 from dexkit.threads import Worker
 
 __all__ = [
@@ -352,7 +353,6 @@ class _Cyclone:
         self.data_available = int(core.DDSStatus.DataAvailable)
         self.publication_matched = int(core.DDSStatus.PublicationMatched)
         self.subscription_matched = int(core.DDSStatus.SubscriptionMatched)
-        self.sample_rejected = int(core.DDSStatus.SampleRejected)
 
     def __getattr__(self, name: str) -> Any:  # the C functions set above
         raise AttributeError(name)
@@ -456,7 +456,11 @@ def _config(interface: str, more: str = "") -> str:
     ``multicast="default"`` keeps listening to it where it is on, because an SDK process then
     listens to nothing else.
     """
-    peers = '<Peers><Peer address="127.0.0.1"/></Peers>' if ingress.is_loopback(interface) else ""
+    peers = (
+        '<Peers><Peer address="127.0.0.1"/></Peers>'
+        if interface_filter.is_loopback(interface)
+        else ""
+    )
     return (
         "<CycloneDDS><Domain>"
         "<General><Interfaces>"
@@ -545,18 +549,18 @@ def _shut_out_others(number: int, interface: str, before: dict[int, int]) -> Dom
     try:
         return DomainSockets(number, interface, before)
     except OSError as error:
-        if ingress.all_interfaces_allowed():
+        if interface_filter.all_interfaces_allowed():
             _log.warning(
                 "domain %d is open to every network of this machine, not only to %s (%s=1)",
                 number,
                 interface,
-                ingress.ALL_INTERFACES,
+                interface_filter.ALL_INTERFACES,
             )
             return None
         raise DdsSetupError(
             f"other networks than {interface} cannot be kept out of domain {number}: "
             f"{error.strerror or error}",
-            hint=ingress.HINT,
+            hint=interface_filter.HINT,
         ) from error
 
 
@@ -692,7 +696,7 @@ class Writer(_Handle):
         :param source_timestamp_ns: wall clock, ns since the epoch; None means now.
         :returns: False when it was given up after 100 ms because a reliable reader does not
             keep up (:attr:`timeouts` counts them).
-        :raises EncodeError: no room for a header.
+        :raises EncodeError: no space for a header.
         :raises DdsError: the writer is closed, or CycloneDDS refuses.
         """
         if self._entity is None:
@@ -907,7 +911,7 @@ class DdsNode:
     def __init__(self, domain: int = 1, interface: str = "lo") -> None:
         if not 0 <= domain <= 230:
             raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
-        room_for_files(_FILES, "DDS")
+        require_open_files(_FILES, "DDS")
         cyclone = _cyclone()
         self.domain = domain
         self.interface = interface

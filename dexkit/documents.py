@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.errors import DexkitError, UsageError
-from dexkit.untrusted import one_line, output_error
+from dexkit.escaping import one_line, output_error
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -34,6 +34,7 @@ __all__ = [
     "DEEPEST",
     "LARGEST",
     "LOCK_PATIENCE",
+    "check_output_paths",
     "parse_json",
     "parse_toml",
     "read_json",
@@ -191,6 +192,34 @@ def _shallow(document: Any) -> None:
             elif isinstance(value, int) and abs(value) >= 10**_DIGITS:
                 raise ValueError(f"a number has more than {_DIGITS} digits")
         level, depth = below, depth + 1
+
+
+def check_output_paths(outputs: Iterable[Path | None], inputs: Iterable[Path | None] = ()) -> None:
+    """Check that no output overwrites an input or another output, before any is written.
+
+    Devices, pipes and ``-`` (standard output) may be named more than once; None is skipped.
+
+    :raises UsageError: two paths are one file.
+    """
+    taken = {_identity(path): "an input" for path in inputs if path is not None}
+    for path in outputs:
+        if path is None or str(path) == "-" or (path.exists() and not path.is_file()):
+            continue
+        identity = _identity(path)
+        if identity in taken:
+            raise UsageError(
+                f"{path} is also {taken[identity]}", hint="choose another name for the output"
+            )
+        taken[identity] = "another output"
+
+
+def _identity(path: Path) -> object:
+    """The same for all names of a file, links included."""
+    try:
+        status = path.stat()
+    except OSError:
+        return path.absolute().resolve()
+    return status.st_dev, status.st_ino
 
 
 def write_file(path: Path, content: str | bytes) -> None:

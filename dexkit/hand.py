@@ -304,7 +304,7 @@ class HandState:
     error: int = 0
 
     @classmethod
-    def of(
+    def from_values(
         cls,
         q: ArrayLike,
         *,

@@ -6,7 +6,7 @@ dexkit: **one that dies ends the program, with a message and an error exit code.
 
 :class:`Worker` is that rule. When its function raises, it logs why, keeps the exception as
 :attr:`Worker.failure`, tells its owner (``failed``), and tells everybody who asked by
-:func:`on_death`. :func:`~dexkit.stopping.stop_on_signals` asks: its request is set, so that the
+:func:`on_death`. :func:`~dexkit.stop_signals.stop_on_signals` asks: its request is set, so that the
 program ends in good order, as on Ctrl-C: hands brake, recordings are finished. Last of all the
 command line asks :func:`check` and exits with 1.
 """

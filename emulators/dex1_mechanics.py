@@ -109,7 +109,7 @@ class Dex1Mechanics:
 
     def state(self, stamp: float) -> HandState:
         """What can be seen, measured at ``stamp``; heat and voltage are not modelled: NaN."""
-        return HandState.of(
+        return HandState.from_values(
             self.joint.q,
             dq=self.joint.dq,
             tau_est=self.torque,

@@ -24,8 +24,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from dexkit.errors import UsageError
+from dexkit.escaping import one_line
 from dexkit.hand import Side
-from dexkit.untrusted import one_line
 
 __all__ = [
     "DEX3_FAULTS",

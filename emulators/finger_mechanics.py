@@ -408,11 +408,6 @@ class FingerMechanics:
         return [motor.error for motor in self._motors]
 
     @property
-    def powered(self) -> list[bool]:
-        """Whether each motor has power."""
-        return [motor.most > 0.0 for motor in self._motors]
-
-    @property
     def temperature(self) -> Floats:
         """Of the motors' cases, °C, shape (n_joints,)."""
         return np.array([motor.case for motor in self._motors])

@@ -9,9 +9,9 @@ import time
 from collections.abc import Sequence
 from typing import IO
 
+from dexkit.child_processes import command_line
 from dexkit.emulators.faults import FaultFamily, parse_fault
 from dexkit.errors import EmulatorError
-from dexkit.processes import command_line
 
 __all__ = ["EmulatorProcess"]
 

@@ -22,7 +22,7 @@ from dexkit.clock import Clock, RealClock
 from dexkit.emulators.faults import Fault
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import TemporaryFolder
 from dexkit.threads import Worker
 
 __all__ = ["Port", "client_baudrate"]
@@ -79,9 +79,9 @@ class Port:
         self.error: BaseException | None = None
         self._clock: Clock = clock or RealClock()
         self._check_baudrate = check_baudrate
-        self._directory: Scratch | None = None
+        self._directory: TemporaryFolder | None = None
         if link is None:
-            self._directory = Scratch("tty")
+            self._directory = TemporaryFolder("tty")
             self.path = str(self._directory.path / "tty")
         else:
             self.path = os.path.abspath(os.fspath(link))

@@ -9,9 +9,9 @@ from typing import Protocol
 
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import PAUSE
 from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.errors import HandLost, UsageError
-from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandSpec, HandState
 
 __all__ = ["Mechanics", "SimulatedHand", "number"]

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
 
-from dexkit.processes import command_line
+from dexkit.child_processes import command_line
 from tests.patience import PATIENCE
 
 __all__ = ["Process", "running"]

@@ -123,7 +123,7 @@ class FakeHand:
         q = np.full(self.n, 0.1)
         q[0] = self.q(self.count)
         bits = np.where(self.tripped, int(MotorError.MOTOR_SAW_HOST_TIMEOUT), 0)
-        state = HandState.of(
+        state = HandState.from_values(
             q,
             stamp=0.0,
             temperature=30.0,

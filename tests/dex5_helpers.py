@@ -16,7 +16,7 @@ from dexkit.messages import message_type
 from dexkit.models import DEX5_1
 from dexkit.service.dialects import StateView, dialect_map
 from dexkit.teleop import Operator, client_for, profile
-from dexkit.teleop.wire import ClientWire
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces import Recorder, sample_path
 
 EPOCH_NS = 1_795_000_000_000_000_000

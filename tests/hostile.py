@@ -167,7 +167,7 @@ def commands() -> Iterator[tuple[tuple[str, ...], click.Command]]:
 
 def raw(text: str) -> set[str]:
     """Characters of an output that must not be there: control characters, C1, bidi, ..."""
-    from dexkit.untrusted import visible
+    from dexkit.escaping import visible
 
     return {c for c in set(text) if visible(c) != c}
 

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.child_processes import Tool
 from dexkit.dds import DdsNode
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.m4010 import Dex1Motors
@@ -36,7 +37,6 @@ from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import unitree_go, unitree_hg
 from dexkit.models import Dialect, dialect, model
-from dexkit.processes import Tool
 from dexkit.wire import mx64
 from tests.patience import PATIENCE
 

@@ -66,7 +66,7 @@ class ScriptedHand:
         mode = int(command.mode[0])
         if mode != JointMode.BRAKE and command.kp[0] > 0:
             self.q = float(command.q[0])
-        return HandState.of(self.q, stamp=self.clock.now(), mode=mode)
+        return HandState.from_values(self.q, stamp=self.clock.now(), mode=mode)
 
 
 @dataclass(frozen=True)

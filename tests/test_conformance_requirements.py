@@ -11,7 +11,6 @@ from dexkit.conformance import requirements
 from dexkit.conformance.checks import all_checks
 from dexkit.conformance.mutants import MUTANTS
 from dexkit.conformance.requirements import LAYERS, Level, catalogue, models, parse, select
-from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.selection import quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
@@ -21,8 +20,6 @@ from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import model
 from tests import hostile
-
-DOCS = Path(__file__).parent.parent / "docs" / "conformance.md"
 
 GOOD = """
 model = "dex1-1"
@@ -158,14 +155,6 @@ def test_select() -> None:
         select(catalogue(), prefixes=["DEX9"])
     with pytest.raises(UsageError, match="no level"):
         select(catalogue(), level="may")
-
-
-def test_the_documented_catalogue_is_the_data() -> None:
-    text = DOCS.read_text(encoding="utf-8")
-    page = text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip()
-    assert page == catalogue_page().strip(), (
-        "docs/conformance.md is out of date: python -m dexkit.conformance.requirements.page"
-    )
 
 
 def test_what_is_quick_can_be_told_of_every_hand_at_once() -> None:

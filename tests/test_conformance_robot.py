@@ -27,7 +27,6 @@ from dexkit.conformance.mutants.robot import (
 from dexkit.conformance.phases import ROBOT, Stimulus
 from dexkit.conformance.processes import RigOptions
 from dexkit.conformance.requirements import Level, catalogue, select
-from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.robot import (
     SPOILS,
@@ -54,7 +53,6 @@ from tests.dds_helpers import free_domain
 from tests.test_conformance_schema import validate
 
 NAMES = list(ROBOTS)
-DOCS = Path(__file__).parent.parent / "docs" / "conformance-robots.md"
 
 
 def plan(name: str, phases: Iterable[str]) -> Plan:
@@ -151,14 +149,6 @@ def test_every_stimulus_that_is_needed_exists(name: str) -> None:
     script = SCRIPTS[name](plan(name, everything(name)))
     assert 15 < script.length() < 40
     assert everything(name) <= {p.name for p in script.phases}
-
-
-def test_the_documented_catalogue_is_the_current_one() -> None:
-    text = DOCS.read_text(encoding="utf-8")
-    page = text[text.index(BEGIN) + len(BEGIN) : text.index(END)].strip()
-    assert page == catalogue_page("robot").strip(), (
-        "docs/conformance-robots.md is out of date: python -m dexkit.conformance.requirements.page"
-    )
 
 
 # ------------------------------------------------------------------------------ single findings

@@ -17,14 +17,12 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.processes import Tool
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.requirements.page import BEGIN, END
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
 from dexkit.conformance.usb.checks import CHECKS
 from dexkit.conformance.usb.judge import judge_usb
 from dexkit.conformance.usb.mutants import MUTANTS, try_mutant
-from dexkit.conformance.usb.page import catalogue_page
 from dexkit.conformance.usb.record import (
     RECORD,
     SCHEMA,
@@ -175,10 +173,8 @@ def test_every_requirement_has_a_check_and_a_device_that_breaks_it() -> None:
     assert {r.phase for r in usb()} - {None} <= {p.name for p in hand.record.phases}
 
 
-def test_the_documented_catalogue_is_the_current_one() -> None:
+def test_the_documented_schema_is_the_current_one() -> None:
     text = (Path(__file__).parent.parent / "docs" / "conformance-usb.md").read_text()
-    page = text[text.index(BEGIN) + len(BEGIN) : text.index(END)]
-    assert page.strip() == catalogue_page().strip(), "run python -m dexkit.conformance.usb.page"
     schema = [line.split("#")[0].strip() for line in SCHEMA.splitlines()[1:]]
     assert all(line in text for line in schema)
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.child_processes import command_line
 from dexkit.dds import DdsNode, Qos, Sample
 from dexkit.emulators.dex3_mcu import emulated_dex3
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
-from dexkit.processes import command_line
 from dexkit.service import real_time
 from tests.dds_helpers import dds_domain, dds_node
 from tests.test_service_cli import serving

@@ -21,7 +21,7 @@ from dexkit.errors import (
 from dexkit.hand import Side
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
-from dexkit.wire.dex3_usb.page import BLOCKS, PAGE, fill, worked_example
+from tools.generate.dex3_protocol_page import BLOCKS, PAGE, worked_example
 
 # --- layouts, against the numbers of docs/sources/unitree-dex.md#c
 
@@ -136,11 +136,10 @@ def test_the_worked_example(layout: d.CommandLayout, crc: int, digest: str) -> N
     ]  # fmt: skip
 
 
-def test_the_page_is_up_to_date() -> None:
+def test_the_page_has_every_table() -> None:
     text = PAGE.read_text(encoding="utf-8")
     for name in BLOCKS:
         assert f"<!-- made: {name} -->" in text, f"docs/dex3-protocol.md has no block {name}"
-    assert fill(text) == text, "docs/dex3-protocol.md: python -m dexkit.wire.dex3_usb.page"
 
 
 # --- single packets

@@ -32,7 +32,7 @@ from dexkit.models import DEX3_1
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import units
-from dexkit.wire.dex3_usb.page import worked_example
+from tools.generate.dex3_protocol_page import worked_example
 
 JOINTS = DEX3_1.joints[Side.LEFT]
 RATIOS = [j.gear_ratio for j in JOINTS]
@@ -257,7 +257,7 @@ def a_state(seed: int = 0, **values: Any) -> HandState:
     pressure = np.full((9, 12), math.nan)
     for i, sensor in enumerate(DEX3_1.sensors):
         pressure[i, list(sensor.slots)] = 8.0 * rng.integers(0, 29999, len(sensor.slots))
-    made = HandState.of(
+    made = HandState.from_values(
         joints(units.POSITION, 2**31 - 1),
         stamp=5.0,
         dq=joints(units.VELOCITY, 32767),

@@ -193,7 +193,7 @@ def test_a_state_is_twenty_joints_and_nothing_that_is_not_known(
     tau: list[float], fill: Fill
 ) -> None:
     modes = [i % 2 for i in range(N)]
-    state = HandState.of(DEX5_1.rest_q[LEFT], tau_est=tau, mode=modes, stamp=0.0)
+    state = HandState.from_values(DEX5_1.rest_q[LEFT], tau_est=tau, mode=modes, stamp=0.0)
     data = mapping(fill).encode({LEFT: StateView(state, (0,) * N)})
     assert len(data) == 1220  # docs/sources/unitree-dex.md#a4
     sent = STATES.decode(data)

@@ -33,7 +33,7 @@ def hg_cmd(q: float, **fields: Any) -> unitree_hg.HandCmd_:
 
 
 def view(q: float = 1.0, *, missed: int = 0, fault: int = 0, **state: Any) -> StateView:
-    return StateView(HandState.of(q, stamp=0.0, **state), (fault,), missed)
+    return StateView(HandState.from_values(q, stamp=0.0, **state), (fault,), missed)
 
 
 def via_wire(name: str, message: Any) -> Any:
@@ -170,7 +170,7 @@ class TestGoState:
         )  # fmt: skip
 
     FULL = StateView(
-        HandState.of(
+        HandState.from_values(
             1.5, stamp=0.0, dq=0.25, ddq=2.0, tau_est=-0.5, temperature=31.4, voltage=12.1,
             mode=JointMode.FOC, measured=False,
         ),
@@ -276,7 +276,7 @@ def test_any_state_can_be_sent(
     name: str, q: float, values: list[float], missed: int, fault: int
 ) -> None:
     dq, ddq, tau, celsius, volt = values
-    state = HandState.of(
+    state = HandState.from_values(
         q, stamp=0.0, dq=dq, ddq=ddq, tau_est=tau, temperature=celsius, voltage=volt
     )
     mapping = one(name)

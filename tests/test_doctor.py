@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.dds import DdsNode, Qos, Writer, type_hash
 from dexkit.doctor import Finding, Observations, Wish, diagnose, readiness
@@ -30,7 +31,6 @@ from dexkit.doctor.rtps import parse_message, unicast_port
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.models import DIALECTS
-from dexkit.processes import command_line
 from tests import doctor_packets as packets
 from tests.dds_helpers import free_domain
 
@@ -178,7 +178,7 @@ def looked() -> _Looked:
         world = _World(stack)
         _build(world)
         world.start()
-        views = doctor_dds.look(sorted(world.domains.values()), seconds=1.0)
+        views = doctor_dds.observe_domains(sorted(world.domains.values()), seconds=1.0)
     return _Looked(world.domains, Observations(domains=views))
 
 
@@ -282,7 +282,7 @@ def test_a_participant_of_cyclonedds_11() -> None:
     thread.start()
     try:
         assert ready.wait(60)
-        views = doctor_dds.look([domain], seconds=0.2)
+        views = doctor_dds.observe_domains([domain], seconds=0.2)
     finally:
         stop.set()
         thread.join()
@@ -303,7 +303,7 @@ def test_a_look_leaves_nothing_behind() -> None:
 
         thread = threading.Thread(target=watch)
         thread.start()
-        (view,) = doctor_dds.look([domain], seconds=0.3)
+        (view,) = doctor_dds.observe_domains([domain], seconds=0.3)
         thread.join()
         assert view.streams[0].samples == 0
         assert matched.is_set()  # it was a reader while it looked

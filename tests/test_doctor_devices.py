@@ -19,7 +19,7 @@ from dexkit.doctor import usb as doctor_usb
 from dexkit.doctor.environment import environment, uri_problem
 from dexkit.doctor.network import dds_sockets, interfaces
 from dexkit.doctor.observations import SerialPort, UsbDevice
-from dexkit.doctor.processes import command_line, holders, start_time
+from dexkit.doctor.proc_files import command_line, holders, start_time
 from dexkit.doctor.rtps import unicast_port
 from dexkit.emulators.dex3_mcu.hands import emulated_dex3
 from dexkit.emulators.mx64 import Bus, Port, Servo

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from dexkit.doctor import DIAGNOSES, Observations, Severity, Wish, diagnose, readiness, verdict
-from dexkit.doctor.catalogue import table
 from dexkit.doctor.observations import (
     DdsSocket,
     DomainView,
@@ -307,11 +305,6 @@ def test_a_slip_of_the_pen(topic: str, meant: str) -> None:
 )
 def test_a_name_of_its_own(topic: str) -> None:
     assert nearly(topic) is None
-
-
-def test_the_docs_have_the_table() -> None:
-    page = Path(__file__).parent.parent / "docs" / "doctor.md"
-    assert table() in page.read_text(), "python -m dexkit.doctor.catalogue prints the table"
 
 
 def test_topics_are_whole_in_a_narrow_terminal() -> None:

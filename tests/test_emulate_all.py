@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from dexkit.child_processes import Tool
 from dexkit.cli import cli
 from dexkit.cli.emulate import command as emulate
 from dexkit.dds import DdsNode
 from dexkit.hand import Side
 from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
-from dexkit.processes import Tool
 from dexkit.robots import G1
 from dexkit.wire import low_level
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until

@@ -20,6 +20,7 @@ import pytest
 import usbip
 from click.testing import CliRunner
 
+from dexkit.child_processes import command_line
 from dexkit.cli.emulate import command
 from dexkit.emulators.dex3_mcu import Dex3Process
 from dexkit.emulators.faults import FAULT_KINDS
@@ -34,7 +35,6 @@ from dexkit.emulators.mx64 import (
 )
 from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
-from dexkit.processes import command_line
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
 from tests.patience import PATIENCE

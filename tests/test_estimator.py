@@ -283,7 +283,7 @@ class TestStateEstimator:
     def test_a_prediction_says_so_and_keeps_the_rest(self) -> None:
         e = StateEstimator(self.spec, [(2.0, 2.0)])
         assert e.predict(0.0) is None
-        e.measure(HandState.of(1.0, stamp=0.0, tau_est=-0.5, temperature=31.0), 0.0)
+        e.measure(HandState.from_values(1.0, stamp=0.0, tau_est=-0.5, temperature=31.0), 0.0)
         e.follow(HandCommand.position(4.0), 0.0)
         state = e.predict(0.5)
         assert state is not None
@@ -298,7 +298,7 @@ class TestStateEstimator:
     )
     def test_brake_and_limp_move_nothing(self, command: HandCommand) -> None:
         e = StateEstimator(self.spec, [(2.0, 2.0)])
-        e.measure(HandState.of(1.0, stamp=0.0), 0.0)
+        e.measure(HandState.from_values(1.0, stamp=0.0), 0.0)
         e.follow(command, 0.0)
         state = e.predict(1.0)
         assert state is not None

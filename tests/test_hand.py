@@ -112,7 +112,7 @@ class TestCommand:
 
 class TestState:
     def test_what_is_not_known_is_nan(self) -> None:
-        s = HandState.of([1.0, 2.0], stamp=3.0)
+        s = HandState.from_values([1.0, 2.0], stamp=3.0)
         assert s.dq.shape == (2,)
         assert np.isnan(s.temperature).all()
         assert np.isnan(s.voltage).all()
@@ -120,7 +120,7 @@ class TestState:
         assert s.measured
 
     def test_faults_hold_all_32_bits(self) -> None:
-        s = HandState.of(0.0, stamp=0.0, fault=int(MotorError.HOST_SAW_MOTOR_TIMEOUT))
+        s = HandState.from_values(0.0, stamp=0.0, fault=int(MotorError.HOST_SAW_MOTOR_TIMEOUT))
         assert MotorError(int(s.fault[0])) is MotorError.HOST_SAW_MOTOR_TIMEOUT
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import click
 import pytest
 
-from dexkit import stopping
-from dexkit.cli.common import Number
+from dexkit import stop_signals
+from dexkit.cli.options import Number
 from dexkit.emulators.faults import (
     DEX3_FAULTS,
     M4010_FAULTS,
@@ -59,7 +59,7 @@ def test_every_number_on_the_command_line_is_finite_and_bounded() -> None:
         kind = option.type
         where = f"dexkit {' '.join(name)} {option.opts[0]}"
         if isinstance(kind, click.types.FloatParamType):
-            assert isinstance(kind, Number), f"{where}: take dexkit.cli.common.Number"
+            assert isinstance(kind, Number), f"{where}: take dexkit.cli.options.Number"
             seen += 1
             for text in ("nan", "-nan", "inf", "-inf", "1e400", "1e300", "", "²", "1e"):
                 with pytest.raises(click.BadParameter):
@@ -84,7 +84,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
         def __init__(self, *args: object, **settings: object) -> None:
             raise DdsUnavailable("no DDS here")
 
-    class Ended(stopping.StopRequest):
+    class Ended(stop_signals.StopRequest):
         def __init__(self) -> None:
             super().__init__()
             self.set()
@@ -92,7 +92,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dexkit.dds.DdsNode", NoNode)
     monkeypatch.setattr("dexkit.doctor.dds.look", lambda *a, **k: ())
     monkeypatch.setattr("dexkit.doctor.environment._import_problem", lambda module: "")
-    monkeypatch.setattr("dexkit.stopping.StopRequest", Ended)
+    monkeypatch.setattr("dexkit.stop_signals.StopRequest", Ended)
 
 
 def _run_all(
@@ -226,7 +226,7 @@ def _feed(lines: list[Any], inject: Callable[[str], None], monkeypatch: Any) -> 
 
     pieces = iter([*lines, b""])
     monkeypatch.setattr(stdin.os, "read", lambda fd, size: next(pieces))
-    stdin._read(inject, stopping.StopRequest())
+    stdin._read(inject, stop_signals.StopRequest())
 
 
 def test_lines_of_input_do_not_end_an_emulator(monkeypatch: pytest.MonkeyPatch) -> None:

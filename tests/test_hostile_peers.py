@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dexkit.child_processes import process_id
 from dexkit.dds import DdsNode, Participant
 from dexkit.doctor.dds import _participant, look
 from dexkit.doctor.rtps import ParticipantData
-from dexkit.processes import process_id
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from tests.dds_helpers import free_domain, wait_until

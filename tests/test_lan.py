@@ -26,7 +26,7 @@ from typing import Any
 
 import pytest
 
-from dexkit import ingress
+from dexkit import interface_filter
 from dexkit.cli import main
 from dexkit.dds import DdsNode
 from dexkit.errors import DdsSetupError
@@ -328,7 +328,7 @@ def _filter_in(pid: int, descriptor: int) -> bytes:
 
 def _listening(program: Program, indices: Sequence[int]) -> list[tuple[str, str, bool]]:
     """What a program takes packets on: protocol, local address, and if only by these interfaces."""
-    wanted = ingress.program(indices)
+    wanted = interface_filter.program(indices)
     found = []
     for pid in _family(program.process.pid):
         own = _sockets(pid)
@@ -460,11 +460,11 @@ def test_the_filter_goes_by_the_interface_alone() -> None:
             ([7, _LOOPBACK_INDEX, 9], True),
             ([7, 8, 9], False),
             ([], False),
-            (ingress.accepted_indices("lo"), True),
-            (ingress.accepted_indices("nowhere0"), True),  # this machine is always heard
+            (interface_filter.accepted_indices("lo"), True),
+            (interface_filter.accepted_indices("nowhere0"), True),  # this machine is always heard
         ):
-            ingress.accept_only(sock, indices)
-            assert _filter_of(sock) == ingress.program(indices)
+            interface_filter.accept_only(sock, indices)
+            assert _filter_of(sock) == interface_filter.program(indices)
             sender.sendto(b"x", sock.getsockname())
             try:
                 heard = sock.recv(10) == b"x"
@@ -485,14 +485,14 @@ def test_without_a_filter_nothing_starts(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(ingress, "accept_only", _refuse)
-    monkeypatch.delenv(ingress.ALL_INTERFACES, raising=False)
+    monkeypatch.setattr(interface_filter, "accept_only", _refuse)
+    monkeypatch.delenv(interface_filter.ALL_INTERFACES, raising=False)
     with pytest.raises(SystemExit) as ended:
         main([*arguments, "--domain", str(free_domain())])
     assert ended.value.code == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "other networks than lo cannot be kept out" in said
-    assert ingress.ALL_INTERFACES in said
+    assert interface_filter.ALL_INTERFACES in said
 
 
 def test_without_free_file_descriptors_nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -515,8 +515,8 @@ def test_without_free_file_descriptors_nothing_starts(monkeypatch: pytest.Monkey
 def test_a_user_may_go_on_without_a_filter_and_is_warned(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(ingress, "accept_only", _refuse)
-    monkeypatch.setenv(ingress.ALL_INTERFACES, "1")
+    monkeypatch.setattr(interface_filter, "accept_only", _refuse)
+    monkeypatch.setenv(interface_filter.ALL_INTERFACES, "1")
     domain = free_domain()
     with DdsNode(domain) as node, DdsNode(domain) as other:
         reader = node.reader("rt/x", "unitree_go::msg::dds_::MotorCmds_")

@@ -1,4 +1,4 @@
-"""The rooms, their links, and who may import whom."""
+"""The top-level packages, their links in dexkit/, and which may import which."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("drivers", "emulators", "conformance", "traces")
-# what a room may import besides itself and the core
+PACKAGES = ("drivers", "emulators", "conformance", "traces")
+# what a package may import besides itself and the core
 MAY_IMPORT = {
     "drivers": set(),
     "emulators": set(),
@@ -22,7 +22,7 @@ MAY_IMPORT = {
 
 
 def modules(folder: Path) -> Iterator[Path]:
-    """Python files below ``folder``, not through the rooms' links."""
+    """Python files below ``folder``, not through the packages' links."""
     for base, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if not (Path(base) / f).is_symlink()]
         yield from (Path(base) / f for f in files if f.endswith(".py"))
@@ -41,11 +41,11 @@ def imported(path: Path) -> frozenset[str]:
     return frozenset(names)
 
 
-def rooms_imported(path: Path) -> set[str]:
+def packages_imported(path: Path) -> set[str]:
     return {
         name.split(".")[1]
         for name in imported(path)
-        if name.startswith("dexkit.") and name.split(".")[1] in ROOMS
+        if name.startswith("dexkit.") and name.split(".")[1] in PACKAGES
     }
 
 
@@ -55,46 +55,48 @@ def files(folder: str) -> list[Path]:
     return found
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_the_room_is_linked_into_the_package(room: str) -> None:
-    link = ROOT / "dexkit" / room
+@pytest.mark.parametrize("package", PACKAGES)
+def test_each_package_is_linked_into_dexkit(package: str) -> None:
+    link = ROOT / "dexkit" / package
     assert link.is_symlink()
-    assert os.readlink(link) == f"../{room}"
+    assert os.readlink(link) == f"../{package}"
     assert (link / "__init__.py").is_file()
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_rooms_keep_their_distance(room: str) -> None:
-    for path in files(room):
-        others = rooms_imported(path) - {room} - MAY_IMPORT[room]
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_do_not_import_each_other(package: str) -> None:
+    for path in files(package):
+        others = packages_imported(path) - {package} - MAY_IMPORT[package]
         assert not others, f"{path.relative_to(ROOT)} imports {', '.join(others)}"
 
 
-def test_the_core_imports_no_room() -> None:
+def test_the_core_imports_none_of_them() -> None:
     for path in files("dexkit"):
         if ROOT / "dexkit" / "cli" not in path.parents:
-            assert not rooms_imported(path), f"{path.relative_to(ROOT)}: {rooms_imported(path)}"
+            assert not packages_imported(path), (
+                f"{path.relative_to(ROOT)}: {packages_imported(path)}"
+            )
 
 
-@pytest.mark.parametrize("folder", ["dexkit", "tests", "benchmarks", *ROOMS])
-def test_nothing_imports_a_room_by_its_bare_name(folder: str) -> None:
+@pytest.mark.parametrize("folder", ["dexkit", "tests", "benchmarks", *PACKAGES])
+def test_nothing_imports_a_package_by_its_bare_name(folder: str) -> None:
     for path in files(folder):
-        bare = {name for name in imported(path) if name.split(".")[0] in ROOMS}
+        bare = {name for name in imported(path) if name.split(".")[0] in PACKAGES}
         assert not bare, f"{path.relative_to(ROOT)} imports {', '.join(bare)}: say dexkit.…"
 
 
-@pytest.mark.parametrize("folder", ["dexkit", "benchmarks", *ROOMS])
+@pytest.mark.parametrize("folder", ["dexkit", "benchmarks", *PACKAGES])
 def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))
         assert not touches or path == ROOT / "dexkit" / "dds.py", path.relative_to(ROOT)
 
 
-def test_help_imports_no_room_and_no_dds() -> None:
+def test_help_imports_neither_packages_nor_dds() -> None:
     """``dexkit --help`` is quick, and works where parts are missing."""
     for path in (ROOT / "dexkit" / "cli" / "__init__.py", ROOT / "dexkit" / "__init__.py"):
         tree = ast.parse(path.read_text())
         top = [n for n in tree.body if isinstance(n, (ast.Import, ast.ImportFrom))]
         names = {getattr(n, "module", None) or n.names[0].name for n in top}
-        assert not any(name.startswith(("dexkit.dds", *(f"dexkit.{r}" for r in ROOMS)))
+        assert not any(name.startswith(("dexkit.dds", *(f"dexkit.{r}" for r in PACKAGES)))
                        for name in names)  # fmt: skip

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode
-from dexkit.sockets import DdsSockets
+from dexkit.socket_losses import DdsSockets
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.losses import PAUSE, Losses
@@ -156,7 +156,7 @@ CHILD = textwrap.dedent(
     """
     import socket, sys
     from dexkit.cli import main
-    from dexkit.sockets import DdsSockets
+    from dexkit.socket_losses import DdsSockets
     def shrink(self, size):
         for sock in self._sockets():
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
@@ -287,6 +287,6 @@ def test_sockets_are_found_and_count_for_their_domain_only() -> None:
         sockets = DdsSockets(domain)
         assert sockets.known
         assert sockets.enlarge(100_000) >= 100_000
-        assert sockets.look() == 0
+        assert sockets.count_new_drops() == 0
         assert not DdsSockets(other).known
         assert DdsSockets(other).enlarge(100_000) == 0

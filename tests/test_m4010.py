@@ -79,12 +79,12 @@ def test_calibration_is_that_of_the_vendors_library() -> None:
     calibration = Calibration(0, position=0.0, range=5.61996, time=0x6B015A28)
     assert calibration.pack() == frame
     assert Calibration(0, time=0x6B015A28).pack() == frame  # the service's 322 degrees
-    parsed = Calibration.of(MotorCmd.parse(frame))
+    parsed = Calibration.from_command(MotorCmd.parse(frame))
     assert parsed is not None
     assert parsed == dataclasses.replace(calibration, range=parsed.range)
     assert parsed.range == pytest.approx(5.61996, abs=2e-4)
-    assert Calibration.of(MotorCmd(0, Status.CALIBRATE)) is None
-    assert Calibration.of(MotorCmd.setpoint(0, tau=-10.0)) is None
+    assert Calibration.from_command(MotorCmd(0, Status.CALIBRATE)) is None
+    assert Calibration.from_command(MotorCmd.setpoint(0, tau=-10.0)) is None
 
 
 # docs/sources/unitree-dex.md#g: codes that were read at single values, rotor side
@@ -244,7 +244,7 @@ def test_calibration_round_trip(
     number: int, position: float, stroke: float, time: int, user: int
 ) -> None:
     sent = Calibration(number, position, stroke, time, user)
-    found = Calibration.of(MotorCmd.parse(sent.pack()))
+    found = Calibration.from_command(MotorCmd.parse(sent.pack()))
     assert found is not None
     assert (found.id, found.time, found.user_id) == (number, time, user)
     assert found.position == pytest.approx(position, abs=2e-4)

@@ -1,4 +1,4 @@
-"""Whatever cannot be written is told with an exit code, and what was there before stays."""
+"""Output that cannot be written gives an error and an exit code; existing files stay whole."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
-from dexkit.cli import main
-from dexkit.processes import command_line
+from dexkit.child_processes import command_line
+from dexkit.cli import cli, main
+from dexkit.errors import UsageError
 from tests import hostile
 
 _SAMPLE = "<sample>"
@@ -151,13 +153,39 @@ def test_without_standard_streams_nothing_is_written_into_what_is_opened_next(
         check=False,
         timeout=60,
     )
-    assert done.returncode in (0, 1)
+    assert done.returncode == 2  # the table went nowhere
     assert out.read_text().startswith("{")
+
+
+def test_a_closed_standard_output_is_an_error_if_something_was_to_be_written(
+    tmp_path: Path,
+) -> None:
+    _, recording = hostile.judged_result(tmp_path)
+    result = str(tmp_path / "good.json")
+    report = tmp_path / "report.md"
+    for arguments, code in (
+        (("info", "--json", str(recording)), 2),
+        (("--help",), 2),
+        (("check", str(tmp_path / "missing.mcap")), 2),
+        (("badge", result, "-o", "-"), 2),
+        (("report", result, "--markdown", str(report)), 0),
+    ):
+        done = subprocess.run(
+            ["sh", "-c", 'exec "$@" >&-', "sh", *command_line(*arguments)],
+            stderr=subprocess.PIPE,
+            check=False,
+            timeout=60,
+            text=True,
+        )
+        assert done.returncode == code, (arguments, done.stderr)
+        unwritten = "error: cannot write standard output: it is closed\n"
+        assert (done.stderr == unwritten) == (code == 2 and "missing" not in str(arguments))
+    assert report.read_text().startswith("#")
 
 
 _OPENED_NEXT = """
 import os, subprocess, sys
-from dexkit.untrusted import guarded
+from dexkit.escaping import guarded
 with guarded():
     assert os.open(sys.argv[1], os.O_RDWR) > 2
     assert [s.fileno() for s in (sys.stdin, sys.stdout, sys.stderr)] == [0, 1, 2]
@@ -194,3 +222,43 @@ def test_who_has_no_input_is_not_asked(tmp_path: Path, gripper: tuple[str, ...])
     assert done.returncode == 2
     assert "nobody can be asked" in done.stderr
     assert "--yes" in done.stderr
+
+
+def test_no_command_overwrites_its_input_or_writes_a_file_twice(tmp_path: Path) -> None:
+    _, recording = hostile.judged_result(tmp_path)
+    session = tmp_path / "session.mcap"
+    session.write_bytes(recording.read_bytes())
+    result = tmp_path / "good.json"
+    link = tmp_path / "link.json"
+    link.symlink_to(result)
+    hard_link = tmp_path / "hard.json"
+    hard_link.hardlink_to(result)
+    before = result.read_bytes()
+    new = tmp_path / "new"
+    for arguments in (
+        ("report", result, "--html", result),
+        ("report", result, "--junit", link),
+        ("report", result, "--markdown", hard_link),
+        ("report", result, "--recording", recording, "--html", recording),
+        ("report", result, "--html", new, "--junit", new),
+        ("badge", result, "-o", result),
+        ("compare", result, "--html", result),
+        ("compare", result, "--html", new, "--markdown", tmp_path / "." / "new"),
+        ("check", session, "--json", session),
+        ("check", session, "--json", new, "--html", new),
+    ):
+        found = CliRunner().invoke(cli, list(map(str, arguments)))
+        assert isinstance(found.exception, UsageError), (arguments, found.output)
+        assert "is also an" in found.exception.message
+    assert result.read_bytes() == before
+    assert session.read_bytes() == recording.read_bytes()
+    assert not new.exists()
+
+
+def test_one_device_may_take_several_outputs(tmp_path: Path) -> None:
+    hostile.judged_result(tmp_path)
+    result = str(tmp_path / "good.json")
+    found = CliRunner().invoke(
+        cli, ["report", result, "--html", "/dev/null", "--junit", "/dev/null"]
+    )
+    assert found.exit_code == 0, found.output

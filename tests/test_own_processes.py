@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
+from dexkit.child_processes import END_WITH_PARENT, Tool, command_line
 from dexkit.emulators.mx64 import EmulatedProcess
 from dexkit.errors import DexkitError
-from dexkit.limits import room_for_files
-from dexkit.processes import END_WITH_PARENT, Tool, command_line
-from dexkit.scratch import PREFIX, Scratch, sweep
+from dexkit.open_file_limit import require_open_files
+from dexkit.temporary_folder import PREFIX, TemporaryFolder, sweep
 
 _HOSTILE = """
 import os
@@ -100,7 +100,7 @@ def _ended(pid: int) -> bool:
 
 _PARENT = """
 import os, sys, threading
-from dexkit.processes import Tool
+from dexkit.child_processes import Tool
 tool = Tool("emulate", "mx64", "--link", sys.argv[1])
 if sys.argv[2] == "ready":
     tool.wait_ready(threading.Event())
@@ -132,7 +132,7 @@ def test_a_process_ends_with_its_parent_however_that_ends(when: str, tmp_path: P
 
 def test_a_process_that_does_not_end_when_told_is_killed(tmp_path: Path) -> None:
     code = (
-        "import signal, time, dexkit.processes as p\n"
+        "import signal, time, dexkit.child_processes as p\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
         "p.STOP_TIMEOUT = 0.05\n"
         "p.end_with_parent()\n"
@@ -158,8 +158,8 @@ def test_a_process_that_does_not_end_when_told_is_killed(tmp_path: Path) -> None
 
 _RUN = """
 import sys
-from dexkit.scratch import Scratch
-folder = Scratch("run")
+from dexkit.temporary_folder import TemporaryFolder
+folder = TemporaryFolder("run")
 (folder.path / "run.mcap").write_bytes(bytes(1000))
 print(folder.path, flush=True)
 sys.stdin.read()
@@ -191,7 +191,7 @@ def test_folders_of_killed_programs_are_removed_and_those_of_others_stay(tempora
         (temporary / "dexkit-somebody").mkdir()
         (temporary / f"{PREFIX}link").symlink_to(kept)
         (temporary / f"{PREFIX}file").write_text("x")
-        with Scratch() as own:
+        with TemporaryFolder() as own:
             assert sweep() == []
             assert own.exists()
             assert own.stat().st_mode & 0o077 == 0
@@ -215,7 +215,7 @@ def test_a_folder_that_was_swept_before_its_lock_is_made_again(
         genuine(descriptor, how)
 
     monkeypatch.setattr(fcntl, "flock", sweeping)
-    with Scratch() as folder:
+    with TemporaryFolder() as folder:
         assert removed
         assert folder not in removed
         assert folder.exists()
@@ -225,9 +225,9 @@ def test_a_folder_that_was_swept_before_its_lock_is_made_again(
 # ------------------------------------------------------------------------------- descriptors
 
 
-def test_without_room_for_files_nothing_begins() -> None:
+def test_without_require_open_files_nothing_begins() -> None:
     commands = {
-        ("doctor", "--seconds", "0.2"): "a look at 11 domain(s) needs",
+        ("doctor", "--seconds", "0.2"): "examining 11 domain(s) needs",
         ("serve", "sim-dex1", "--side", "left", "--domain", "1"): "DDS needs 16 more",
     }
 
@@ -256,9 +256,9 @@ def test_a_limit_that_may_be_raised_is_raised() -> None:
     used = len(os.listdir("/proc/self/fd"))
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (used + 5, before[1]))
-        room_for_files(20, "a test")
+        require_open_files(20, "a test")
         assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > used + 5
         with pytest.raises(DexkitError, match="a test needs 100000000 more open files"):
-            room_for_files(10**8, "a test")
+            require_open_files(10**8, "a test")
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)

@@ -16,6 +16,7 @@ import pytest
 from dexkit.bridge import Bridge, End
 from dexkit.bridge.core import PATIENCE, Commands, States
 from dexkit.clock import ManualClock, RealClock
+from dexkit.command_age import PAUSE
 from dexkit.dds import DdsNode
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
@@ -27,7 +28,6 @@ from dexkit.emulators.mx64 import EmulatedThread, emulated_ezgripper
 from dexkit.emulators.robot import EmulatedRobot, RobotMechanics
 from dexkit.emulators.sim_hand import SimHand
 from dexkit.errors import HandTimeout
-from dexkit.freshness import PAUSE
 from dexkit.hand import Hand, HandCommand, JointMode, Side
 from dexkit.messages import encode, message_type, unitree_go
 from dexkit.models import dialect

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 import pytest
 from click.testing import CliRunner
 
+from dexkit.child_processes import command_line
 from dexkit.cli.emulate import command
 from dexkit.dds import DdsNode, Sample
 from dexkit.emulators.robot import EmulatedRobot, run_robot
 from dexkit.errors import EmulatorError, TopicConflict
 from dexkit.messages import encode
-from dexkit.processes import command_line
 from dexkit.robots import G1, H1
 from dexkit.wire.low_level import encode_with_crc, verify_payload
 from tests.dds_helpers import free_domain, take_until, wait_until

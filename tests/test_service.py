@@ -231,7 +231,7 @@ class TestLink:
 
         with pytest.raises(HandError, match="returned a float, not a HandState") as raised:
             serve(Bare(), FakeNode()).start()
-        assert "HandState.of" in raised.value.hint
+        assert "HandState.from_values" in raised.value.hint
 
     def test_missing_at_the_start_can_be_waited_for(self) -> None:
         hand, node = ScriptedHand(q=0.5), FakeNode()
@@ -377,7 +377,7 @@ def test_an_endless_state_is_not_sent() -> None:
 
     class Broken(ScriptedHand):
         def exchange(self, command: object) -> HandState:
-            return HandState.of(1e300, stamp=0.0)
+            return HandState.from_values(1e300, stamp=0.0)
 
     node = FakeNode()
     with serve(Broken(), node):

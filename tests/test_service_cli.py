@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
-from dexkit.cli.common import stop_on_signals
 from dexkit.dds import DdsNode, Qos
 from dexkit.emulators.mx64 import emulated_ezgripper
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_go
 from dexkit.models import dialect
+from dexkit.stop_signals import stop_on_signals
 from tests.cli_helpers import Process, running
 from tests.dds_helpers import dds_domain, dds_node, take_until
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
+from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
-from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import Backoff, Estimation, HandCore
@@ -40,7 +40,7 @@ class Bench:
 
     def exchange(self, **state: object) -> HandCommand:
         command = self.core.next_command()
-        self.core.measured(HandState.of(self.q, stamp=self.clock.now(), **state))  # type: ignore[arg-type]
+        self.core.measured(HandState.from_values(self.q, stamp=self.clock.now(), **state))  # type: ignore[arg-type]
         return command
 
     def command(self, q: float, **fields: float) -> bool:
@@ -300,7 +300,7 @@ class TestFailedExchanges:
     def test_a_state_that_is_none_is_a_failure(self, q: list[float]) -> None:
         bench = Bench()
         with pytest.raises(HandError, match="backend returned"):
-            bench.core.measured(HandState.of(q, stamp=0.0))
+            bench.core.measured(HandState.from_values(q, stamp=0.0))
         view = bench.core.view()
         assert view is not None
         assert view.state.q[0] == 1.0

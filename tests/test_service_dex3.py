@@ -159,7 +159,7 @@ def full_state(**fields: Any) -> HandState:
         "error": 0x10,
         **fields,
     }
-    return HandState.of(DEX3_1.rest_q[LEFT], stamp=0.0, **values)
+    return HandState.from_values(DEX3_1.rest_q[LEFT], stamp=0.0, **values)
 
 
 def sent(view: StateView, fill: Fill = Fill.KNOWN) -> unitree_hg.HandState_:
@@ -213,7 +213,7 @@ class TestState:
         assert sent(StateView(full_state(), (LINK,) * N)).error[0] == LINK | 0x10
 
     def test_what_is_not_known_is_zero_or_no_value(self) -> None:
-        m = sent(StateView(HandState.of([0.1] * N, stamp=0.0, dq=math.nan), (0,) * N))
+        m = sent(StateView(HandState.from_values([0.1] * N, stamp=0.0, dq=math.nan), (0,) * N))
         assert [x.dq for x in m.motor_state] == [0.0] * N
         assert [x.temperature for x in m.motor_state] == [(0, 0)] * N
         assert [p.pressure for p in m.press_sensor_state] == [(30000.0,) * 12] * SENSORS
@@ -229,9 +229,11 @@ class TestState:
 
     def test_one_state_leaves_nothing_in_the_next(self) -> None:
         encoder = FingerStateEncoder(spec())
-        fresh = FingerStateEncoder(spec()).encode(HandState.of([0.1] * N, stamp=0.0), (0,) * N)
+        fresh = FingerStateEncoder(spec()).encode(
+            HandState.from_values([0.1] * N, stamp=0.0), (0,) * N
+        )
         encoder.encode(full_state(), self.VIEW.fault, 3, self.VIEW.tripped)
-        assert encoder.encode(HandState.of([0.1] * N, stamp=0.0), (0,) * N) == fresh
+        assert encoder.encode(HandState.from_values([0.1] * N, stamp=0.0), (0,) * N) == fresh
 
     anything = st.floats(allow_nan=True, allow_infinity=True)
 
@@ -245,7 +247,7 @@ class TestState:
         self, values: list[float], fault: list[int], missed: int
     ) -> None:
         dq, tau, celsius, volt, pascal, amps = values
-        state = HandState.of(
+        state = HandState.from_values(
             [0.1] * N, stamp=0.0, dq=dq, ddq=tau, tau_est=tau, temperature=celsius, voltage=volt,
             winding_temperature=np.full(N, celsius), pressure=np.full((SENSORS, 12), pascal),
             sensor_temperature=np.full((SENSORS, 12), celsius),
@@ -287,7 +289,9 @@ class Bench:
     def exchange(self) -> HandCommand:
         command = self.core.next_command()
         self.core.measured(
-            HandState.of(DEX3_1.rest_q[LEFT], stamp=self.clock.now(), mode=command.mode.tolist())
+            HandState.from_values(
+                DEX3_1.rest_q[LEFT], stamp=self.clock.now(), mode=command.mode.tolist()
+            )
         )
         return command
 
@@ -466,7 +470,7 @@ class InstantDex3:
 
     def exchange(self, command: HandCommand) -> HandState:
         self.q = np.where((command.mode == 1) & (command.kp > 0), command.q, self.q)
-        return HandState.of(self.q, stamp=time.monotonic(), mode=command.mode.tolist())
+        return HandState.from_values(self.q, stamp=time.monotonic(), mode=command.mode.tolist())
 
 
 CMD, STATE = DEX3.topics(LEFT)

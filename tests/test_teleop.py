@@ -33,7 +33,7 @@ from dexkit.teleop import (
     recorded,
 )
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
-from dexkit.teleop.wire import ClientWire
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces import open_trace, sample_path
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
@@ -58,7 +58,6 @@ def test_states_are_read_left_then_right_and_kept_until_both_are_there() -> None
     receiver = StateReceiver([(LEFT,), (RIGHT,)])
     receiver.receive(0.0, {RIGHT: (1.0,)})
     assert receiver.latest == {}
-    assert receiver.waits_for == (LEFT,)
     receiver.receive(0.5, {LEFT: (2.0,)})
     assert receiver.latest == {LEFT: (2.0,), RIGHT: (1.0,)}
     assert receiver.wakes_at == 0.5 + POLL_PAUSE

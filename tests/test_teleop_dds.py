@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from dexkit.child_processes import command_line
 from dexkit.cli import cli
+from dexkit.command_age import PAUSE
 from dexkit.conformance.view import Recording
 from dexkit.dds import DdsNode
 from dexkit.errors import DexkitError, UsageError
-from dexkit.freshness import PAUSE
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_
 from dexkit.models import DIALECTS
-from dexkit.processes import command_line
 from dexkit.teleop import profile
 from dexkit.traces import open_trace
 from tests.dds_helpers import free_domain, take_until

@@ -11,15 +11,15 @@ import pytest
 
 from dexkit import threads
 from dexkit.bridge import bridge as bridge_module
+from dexkit.child_processes import Tool
 from dexkit.cli import main
 from dexkit.dds import DdsNode
 from dexkit.emulators.robot.run import EmulatedRobot
 from dexkit.emulators.serial_port import Port
 from dexkit.errors import DexkitError, HandLost
-from dexkit.processes import Tool
 from dexkit.service import HandService
 from dexkit.service.publisher import Publisher
-from dexkit.stopping import stop_on_signals
+from dexkit.stop_signals import stop_on_signals
 from dexkit.threads import Worker
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording

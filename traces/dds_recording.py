@@ -19,7 +19,7 @@ from dexkit.errors import DdsError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS
-from dexkit.sockets import DdsSockets
+from dexkit.socket_losses import DdsSockets
 from dexkit.threads import Worker
 from dexkit.topics import HAND_TOPICS
 from dexkit.traces.losses import Losses
@@ -195,7 +195,7 @@ class DdsRecording:
         for (topic, _), reader in self._readers.items():
             if count := reader.refused:
                 refused[topic] = refused.get(topic, 0) + count
-        return self.losses.look(now, self._sockets.look(), refused)
+        return self.losses.look(now, self._sockets.count_new_drops(), refused)
 
     def _discover(self) -> bool:
         with self._fresh_lock:

@@ -5,7 +5,7 @@ next. Gaps are kept unless capped. What is to be played is loaded beforehand (ab
 message beside its payload), so that no chunk is unpacked between two deadlines.
 
 **After a pause of the player itself** (stopped, suspended, starved; more than
-:data:`~dexkit.freshness.PAUSE`) nothing that fell due meanwhile is sent at once: it would be sent
+:data:`~dexkit.command_age.PAUSE`) nothing that fell due meanwhile is sent at once: it would be sent
 with the time of now, so that no hand could tell that it is old. The time line is held instead: the
 recording goes on where it was left. So it does when publishing itself cannot keep up.
 """
@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.clock import Clock, RealClock, wait_until
+from dexkit.command_age import PAUSE, PauseWatch
 from dexkit.errors import UsageError
-from dexkit.freshness import PAUSE, PauseWatch
 from dexkit.traces.names import select_topics
 from dexkit.traces.reader import Trace, TraceMessage
 
@@ -215,7 +215,7 @@ class _TimeLine:
 
     def _look(self) -> None:
         """Notice a pause, and move what is still to come behind it."""
-        away = self._watch.look()
+        away = self._watch.measure_pause()
         if away:
             self.pauses += 1
             self._paused(away)

@@ -134,10 +134,8 @@ class Recorder:
         self._closing = False
         self._thread: Worker | None = None
         self._file = RecordingFile(self.path, overwrite=overwrite)
-        self._pending_bytes = 0
         self._error: Exception | None = None
         self._written = 0
-        self._bytes = 0
 
     # -- what has happened ---------------------------------------------------------------------
 
@@ -145,11 +143,6 @@ class Recorder:
     def written(self) -> int:
         """Messages that are in the file: they can be read even if the process is killed now."""
         return self._written
-
-    @property
-    def written_bytes(self) -> int:
-        """Bytes of payload in the file."""
-        return self._bytes
 
     @property
     def dropped(self) -> int:
@@ -379,7 +372,6 @@ class Recorder:
         with self._lock:
             self._queued -= messages
             self._queued_bytes -= size
-        self._pending_bytes += size
 
     def _commit_after(self, committed: float) -> float:
         """Complete the chunk if it is time; returns when that was last done."""
@@ -398,8 +390,6 @@ class Recorder:
                 channel.written += channel.pending
                 self._written += channel.pending
                 channel.pending = 0
-        self._bytes += self._pending_bytes
-        self._pending_bytes = 0
         if self._written:
             self._file.publish()
         self._file.check()

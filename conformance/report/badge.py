@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dexkit.conformance.report.wording import model_title, nature, tally
 from dexkit.conformance.results import Overall, RunResult
-from dexkit.untrusted import html as escape
+from dexkit.escaping import html as escape
 
 __all__ = ["badge_text", "render_badge"]
 

@@ -19,7 +19,7 @@ from dexkit.conformance.report.wording import (
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.errors import UsageError
-from dexkit.untrusted import html as escape
+from dexkit.escaping import html as escape
 
 __all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
 

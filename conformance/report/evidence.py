@@ -24,8 +24,8 @@ from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.view import Recording, SideView
 from dexkit.errors import UsageError
+from dexkit.escaping import html as escape
 from dexkit.hand import Floats, JointSpec, Side
-from dexkit.untrusted import html as escape
 
 __all__ = ["PHASES", "command_and_state", "evidence", "operated", "phase_bands"]
 

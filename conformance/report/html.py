@@ -42,7 +42,7 @@ from dexkit.conformance.results import (
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording
 from dexkit.documents import write_file
-from dexkit.untrusted import html as escape
+from dexkit.escaping import html as escape
 
 __all__ = ["document", "render", "write_html"]
 

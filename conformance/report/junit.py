@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 from dexkit.conformance.report.wording import hand_name
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.documents import write_file
-from dexkit.untrusted import visible
+from dexkit.escaping import visible
 
 __all__ = ["write_junit"]
 

@@ -23,7 +23,7 @@ from dexkit.conformance.report.wording import (
 )
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
-from dexkit.untrusted import REMARK, one_line
+from dexkit.escaping import REMARK, one_line
 
 __all__ = ["code", "plain", "render_markdown", "table"]
 

@@ -10,8 +10,8 @@ from dexkit.conformance.report.wording import subject, whose
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.view import Recording, SideView
+from dexkit.escaping import html as escape
 from dexkit.hand import JointSpec
-from dexkit.untrusted import html as escape
 
 __all__ = ["overview"]
 

@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from dexkit.escaping import html as escape
 from dexkit.hand import Floats
-from dexkit.untrusted import html as escape
 
 __all__ = [
     "Band",
@@ -242,10 +242,6 @@ def _figure(
         f'focusable="false"><title>{text}</title>{svg}</svg>'
         f"{''.join(labels)}</div></div>{legend}</figure>"
     )
-
-
-def _inside(value: float, span: tuple[float, float]) -> bool:
-    return span[0] <= value <= span[1]
 
 
 def chart(

@@ -13,7 +13,7 @@ from dexkit.conformance.report.wording import about_harness, causes
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape
-from dexkit.untrusted import REMARK, one_line
+from dexkit.escaping import REMARK, one_line
 
 __all__ = ["MARKS", "print_result"]
 

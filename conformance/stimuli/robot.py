@@ -33,6 +33,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+from dexkit.command_age import PAUSE
 from dexkit.conformance.phases import ROBOT, Phase
 from dexkit.conformance.robot import SPOILS, RobotWire
 from dexkit.conformance.stimuli.script import (
@@ -48,7 +49,6 @@ from dexkit.conformance.stimuli.script import (
     Steps,
 )
 from dexkit.conformance.wire import Motor, Motors
-from dexkit.freshness import PAUSE
 from dexkit.hand import Side
 from dexkit.robots import robot
 

@@ -1,4 +1,4 @@
-"""An old client meets a new gripper, and the reverse: one dialect's topics carried to another's.
+"""Translate between Dex1 dialects: topics of one dialect are published in another one.
 
 :class:`Bridge` is the thing to use. Its parts, each testable alone:
 :mod:`~dexkit.bridge.translate` (what one side's part of a message means in another dialect),

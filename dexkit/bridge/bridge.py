@@ -16,13 +16,13 @@ from typing import Any
 
 from dexkit.bridge.core import Commands, Direction, Outgoing, States
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import PAUSE, Ages, PauseWatch
 from dexkit.dds import DdsNode, Endpoint, Reader, Sample, Writer
 from dexkit.errors import DexkitError, TopicConflict, UsageError
-from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
-from dexkit.sole import LOOK, Place, SolePublisher
+from dexkit.single_publisher import LOOK, Place, SolePublisher
 from dexkit.threads import Worker
 
 __all__ = ["Bridge", "End"]
@@ -116,7 +116,7 @@ class Bridge:
         sole = self._sole
         if not self._force:
             self._refuse_loop()
-        sole.look()
+        sole.search()
         claim = sole.announce()
         try:
             for direction, source, target in (
@@ -292,7 +292,7 @@ class _Way:
 
     def _stood_still(self) -> bool:
         """Whether this thread did; then what came before counts no more."""
-        away = self._watch.look()
+        away = self._watch.measure_pause()
         if not away:
             return False
         self._ages.resumed(self._bridge._clock.since_boot())

@@ -223,7 +223,7 @@ def _command_from_hg(message: unitree_hg.HandCmd_) -> unitree_go.MotorCmd_:
 
 
 def _state_to_hg(motor: unitree_go.MotorState_) -> unitree_hg.HandState_:
-    state = HandState.of(
+    state = HandState.from_values(
         motor.q,
         stamp=0.0,  # goes into no message
         dq=motor.dq,

@@ -1,7 +1,7 @@
 """The ``dexkit`` command: one module a sub-command, loaded only when it is called.
 
-This package is the top of the import order: unlike the rest of the core it may import the
-rooms (drivers, emulators, traces, conformance).
+This package may import every other one; the rest of dexkit/ imports none of the packages drivers,
+emulators, traces and conformance.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ import click
 
 from dexkit import __version__, threads
 from dexkit.errors import DexkitError, OutputError
-from dexkit.untrusted import REMARK, guarded, one_line
+from dexkit.escaping import REMARK, guarded, one_line
 
 __all__ = ["cli", "main"]
 
 # name -> (module, one-line help); the help is here so that `dexkit --help` imports nothing
 _COMMANDS: dict[str, tuple[str, str]] = {
-    "backends": ("dexkit.cli.backends", "List the hands that can be served."),
-    "badge": ("dexkit.cli.badge", "Draw a badge of a result."),
-    "bridge": ("dexkit.cli.bridge", "Let a client of one dialect meet a gripper of another."),
-    "calibrate": ("dexkit.cli.calibrate", "Find a gripper's zero and speed and store them."),
-    "check": ("dexkit.cli.check", "Judge a recording against the requirements."),
-    "compare": ("dexkit.cli.compare", "Put several results side by side."),
-    "demo": ("dexkit.cli.demo", "The whole story on emulators, in some 75 seconds."),
-    "doctor": ("dexkit.cli.doctor", "Say why a client and a hand do not meet."),
-    "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a whole robot."),
-    "info": ("dexkit.cli.info", "Say what is in a recording."),
+    "backends": ("dexkit.cli.backends", "List the backends that can be served."),
+    "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
+    "bridge": ("dexkit.cli.bridge", "Translate between Dex1 dialects."),
+    "calibrate": ("dexkit.cli.calibrate", "Measure and store a gripper's zero and speed."),
+    "check": ("dexkit.cli.check", "Check a recording against the requirements."),
+    "compare": ("dexkit.cli.compare", "Compare several results."),
+    "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (75 s)."),
+    "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
+    "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
+    "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
     "models": ("dexkit.cli.models", "Print hands and robots: joints, limits, topics, rates."),
-    "mutants": ("dexkit.cli.mutants", "Prove the checks on deliberately wrong hands."),
+    "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
-    "replay": ("dexkit.cli.replay", "Publish the commands of a recording again."),
-    "report": ("dexkit.cli.report", "Write the reports of a result again."),
-    "serve": ("dexkit.cli.serve", "Put a hand on Unitree's topics."),
+    "replay": ("dexkit.cli.replay", "Publish the commands of a recording."),
+    "report": ("dexkit.cli.report", "Write the reports of a result."),
+    "serve": ("dexkit.cli.serve", "Publish and subscribe Unitree's topics for a hand."),
     "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
 }
 
@@ -95,8 +95,8 @@ def cli() -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns (through ``sys.exit``) the exit code.
 
-    0 success, 1 a negative result or a failed operation, 2 wrong usage or something unusable,
-    130 interrupted, 141 nobody reads the output any more.
+    0 success, 1 a negative result or a failed operation, 2 wrong usage or an unusable file or
+    device, 130 interrupted, 141 the reader of the output has closed the pipe.
     """
     try:
         with guarded():
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> int:
     except OutputError as error:
         if error.exit_code != _NO_READER:
             with contextlib.suppress(OutputError), guarded():
-                _tell(error)
+                _print_error(error)
         code = error.exit_code
     sys.exit(code)
 
@@ -122,7 +122,7 @@ def _run(argv: list[str] | None) -> int:
     except OutputError:
         raise
     except DexkitError as error:
-        _tell(error)
+        _print_error(error)
         return error.exit_code
     except KeyboardInterrupt:
         click.echo("interrupted", err=True)
@@ -132,11 +132,11 @@ def _run(argv: list[str] | None) -> int:
             raise
         where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         hint = _HINTS.get(error.errno or 0, "")
-        _tell(DexkitError(where + (error.strerror or str(error)), hint=hint))
+        _print_error(DexkitError(where + (error.strerror or str(error)), hint=hint))
         return 2
 
 
-def _tell(error: DexkitError) -> None:
+def _print_error(error: DexkitError) -> None:
     """Print an error: one line, then what to do, indented, so that no part of it looks like
     something else that dexkit prints.
     """

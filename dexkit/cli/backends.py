@@ -9,7 +9,7 @@ from rich.text import Text
 
 from dexkit.backends import BackendInfo, list_backends
 from dexkit.console import Console
-from dexkit.untrusted import one_line
+from dexkit.escaping import one_line
 
 _WIDEST = 100  # columns; longer lines are hard to read
 

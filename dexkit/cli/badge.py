@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from dexkit.cli.report import write_text
+from dexkit.documents import check_output_paths
 
 
 @click.command("badge")
@@ -29,6 +30,7 @@ def command(result: Path, output: Path) -> None:
     from dexkit.conformance.report.badge import badge_text, render_badge
     from dexkit.conformance.results import read_json
 
+    check_output_paths([output], [result])
     found = read_json(result)
     write_text(output, render_badge(found))
     if str(output) != "-":

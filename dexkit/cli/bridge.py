@@ -1,4 +1,4 @@
-"""``dexkit bridge``: an old client meets a new gripper, and the reverse."""
+"""``dexkit bridge``: translate between Dex1 dialects."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import (
-    MOST_REMARKS,
-    Number,
-    StopRequest,
+from dexkit.cli.options import (
+    DOMAIN,
     dds_options,
-    log_to_stderr,
-    stop_on_signals,
+    duration_option,
+    force_option,
+    quiet_option,
+    real_time_option,
+    side_option,
 )
+from dexkit.cli.status_line import MOST_REMARKS, log_to_stderr
 from dexkit.errors import DexkitError, TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, dialect
 from dexkit.service import prepare_process
 from dexkit.service import real_time as real_time_priority
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.bridge import Bridge
@@ -38,20 +41,13 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
 
 
 @click.command("bridge")
-@click.option("--from", "source", type=_DIALECTS, required=True, help="What the client speaks.")
-@click.option("--to", "target", type=_DIALECTS, required=True, help="What the gripper speaks.")
-@click.option(
-    "--side",
-    "side_name",
-    type=click.Choice(["left", "right", "both"]),
-    default="both",
-    show_default=True,
-    help="Which grippers there are.",
-)
-@dds_options(default_domain=1)
+@click.option("--from", "source", type=_DIALECTS, required=True, help="Dialect of the client.")
+@click.option("--to", "target", type=_DIALECTS, required=True, help="Dialect of the gripper.")
+@side_option("Grippers to translate for.", default="both")
+@dds_options()
 @click.option(
     "--to-domain",
-    type=click.IntRange(0, 230),
+    type=DOMAIN,
     help="DDS domain of the gripper.  [default: that of the client]",
 )
 @click.option(
@@ -59,26 +55,14 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
     metavar="IF",
     help="Network interface of the gripper.  [default: that of the client]",
 )
-@click.option(
-    "--duration",
-    type=Number(min=0, min_open=True),
-    metavar="S",
-    help="End after so many seconds.  [default: at Ctrl-C]",
-)
-@click.option(
-    "--force", is_flag=True, help="Even if another process publishes what the bridge publishes."
-)
-@click.option(
-    "--real-time/--no-real-time",
-    default=True,
-    show_default=True,
-    help="Run before ordinary processes where the system permits it (docs/service.md).",
-)
-@click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+@duration_option()
+@force_option()
+@real_time_option()
+@quiet_option()
 def command(
     source: str,
     target: str,
-    side_name: str,
+    sides: tuple[Side, ...],
     domain: int,
     interface: str,
     to_domain: int | None,
@@ -88,16 +72,16 @@ def command(
     real_time: bool,
     quiet: bool,
 ) -> int:
-    """Carry a client's commands to a Dex1-1 of another dialect, and its states back.
+    """Translate between Dex1 dialects: commands of a client to a Dex1-1, and its states back.
 
     \b
-    xr_teleoperate v1.1 (--sim) drives a gripper of today:
+    client xr_teleoperate v1.1 (--sim), gripper with today's service:
       dexkit bridge --from unitree_actuator --to unitree_go
-    today's client on domain 1 drives a gripper of the DDS specification on the robot:
+    today's client on domain 1, gripper of the DDS specification on the robot:
       dexkit bridge --from unitree_go --to unitree_hg --to-domain 0 --to-interface eth0
 
-    Prints "ready: ..." when the topics are up. Nothing is repeated: when the client stops, the
-    gripper hears nothing and brakes (docs/bridge.md).
+    Prints "ready: ..." when the topics are up. No message is repeated: when the client stops, the
+    gripper gets no commands and brakes (docs/bridge.md).
     """  # noqa: D301 - click wants the character, not a backslash
     from dexkit.bridge import Bridge, End
     from dexkit.dds import DdsNode
@@ -119,7 +103,7 @@ def command(
         bridge = Bridge(
             End(near, dialect(source)),
             End(far, dialect(target)),
-            sides=list(Side) if side_name == "both" else [Side(side_name)],
+            sides=sides,
             force=force,
         )
         prepare_process()

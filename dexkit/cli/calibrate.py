@@ -1,4 +1,4 @@
-"""``dexkit calibrate``: find a gripper's zero and speed and store them."""
+"""``dexkit calibrate``: measure and store a gripper's zero and speed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.common import Number, StopRequest, stop_on_signals
+from dexkit.cli.options import Number
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
@@ -20,7 +20,8 @@ from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.scaling import amperes
 from dexkit.drivers.ezgripper.servo import Servo
 from dexkit.errors import UsageError
-from dexkit.untrusted import one_line
+from dexkit.escaping import one_line
+from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.wire import mx64
 
 __all__ = ["command"]
@@ -98,9 +99,13 @@ class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
     type=click.Path(dir_okay=False, path_type=Path),
     help="File to store in, instead of the user's.",
 )
-@click.option("--dry-run", is_flag=True, help="Only look: nothing moves, nothing is written.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Only print the servo's state: nothing moves, nothing is written.",
+)
 @click.option("--yes", is_flag=True, help="Do not ask whether the gripper is empty.")
-@click.option("--show", is_flag=True, help="Print what is stored, and stop.")
+@click.option("--show", is_flag=True, help="Print the stored values, and stop.")
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -119,14 +124,14 @@ def command(
     yes: bool,
     show: bool,
 ) -> None:
-    """Find a gripper's zero, and with --speed its speed, and store them.
+    """Measure and store a gripper's zero and, with --speed, its speed.
 
     The gripper MOVES: it closes until it is stopped, then opens. It must be empty and free. The
     result is stored under the adapter's USB serial number (or the path, where there is none), so
     that it is found again whatever port it is plugged into.
 
-    GRIPPER dex1-serial is another matter: you hold the jaws closed, nothing moves, and the motor
-    itself stores that as its zero. Of the options only --device, --side, --dry-run and --yes
+    With GRIPPER dex1-serial nothing moves: you hold the jaws closed, and the motor itself stores
+    that position as its zero. Of the options only --device, --side, --dry-run and --yes
     apply.
     """
     if gripper == "dex1-serial":
@@ -150,7 +155,7 @@ def command(
     )
     hand = EZGripper(device, configuration=configuration)
     if dry_run:
-        _look(hand, console, store)
+        _print_servo(hand, console, store)
         return
     if not yes and not sys.stdin.isatty():
         raise UsageError("nobody can be asked whether the gripper is empty", hint="give --yes")
@@ -267,7 +272,7 @@ def _change_baudrate(servo: Servo, baudrate: int) -> None:
     servo.bus.ping(servo.id)
 
 
-def _look(hand: EZGripper, console: Console, store: Store) -> None:
+def _print_servo(hand: EZGripper, console: Console, store: Store) -> None:
     device = discovery.find_device(hand.device_name)
     configuration = hand.configuration
     warning = discovery.latency_warning(device.path)

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.options import FILE, html_option, junit_option, require_option, verbose_option
 from dexkit.console import Console
+from dexkit.documents import check_output_paths
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import DIALECTS
 from dexkit.robots import ROBOTS
@@ -32,12 +34,7 @@ from dexkit.robots import ROBOTS
     show_default=True,
     help="How the hand speaks, or which robot it is; auto takes it from topics and types.",
 )
-@click.option(
-    "--require",
-    multiple=True,
-    metavar="PREFIX",
-    help="Only requirements whose id begins so (DEX1-RATE). May be given several times.",
-)
+@require_option("DEX1-RATE")
 @click.option(
     "--level",
     type=click.Choice(["must", "should", "info"], case_sensitive=False),
@@ -52,12 +49,10 @@ from dexkit.robots import ROBOTS
 @click.option(
     "--list", "list_only", is_flag=True, help="Print the requirements that are selected, and end."
 )
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the result file.")
-@click.option("--junit", "junit_path", type=click.Path(path_type=Path), help="Write JUnit XML.")
-@click.option(
-    "--report", "--html", "html_path", type=click.Path(path_type=Path), help="Write a report page."
-)
-@click.option("-v", "--verbose", is_flag=True, help="Also say what could not be judged, and why.")
+@click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the result file.")
+@junit_option()
+@html_option()
+@verbose_option("Also print what could not be judged, and why.")
 def command(
     recording: Path | None,
     side: str | None,
@@ -87,6 +82,7 @@ def command(
     from dexkit.conformance.view import sides_of
     from dexkit.traces import open_trace
 
+    check_output_paths([json_path, junit_path, html_path], [recording, capabilities])
     view, model_name, also = None, None, ""
     if dialect != "auto":
         model_name = dialect if dialect in ROBOTS else DIALECTS[dialect].model

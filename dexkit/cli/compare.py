@@ -6,7 +6,9 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.options import html_option, markdown_option
 from dexkit.cli.report import write_text
+from dexkit.documents import check_output_paths
 
 
 @click.command("compare")
@@ -17,21 +19,8 @@ from dexkit.cli.report import write_text
     type=click.Path(exists=True, path_type=Path),
     metavar="A.json B.json ...",
 )
-@click.option(
-    "--report",
-    "--html",
-    "html_path",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the comparison as a page.",
-)
-@click.option(
-    "--markdown",
-    "markdown_path",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write it as Markdown; - prints it. Default: print it.",
-)
+@html_option()
+@markdown_option(default="print it")
 def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Path | None) -> None:
     """Put results of several hands, or of several versions of one, side by side.
 
@@ -47,6 +36,7 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     )
     from dexkit.conformance.results import read_json
 
+    check_output_paths([html_path, markdown_path], results)
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
     if html_path:
         write_text(html_path, render_comparison(comparison))

@@ -1,4 +1,4 @@
-"""``dexkit demo``: the whole story on emulators, in some 75 seconds."""
+"""``dexkit demo``: the conformance suite on two emulated EZGrippers, in some 75 seconds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.common import stop_on_signals
+from dexkit.cli.options import DOMAIN
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
+from dexkit.stop_signals import stop_on_signals
 
 __all__ = ["command"]
 
@@ -40,9 +41,9 @@ _INTRO = (
     show_default=True,
     help="Hand to show; its device is emulated.",
 )
-@click.option("--domain", type=click.IntRange(0, 230), help="DDS domain.  [default: a free one]")
+@click.option("--domain", type=DOMAIN, help="DDS domain.  [default: a free one]")
 def command(out: Path, backend: str, domain: int | None) -> None:
-    """Two emulated EZGrippers prove themselves as Dex1 drop-ins, in some 75 seconds.
+    """Run the conformance suite on two emulated EZGrippers, in some 75 seconds.
 
     Traffic stays on this machine, on a DDS domain of its own. Exit code: 0 the hands passed,
     1 they did not, 2 they could not be judged.
@@ -64,13 +65,13 @@ def command(out: Path, backend: str, domain: int | None) -> None:
     begin = time.monotonic()
     lock = threading.Lock()
 
-    def say(text: str) -> None:
+    def print_progress(text: str) -> None:
         with lock:
             console.print(f"[dim]{time.monotonic() - begin:5.1f} s[/dim]  {text}")
 
     with stop_on_signals() as stop:
         try:
-            result = run_suite(options, say, stop.event)
+            result = run_suite(options, print_progress, stop.event)
         except ConformanceError:
             if not stop:
                 raise

@@ -1,4 +1,4 @@
-"""``dexkit doctor``: why a client and a hand do not meet."""
+"""``dexkit doctor``: find out why a client and a hand do not connect."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import Number, StopRequest, stop_on_signals
+from dexkit.cli.options import DIALECT, DOMAIN, Number, json_option
 from dexkit.errors import UsageError
-from dexkit.limits import room_for_files
 from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.open_file_limit import require_open_files
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.doctor import Finding, Observations, Readiness, Verdict
@@ -48,8 +49,8 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 @click.command("doctor")
 @click.option(
     "--domain",
-    type=click.IntRange(0, 230),
-    help="Domain that the client uses: 0 is the robot, 1 xr_teleoperate --sim.  [default: any]",
+    type=DOMAIN,
+    help="Domain of the client: 0 is the robot, 1 xr_teleoperate's simulation.  [default: any]",
 )
 @click.option(
     "--scan",
@@ -57,34 +58,34 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     show_default=True,
     callback=_scan,
     metavar="RANGE",
-    help="Also look at these domains; none for no others.",
+    help="Also examine these domains; none for no others.",
 )
 @click.option(
     "--interface",
     "interfaces",
     multiple=True,
     metavar="IF",
-    help="Look at this network interface as well as at lo; may be repeated.",
+    help="Examine this network interface as well as lo; may be repeated.",
 )
 @click.option(
-    "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand counts.  [default: any]"
+    "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand model.  [default: any]"
 )
-@click.option("--dialect", type=click.Choice(list(DIALECTS)), help="Only this dialect counts.")
+@click.option("--dialect", type=DIALECT, help="Only this dialect.  [default: any]")
 @click.option(
     "--device",
     "devices",
     multiple=True,
     metavar="PATH",
-    help="Also look at a serial port and ask for servos on it, at 'usb', or at usbip://HOST:PORT.",
+    help="Also examine a serial port and ask for servos on it, 'usb', or usbip://HOST:PORT.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON (docs/doctor.md).")
-@click.option("--watch", is_flag=True, help="Look again and again until Ctrl-C.")
+@json_option("Print JSON (docs/doctor.md).")
+@click.option("--watch", is_flag=True, help="Repeat the examination until Ctrl-C.")
 @click.option(
     "--seconds",
     type=Number(0.2, 600),
     default=2.0,
     show_default=True,
-    help="How long samples are watched.",
+    help="Seconds during which samples are counted.",
 )
 def command(
     domain: int | None,
@@ -97,30 +98,30 @@ def command(
     watch: bool,
     seconds: float,
 ) -> int:
-    """Say why a client and a hand do not meet, and what to do.
+    """Find out why a client and a hand do not connect, and what to do.
 
-    For the worst day: "Waiting to subscribe dds...". Looks at DDS domains without publishing
-    any topic and without CycloneDDS, at this Python, and at the device if one is named. Traffic
-    stays on this machine unless --interface names a network. A servo on a named serial port is
-    asked who it is, and nothing else.
+    Use it when a client hangs at "Waiting to subscribe dds...". It observes DDS domains without
+    publishing any topic and without CycloneDDS, checks this Python environment, and checks the
+    device if one is named. Traffic stays on this machine unless --interface names a network. A
+    servo on a named serial port is only asked for its id and model.
 
-    Exit codes: 0 healthy, 1 problems found, 2 it could not look, 130 interrupted. Ctrl-C ends a
-    watch with the code of its last complete look.
+    Exit codes: 0 healthy, 1 problems found, 2 the examination failed, 130 interrupted. Ctrl-C ends
+    --watch with the code of the last complete examination.
     """
     from dexkit.doctor import Wish, diagnose, readiness, verdict
     from dexkit.doctor.environment import environment
 
     if domain is None and not scan:
-        raise UsageError("no domain to look at", hint="give --domain or --scan")
+        raise UsageError("no domain to examine", hint="give --domain or --scan")
     wish = Wish(domain, _dialects(model, dialect), bool(devices) and domain is None)
     windows = len({*scan, *([] if domain is None else [domain])}) * len({"lo", *interfaces})
-    room_for_files(windows + _FILES, f"a look at {windows} domain(s)")
+    require_open_files(windows + _FILES, f"examining {windows} domain(s)")
     with stop_on_signals() as stop, ThreadPoolExecutor(1) as beside:
         env = beside.submit(environment)  # it starts processes, which takes a second
         last: int | None = None
         before = ""
         while True:
-            seen = _look(
+            seen = _observe(
                 sorted({*scan, *([] if domain is None else [domain])}),
                 tuple(dict.fromkeys(("lo", *interfaces))),
                 devices,
@@ -162,7 +163,7 @@ def _dialects(model: str | None, dialect: str | None) -> tuple[Dialect, ...]:
     return MODELS[_MODEL_NAMES[model]].dialects if model is not None else ()
 
 
-def _look(
+def _observe(
     domains: list[int],
     interfaces: tuple[str, ...],
     devices: tuple[str, ...],
@@ -184,7 +185,9 @@ def _look(
             hands += doctor_devices.on_server(device)
         else:
             ports.append(doctor_devices.look_at(device, progress=progress))
-    views = dds.look(domains, interfaces, seconds=seconds, stop=stop.event, progress=progress)
+    views = dds.observe_domains(
+        domains, interfaces, seconds=seconds, stop=stop.event, progress=progress
+    )
     progress("")
     return Observations(
         domains=views,

@@ -15,7 +15,7 @@ from pathlib import Path
 from serial.tools import list_ports
 
 from dexkit.doctor.observations import SerialPort, Servo, UsbDevice
-from dexkit.doctor.processes import command_line, holders
+from dexkit.doctor.proc_files import command_line, holders
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.discovery import SCAN_BAUD_RATES, latency_timer
 from dexkit.errors import DexkitError, HandError, HandRefused, HandTimeout

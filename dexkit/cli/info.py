@@ -1,4 +1,4 @@
-"""``dexkit info``: what is in a recording."""
+"""``dexkit info``: topics, rates, gaps and damage of a recording."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from dexkit.cli.options import json_option
+
 if TYPE_CHECKING:
     from dexkit.traces import Trace
 
@@ -17,7 +19,7 @@ __all__ = ["command", "summary"]
 
 
 def summary(trace: Trace) -> dict[str, Any]:
-    """Everything that ``dexkit info`` tells, as JSON data."""
+    """Everything that ``dexkit info`` prints, as JSON data."""
     loaded = trace.load(payloads=False)
     topics = []
     for channel in trace.channels:
@@ -69,9 +71,9 @@ def summary(trace: Trace) -> dict[str, Any]:
 
 @click.command("info")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option("Print JSON.")
 def command(file: Path, as_json: bool) -> int:
-    """Say what is in a recording: topics, types, rates, gaps, and what is odd about it.
+    """Show the topics, types, rates, gaps and damage of a recording.
 
     FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
     read as far as it goes.
@@ -95,7 +97,7 @@ def _print(data: dict[str, Any]) -> None:
 
     from dexkit.console import Console
     from dexkit.console import markup as escape
-    from dexkit.untrusted import LONGEST
+    from dexkit.escaping import LONGEST
 
     # wide enough for the table: in a pipe rich would cut topics to 80 columns
     console = Console(width=max(Console().width, 120))

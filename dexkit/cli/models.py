@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.options import json_option
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -23,16 +25,16 @@ _SIDES = ("left", "right")
 @click.command("models")
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="All of every model.")
-@click.option("--json", "as_json", is_flag=True, help="The same as JSON, always all of it.")
+@json_option("Print JSON, always with everything.")
 def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     """Print the models: joints, limits, topics, types, rates, gains, who implements them.
 
     Without a NAME, an overview. docs/models.md has the same with drawings; the shape of the
-    JSON is in dexkit/family/facts.py: one object with a list "models".
+    JSON is in dexkit/model_facts.py: one object with a list "models".
     """
     from dexkit.console import Console
-    from dexkit.family.facts import describe
-    from dexkit.family.facts import names as all_names
+    from dexkit.model_facts import describe
+    from dexkit.model_facts import names as all_names
 
     models = [describe(name) for name in (names if names and not every else all_names())]
     if as_json:
@@ -91,7 +93,7 @@ def _command_rate(rates: dict[str, Any]) -> float:
 
 
 def _hand(console: Console, data: dict[str, Any]) -> None:
-    from dexkit.family.facts import indices, torque_units
+    from dexkit.model_facts import indices, torque_units
 
     console.print(f"[bold]{data['name']}[/bold]  {data['title']}")
     for dialect in data["dialects"]:
@@ -145,7 +147,7 @@ def _hand(console: Console, data: dict[str, Any]) -> None:
 
 
 def _robot(console: Console, data: dict[str, Any]) -> None:
-    from dexkit.family.facts import indices
+    from dexkit.model_facts import indices
 
     console.print(f"[bold]{data['name']}[/bold]  {data['title']}\n")
     _topics(
@@ -208,7 +210,7 @@ def _topics(console: Console, rows: Sequence[tuple[str, str, str]]) -> None:
 
 
 def _gains(data: dict[str, Any]) -> list[tuple[str, str]]:
-    from dexkit.family.facts import gain_groups
+    from dexkit.model_facts import gain_groups
 
     groups = gain_groups(data)
     texts = [

@@ -1,4 +1,4 @@
-"""``dexkit mutants``: prove the checks on deliberately wrong hands."""
+"""``dexkit mutants``: test the conformance checks on deliberately wrong hands."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from pathlib import Path
 import click
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from dexkit.cli.common import stop_on_signals
+from dexkit.cli.options import FILE, require_option, verbose_option
 from dexkit.console import Console
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
+from dexkit.stop_signals import stop_on_signals
 
 
 @click.command("mutants")
@@ -21,17 +22,12 @@ from dexkit.robots import ROBOTS
     type=click.Choice([*MODELS, *ROBOTS]),
     help="Only wrong hands, or robots, of this model.",
 )
+@require_option("DEX1-SAFE")
+@click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the score as JSON.")
 @click.option(
-    "--require",
-    multiple=True,
-    metavar="PREFIX",
-    help="Only requirements whose id begins so (DEX1-SAFE). May be given several times.",
+    "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
 )
-@click.option(
-    "--json", "json_path", type=click.Path(path_type=Path), help="Write the score as JSON."
-)
-@click.option("--jobs", type=click.IntRange(1, 1024), help="Processes. Default: one a processor.")
-@click.option("-v", "--verbose", is_flag=True, help="Say what every wrong hand does wrong.")
+@verbose_option("Print what every wrong hand does wrong.")
 def command(
     model: str | None,
     require: tuple[str, ...],

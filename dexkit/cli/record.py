@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit import threads
-from dexkit.cli.common import Number, dds_options, stop_on_signals
+from dexkit.cli.options import dds_options, duration_option, topic_option
 from dexkit.errors import TraceError, UsageError
-from dexkit.untrusted import REMARK, one_line
+from dexkit.escaping import REMARK, one_line
+from dexkit.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
@@ -25,30 +26,16 @@ __all__ = ["command"]
 
 @click.command("record")
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--topic",
-    "topics",
-    multiple=True,
-    metavar="TOPIC",
-    help="Record this topic (rt/dex1/left/cmd or /dex1/left/cmd; patterns such as '/dex1/*'). "
-    "May be repeated. Default: every topic whose type is known, also those that appear later.",
-)
-@dds_options(default_domain=1)
-@click.option(
-    "--duration",
-    type=Number(min=0, min_open=True),
-    metavar="S",
-    help="Stop after so many seconds. Default: record until Ctrl-C.",
-)
-@click.option(
-    "--force", is_flag=True, help="Replace OUT, as soon as there is something to replace it by."
-)
+@topic_option("Record", "every topic of a known type, also those that appear later")
+@dds_options()
+@duration_option()
+@click.option("--force", is_flag=True, help="Overwrite OUT, once there is something to write.")
 @click.option(
     "--compression",
     type=click.Choice(["zstd", "lz4", "none"]),
     default="zstd",
     show_default=True,
-    help="Of the chunks in the file.",
+    help="Compression of the chunks in the file.",
 )
 def command(
     out: Path,

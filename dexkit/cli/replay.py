@@ -1,4 +1,4 @@
-"""``dexkit replay``: publish a recording's commands again, with their timing."""
+"""``dexkit replay``: publish the commands of a recording with their timing."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import Number, StopRequest, dds_options, stop_on_signals
+from dexkit.cli.options import Number, dds_options, force_option, topic_option
 from dexkit.errors import DdsError, TraceUnsupported
-from dexkit.sole import Place, SolePublisher
+from dexkit.escaping import REMARK, one_line
+from dexkit.single_publisher import Place, SolePublisher
+from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.threads import Worker
-from dexkit.untrusted import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
@@ -39,36 +40,27 @@ _LINGER = 0.1
     type=Number(1e-3, 1e3),
     default=1.0,
     show_default=True,
-    help="2 plays in half the time.",
+    help="Factor of the speed: 2 plays in half the time.",
 )
 @click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
-@click.option(
-    "--topic",
-    "topics",
-    multiple=True,
-    metavar="TOPIC",
-    help="Play this topic (patterns such as '/dex1/*' are allowed). May be repeated. "
-    "Default: the command topics, those that end in /cmd.",
-)
+@topic_option("Play", "the command topics, those that end in /cmd")
 @click.option(
     "--max-gap",
     type=Number(min=0, min_open=True),
     metavar="S",
-    help="Shorten longer pauses to this. Default: keep them.",
+    help="Shorten longer pauses to S seconds.  [default: keep them]",
 )
-@dds_options(default_domain=1)
+@dds_options()
 @click.option(
     "--wait",
     type=Number(min=0),
     default=10.0,
     show_default=True,
     metavar="S",
-    help="Wait so long for somebody to subscribe each topic.",
+    help="Wait up to S seconds until each topic is subscribed.",
 )
 @click.option("--no-wait", is_flag=True, help="Start at once, subscribed or not.")
-@click.option(
-    "--force", is_flag=True, help="Play although somebody else publishes on these topics."
-)
+@force_option()
 def command(
     file: Path,
     speed: float,
@@ -113,7 +105,7 @@ def command(
             force=force,
             yields=True,
         )
-        sole.look()
+        sole.search()
         claim = sole.announce()
         writers = {
             topic: node.writer(topic, name, user_data=claim)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.documents import write_file
+from dexkit.cli.options import html_option, junit_option, markdown_option, verbose_option
+from dexkit.documents import check_output_paths, write_file
 from dexkit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from dexkit.conformance.view import Recording
 
 _SIDES = ("left", "right")
-_FILE = click.Path(path_type=Path)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -35,14 +35,10 @@ def write_text(path: Path, text: str) -> None:
     help="The recording that was judged: the page then shows plots. Default: the one that the "
     "result names, if it lies beside it.",
 )
-@click.option(
-    "--report", "--html", "html_path", type=_FILE, metavar="FILE", help="Write the report page."
-)
-@click.option(
-    "--markdown", "markdown_path", type=_FILE, metavar="FILE", help="Write a summary; - prints it."
-)
-@click.option("--junit", "junit_path", type=_FILE, metavar="FILE", help="Write JUnit XML.")
-@click.option("-v", "--verbose", is_flag=True, help="Also say what could not be judged, and why.")
+@html_option()
+@markdown_option()
+@junit_option()
+@verbose_option("Also print what could not be judged, and why.")
 def command(
     result: Path,
     recording: Path | None,
@@ -51,7 +47,7 @@ def command(
     junit_path: Path | None,
     verbose: bool,
 ) -> None:
-    """Write the reports of a result file again.
+    """Write the reports of a result file.
 
     A result file comes from 'dexkit check --json FILE' or from the conformance suite with
     '--json FILE'. Without an option the result is printed as a table.
@@ -67,8 +63,9 @@ def command(
     from dexkit.console import Console
 
     found = read_json(result)
+    file = recording or _beside(result, found.subject.get("recording", ""))
+    check_output_paths([html_path, markdown_path, junit_path], [result, file])
     if html_path:
-        file = recording or _beside(result, found.subject.get("recording", ""))
         view = None
         if file is not None:
             view = _view(file, found, given=recording is not None)

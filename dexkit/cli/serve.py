@@ -1,4 +1,4 @@
-"""``dexkit serve``: put a hand on Unitree's topics."""
+"""``dexkit serve``: publish and subscribe Unitree's topics for a hand."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from types import FrameType
 import click
 
 from dexkit.backends import BackendOptions, backend
-from dexkit.cli.common import (
-    MOST_REMARKS,
+from dexkit.cli.options import (
+    DIALECT,
     Number,
-    StatusLine,
-    StopRequest,
     dds_options,
-    log_to_stderr,
-    stop_on_signals,
+    force_option,
+    quiet_option,
+    real_time_option,
+    set_option,
+    side_option,
 )
+from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
 from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Hand, Side
-from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.models import MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 from dexkit.service import (
@@ -36,6 +38,7 @@ from dexkit.service import (
     prepare_process,
 )
 from dexkit.service import real_time as real_time_priority
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 __all__ = ["command"]
 
@@ -48,13 +51,7 @@ _LONELY = 10.0  # seconds without a client before a hint
 
 @click.command("serve")
 @click.argument("backend_name", metavar="BACKEND")
-@click.option(
-    "--side",
-    "side_name",
-    type=click.Choice(["left", "right", "both"]),
-    required=True,
-    help="Which hand; both needs a device for each.",
-)
+@side_option("Hand to serve; both needs a device for each.", required=True)
 @click.option(
     "--device",
     "devices",
@@ -62,13 +59,9 @@ _LONELY = 10.0  # seconds without a client before a hint
     metavar="PATH",
     help="Path or serial number of the device; with --side both left=PATH and right=PATH.",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="A setting of the backend; 'dexkit backends' lists them. left.KEY=VALUE and "
-    "right.KEY=VALUE are for one hand.",
+@set_option(
+    "Setting of the backend, e.g. object=40; left.object=40 is for one hand. 'dexkit backends' "
+    "lists the settings."
 )
 @click.option(
     "--usb",
@@ -77,12 +70,12 @@ _LONELY = 10.0  # seconds without a client before a hint
 )
 @click.option(
     "--dialect",
-    type=click.Choice(list(DIALECTS)),
+    type=DIALECT,
     help="Topics, types and units.  [default: the model's first: "
     + ", ".join(f"{m.dialects[0].name} for a {m.name}" for m in MODELS.values())
     + "]",
 )
-@dds_options(default_domain=None)
+@dds_options(default_domain=None, domain_default_text="0 for a device, else 1")
 @click.option(
     "--state-rate",
     type=Number(1, 1000),
@@ -105,18 +98,15 @@ _LONELY = 10.0  # seconds without a client before a hint
     show_default=True,
     help="Fields of a state: all that is known, or only those the vendor's service fills.",
 )
-@click.option("--wait-for-device", is_flag=True, help="Do not fail if it is not there yet.")
-@click.option("--force", is_flag=True, help="Even if another process publishes the state topic.")
 @click.option(
-    "--real-time/--no-real-time",
-    default=True,
-    show_default=True,
-    help="Run before ordinary processes where the system permits it (docs/service.md).",
+    "--wait-for-device", is_flag=True, help="Wait for a device that is not connected yet."
 )
-@click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+@force_option()
+@real_time_option()
+@quiet_option()
 def command(
     backend_name: str,
-    side_name: str,
+    sides: tuple[Side, ...],
     devices: tuple[str, ...],
     settings: tuple[str, ...],
     usb: str | None,
@@ -131,7 +121,7 @@ def command(
     real_time: bool,
     quiet: bool,
 ) -> int:
-    """Put a hand on Unitree's topics until Ctrl-C or SIGTERM.
+    """Serve a hand on Unitree's topics until Ctrl-C or SIGTERM.
 
     BACKEND is a name from 'dexkit backends' or package.module:Class. Prints "ready: ..." when
     the topics are up. SIGUSR1 logs the counters.
@@ -150,7 +140,6 @@ def command(
     status = StatusLine(quiet)
     log_to_stderr(quiet, status.on_terminal, "dexkit.service.counters")
     kind = backend(backend_name)
-    sides = list(Side) if side_name == "both" else [Side(side_name)]
     by_side = _devices(devices, sides)
     values = _settings(settings, sides)
     hands = [kind.create(BackendOptions(side, by_side.get(side), values[side])) for side in sides]

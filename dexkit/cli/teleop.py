@@ -1,4 +1,4 @@
-"""``dexkit teleop``: drive a hand as xr_teleoperate does, and say what an operator would feel."""
+"""``dexkit teleop``: drive a hand as xr_teleoperate does, and measure its response."""
 
 from __future__ import annotations
 
@@ -12,12 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dexkit.cli.common import Number, dds_options, stop_on_signals
+from dexkit.cli.options import (
+    DIALECT,
+    Number,
+    dds_options,
+    duration_option,
+    force_option,
+    json_option,
+    side_option,
+)
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
+from dexkit.stop_signals import stop_on_signals
 from dexkit.teleop import (
     Operator,
     Pose,
@@ -48,32 +57,22 @@ _MS = 1e3
 @click.option(
     "--dialect",
     "dialect_name",
-    type=click.Choice(list(DIALECTS)),
+    type=DIALECT,
     default="unitree_go",
     show_default=True,
-    help="How the hands speak; dex3 is the Dex3-1's, dex5 the Dex5-1's.",
+    help="Topics, types and units of the hands; dex3 for a Dex3-1, dex5 for a Dex5-1.",
 )
-@dds_options(default_domain=1)
-@click.option(
-    "--side",
-    "side_name",
-    type=click.Choice(["left", "right", "both"]),
-    default="both",
-    show_default=True,
-    help="Hands to drive. The genuine client drives both, and waits for both.",
-)
-@click.option(
-    "--duration",
-    type=Number(min=0.5),
-    metavar="S",
-    help="Go on for so long; the profile repeats.  [default: once]",
+@dds_options()
+@side_option("Hands to drive. The genuine client drives both, and waits for both.", default="both")
+@duration_option(
+    "Drive for S seconds, repeating the profile.  [default: once through it]", least=0.5
 )
 @click.option(
     "--wait",
     "patience",
     type=Number(min=0),
     metavar="S",
-    help="Give up waiting for state after so long.  [default: never, as the genuine client]",
+    help="Wait up to S seconds for states.  [default: for ever, as the genuine client]",
 )
 @click.option(
     "--release",
@@ -94,15 +93,15 @@ _MS = 1e3
     metavar="F.mcap",
     help="Record the hands' topics meanwhile; 'dexkit check' judges them.",
 )
-@click.option("--force", is_flag=True, help="Go on although somebody else commands the hand.")
-@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON (docs/teleop.md).")
+@force_option()
+@json_option("Print the measurements as JSON (docs/teleop.md).")
 def command(
     profile_name: str | None,
     list_profiles: bool,
     dialect_name: str,
     domain: int,
     interface: str,
-    side_name: str,
+    sides: tuple[Side, ...],
     duration: float | None,
     patience: float | None,
     release_name: str | None,
@@ -111,12 +110,12 @@ def command(
     force: bool,
     as_json: bool,
 ) -> int:
-    """Drive a hand as xr_teleoperate does, and say what an operator would feel.
+    """Drive a hand as xr_teleoperate does, and measure its response: delay, lag, overshoot.
 
     PROFILE is what the operator does ('dexkit teleop --list'), or a recording: FILE.mcap, whose
     commands are then what the operator wants. The client waits for the state of both hands,
     clips each Dex1-1 command to 0.18 rad of the last state and smooths it, as the genuine one
-    does; how the hand feels is measured meanwhile. The default domain is 1, the simulation's:
+    does. The default domain is 1, the simulation's:
     --domain 0 with a robot's interface moves real hands.
 
     At the end, on Ctrl-C too, the hands are told to stay where they are.
@@ -130,7 +129,6 @@ def command(
     if profile_name is None:
         raise UsageError("no profile", hint="'dexkit teleop --list' names them")
     spoken = dialect_by_name(dialect_name)
-    sides = tuple(Side) if side_name == "both" else (Side(side_name),)
     chosen = _profile(profile_name, spoken)
     client = client_for(
         spoken,
@@ -152,7 +150,9 @@ def command(
         waiting = _Waiting(node, spoken, patience)
         if not live.wait_ready(stop.event, waiting):
             return 130
-        _say(f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s")
+        _print_to_stderr(
+            f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s"
+        )
         show = _Progress(seconds)
         try:
             session = live.perform(operator, seconds, stop.event, show)
@@ -161,18 +161,20 @@ def command(
             live.leave()
         stopped = bool(stop)
     for at, seconds_away in session.pauses:
-        _say(
+        _print_to_stderr(
             f"this program stood still for {seconds_away:.2f} s, {at:.1f} s after the beginning; "
             "figures of then are not the hand's"
         )
     _report(session, operator, 1 / client.period, as_json=as_json)
     silent = [] if stopped else _silent(session, seconds)
     for side in silent:
-        _say(f"{side}: no state in the end; the genuine client goes on with what it last read")
+        _print_to_stderr(
+            f"{side}: no state in the end; the genuine client goes on with what it last read"
+        )
     return 130 if stopped else int(bool(silent))
 
 
-def _say(text: str) -> None:
+def _print_to_stderr(text: str) -> None:
     click.echo(text, err=True)
 
 
@@ -245,11 +247,11 @@ class _Waiting:
             error.exit_code = 1
             raise error
         if missing and missing != self._said:
-            _say(f"waiting for state of {what} ...")
+            _print_to_stderr(f"waiting for state of {what} ...")
             self._said = dict(missing)
         if seconds >= _HINT_AFTER and not self._helped:
             self._helped = True
-            _say(f"  {self._advice}")
+            _print_to_stderr(f"  {self._advice}")
 
     @property
     def _advice(self) -> str:

@@ -1,4 +1,4 @@
-"""``dexkit doctor``: why a client and a hand do not meet, from what can be seen.
+"""``dexkit doctor``: find out why a client and a hand do not connect.
 
 :mod:`rules` judges :mod:`observations` and is pure; :mod:`dds` (with the sans-IO
 :mod:`observer` and :mod:`rtps`), :mod:`network`, :mod:`usb`, :mod:`environment` and

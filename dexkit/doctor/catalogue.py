@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
-__all__ = ["DIAGNOSES", "Diagnosis", "Finding", "Severity", "table"]
+__all__ = ["DIAGNOSES", "Diagnosis", "Finding", "Severity"]
 
 
 class Severity(Enum):
@@ -417,21 +417,3 @@ _ALL = (
 
 DIAGNOSES: dict[str, Diagnosis] = {d.id: d for d in _ALL}
 assert len(DIAGNOSES) == len(_ALL)
-
-
-def table() -> str:
-    """The diagnoses as a Markdown table: symptom, diagnosis, remedy."""
-    rows = ["| You see | Diagnosis | What to do |", "| --- | --- | --- |"]
-    rows += [
-        f"| {_cell(d.symptom)} | `{d.id}` ({d.severity}): {d.title}; {d.why} | {_cell(d.fix)} |"
-        for d in DIAGNOSES.values()
-    ]
-    return "\n".join(rows) + "\n"
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
-if __name__ == "__main__":
-    print(table(), end="")

@@ -12,19 +12,19 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from dexkit import ingress
+from dexkit import interface_filter
+from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
-from dexkit.doctor.processes import command_line, environment_of, start_time
+from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
 from dexkit.doctor.topics import is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
-from dexkit.processes import process_id
 
-__all__ = ["DISCOVERY_SECONDS", "look"]
+__all__ = ["DISCOVERY_SECONDS", "observe_domains"]
 
 DISCOVERY_SECONDS = 0.7
 """How long an empty domain is waited on; a participant on this machine answers within 10 ms."""
@@ -138,7 +138,6 @@ class _Window:
             self.socket.close()
             raise DdsSetupError(f"cannot look at {interface}: {error.strerror}") from error
         self.watches: dict[bytes, _Watch] = {}
-        self.wanted_since: dict[bytes, float] = {}
         self.observer = Observer(
             os.urandom(12),
             Locator(self.address, self.socket.getsockname()[1]),
@@ -154,12 +153,12 @@ class _Window:
     def _restrict(self) -> None:
         """See what comes by this interface only: an address is reached by the others, too."""
         try:
-            ingress.restrict(self.socket, self.interface)
+            interface_filter.restrict(self.socket, self.interface)
         except OSError as error:
-            if not ingress.all_interfaces_allowed():
+            if not interface_filter.all_interfaces_allowed():
                 raise DdsSetupError(
                     f"other networks than {self.interface} cannot be kept out: {error.strerror}",
-                    hint=ingress.HINT,
+                    hint=interface_filter.HINT,
                 ) from error
 
     def sample(self, writer: EndpointData, sequence: int, data: bytes, now: float) -> None:
@@ -207,7 +206,7 @@ class _Window:
         )
 
 
-def look(
+def observe_domains(
     domains: Sequence[int],
     interfaces: Sequence[str] = ("lo",),
     *,

@@ -8,9 +8,9 @@ import socket
 from pathlib import Path
 
 from dexkit.doctor.observations import DdsSocket, Interface
-from dexkit.doctor.processes import command_line, open_sockets
+from dexkit.doctor.proc_files import command_line, open_sockets
 from dexkit.errors import DdsSetupError
-from dexkit.ingress import interface_address, interface_flags
+from dexkit.interface_filter import interface_address, interface_flags
 
 __all__ = ["ROBOT_NETWORK", "address_of", "dds_sockets", "interfaces"]
 

@@ -14,9 +14,9 @@ from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
 from dexkit.doctor.rules import Readiness, Verdict
 from dexkit.doctor.topics import short
+from dexkit.escaping import LONGEST
 from dexkit.robots import ROBOTS
 from dexkit.topics import roles
-from dexkit.untrusted import LONGEST
 
 __all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
 

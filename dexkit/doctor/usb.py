@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from dexkit.doctor.observations import UsbDevice
-from dexkit.doctor.processes import command_line, holders
+from dexkit.doctor.proc_files import command_line, holders
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
 
 __all__ = ["devices"]

@@ -7,7 +7,7 @@
     >>> mt.decode(data).cmds[0].q
     1.5
 
-The layouts are written down once, in ``idl/*.idl``; ``python -m dexkit.messages.generate`` writes
+The layouts are written down once, in ``idl/*.idl``; ``python -m tools.generate`` writes
 the modules :mod:`dexkit.messages.unitree_go` and :mod:`dexkit.messages.unitree_hg` from them.
 """
 

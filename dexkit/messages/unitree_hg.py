@@ -1,6 +1,6 @@
 """Messages of ``unitree_hg``: dataclasses and their CDR codec.
 
-Generated from idl/unitree_hg.idl by ``python -m dexkit.messages.generate``; do not edit.
+Generated from idl/unitree_hg.idl by ``python -m tools.generate``; do not edit.
 Use the codec through :func:`dexkit.messages.message_type`: it checks the header and the
 bounds and turns every failure into a :class:`dexkit.errors.WireError`.
 """

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.clock import Clock
+from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandTimeout
-from dexkit.freshness import PAUSE
 from dexkit.hand import (
     CommandGate,
     Floats,
@@ -132,7 +132,7 @@ class HandCore:
     def submit(self, command: HandCommand, sent: float | None = None) -> bool:
         """A command came. False when it does not count: the one before stays in force, and the
         watchdog is not fed. It may have been rejected, or be stale: sent more than
-        :data:`~dexkit.freshness.PAUSE` seconds ago, or before the link was opened, a fault ended
+        :data:`~dexkit.command_age.PAUSE` seconds ago, or before the link was opened, a fault ended
         or a pause did.
 
         :param sent: when it was sent, on the core's clock: as it was received, less its age;
@@ -199,7 +199,7 @@ class HandCore:
         if not isinstance(given, HandState):
             raise HandError(
                 f"the backend returned a {type(given).__name__}, not a HandState",
-                hint="exchange ends with: return HandState.of(q, stamp=time.monotonic())",
+                hint="exchange ends with: return HandState.from_values(q, stamp=time.monotonic())",
             )
         if state.q.shape != (n,) or not all(map(math.isfinite, state.q.tolist())):
             raise HandError(f"the backend returned q = {state.q}, not {n} finite value(s)")

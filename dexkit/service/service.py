@@ -11,8 +11,8 @@ Three activities, each with its own clock:
 All three share one interpreter lock, so the publishing thread does little: it writes bytes that
 were encoded once for each new state.
 
-Each of them notices when it stood still (:class:`~dexkit.freshness.PauseWatch`): whoever does tells
-the cores, which brake until a command comes that was sent later.
+Each of them notices when it stood still (:class:`~dexkit.command_age.PauseWatch`): whoever does
+tells the cores, which brake until a command comes that was sent later.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from dexkit.clock import Clock, Rate, RealClock
+from dexkit.command_age import PAUSE, Ages, PauseWatch
 from dexkit.errors import (
     BackendBroken,
     DexkitError,
@@ -36,7 +37,6 @@ from dexkit.errors import (
     UsageError,
     WireError,
 )
-from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model
@@ -45,7 +45,7 @@ from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
 from dexkit.service.publisher import Publisher, align
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 from dexkit.threads import Worker
 
 __all__ = ["HandService", "Node"]
@@ -112,8 +112,8 @@ class HandService:
     :param force: start, and go on, even if somebody else publishes the state topic.
     :raises UsageError: hands and dialect do not fit.
 
-    A service that is to give way to another one after its start (:mod:`dexkit.sole`) brakes and
-    releases its hands; :attr:`failure` then is a :class:`~dexkit.errors.TopicConflict`.
+    A service that is to give way to another one after its start (:mod:`dexkit.single_publisher`)
+    brakes and releases its hands; :attr:`failure` then is a :class:`~dexkit.errors.TopicConflict`.
 
     A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
     and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.
@@ -235,7 +235,7 @@ class HandService:
         sole = self._sole = SolePublisher(
             [Place(node, topics)], hint=_CONFLICT_HINT, force=self._force
         )
-        sole.look()
+        sole.search()
         claim = sole.announce()
         self._writer = node.writer(self.state_topic, self.dialect.state_type, user_data=claim)
         if self.low_rate_topic:
@@ -430,7 +430,7 @@ class HandService:
         """Whether a loop of this service stood still; then these hands brake until a command comes
         that was sent later.
         """
-        away = watch.look(allowed)
+        away = watch.measure_pause(allowed)
         if not away:
             return False
         now = self._clock.since_boot()

@@ -130,11 +130,6 @@ class StateReceiver:
         """When the pause ends; a read waits from then on."""
         return self._time
 
-    @property
-    def waits_for(self) -> tuple[Side, ...]:
-        """The sides that the next read brings."""
-        return self._reads[self._at]
-
     def forget(self) -> None:
         """As if nothing had come yet."""
         self._kept, self._seen, self._held, self.latest = {}, {}, {}, {}

@@ -6,7 +6,7 @@ the genuine one would be a nuisance: it waits until the hand listens before its 
 it leaves the hand at rest (:meth:`LiveClient.leave`).
 
 It differs after a pause of its own, too (stopped, suspended, starved; more than
-:data:`~dexkit.freshness.PAUSE`). The genuine client would go on by what it last read, or by where
+:data:`~dexkit.command_age.PAUSE`). The genuine client would go on by what it last read, or by where
 the operator is by now. This one is silent until each hand has told where it is *now*, forgets what
 it smoothed, and lets the operator go on where he was.
 """
@@ -22,16 +22,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.clock import RealClock
+from dexkit.command_age import PAUSE, SETTLE, PauseWatch
 from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
-from dexkit.freshness import PAUSE, SETTLE, PauseWatch
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX1_1, Dialect, model
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator
-from dexkit.teleop.wire import ClientWire
 
 __all__ = ["LiveClient", "Session"]
 
@@ -116,7 +116,7 @@ class LiveClient:
             force=force,
             yields=True,
         )
-        self._sole.look()
+        self._sole.search()
         claim = self._sole.announce()
         self._writers = {
             topic: node.writer(topic, dialect.cmd_type, qos=Qos.writer_default(), user_data=claim)
@@ -178,7 +178,7 @@ class LiveClient:
         start = told = seen = time.monotonic()
         self._watch.restart()
         while not stop.is_set():
-            away = self._watch.look()
+            away = self._watch.measure_pause()
             if away:
                 session.pauses.append((seen - start, away))
                 self._come_back(stop)
@@ -240,7 +240,7 @@ class LiveClient:
         stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
         self._watch.restart()
         end = time.monotonic() + _LEAVING
-        while stay and time.monotonic() < end and not self._watch.look():
+        while stay and time.monotonic() < end and not self._watch.measure_pause():
             self._send(stay)
             time.sleep(self._client.period)
 

@@ -437,7 +437,7 @@ class Calibration:
         return packet + _U32.pack(crc32_words(packet))
 
     @classmethod
-    def of(cls, command: MotorCmd) -> Calibration | None:
+    def from_command(cls, command: MotorCmd) -> Calibration | None:
         """The calibration that a command with status 6 is, or None."""
         if command.status != Status.CALIBRATE or command.tor_des != _CALIBRATION_TORQUE:
             return None

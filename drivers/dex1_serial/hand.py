@@ -11,11 +11,11 @@ import numpy as np
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import Promptly
 from dexkit.drivers.dex1_serial.discovery import find_motor
 from dexkit.drivers.dex1_serial.line import LATE, LineStatistics, MotorLine
 from dexkit.drivers.dex1_serial.settings import SETTINGS, Dex1Settings, from_options
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
-from dexkit.freshness import Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire.m4010 import (

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import serial
 
+from dexkit.command_age import Promptly
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
-from dexkit.freshness import Promptly
 from dexkit.wire.m4010 import DATA, FrameParser, MotorData
 
 __all__ = ["LATE", "LineStatistics", "MotorLine", "acquire", "is_shared"]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import Promptly
 from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
 from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, WireError
-from dexkit.freshness import Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, CommandLayout, HandCodec, parse_state

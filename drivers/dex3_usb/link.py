@@ -18,8 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from dexkit.command_age import Promptly
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
-from dexkit.freshness import Promptly
 
 __all__ = ["Backend", "Endpoints", "LinkStatistics", "UsbLink", "hand_error", "read_serial"]
 

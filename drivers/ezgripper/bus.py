@@ -35,6 +35,7 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
+from dexkit.command_age import Promptly
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import (
     HandLost,
@@ -42,7 +43,6 @@ from dexkit.errors import (
     HandTimeout,
     UsageError,
 )
-from dexkit.freshness import Promptly
 from dexkit.wire import dynamixel, mx64
 from dexkit.wire.dynamixel import Instruction
 

@@ -134,7 +134,6 @@ class Control:
         self.settings = settings if settings is not None else ControlSettings()
         self.detector = ContactDetector()
         self.phase = Phase.LIMP
-        self._planned: Goal | None = None
         self._braked_at: int | None = None
         self._braking = 0
         self._refused: HandCommand | None = None
@@ -153,11 +152,6 @@ class Control:
         """The contact in force, or None."""
         return self.detector.contact
 
-    @property
-    def starting(self) -> bool:
-        """Whether the start-up speed limit is in force."""
-        return self._starting
-
     def position(self, sample: Sample) -> int:
         """Ticks from the zero."""
         return relative_position(sample.position, self.zero)
@@ -175,7 +169,6 @@ class Control:
         if overload_at is not None:
             self._overloaded_at = overload_at
         self._braked_at = None
-        self._planned = None
         self.detector.reset()
         self._start_up()
 
@@ -201,7 +194,6 @@ class Control:
             goal = Goal(_bounded(sample.position), 0, self._profile())
         else:
             goal = self._drive(command, sample, now, position, base)
-        self._planned = goal
         return goal
 
     def _leave_drive(self, phase: Phase) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from dexkit import documents
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import PAUSE, Promptly
 from dexkit.drivers.ezgripper import calibration, settings
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BusStatistics, Ping, ServoBus
@@ -36,7 +37,6 @@ from dexkit.drivers.ezgripper.scaling import (
 from dexkit.drivers.ezgripper.servo import BOOT_TIME, Servo, ServoStatistics, line_time
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.errors import HandError, HandFault, HandLost, HandRefused, HandTimeout, UsageError
-from dexkit.freshness import PAUSE, Promptly
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import mx64

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import Promptly
 from dexkit.drivers.ezgripper import block
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BITS_PER_BYTE, ServoBus
@@ -15,7 +16,6 @@ from dexkit.drivers.ezgripper.settings import (
     hold_here,
 )
 from dexkit.errors import HandTimeout
-from dexkit.freshness import Promptly
 from dexkit.wire import mx64
 
 __all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "line_time"]

@@ -36,11 +36,11 @@ from typing import Any, Protocol
 from usbip import protocol
 from usbip.device import USBDevice
 
-from dexkit import ingress
+from dexkit import interface_filter
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
+from dexkit.escaping import one_line
 from dexkit.threads import Worker
-from dexkit.untrusted import one_line
 
 __all__ = [
     "DEAD",
@@ -495,7 +495,7 @@ class _Connection:
 def _keep_networks_out(listener: socket.socket) -> None:
     """With route_localnet set, the kernel takes packets for 127.0.0.1 from networks, too."""
     try:
-        ingress.restrict(listener, "lo")
+        interface_filter.restrict(listener, "lo")
     except OSError as error:
         # the address alone keeps them out unless the kernel was told otherwise
         log.warning("packets from networks are not kept from 127.0.0.1: %s", error.strerror)

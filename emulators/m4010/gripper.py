@@ -17,7 +17,7 @@ from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = ["Dex1Motors", "Dex1Process", "emulated_dex1"]
 
@@ -180,9 +180,9 @@ class Dex1Process(EmulatorProcess):
         *,
         timeout: float = 20.0,
     ) -> None:
-        self._directory: Scratch | None = None
+        self._directory: TemporaryFolder | None = None
         if link is None:
-            self._directory = Scratch("dex1")
+            self._directory = TemporaryFolder("dex1")
             link = self._directory.path / "tty"
         self.path = os.path.abspath(os.fspath(link))
         try:

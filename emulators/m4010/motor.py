@@ -182,7 +182,7 @@ class Motor:
         """
         if self.silent or command.id not in (self.number, BROADCAST_ID):
             return None
-        calibration = Calibration.of(command)
+        calibration = Calibration.from_command(command)
         if calibration is not None:
             answer = self._calibrate(calibration)
         else:

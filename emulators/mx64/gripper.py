@@ -15,7 +15,7 @@ from dexkit.emulators.mx64.settings import Firmware, Physics
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
-from dexkit.scratch import Scratch
+from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
 
@@ -72,9 +72,9 @@ class EmulatedProcess(EmulatorProcess):
         *,
         timeout: float = 20.0,
     ) -> None:
-        self._directory: Scratch | None = None
+        self._directory: TemporaryFolder | None = None
         if link is None:
-            self._directory = Scratch("mx64")
+            self._directory = TemporaryFolder("mx64")
             link = self._directory.path / "tty"
         self.path = os.path.abspath(os.fspath(link))
         super().__init__("mx64", ["--link", self.path, *arguments], MX64_FAULTS, timeout=timeout)

@@ -14,14 +14,14 @@ import logging
 import threading
 
 from dexkit.clock import Clock, RealClock
+from dexkit.command_age import PAUSE, Ages, PauseWatch
 from dexkit.dds import DdsNode, Endpoint, Reader, Writer
 from dexkit.emulators.robot.mechanics import RobotMechanics
 from dexkit.emulators.robot.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
-from dexkit.freshness import PAUSE, Ages, PauseWatch
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.service import Publisher
-from dexkit.sole import Place, SolePublisher
+from dexkit.single_publisher import Place, SolePublisher
 
 __all__ = ["EmulatedRobot", "run_robot"]
 
@@ -169,7 +169,7 @@ class EmulatedRobot:
         """States must arrive: some clients have a writer for them, which they never use."""
         model = self.model
         with node.reader(model.state_topic, model.state_type) as reader:
-            sole.look()
+            sole.search()
             if not reader.take() or self._force:
                 return
         self._heard = True
@@ -204,7 +204,7 @@ class EmulatedRobot:
         assert self._commands is not None
         assert self._arm_commands is not None
         self.missed += missed
-        if self._watch.look(PAUSE + 1.0 / self._publisher.hz):
+        if self._watch.measure_pause(PAUSE + 1.0 / self._publisher.hz):
             self._ages.resumed(self._clock.since_boot())
             robot.paused()
         for reader, obey in (

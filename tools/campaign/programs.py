@@ -22,7 +22,7 @@ from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import encode, unitree_go
 from dexkit.models import dialect
-from dexkit.scratch import sweep
+from dexkit.temporary_folder import sweep
 from tools.campaign.case import Batch, Case
 from tools.campaign.devices import Bench, bench_of
 from tools.campaign.process import Program, traceback_in

@@ -2,7 +2,8 @@
 
 ``python -m dexkit`` puts the working folder in front of the import path, and a ``click.py`` that
 lies there would be run. A folder that is run is in front itself, and nothing else is in this one
-(what ``-P`` does from Python 3.11 on). :func:`dexkit.processes.command_line` makes the command.
+(what ``-P`` does from Python 3.11 on). :func:`dexkit.child_processes.command_line` makes the
+command.
 """
 
 import sys

@@ -13,18 +13,20 @@ from concurrent.futures import ThreadPoolExecutor
 
 import click
 
-from dexkit.cli.common import (
-    STATUS_LINES,
-    Number,
-    StatusLine,
-    StopRequest,
+from dexkit.child_processes import READY_TIMEOUT, Tool
+from dexkit.cli.options import (
+    DIALECT,
     dds_options,
-    stop_on_signals,
+    duration_option,
+    force_option,
+    quiet_option,
+    set_option,
 )
+from dexkit.cli.status_line import STATUS_LINES, StatusLine
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1
-from dexkit.processes import READY_TIMEOUT, Tool
 from dexkit.robots import ROBOTS
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 __all__ = ["emulate_all"]
 
@@ -45,24 +47,18 @@ _POLL = 0.05  # seconds between looks whether all parts live
     "--hands", type=click.Choice([*_HANDS, "none"]), default="dex3", help="Which hands, both sides."
 )
 @click.option(
-    "--dialect", help="Of the hands, as of 'dexkit serve'.  [default: the hand model's first]"
+    "--dialect",
+    type=DIALECT,
+    help="Topics, types and units of the hands.  [default: the hand model's first]",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="A setting of the hands, e.g. right.object=40; 'dexkit backends' lists them.",
+@set_option(
+    "Setting of the hands, e.g. object=40; right.object=40 is for one hand. 'dexkit backends' "
+    "lists the settings."
 )
-@dds_options(default_domain=1)
-@click.option(
-    "--duration",
-    type=Number(min=0, min_open=True),
-    metavar="S",
-    help="End after so many seconds.  [default: at Ctrl-C]",
-)
-@click.option("--force", is_flag=True, help="Even if others publish the state topics.")
-@click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+@dds_options()
+@duration_option()
+@force_option()
+@quiet_option()
 def emulate_all(
     robot: str,
     hands: str,

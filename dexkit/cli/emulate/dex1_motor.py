@@ -6,22 +6,28 @@ import sys
 
 import click
 
-from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
+from dexkit.cli.options import (
+    Number,
+    any_baudrate_option,
+    fault_options,
+    latency_timer_option,
+    line_time_option,
+    object_option,
+    seed_option,
+    side_option,
+    start_option,
+)
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import Side
+from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import m4010
 
 __all__ = ["emulate_dex1_motor"]
 
 
 @click.command("dex1-motor", context_settings={"show_default": True})
-@click.option(
-    "--side",
-    type=click.Choice(["left", "right", "both"]),
-    default="left",
-    help="Whose motor: id 0 is the right one, 1 the left one.",
-)
+@side_option("Motor to emulate: id 0 is the right one, 1 the left one.", default="left")
 @click.option(
     "--link",
     "links",
@@ -31,14 +37,8 @@ __all__ = ["emulate_dex1_motor"]
     help="Link that clients open. With --side both, one for a line with both motors, or "
     "left=PATH and right=PATH for a line each.",
 )
-@click.option(
-    "--object",
-    "object_pct",
-    type=Number(0, 100, min_open=True, max_open=True),
-    metavar="PCT",
-    help="Percent of opening at which the jaws touch an object.  [default: no object]",
-)
-@click.option("--start", type=Number(0, 100), default=20.0, metavar="PCT", help="Opening at first.")
+@object_option("Percent of opening at which the jaws touch an object")
+@start_option("Opening at first.", 20.0)
 @click.option(
     "--zero-error",
     type=Number(-6, 6),
@@ -53,7 +53,7 @@ __all__ = ["emulate_dex1_motor"]
     metavar="B",
     help="Bits a second that the motor understands.",
 )
-@click.option("--line-time/--no-line-time", default=True, help="Bytes take their time.")
+@line_time_option()
 @click.option(
     "--answer-time",
     type=Number(0, 1000),
@@ -61,29 +61,12 @@ __all__ = ["emulate_dex1_motor"]
     metavar="MS",
     help="From a command to its answer; what the real motor needs is not known.",
 )
-@click.option(
-    "--latency-timer",
-    type=Number(0, 255),
-    default=0.0,
-    metavar="MS",
-    help="Of the USB-serial adapter, where it has one.",
-)
-@click.option(
-    "--fault",
-    "faults",
-    multiple=True,
-    metavar="SPEC",
-    help="Have a fault, e.g. unplug@5s:for=2s, stray:before=1, silent:id=1; may be repeated.",
-)
-@click.option(
-    "--faults-from-stdin",
-    is_flag=True,
-    help="Also take faults as lines of input, and stop at its end.",
-)
-@click.option("--seed", type=SEED, default=0, help="Of the faults' chance.")
-@click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
+@latency_timer_option(0.0)
+@fault_options("unplug@5s:for=2s, stray:before=1, silent:id=1")
+@seed_option("the faults")
+@any_baudrate_option()
 def emulate_dex1_motor(
-    side: str,
+    sides: tuple[Side, ...],
     links: tuple[str, ...],
     object_pct: float | None,
     start: float,
@@ -104,7 +87,6 @@ def emulate_dex1_motor(
     """
     from dexkit.emulators.m4010 import Dex1Motors, Firmware
 
-    sides = tuple(Side) if side == "both" else (Side(side),)
     with (
         stop_on_signals() as request,
         Dex1Motors(

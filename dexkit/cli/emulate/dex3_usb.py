@@ -8,11 +8,19 @@ from contextlib import nullcontext
 
 import click
 
-from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
+from dexkit.cli.options import (
+    fault_options,
+    object_option,
+    real_time_option,
+    seed_option,
+    side_option,
+    start_option,
+)
 from dexkit.errors import EmulatorError
+from dexkit.escaping import one_line
 from dexkit.hand import Side
-from dexkit.untrusted import one_line
+from dexkit.stop_signals import stop_on_signals
 
 __all__ = ["emulate_dex3_usb"]
 
@@ -30,9 +38,7 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
 
 
 @click.command("dex3-usb", context_settings={"show_default": True})
-@click.option(
-    "--side", type=click.Choice(["left", "right", "both"]), default="left", help="Which hand."
-)
+@side_option("Hand to emulate.", default="left")
 @click.option(
     "--serial",
     "serials",
@@ -49,45 +55,19 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     metavar="ADDRESS",
     help="Address to serve on. Whoever reaches it can move the hand: there is no password.",
 )
-@click.option(
-    "--object",
-    "object_pct",
-    type=Number(0, 100, min_open=True, max_open=True),
-    metavar="PCT",
-    help="How far the fingers close until they touch an object.  [default: no object]",
-)
-@click.option(
-    "--start",
-    type=Number(0, 100),
-    metavar="PCT",
-    help="How far they are closed at first.  [default: at rest, about 20]",
-)
+@object_option("Percent of closing at which the fingers touch an object")
+@start_option("Percent of closing at first.  [default: at rest, about 20]")
 @click.option(
     "--out-endpoint", callback=_endpoint, default="0x02", metavar="EP", help="Bulk OUT endpoint."
 )
 @click.option(
     "--in-endpoint", callback=_endpoint, default="0x81", metavar="EP", help="Bulk IN endpoint."
 )
-@click.option(
-    "--fault",
-    "faults",
-    multiple=True,
-    metavar="SPEC",
-    help="Have a fault, e.g. unplug@5s:for=2s, silent:id=3, drop:p=0.05; may be repeated.",
-)
-@click.option(
-    "--faults-from-stdin",
-    is_flag=True,
-    help="Also take faults as lines of input, and stop at its end.",
-)
-@click.option("--seed", type=SEED, default=0, help="Of the faults' chance.")
-@click.option(
-    "--real-time",
-    is_flag=True,
-    help="Run before ordinary processes, as 'dexkit serve' does, where the system permits it.",
-)
+@fault_options("unplug@5s:for=2s, silent:id=3, drop:p=0.05")
+@seed_option("the faults")
+@real_time_option(default=False)
 def emulate_dex3_usb(
-    side: str,
+    sides: tuple[Side, ...],
     serials: tuple[str, ...],
     port: int,
     host: str,
@@ -107,7 +87,6 @@ def emulate_dex3_usb(
     from dexkit.emulators.dex3_mcu import Dex3Hands
     from dexkit.service.realtime import real_time as real_time_priority
 
-    sides = tuple(Side) if side == "both" else (Side(side),)
     with (
         # before its thread is started, which inherits it
         real_time_priority() if real_time else nullcontext(True) as granted,

@@ -11,10 +11,19 @@ from pathlib import Path
 import click
 
 from dexkit import documents
-from dexkit.cli.common import SEED, Number, stop_on_signals
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
+from dexkit.cli.options import (
+    any_baudrate_option,
+    fault_options,
+    latency_timer_option,
+    line_time_option,
+    object_option,
+    seed_option,
+    start_option,
+)
 from dexkit.clock import RealClock
 from dexkit.errors import EmulatorError, UsageError
+from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import mx64
 
 __all__ = ["emulate_mx64"]
@@ -37,14 +46,8 @@ __all__ = ["emulate_mx64"]
     metavar="B",
     help="Bits a second that the servo is set to.",
 )
-@click.option(
-    "--object",
-    "object_pct",
-    type=Number(0, 100, min_open=True, max_open=True),
-    metavar="PCT",
-    help="Percent of opening at which the fingers touch an object.  [default: no object]",
-)
-@click.option("--start", type=Number(0, 100), default=50.0, metavar="PCT", help="Opening at first.")
+@object_option("Percent of opening at which the fingers touch an object")
+@start_option("Opening at first.", 50.0)
 @click.option(
     "--closed-at",
     type=click.IntRange(0, mx64.TICKS_PER_TURN - 1),
@@ -52,34 +55,17 @@ __all__ = ["emulate_mx64"]
     metavar="TICK",
     help="Encoder tick at which the fingers are closed.",
 )
-@click.option("--line-time/--no-line-time", default=True, help="Bytes take their time.")
-@click.option(
-    "--latency-timer",
-    type=Number(0, 255),
-    default=1.0,
-    metavar="MS",
-    help="Of the USB-serial adapter; an untuned one has 16, a ttyACM device 0.",
-)
-@click.option(
-    "--fault",
-    "faults",
-    multiple=True,
-    metavar="SPEC",
-    help="Have a fault, e.g. overload@3s, drop:p=0.05, unplug@5s:for=2s; may be repeated.",
-)
-@click.option(
-    "--faults-from-stdin",
-    is_flag=True,
-    help="Also take faults as lines of input, and stop at its end.",
-)
-@click.option("--seed", type=SEED, default=0, help="Of the faults' chance and of noise.")
+@line_time_option()
+@latency_timer_option(1.0)
+@fault_options("overload@3s, drop:p=0.05, unplug@5s:for=2s")
+@seed_option("the faults and of measurement noise")
 @click.option(
     "--eeprom",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
     help="Keep the servos' EEPROM here from run to run; it wins over --id and --baudrate.",
 )
-@click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
+@any_baudrate_option()
 @click.option("--fast-reads", is_flag=True, help="Firmware with Fast Sync and Fast Bulk Read.")
 @click.option("--backup", is_flag=True, help="Firmware with Control Table Backup.")
 @click.option("--protocol-1", is_flag=True, help="Old firmware that speaks Protocol 1.0 only.")

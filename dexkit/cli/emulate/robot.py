@@ -1,4 +1,4 @@
-"""``dexkit emulate h1`` and ``dexkit emulate g1``: an emulated robot robot on Unitree's topics."""
+"""``dexkit emulate h1`` and ``dexkit emulate g1``: an emulated robot on Unitree's topics."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.common import (
-    MOST_REMARKS,
-    SEED,
-    Number,
-    StatusLine,
-    StopRequest,
-    dds_options,
-    log_to_stderr,
-    stop_on_signals,
-)
 from dexkit.cli.emulate.stdin import read_faults
+from dexkit.cli.options import (
+    Number,
+    dds_options,
+    duration_option,
+    force_option,
+    json_option,
+    quiet_option,
+    real_time_option,
+    seed_option,
+)
+from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
 from dexkit.errors import DdsError, TopicConflict
 from dexkit.robots import G1, H1, RobotModel
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.emulators.robot import EmulatedRobot
@@ -121,21 +123,21 @@ def _command(model: RobotModel) -> click.Command:
             show_default=True,
             help="Kind of machine that it says it is (the table is in unitree_ros).",
         )(decorated)
-    return click.command(model.name)(dds_options(default_domain=1)(decorated))
+    return click.command(model.name)(dds_options()(decorated))
 
 
 _OPTIONS = [
-    click.option("--duration", type=Number(0), metavar="S", help="Stop after S seconds."),
+    duration_option(),
     click.option(
         "--remote",
         default="",
         metavar="KEYS",
-        help="Keys held on the wireless remote and where its sticks stand, e.g. A,R1,lx=0.5.",
+        help="Keys held on the wireless remote, and positions of its sticks, e.g. A,R1,lx=0.5.",
     ),
     click.option(
         "--remote-from-stdin",
         is_flag=True,
-        help="Also take such KEYS (or 'release') as lines of input, and stop at its end.",
+        help="Also read KEYS (or 'release') as lines of standard input, and stop at its end.",
     ),
     click.option(
         "--lenient",
@@ -150,16 +152,11 @@ _OPTIONS = [
         metavar="X",
         help="Noise of the IMU; 1 is that of a plain one.",
     ),
-    click.option("--seed", type=SEED, default=0, show_default=True, help="Of the noise."),
-    click.option("--force", is_flag=True, help="Even if another process publishes the state."),
-    click.option(
-        "--real-time/--no-real-time",
-        default=True,
-        show_default=True,
-        help="Run before ordinary processes where the system permits it (docs/service.md).",
-    ),
-    click.option("--json", "as_json", is_flag=True, help="A line of JSON each second."),
-    click.option("--quiet", is_flag=True, help="No status line."),
+    seed_option("the noise"),
+    force_option(),
+    real_time_option(),
+    json_option("Print a line of JSON each second."),
+    quiet_option(),
 ]
 
 

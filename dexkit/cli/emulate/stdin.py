@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import click
 
-from dexkit.cli.common import StopRequest
 from dexkit.errors import DexkitError
+from dexkit.stop_signals import StopRequest
 from dexkit.threads import Worker
 
 __all__ = ["A_MISTAKE", "read_faults"]

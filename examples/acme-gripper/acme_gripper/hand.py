@@ -65,7 +65,7 @@ class AcmeGripper:
             opening, speed, force, celsius = map(float, answer.split())
         except ValueError as error:
             raise HandLost(f"{self._address} answers {answer!r}") from error
-        return HandState.of(
+        return HandState.from_values(
             opening * RADIANS,
             dq=speed * RADIANS,
             tau_est=force * NEWTON_METRES,

@@ -26,7 +26,7 @@ from dexkit.messages.packed import Packed
 from dexkit.models import DIALECTS, model
 from dexkit.service.core import HandCore
 from dexkit.service.dialects import dialect_map
-from dexkit.teleop.wire import ClientWire
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces import names as trace_names
 from dexkit.traces import schemas
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target

@@ -240,7 +240,7 @@ def _m4010_motor(data: bytes) -> None:
     command = m4010.MotorCmd.parse(data)
     _same(command.pack(), data, "packed again")
     command.joint()
-    calibration = m4010.Calibration.of(command)
+    calibration = m4010.Calibration.from_command(command)
     if calibration is not None:
         calibration.answer().pack()
 

@@ -1,4 +1,4 @@
-"""Which commands may be old: pauses of a program's own loops, and the age of what it receives.
+"""Age of received commands, and pauses of a program's own loops: what is too old to be obeyed.
 
 A process may stand still at any point (stopped, suspended, swapped out, in a debugger, not
 scheduled), and what was sent to it meanwhile waits in the socket. After a pause, nothing that may
@@ -6,9 +6,9 @@ have been sent before its end moves a hand; without one, neither does a command 
 :data:`PAUSE` seconds older than its writer's commands usually are.
 
 :class:`PauseWatch` notices pauses, :class:`Ages` says how old a sample is, :class:`Promptly` keeps
-a driver from writing what it was told before a pause. None has a thread or DDS. Times are those of
-:meth:`dexkit.clock.Clock.since_boot`, which go on while the machine is suspended and do not jump
-with the wall clock.
+a driver from writing a command that it got before a pause. None has a thread or DDS. Times are
+those of :meth:`dexkit.clock.Clock.since_boot`, which go on while the machine is suspended and do
+not jump with the wall clock.
 
 **How old a sample is.** A sample says when it was written, on its writer's clock. How that clock
 relates to ours is unknown, it may be hours off; but reception minus source timestamp is that
@@ -17,10 +17,10 @@ offset plus its least latency, and what a sample exceeds it by is its age. The b
 :data:`DRIFT` to follow clocks that run differently, and has to be confirmed anew after
 :data:`FORGET` seconds without a sample.
 
-**What can be told after a pause.** With a baseline that was confirmed before, each single sample:
+**What is known after a pause.** With a baseline that was confirmed before, each single sample:
 it counts if it was sent :data:`SETTLE` seconds after the end of the pause or later. That time is
 for what the estimate may be wrong by: the least latency, and the drift. Without one, the first
-samples tell nothing, they may have waited in the socket. A baseline is *confirmed* by two samples
+samples prove nothing, they may have waited in the socket. A baseline is *confirmed* by two samples
 that lie ``SETTLE`` seconds or more apart on both clocks alike: while a queue is being emptied,
 source timestamps run faster than ours. Samples of a writer that is not confirmed count
 :data:`QUIET` seconds after the pause, when the socket has long been emptied.
@@ -81,12 +81,12 @@ class PauseWatch:
         self._last = self._clock.since_boot()
 
     def away(self) -> float:
-        """Seconds since the last look or restart, for another thread; 0 before the first."""
+        """Seconds since the last measurement or restart, for another thread; 0 before the first."""
         last = self._last
         return 0.0 if last is None else self._clock.since_boot() - last
 
-    def look(self, allowed: float = PAUSE) -> float:
-        """Seconds since the last look if they are more than ``allowed``; else 0."""
+    def measure_pause(self, allowed: float = PAUSE) -> float:
+        """Seconds since the last call if they are more than ``allowed``; else 0."""
         now = self._clock.since_boot()
         last, self._last = self._last, now
         if last is None or now - last <= allowed:

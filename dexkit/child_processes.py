@@ -1,4 +1,4 @@
-"""``dexkit`` commands as processes of this one: started, heard, stopped."""
+"""Run ``dexkit`` commands as child processes: start them, read their output, stop them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Ending in good order when the user or the system asks for it: Ctrl-C, SIGTERM, SIGHUP.
+"""Turn Ctrl-C, SIGTERM and SIGHUP into a request to stop.
 
-A program that dies at once leaves a hand driven by whatever it was told last. A thread that died
-asks for the same: what it did is no longer done.
+A program that dies at once leaves a hand driven by its last command. The death of a thread
+requests a stop, too: its work is no longer done.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""What /proc tells of this machine's processes; whatever may not be read is left out."""
+"""Read command lines, environments and open files of processes from /proc.
+
+What this user may not read is left out.
+"""
 
 from __future__ import annotations
 

@@ -1,48 +1,64 @@
-"""The catalogue as a page: ``python -m dexkit.conformance.requirements.page`` brings it up to date
-in docs/conformance.md, that of robots in docs/conformance-robots.md. Of what is like another
-requirement only the differences are told.
+"""The requirement catalogues in docs/conformance*.md, one page per layer.
+
+Of a requirement that is like another one, only the differences are written.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
+from dexkit.conformance.mutants import MUTANTS, robot
 from dexkit.conformance.requirements import Requirement, catalogue, renamed
+from dexkit.conformance.usb import mutants as usb_mutants
+from tools.generate import DOCS
 
-__all__ = ["BEGIN", "END", "PAGES", "catalogue_page", "entry"]
+__all__ = ["PAGES", "catalogue_page", "files"]
 
-BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
-END = "<!-- end of catalogue -->"
+_BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
+_END = "<!-- end of catalogue -->"
 
 
 _CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z])([\d-]*))")
 
-PAGES = {"dds": "conformance.md", "robot": "conformance-robots.md"}
-"""The page of each layer that is written here, in docs."""
+PAGES = {
+    "dds": "conformance.md",
+    "robot": "conformance-robots.md",
+    "usb": "conformance-usb.md",
+}
+"""The page of each layer, in docs."""
 
 
-def catalogue_page(layer: str = "dds") -> str:
+def catalogue_page(layer: str) -> str:
     """Markdown of a layer's requirements, by area."""
-    from dexkit.conformance.mutants import MUTANTS, robot
-
+    wrong_hands = _wrong_hands(layer)
     lines: list[str] = []
     area = ""
     every = catalogue(layer=layer)
     derived = {r.model for r in every if r.like}  # they come after what they are like
     for requirement in sorted(every, key=lambda r: r.model in derived):
-        whose = f"{requirement.model.upper()}: " if layer == "robot" else ""
-        if f"{whose}{requirement.area}" != area:
-            area = f"{whose}{requirement.area}"
+        heading = requirement.area
+        if layer == "robot":
+            heading = f"{requirement.model.upper()}: {heading}"
+        elif layer == "usb":
+            heading = heading.removeprefix("USB: ").capitalize()
+        if heading != area:
+            area = heading
             lines += ["", f"### {area}", ""]
-        zoo = robot.MUTANTS if layer == "robot" else MUTANTS
-        killers = [m.name for m in zoo if m.kills == requirement.id]
-        lines += entry(requirement, _needs(requirement), killers)
+        killers = [m.name for m in wrong_hands if m.kills == requirement.id]
+        lines += _entry(requirement, _judged_from(requirement), killers)
     return "\n".join(lines)
 
 
-def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[str]:
+def _wrong_hands(layer: str) -> Sequence[Any]:
+    if layer == "robot":
+        return robot.MUTANTS
+    return usb_mutants.MUTANTS if layer == "usb" else MUTANTS
+
+
+def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[str]:
     """Lines about one requirement.
 
     :param where: what it is judged from.
@@ -54,7 +70,7 @@ def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[
     known: set[str] = set()
     if requirement.like:
         lines.append(f"Like {requirement.like}.  ")
-        known = _told_of(requirement)
+        known = _inherited_texts(requirement)
     if requirement.rationale not in known:
         lines.append(f"{requirement.rationale}  ")
     if requirement.expected not in {requirement.sentence} | known:
@@ -70,8 +86,8 @@ def entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[
     return [*lines, ""]
 
 
-def _told_of(requirement: Requirement) -> set[str]:
-    """What is told of the requirement that this one is like, in this one's names."""
+def _inherited_texts(requirement: Requirement) -> set[str]:
+    """Texts of the requirement that this one is like, with its id replaced by this one's."""
     theirs = next(r for r in catalogue(None, None) if r.id == requirement.like)
     ours, others = (name.partition("-")[0] for name in (requirement.id, theirs.id))
     texts = (theirs.rationale, theirs.expected, theirs.cause, theirs.advice)
@@ -88,7 +104,9 @@ def _source(requirement: Requirement) -> str:
     return _CITED.sub(link, requirement.source)
 
 
-def _needs(requirement: Requirement) -> str:
+def _judged_from(requirement: Requirement) -> str:
+    if requirement.layer == "usb":
+        return f"phase `{requirement.phase}`" if requirement.phase else "the descriptors"
     where = {
         "nothing": "any recording",
         "endpoints": "what discovery saw",
@@ -106,14 +124,11 @@ def _needs(requirement: Requirement) -> str:
     return f"{where}, in {' and '.join(requirement.dialects)}"
 
 
-def main() -> None:
-    """Write it into the documentation."""
+def files() -> dict[Path, str]:
+    """The pages with their catalogues made anew."""
+    made = {}
     for layer, name in PAGES.items():
-        path = Path(__file__).resolve().parents[2] / "docs" / name
-        text = path.read_text(encoding="utf-8")
-        head, tail = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
-        path.write_text(f"{head}\n{catalogue_page(layer)}\n{tail}", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        text = (DOCS / name).read_text(encoding="utf-8")
+        head, tail = text[: text.index(_BEGIN) + len(_BEGIN)], text[text.index(_END) :]
+        made[DOCS / name] = f"{head}\n{catalogue_page(layer)}\n{tail}"
+    return made

@@ -19,7 +19,7 @@ from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.robots import G1
 from dexkit.service import HandService
-from dexkit.sole import LOOK, SETTLE, Claim, Place, SolePublisher
+from dexkit.single_publisher import LOOK, SETTLE, Claim, Place, SolePublisher
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.live import LiveClient
 from dexkit.traces import sample_path
@@ -184,17 +184,17 @@ def test_publishers_that_know_nothing_of_claims() -> None:
     node, one = sole()
     node.known["v"] = vendor
     with pytest.raises(TopicConflict, match=f"vendor already publishes {TOPIC} on domain 1") as e:
-        one.look()
+        one.search()
     assert e.value.hint == "stop it"
     node, one = sole()
-    one.look()
+    one.search()
     one.announce()
     node.known["v"] = vendor
     with pytest.raises(TopicConflict):
         one.settle()
     for yields in (False, True):
         node, one = sole(yields=yields)
-        one.look()
+        one.search()
         one.announce()
         one.settle()
         node.known["v"] = vendor

@@ -19,10 +19,10 @@ from mcap.writer import Writer
 from rich.table import Table
 from rich.text import Text
 
-from dexkit.cli.common import log_to_stderr
+from dexkit.cli.status_line import log_to_stderr
 from dexkit.console import Console, markup
 from dexkit.errors import DdsUnavailable, OutputError, UsageError
-from dexkit.untrusted import Guard, guarded, html, one_line, visible
+from dexkit.escaping import Guard, guarded, html, one_line, visible
 from tests import hostile
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
 
@@ -249,11 +249,7 @@ def test_a_stream_that_cannot_be_written_is_a_typed_error_each_time() -> None:
 _ALONE = {
     r"\brich\.console\b": {"dexkit/console.py"},
     r"^from html import|^import html": {
-        "dexkit/untrusted.py",
-        # drawings of dexkit's own models
-        "dexkit/family/drawing.py",
-        "dexkit/family/page.py",
-        "dexkit/family/svg.py",
+        "dexkit/escaping.py",
     },
     r"sys\.std(out|err)\.buffer|sys\.__std": set(),
 }

@@ -1,8 +1,9 @@
-"""The sockets that CycloneDDS opens for a domain of this process, and the interface they hear.
+"""Restrict the sockets that CycloneDDS opens for a domain to one network interface.
 
 CycloneDDS 0.10 binds them to all addresses, tells nobody which they are, and asks for the index
 of its interface once. So they are found among the sockets of the process, get a filter
-(:mod:`dexkit.ingress`), and follow an interface that is unplugged and comes back as another one.
+(:mod:`dexkit.interface_filter`), and follow an interface that is unplugged and comes back as
+another one.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from dexkit import ingress
+from dexkit import interface_filter
 from dexkit.errors import DdsSetupError
 
 __all__ = ["DomainSockets", "open_sockets"]
@@ -58,11 +59,11 @@ class DomainSockets:
 
     def __init__(self, domain: int, interface: str, before: dict[int, int]) -> None:
         self.interface = interface
-        self.fixed = ingress.is_loopback(interface)
+        self.fixed = interface_filter.is_loopback(interface)
         """The interface stays as it is, so that :meth:`follow` is never needed."""
         self._first_port = 7400 + 250 * domain  # RTPS 9.6.2
-        self._indices = ingress.accepted_indices(interface)
-        self._address = self._seen_address = ingress.interface_address(interface)
+        self._indices = interface_filter.accepted_indices(interface)
+        self._address = self._seen_address = interface_filter.interface_address(interface)
         self._lock = threading.Lock()
         self._receiving: list[socket.socket] = []
         self._sending: list[socket.socket] = []
@@ -84,11 +85,11 @@ class DomainSockets:
 
     def _filter(self) -> None:
         for sock in self._sockets():
-            ingress.accept_only(sock, self._indices)
+            interface_filter.accept_only(sock, self._indices)
 
     def _find(self, before: dict[int, int]) -> None:
         # CycloneDDS takes any of its interface's addresses
-        addresses = ingress.interface_addresses(self.interface)
+        addresses = interface_filter.interface_addresses(self.interface)
         for inode, descriptor in open_sockets().items():
             if inode in before:
                 continue
@@ -158,11 +159,11 @@ class DomainSockets:
         To be called twice a second or so; cheap.
         """
         with self._lock:
-            indices = ingress.accepted_indices(self.interface)
+            indices = interface_filter.accepted_indices(self.interface)
             if indices != self._indices:
                 self._indices = indices
                 self._change()
-            address = ingress.interface_address(self.interface)
+            address = interface_filter.interface_address(self.interface)
             if address in ("", self._seen_address):
                 return
             self._seen_address = address

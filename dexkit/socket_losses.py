@@ -1,7 +1,7 @@
-"""UDP sockets of this process, as the kernel sees them: what they hold and what they dropped.
+"""Count the datagrams that the kernel dropped on DDS sockets, and enlarge their buffers.
 
-CycloneDDS tells nobody when a datagram is lost because its socket's receive buffer was full, so
-the kernel is asked. Linux only; elsewhere there are no sockets to be found.
+CycloneDDS does not report a datagram that is lost because its socket's receive buffer was full, so
+the kernel's counters are read. Linux only; elsewhere no sockets are found.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class DdsSockets:
         self._seen = self._drops()
         self._errors = _receive_buffer_errors()
         self.dropped = 0
-        """Datagrams with samples that found no room since this was made, as of :meth:`look`."""
+        """Datagrams with samples that the kernel dropped since this was made, as last counted."""
 
     @property
     def known(self) -> bool:
@@ -69,8 +69,8 @@ class DdsSockets:
                 found[os.fstat(sock.fileno()).st_ino] = _MEMINFO.unpack(info)[_DROPS]
         return found
 
-    def look(self) -> int:
-        """Datagrams that found no room since the last look.
+    def count_new_drops(self) -> int:
+        """Datagrams that the kernel dropped since the last call, for want of buffer space.
 
         The socket's counter includes what a filter kept out, so it is believed only as far as
         the system counted errors of receive buffers meanwhile.

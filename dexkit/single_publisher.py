@@ -1,9 +1,10 @@
-"""The only publisher of a topic: how programs that must not publish side by side agree on one.
+"""Single publisher of a topic: of several programs that would publish it, exactly one goes on.
 
-Two services of one side would make clients see two hands in one, two sources of commands would
-fight over a hand. Whoever must be alone on its topics uses a :class:`SolePublisher`:
+Two services of one side would mix the states of two hands on one topic; two sources of commands
+would alternate on one hand. A program that must be alone on its topics uses a
+:class:`SolePublisher`:
 
-1. *look*: for :data:`LOOK` seconds it looks for other publishers. If there is one, it gives way.
+1. *search*: for :data:`LOOK` seconds it searches for other publishers. If there is one, it stops.
 2. *settle*: it announces its writers with a claim (the time, and a random number) in their user
    data, and looks for :data:`SETTLE` seconds more. Of programs that announced at the same time the
    one with the smallest claim goes on and the others give way. A publisher without a claim (the
@@ -24,13 +25,13 @@ import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any
 
 from dexkit.errors import TopicConflict
 
 __all__ = ["LOOK", "SETTLE", "Claim", "Place", "SolePublisher"]
 
-log = logging.getLogger("dexkit.sole")
+log = logging.getLogger("dexkit.single_publisher")
 
 LOOK = 0.3
 """Seconds to look for others before the own writers are announced: participants find each other
@@ -71,19 +72,13 @@ class Claim:
         return cls(int(found[1]), int(found[2], 16)) if found else None
 
 
-class _Node(Protocol):
-    """The part of :class:`dexkit.dds.DdsNode` that is needed; one without ``discovery`` is only
-    asked for its endpoints.
-    """
-
-    def endpoints(self) -> Sequence[Any]: ...
-
-
 @dataclass(frozen=True)
 class Place:
     """Topics on a node.
 
-    :param counts: which writers without a claim are company; by default all.
+    :param node: a :class:`dexkit.dds.DdsNode`; one without ``discovery`` is only asked for its
+        endpoints.
+    :param counts: which writers without a claim are rivals; by default all.
     """
 
     node: Any
@@ -134,8 +129,8 @@ class SolePublisher:
 
     # -- life
 
-    def look(self) -> None:
-        """Before the own writers are made.
+    def search(self) -> None:
+        """Look for other publishers, before the own writers are made.
 
         :raises TopicConflict: somebody else publishes there.
         """

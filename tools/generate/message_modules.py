@@ -1,19 +1,15 @@
-"""Write the typed message modules from ``idl/*.idl``: ``python -m dexkit.messages.generate``.
-
-``--check`` writes nothing and fails when a module is not what would be written.
-"""
+"""dexkit/messages/unitree_*.py: dataclasses and CDR codec of each IDL package."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 
 from dexkit.messages.layout import Field, Leaf, Primitive, Struct, load
+from tools.generate import ROOT
 
-__all__ = ["main", "render"]
+__all__ = ["files", "render"]
 
 
 def _padded(leaves: Iterable[Leaf | None], offset: int) -> tuple[str, int]:
@@ -266,7 +262,7 @@ def render(package: str, structs: Iterable[Struct]) -> str:
     lines = [
         f'"""Messages of ``{package}``: dataclasses and their CDR codec.',
         "",
-        f"Generated from idl/{package}.idl by ``python -m dexkit.messages.generate``; do not edit.",
+        f"Generated from idl/{package}.idl by ``python -m tools.generate``; do not edit.",
         "Use the codec through :func:`dexkit.messages.message_type`: it checks the header and the",
         "bounds and turns every failure into a :class:`dexkit.errors.WireError`.",
         '"""',
@@ -303,24 +299,10 @@ def render(package: str, structs: Iterable[Struct]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Write (or with ``--check`` compare) one module per IDL package."""
-    parser = argparse.ArgumentParser(prog="python -m dexkit.messages.generate")
-    parser.add_argument("--check", action="store_true", help="only say whether all is up to date")
-    options = parser.parse_args(argv)
+def files() -> dict[Path, str]:
+    """One module per IDL package."""
     structs = list(load().values())
-    stale = []
-    for package in sorted({s.scope[0] for s in structs}):
-        path = Path(__file__).with_name(f"{package}.py")
-        text = render(package, structs)
-        if path.exists() and path.read_text() == text:
-            continue
-        stale.append(path.name)
-        if not options.check:
-            path.write_text(text)
-    print(f"{'stale' if options.check else 'written'}: {', '.join(stale) or 'none'}")
-    return 1 if options.check and stale else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return {
+        ROOT / "dexkit" / "messages" / f"{package}.py": render(package, structs)
+        for package in sorted({s.scope[0] for s in structs})
+    }

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, RealClock
-from dexkit.errors import HandTimeout
-from dexkit.freshness import (
+from dexkit.command_age import (
     DRIFT,
     FORGET,
     PAUSE,
@@ -22,6 +21,7 @@ from dexkit.freshness import (
     PauseWatch,
     Promptly,
 )
+from dexkit.errors import HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import HandCore
@@ -37,25 +37,25 @@ class TestPauseWatch:
         watch = PauseWatch(clock)
         clock.advance(10.0)  # before the first look
         for _ in range(5):
-            assert watch.look() == 0.0
+            assert watch.measure_pause() == 0.0
             clock.advance(PAUSE)
 
     @pytest.mark.parametrize("suspended", [False, True], ids=["stopped", "suspended"])
     def test_a_pause_is_found_once(self, suspended: bool) -> None:
         clock = ManualClock()
         watch = PauseWatch(clock)
-        watch.look()
+        watch.measure_pause()
         (clock.suspend if suspended else clock.advance)(3.0)
-        assert watch.look() == 3.0
-        assert watch.look() == 0.0
+        assert watch.measure_pause() == 3.0
+        assert watch.measure_pause() == 0.0
 
     def test_being_away_on_purpose_is_no_pause(self) -> None:
         clock = ManualClock()
         watch = PauseWatch(clock)
-        watch.look()
+        watch.measure_pause()
         clock.advance(3.0)
         watch.restart()
-        assert watch.look() == 0.0
+        assert watch.measure_pause() == 0.0
 
     def test_the_real_clock_goes_on_in_suspend(self) -> None:
         clock = RealClock()
@@ -144,16 +144,16 @@ class Program:
         self.core.submit(command, now - age)
 
     def tick(self) -> None:
-        if self.receiving.look():
+        if self.receiving.measure_pause():
             self.ages.resumed(self.clock.since_boot())
             self.core.paused()
 
     def exchange(self) -> None:
         command = self.core.next_command()
-        if self.exchanging.look():
+        if self.exchanging.measure_pause():
             self.core.paused()
             command = self.core.next_command()
-        self.core.measured(HandState.of(1.0, stamp=self.clock.now()))
+        self.core.measured(HandState.from_values(1.0, stamp=self.clock.now()))
         boot = self.clock.since_boot()
         if command.is_brake:
             self.braked.append(boot)

@@ -1,7 +1,6 @@
-"""Whether this process may open the files and sockets that a task needs, before it begins.
+"""Check that this process may open the files and sockets that a task needs, before it begins.
 
-Out of descriptors halfway, CycloneDDS 0.10 dies of a segmentation fault, and other code fails where
-nobody expects it.
+Without descriptors, CycloneDDS 0.10 crashes with a segmentation fault.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ import resource
 
 from dexkit.errors import DexkitError
 
-__all__ = ["room_for_files"]
+__all__ = ["require_open_files"]
 
 
 class _TooFew(DexkitError):
     exit_code = 2
 
 
-def room_for_files(count: int, what: str) -> None:
+def require_open_files(count: int, what: str) -> None:
     """Make sure that ``count`` more files can be opened, by raising the soft limit if need be.
 
     :param what: who needs them.

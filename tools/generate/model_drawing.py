@@ -1,6 +1,6 @@
 """The drawings: joints by index and name, how they close, where a hand feels.
 
-Places come from :mod:`dexkit.family.layout`, everything else from the models.
+Places come from :mod:`tools.generate.drawing_layout`, everything else from the models.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dexkit.family.layout import HANDS, ROBOTS, Finger, HandLayout, RobotLayout
-from dexkit.family.svg import Point, Sheet
 from dexkit.hand import JointSpec, Side
 from dexkit.models import HandModel
 from dexkit.robots import RobotModel
+from tools.generate.drawing_layout import HANDS, ROBOTS, Finger, HandLayout, RobotLayout
+from tools.generate.svg_sheet import Point, Sheet
 
 __all__ = ["WIDTH", "draw_hand", "draw_robot"]
 

@@ -1,8 +1,8 @@
-"""Temporary folders that do not outlive their program, even one that was killed.
+"""Temporary folders that are removed even if their program is killed.
 
-A program holds a lock on each of its folders (``flock`` on the folder itself) for as long as it
-lives. Who makes a folder first removes those of this user that nobody has locked. So nothing stays
-of a program that was killed, whenever that was, once another one has started.
+A program holds a lock on each of its folders (``flock`` on the folder itself) while it runs.
+Before a folder is made, those of this user without a lock are removed, which are those of
+programs that were killed.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import tempfile
 from pathlib import Path
 from types import TracebackType
 
-__all__ = ["PREFIX", "Scratch", "sweep"]
+__all__ = ["PREFIX", "TemporaryFolder", "sweep"]
 
 PREFIX = "dexkit-scratch-"
 """Of their names; a folder of such a name that nobody has locked is removed."""
 
 
-class Scratch:
+class TemporaryFolder:
     """A new folder in the system's temporary one, for this user only; a context manager.
 
     :param what: part of its name.

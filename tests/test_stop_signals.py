@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from dexkit.stopping import stop_on_signals
+from dexkit.stop_signals import stop_on_signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

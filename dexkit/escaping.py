@@ -1,4 +1,4 @@
-r"""Text from outside (topic and participant names, notes, result files) on its way to people.
+r"""Escape text from outside (topic names, notes, result files) before it is printed or written.
 
 A name can hold escape sequences that move a terminal's cursor or write its title, characters that
 turn the direction of what follows (U+202E), lines of its own, or markup. Nothing of that is to
@@ -97,12 +97,16 @@ class Guard:
     A write may begin with carriage return and "clear line", as status lines do. What has been
     cleaned otherwise is written to :attr:`trusted`.
 
+    :param missing: the stream was closed when the program started, and ``stream`` is the null
+        device. The program runs on, so that its files are still written; :meth:`finish` raises.
     :raises OutputError: by each of its writes: disk full, pipe closed, ...
     """
 
-    def __init__(self, stream: IO[str], name: str) -> None:
+    def __init__(self, stream: IO[str], name: str, *, missing: bool = False) -> None:
         self._stream = stream
         self._name = name
+        self._missing = missing
+        self._written = False
         self._error: OSError | None = None
         self.trusted = _Trusted(self)
 
@@ -130,6 +134,7 @@ class Guard:
         self._check()
         if not text:
             return  # /dev/full takes not even that, and click tries it
+        self._written = True
         encoding = getattr(self._stream, "encoding", None) or "utf-8"
         try:
             try:
@@ -148,8 +153,17 @@ class Guard:
         except OSError as error:
             self._lost(error)
 
+    def finish(self) -> None:
+        """Flush it at the end of the program.
+
+        :raises OutputError: what was written did not reach the stream.
+        """
+        self.flush()
+        if self._missing and self._written:
+            raise output_error(self._name, OSError(errno.EBADF, "it is closed"))
+
     def _check(self) -> None:
-        """Who swallowed the first error gets it again."""
+        """Raise the first error again: its first receiver may have ignored it."""
         if self._error is not None:
             raise output_error(self._name, self._error) from self._error
 
@@ -185,12 +199,15 @@ def output_error(what: object, error: OSError) -> OutputError:
     return found
 
 
-def open_standard_streams() -> None:
-    """Give whichever of the standard streams was closed by whoever started this the null device.
+def open_standard_streams() -> set[str]:
+    """Open the null device in place of each standard stream that was closed at the start.
 
-    Else what is opened next, a device or a recording, has its number: libraries print into it, and
-    programs that are started read from it. Python's stream is None then, which nobody expects.
+    Otherwise the file that is opened next, a device or a recording, gets its number: libraries
+    print into it, and child processes read from it. Python's stream is None in that case.
+
+    :returns: names of the streams that were closed: ``stdin``, ``stdout``, ``stderr``.
     """
+    missing = set()
     for number in range(3):
         try:
             os.fstat(number)
@@ -200,9 +217,11 @@ def open_standard_streams() -> None:
                 os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
+            missing.add(name)
             mode = "w" if number else "r"
             # not closed with the stream: the number must stay taken until the very end
             setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
+    return missing
 
 
 @contextlib.contextmanager
@@ -211,15 +230,16 @@ def guarded() -> Iterator[None]:
 
     :raises OutputError: the output cannot be written.
     """
-    open_standard_streams()
+    missing = open_standard_streams()
     before = sys.stdout, sys.stderr
-    sys.stdout = cast(TextIO, Guard(sys.stdout, "standard output"))
+    out = Guard(sys.stdout, "standard output", missing="stdout" in missing)
+    sys.stdout = cast(TextIO, out)
     sys.stderr = cast(TextIO, Guard(sys.stderr, "standard error"))
     try:
         try:
             yield
         finally:
-            sys.stdout.flush()
+            out.finish()
     finally:
         with contextlib.suppress(OutputError):
             sys.stderr.flush()

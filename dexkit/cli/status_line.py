@@ -1,83 +1,24 @@
-"""What the sub-commands share: options, and stopping (:mod:`dexkit.stopping`)."""
+"""Log lines and the status line of a command on standard error."""
 
 from __future__ import annotations
 
 import logging
-import math
 import os
 import sys
-from collections.abc import Callable
-from typing import Any, TypeVar
 
-import click
-
-from dexkit.stopping import StopRequest, stop_on_signals
-from dexkit.untrusted import REMARK, one_line
-
-F = TypeVar("F", bound=Callable[..., Any])
+from dexkit.escaping import REMARK, one_line
 
 __all__ = [
     "MOST_REMARKS",
-    "SEED",
     "STATUS_LINES",
-    "Number",
     "StatusLine",
-    "StopRequest",
-    "dds_options",
     "log_to_stderr",
-    "stop_on_signals",
 ]
 
 MOST_REMARKS = 100
 """Different warnings about peers in one run: what they announce is theirs to make up."""
 STATUS_LINES = "DEXKIT_STATUS_LINES"
 """Environment variable: set by a command that starts others and shows what they are doing."""
-
-
-class Number(click.FloatRange):
-    """A finite number. ``click.FloatRange`` lets NaN pass, which is neither too small nor too
-    large, and numbers that no clock or timer can count.
-    """
-
-    _LARGEST = 1e9  # seconds: 30 years
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """The number."""
-        found: float = super().convert(value, param, ctx)
-        if not math.isfinite(found):
-            self.fail(f"{one_line(value, 40)} is not a finite number.", param, ctx)
-        if abs(found) > self._LARGEST:
-            self.fail(f"{one_line(value, 40)} is larger than {self._LARGEST:g}.", param, ctx)
-        return found
-
-
-SEED = click.IntRange(0, 2**32 - 1)
-"""Where a chance begins that can be repeated."""
-
-
-def dds_options(*, default_domain: int | None) -> Callable[[F], F]:
-    """``--domain`` and ``--interface``; the interface defaults to loopback."""
-
-    def decorate(function: F) -> F:
-        function = click.option(
-            "--interface",
-            default="lo",
-            show_default=True,
-            metavar="IF",
-            help="Network interface. Traffic stays on this machine unless one is named.",
-        )(function)
-        domain_help = "DDS domain: 0 is the robot, 1 xr_teleoperate's simulation."
-        return click.option(
-            "--domain",
-            type=click.IntRange(0, 230),
-            default=default_domain,
-            show_default=default_domain is not None,
-            help=domain_help,
-        )(function)
-
-    return decorate
 
 
 class _OneLine(logging.Formatter):

@@ -1,4 +1,4 @@
-"""Which network interface may reach a socket: a filter on what comes in, kept by the kernel.
+"""Accept packets on a socket from one network interface only: a filter in the kernel.
 
 CycloneDDS binds its UDP ports to all addresses whatever interface it is given, and even a port on
 127.0.0.1 can be reached from a network where the kernel routes such packets (``route_localnet``).

@@ -1,4 +1,4 @@
-"""The client's half of the topics: commands to bytes, bytes to the states' positions."""
+"""Encode a client's commands, and decode the positions of the states that it reads."""
 
 from __future__ import annotations
 

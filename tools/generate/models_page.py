@@ -1,4 +1,4 @@
-"""docs/models.md and its drawings: ``python -m dexkit.family.page`` brings both up to date."""
+"""docs/models.md and its drawings: joints, limits, topics and rates of every model."""
 
 from __future__ import annotations
 
@@ -6,18 +6,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from dexkit.family.drawing import draw_hand, draw_robot
-from dexkit.family.facts import describe, gain_groups, indices, names, short_type, torque_units
+from dexkit.model_facts import describe, gain_groups, indices, names, short_type, torque_units
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
+from tools.generate import DOCS
+from tools.generate.model_drawing import draw_hand, draw_robot
 
-__all__ = ["DOCS", "drawing", "files", "page"]
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-"""Where the documentation of a checkout is."""
+__all__ = ["drawing", "files", "page"]
 
 _INTRO = """\
-<!-- made by python -m dexkit.family.page, do not edit -->
+<!-- made by python -m tools.generate, do not edit -->
 
 # The models
 
@@ -227,13 +225,3 @@ def _closes(joint: dict[str, Any]) -> str:
 
 def _limits(joint: dict[str, Any]) -> tuple[str, str]:
     return f"{joint['dq_max_rad_s']:g}", f"{joint['tau_max_nm']:g}"
-
-
-def main() -> None:
-    """Write all of it into the documentation."""
-    for path, content in files().items():
-        path.write_text(content, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,4 @@
-"""The tables of docs/dex3-protocol.md: ``python -m dexkit.wire.dex3_usb.page`` brings them up to
-date from the layouts, the scaling, the bus map and the packers themselves.
-"""
+"""The tables of docs/dex3-protocol.md, from layouts, scaling, bus map and packers of the codec."""
 
 from __future__ import annotations
 
@@ -38,10 +36,11 @@ from dexkit.wire.dex3_usb.packets import (
     pack_command,
 )
 from dexkit.wire.ris import RIS_MODE, Structure
+from tools.generate import DOCS
 
-__all__ = ["BLOCKS", "PAGE", "fill", "main", "worked_example"]
+__all__ = ["BLOCKS", "PAGE", "files", "worked_example"]
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "dex3-protocol.md"
+PAGE = DOCS / "dex3-protocol.md"
 
 _BLOCK = re.compile(r"(<!-- made: ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -294,15 +293,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
 """What is between ``<!-- made: NAME -->`` and ``<!-- end -->``."""
 
 
-def fill(text: str) -> str:
-    """The page ``text`` with every block made anew."""
-    return _BLOCK.sub(lambda m: f"{m[1]}\n{BLOCKS[m[2]]()}\n\n{m[3]}", text)
-
-
-def main() -> None:
-    """Write them into the page."""
-    PAGE.write_text(fill(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+def files() -> dict[Path, str]:
+    """The page with every block made anew."""
+    text = PAGE.read_text(encoding="utf-8")
+    return {PAGE: _BLOCK.sub(lambda m: f"{m[1]}\n{BLOCKS[m[2]]()}\n\n{m[3]}", text)}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dexkit.family.svg import Point
+from tools.generate.svg_sheet import Point
 
 __all__ = ["HANDS", "ROBOTS", "Finger", "HandLayout", "Limb", "RobotLayout"]
 

@@ -1,0 +1,323 @@
+"""Options that several commands have: one definition each, with one help text and one type.
+
+An option of which commands differ in one word or in the default is a function of that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from dexkit.escaping import one_line
+from dexkit.hand import Side
+from dexkit.models import DIALECTS
+
+__all__ = [
+    "DIALECT",
+    "DOMAIN",
+    "FILE",
+    "Number",
+    "any_baudrate_option",
+    "dds_options",
+    "duration_option",
+    "fault_options",
+    "force_option",
+    "html_option",
+    "json_option",
+    "junit_option",
+    "latency_timer_option",
+    "line_time_option",
+    "markdown_option",
+    "object_option",
+    "quiet_option",
+    "real_time_option",
+    "require_option",
+    "seed_option",
+    "set_option",
+    "side_option",
+    "start_option",
+    "topic_option",
+    "verbose_option",
+]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Number(click.FloatRange):
+    """A finite number. ``click.FloatRange`` accepts NaN, which is neither too small nor too
+    large, and numbers that no clock or timer can count.
+    """
+
+    _LARGEST = 1e9  # seconds: 30 years
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number."""
+        found: float = super().convert(value, param, ctx)
+        if not math.isfinite(found):
+            self.fail(f"{one_line(value, 40)} is not a finite number.", param, ctx)
+        if abs(found) > self._LARGEST:
+            self.fail(f"{one_line(value, 40)} is larger than {self._LARGEST:g}.", param, ctx)
+        return found
+
+
+class _Sides(click.Choice):  # type: ignore[type-arg]
+    """``left``, ``right`` or ``both``, as a tuple of :class:`~dexkit.hand.Side`."""
+
+    def __init__(self) -> None:
+        super().__init__([*map(str, Side), "both"])
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Side, ...]:
+        """The sides; a tuple is returned as it is."""
+        if isinstance(value, tuple):
+            return value
+        name = super().convert(value, param, ctx)
+        return tuple(Side) if name == "both" else (Side(name),)
+
+
+DOMAIN = click.IntRange(0, 230)
+"""A DDS domain; those above have no ports (RTPS 9.6.1.1)."""
+DIALECT = click.Choice(list(DIALECTS))
+FILE = click.Path(path_type=Path)
+
+
+# ------------------------------------------------------------------------------ DDS
+
+
+def dds_options(
+    *, default_domain: int | None = 1, domain_default_text: str = ""
+) -> Callable[[F], F]:
+    """``--domain`` and ``--interface``; the interface defaults to loopback.
+
+    :param domain_default_text: what ``--help`` says where there is no fixed default.
+    """
+    suffix = f"  [default: {domain_default_text}]" if domain_default_text else ""
+    domain = click.option(
+        "--domain",
+        type=DOMAIN,
+        default=default_domain,
+        show_default=default_domain is not None,
+        help=f"DDS domain: 0 is the robot, 1 xr_teleoperate's simulation.{suffix}",
+    )
+    interface = click.option(
+        "--interface",
+        default="lo",
+        show_default=True,
+        metavar="IF",
+        help="Network interface. Traffic stays on this machine unless one is named.",
+    )
+    return lambda function: domain(interface(function))
+
+
+def topic_option(verb: str, default: str) -> Callable[[F], F]:
+    """``--topic``, repeated, as ``topics``."""
+    return click.option(
+        "--topic",
+        "topics",
+        multiple=True,
+        metavar="TOPIC",
+        help=f"{verb} this topic, e.g. rt/dex1/left/cmd, /dex1/left/cmd or '/dex1/*'; may be "
+        f"repeated.  [default: {default}]",
+    )
+
+
+def force_option() -> Callable[[F], F]:
+    """``--force`` of the commands that publish."""
+    return click.option(
+        "--force",
+        is_flag=True,
+        help="Publish even if another program publishes the same topics.",
+    )
+
+
+# ------------------------------------------------------------------------------ hands
+
+
+def side_option(
+    help: str, *, default: str | None = None, required: bool = False
+) -> Callable[[F], F]:
+    """``--side``, as a tuple ``sides`` of :class:`~dexkit.hand.Side`."""
+    return click.option(
+        "--side",
+        "sides",
+        type=_Sides(),
+        default=default,
+        required=required,
+        show_default=default is not None,
+        help=help,
+    )
+
+
+def set_option(help: str) -> Callable[[F], F]:
+    """``--set KEY=VALUE``, repeated, as ``settings``."""
+    return click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="KEY=VALUE",
+        help=help,
+    )
+
+
+# ------------------------------------------------------------------------------ running
+
+
+def duration_option(
+    help: str = "Stop after S seconds.  [default: at Ctrl-C]", *, least: float | None = None
+) -> Callable[[F], F]:
+    """``--duration S``; more than 0, or at least ``least``."""
+    return click.option(
+        "--duration",
+        type=Number(min=least or 0, min_open=least is None),
+        metavar="S",
+        help=help,
+    )
+
+
+def real_time_option(*, default: bool = True) -> Callable[[F], F]:
+    """``--real-time/--no-real-time``."""
+    return click.option(
+        "--real-time/--no-real-time",
+        default=default,
+        show_default=True,
+        help="Run before ordinary processes where the system permits it (docs/service.md).",
+    )
+
+
+def quiet_option() -> Callable[[F], F]:
+    """``--quiet``."""
+    return click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
+
+
+# ------------------------------------------------------------------------------ output
+
+
+def json_option(help: str) -> Callable[[F], F]:
+    """``--json`` of the commands that print their result, as ``as_json``."""
+    return click.option("--json", "as_json", is_flag=True, help=help)
+
+
+def html_option() -> Callable[[F], F]:
+    """``--report FILE`` or ``--html FILE``, as ``html_path``."""
+    return click.option(
+        "--report",
+        "--html",
+        "html_path",
+        type=FILE,
+        metavar="FILE",
+        help="Write a report page (HTML).",
+    )
+
+
+def junit_option() -> Callable[[F], F]:
+    """``--junit FILE``, as ``junit_path``."""
+    return click.option("--junit", "junit_path", type=FILE, metavar="FILE", help="Write JUnit XML.")
+
+
+def markdown_option(default: str = "") -> Callable[[F], F]:
+    """``--markdown FILE``, as ``markdown_path``."""
+    suffix = f"  [default: {default}]" if default else ""
+    return click.option(
+        "--markdown",
+        "markdown_path",
+        type=FILE,
+        metavar="FILE",
+        help=f"Write a summary in Markdown; - prints it.{suffix}",
+    )
+
+
+def verbose_option(help: str) -> Callable[[F], F]:
+    """``-v``, ``--verbose``."""
+    return click.option("-v", "--verbose", is_flag=True, help=help)
+
+
+def require_option(example: str) -> Callable[[F], F]:
+    """``--require PREFIX``, repeated."""
+    return click.option(
+        "--require",
+        multiple=True,
+        metavar="PREFIX",
+        help=f"Only requirements whose id begins with PREFIX, e.g. {example}; may be repeated.",
+    )
+
+
+# ------------------------------------------------------------------------------ emulated devices
+
+
+def seed_option(what: str) -> Callable[[F], F]:
+    """``--seed N``.
+
+    :param what: what is random.
+    """
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**32 - 1),
+        default=0,
+        show_default=True,
+        help=f"Seed of the random numbers of {what}.",
+    )
+
+
+def fault_options(example: str) -> Callable[[F], F]:
+    """``--fault SPEC``, repeated, as ``faults``; and ``--faults-from-stdin``."""
+    fault = click.option(
+        "--fault",
+        "faults",
+        multiple=True,
+        metavar="SPEC",
+        help=f"Inject a fault, e.g. {example}; may be repeated.",
+    )
+    from_stdin = click.option(
+        "--faults-from-stdin",
+        is_flag=True,
+        help="Also read faults as lines of standard input, and stop at its end.",
+    )
+    return lambda function: fault(from_stdin(function))
+
+
+def object_option(when: str) -> Callable[[F], F]:
+    """``--object PCT``, as ``object_pct``."""
+    return click.option(
+        "--object",
+        "object_pct",
+        type=Number(0, 100, min_open=True, max_open=True),
+        metavar="PCT",
+        help=f"{when}.  [default: no object]",
+    )
+
+
+def start_option(help: str, default: float | None = None) -> Callable[[F], F]:
+    """``--start PCT``."""
+    return click.option("--start", type=Number(0, 100), default=default, metavar="PCT", help=help)
+
+
+def line_time_option() -> Callable[[F], F]:
+    """``--line-time/--no-line-time``."""
+    return click.option(
+        "--line-time/--no-line-time",
+        default=True,
+        help="Let each byte take its time on the line.",
+    )
+
+
+def latency_timer_option(default: float) -> Callable[[F], F]:
+    """``--latency-timer MS``."""
+    return click.option(
+        "--latency-timer",
+        type=Number(0, 255),
+        default=default,
+        metavar="MS",
+        help="Latency timer of the USB-serial adapter: an untuned FTDI has 16, a ttyACM device 0.",
+    )
+
+
+def any_baudrate_option() -> Callable[[F], F]:
+    """``--any-baudrate``."""
+    return click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
