@@ -1,4 +1,4 @@
-"""Emulated devices under hosts that send anything: samples of the fuzzers, and what they found."""
+"""Emulated devices with hosts that send invalid or far too much data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from dexkit.clock import ManualClock
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.usb import Dex3Usb
-from dexkit.emulators.faults import MX64_FAULTS, parse_fault
+from dexkit.emulators.faults import DEX3_FAULTS, MX64_FAULTS, parse_fault
 from dexkit.emulators.m4010.bus import Bus as MotorBus
 from dexkit.emulators.m4010.motor import Motor
 from dexkit.emulators.mx64 import Bus, Firmware, Port, Servo
@@ -27,12 +27,7 @@ from dexkit.wire import dynamixel as dxl
 from dexkit.wire import m4010
 from dexkit.wire.dynamixel import Instruction
 from tests.cli_helpers import running
-from tests.fuzz import devices
-
-
-@pytest.mark.parametrize("name", sorted(devices.FUZZERS))
-def test_whatever_comes(name: str) -> None:
-    assert devices.FUZZERS[name](0, 2000) == 2000
+from tools.campaign.fuzz.devices import packet
 
 
 def broken(*_: object) -> None:
@@ -55,11 +50,11 @@ PING = dxl.encode(1, Instruction.PING)
 def test_a_fast_read_that_no_packet_can_hold_is_not_answered() -> None:
     for asked in (
         bytes.fromhex("fffffd00fe08008a0000f50301c034"),  # 1013 bytes of servo 1
-        devices.packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1"),
-        devices.packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1\2\3"),
-        devices.packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\2\0\0\xf5\3"),
+        packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1"),
+        packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1\2\3"),
+        packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\2\0\0\xf5\3"),
         # servo 9 is not there: the first would announce a length for it all the same
-        devices.packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\x09\0\0\xff\xff"),
+        packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\x09\0\0\xff\xff"),
     ):
         bus = fast_bus()
         assert ask(bus, asked) == [], asked.hex()
@@ -70,7 +65,7 @@ def test_a_fast_read_that_no_packet_can_hold_is_not_answered() -> None:
 def test_the_longest_fast_read_is_answered() -> None:
     longest = dxl.MAX_LENGTH - 5
     bus = fast_bus()
-    (answer,) = ask(bus, devices.packet(254, 0x8A, b"\0\0" + longest.to_bytes(2, "little") + b"\1"))
+    (answer,) = ask(bus, packet(254, 0x8A, b"\0\0" + longest.to_bytes(2, "little") + b"\1"))
     assert len(answer.params) == 2 + longest  # error (no such range), id, and its place
 
 
@@ -141,7 +136,7 @@ def test_answers_that_are_held_back_are_bounded() -> None:
     clock = ManualClock()
     mcu = Dex3Mcu(Side.LEFT, clock=clock)
     usb = Dex3Usb(mcu, clock)
-    mcu.inject(parse_fault("delay:ms=900000", devices.DEX3_FAULTS))
+    mcu.inject(parse_fault("delay:ms=900000", DEX3_FAULTS))
     clock.advance(0.01)
     for _ in range(200):
         usb._received(usb._out, b"no frame")

@@ -27,9 +27,7 @@ from dexkit.messages.layout import STRUCTS
 from dexkit.messages.unitree_go import MotorState_, MotorStates_
 from dexkit.traces import Recorder, open_trace, sample_path, schemas
 from dexkit.traces.container import MAX_RATIO, SPARE
-from tests import mcap_fuzz
 from tests.dds_helpers import free_domain
-from tests.mcap_fuzz import content
 from tests.trace_helpers import (
     CMD,
     CMD_TYPE,
@@ -42,6 +40,7 @@ from tests.trace_helpers import (
     rows,
     write,
 )
+from tools.campaign.fuzz.recordings import content, count_calls
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -359,7 +358,7 @@ def test_columns_take_memory_for_the_samples_that_there_are(tmp_path: Path) -> N
 def work(path: Path, data: bytes) -> int:
     """Calls that reading takes."""
     write(path, data)
-    return mcap_fuzz._calls(lambda: content(path))[1]
+    return count_calls(lambda: content(path))[1]
 
 
 def many_channels(n: int) -> bytes:
@@ -385,18 +384,6 @@ def test_work_grows_with_the_file_and_not_with_its_square(tmp_path: Path) -> Non
     for make, n in ((many_channels, 40), (overlapping, 40), (misleading, 60)):
         small, large = (work(tmp_path / "a.mcap", make(n * k)) for k in (1, 4))
         assert large < 6 * small, make.__name__
-
-
-def test_the_fuzzer_finds_nothing() -> None:
-    result = mcap_fuzz.run(20_11, 100)
-    assert [f"{f.number}: {f.what}" for f in result.findings] == []
-    assert result.inputs == 100
-
-
-@pytest.mark.soak
-def test_the_fuzzer_finds_nothing_in_many_files() -> None:
-    result = mcap_fuzz.run(4, 20_000)
-    assert [f"{f.number}: {f.what}" for f in result.findings] == []
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
