@@ -16,18 +16,21 @@ _Test = Callable[..., None]
 
 
 def each(
-    names: str, cases: Iterable[Any], ids: Sequence[str] | Callable[[Any], str] | None = None
+    names: str | Sequence[str],
+    cases: Iterable[Any],
+    ids: Sequence[str] | Callable[[Any], str] | None = None,
 ) -> Callable[[_Test], _Test]:
     """A decorator with the arguments of ``pytest.mark.parametrize``, for cases of a millisecond.
 
-    The test runs for all cases, also after one has failed. Fixtures are made once and shared by
-    the cases.
+    The test runs for all cases, also after one has failed. Each has a ``tmp_path`` of its own; the
+    other fixtures are made once and shared.
 
-    :param names: names of the arguments, separated by commas.
+    :param names: names of the arguments, in a sequence or separated by commas.
     :param cases: a value, or a tuple of as many values as there are names, for each case.
     :param ids: a name for each case; a function of the first value, or one for each case.
     """
-    arguments = [name.strip() for name in names.split(",") if name.strip()]
+    given = names.split(",") if isinstance(names, str) else names
+    arguments = [name.strip() for name in given if name.strip()]
     table = [_values(case, len(arguments)) for case in cases]
     assert table, f"there is no case for {names}"
     labels = [_label(i, arguments, values, ids) for i, values in enumerate(table)]
@@ -39,9 +42,13 @@ def each(
         @functools.wraps(test)
         def run(*fixed: Any, **fixtures: Any) -> None:
             failures = []
-            for label, values in zip(labels, table, strict=True):
+            for number, (label, values) in enumerate(zip(labels, table, strict=True)):
+                case = fixtures | dict(zip(arguments, values, strict=True))
+                if "tmp_path" in fixtures:
+                    case["tmp_path"] = fixtures["tmp_path"] / str(number)
+                    case["tmp_path"].mkdir()
                 try:
-                    test(*fixed, **fixtures, **dict(zip(arguments, values, strict=True)))
+                    test(*fixed, **case)
                 except (Exception, pytest.fail.Exception) as error:
                     failures.append((label, error))
             if failures:

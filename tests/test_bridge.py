@@ -18,6 +18,7 @@ from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import DEX1_1, Dialect, dialect
 from dexkit.teleop.client import LEAD, StickyFilter
+from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 BOTH = tuple(Side)
@@ -235,8 +236,8 @@ class TestEveryPair:
             assert direction.due is None
             assert wire.later(5.0) == []
 
-    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-    @pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
+    @each("bad", [math.nan, math.inf, -math.inf])
+    @each("field", ["q", "dq", "tau", "kp", "kd"])
     def test_what_is_not_finite_goes_nowhere(
         self, client: Dialect, gripper: Dialect, field: str, bad: float
     ) -> None:
@@ -408,10 +409,8 @@ class TestReachable:
         reach = (0.0, 2 * math.pi, min(max(q, 0.101), 5.999))
         assert abs(sent - q) == pytest.approx(min(abs(r - q) for r in reach))
 
-    @pytest.mark.parametrize("speed", [1.5, 6.5, 24.0])
-    @pytest.mark.parametrize(
-        ("start", "goal"), [(0.0, 5.4), (5.4, 0.0), (5.412, 0.0), (2.7, 5.4), (5.4, 3.0)]
-    )
+    @each("speed", [1.5, 6.5, 24.0])
+    @each(("start", "goal"), [(0.0, 5.4), (5.4, 0.0), (5.412, 0.0), (2.7, 5.4), (5.4, 3.0)])
     def test_the_teleoperation_client_gets_through(
         self, start: float, goal: float, speed: float
     ) -> None:

@@ -9,9 +9,8 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
 
-import pytest
-
 from dexkit.conformance.requirements import catalogue
+from tests.each import each
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "docs" / "sources"
@@ -131,7 +130,7 @@ def test_every_source_of_the_catalogue_has_words() -> None:
         assert re.search(r"[A-Za-z]{3,}", CITATION.sub("", requirement.source)), requirement.id
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "(facts/unitree-dex B.1)", "facts/mx64 D2", "# F A.5", "seed 002", "(facts G)", "(D5)",
@@ -142,7 +141,7 @@ def test_internal_names_are_found(text: str) -> None:
     assert INTERNAL.search(text)
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["docs/sources/unitree-dex.md#b1", "[B.1](sources/unitree-dex.md#b1)", "FE 0D 1F [D 2]"[:8],
      "the facts are these", "--seed 7", "F 2.5"],

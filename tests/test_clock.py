@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, Rate, RealClock
 from dexkit.errors import UsageError
+from tests.each import each
 
 
 class TestManualClock:
@@ -89,7 +90,7 @@ class TestRate:
         rate.wait()
         assert clock.now() == pytest.approx(0.01)
 
-    @pytest.mark.parametrize("hz", [0.0, -5.0, float("inf"), float("nan")])
+    @each("hz", [0.0, -5.0, float("inf"), float("nan")])
     def test_a_rate_is_positive(self, hz: float) -> None:
         with pytest.raises(UsageError, match="positive"):
             Rate(hz)

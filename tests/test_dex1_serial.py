@@ -28,6 +28,7 @@ from dexkit.emulators.m4010 import Dex1Motors, Dex1Process, Firmware
 from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.wire.m4010 import MotorCmd
+from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
 BRAKE = HandCommand.brake(1)
@@ -249,7 +250,7 @@ def test_a_motor_that_wakes_up_late_is_found() -> None:
 # --- what goes wrong on the line
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "fails"),
     [
         ("short:for=150ms", True),
@@ -529,7 +530,7 @@ def test_the_backend_reads_its_settings() -> None:
     assert spec.exchange_timeout <= 0.1
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"ports": ""},
@@ -604,7 +605,7 @@ def test_calibration_on_the_command_line() -> None:
         assert "before since power-up" in said
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "says"),
     [
         (["dex1-serial"], "say which hand"),

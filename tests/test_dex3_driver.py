@@ -53,6 +53,7 @@ from tests.dex3_driver_helpers import (
     serving,
     usb_error,
 )
+from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
 GO = HandCommand.position(np.full(7, 0.1), kp=1.5, kd=0.2)
@@ -105,7 +106,7 @@ class TestAddress:
         assert parse_server("usbip://[::1]:99") == (Server("::1", 99), None)
         assert str(Server("::1", 99)) == "usbip://[::1]:99"
 
-    @pytest.mark.parametrize(
+    @each(
         "text",
         ["robot", "http://robot", "usbip://", "usbip://h:x", "usbip://h/a/b", "usbip://h?x=1"],
     )
@@ -155,7 +156,7 @@ class TestSettings:
         assert (found.protect, found.timeout, found.send_timeout) == (False, 0.02, 0.03)
         assert (found.out_endpoint, found.in_endpoint) == (0x04, 0x85)
 
-    @pytest.mark.parametrize(
+    @each(
         ("device", "settings", "server", "serial", "local"),
         [
             (None, {}, None, None, True),
@@ -172,7 +173,7 @@ class TestSettings:
         found = from_options(self.options(device, **settings))
         assert (found.server, found.serial, found.local) == (server, serial, local)
 
-    @pytest.mark.parametrize(
+    @each(
         ("device", "settings"),
         [
             (None, {"timeout": "0"}),
@@ -199,7 +200,7 @@ class TestSettings:
         with pytest.raises(UsageError):
             backend.create(self.options(device, **settings))
 
-    @pytest.mark.parametrize(
+    @each(
         ("name", "text", "says"),
         [
             ("motors", "0.0", "motors: the hand has 7, here are 1"),
@@ -643,7 +644,7 @@ class TestExchange:
             fake.spoil = lambda answer: answer
             assert hand.exchange(GO).q[0] != before.q[0]
 
-    @pytest.mark.parametrize(
+    @each(
         "damage",
         [
             lambda a: a[:1000],
@@ -687,7 +688,7 @@ class LateHand(FakeHand):
 class TestLateAnswers:
     """An answer belongs to the command that it follows, however late it comes."""
 
-    @pytest.mark.parametrize("late", [0.105, 0.115, 0.15, 0.3])
+    @each("late", [0.105, 0.115, 0.15, 0.3])
     def test_over_usbip(self, late: float) -> None:
         fake = LateHand()
         with serving(RawDevice(fake)) as server, hand_on(server, SHORT) as hand:

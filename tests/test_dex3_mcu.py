@@ -34,6 +34,7 @@ from dexkit.wire.dex3_usb import (
     pack_command,
     parse_state,
 )
+from tests.each import each
 
 TRIPPED = MotorError.MOTOR_SAW_HOST_TIMEOUT
 SIDES = list(Side)
@@ -112,8 +113,8 @@ def packet(number: int, *, status: int = 1, timeout: bool = True, q: int = 0) ->
 # --- frames
 
 
-@pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("layout", [COMMAND_1234, COMMAND_734])
+@each("side", SIDES)
+@each("layout", [COMMAND_1234, COMMAND_734])
 def test_one_send_one_receive(side: Side, layout: CommandLayout) -> None:
     bench = Bench(side)
     bench.codec = HandCodec(DEX3_1.joints[side], layout=layout)
@@ -240,7 +241,7 @@ def spoil_crc(frame: bytes) -> bytes:
     return frame[:-1] + bytes([frame[-1] ^ 1])
 
 
-@pytest.mark.parametrize(
+@each(
     ("spoil", "counter"),
     [
         (spoil_crc, "bad_crc"),
@@ -347,7 +348,7 @@ def test_lock_brakes_and_foc_drives() -> None:
     assert np.abs(bench.run(0.3, bench.frame(goal)).q - bench.rest).max() > 0.1
 
 
-@pytest.mark.parametrize("status", [2, 5, 6, 7])
+@each("status", [2, 5, 6, 7])
 def test_other_statuses(status: int) -> None:
     bench = Bench()
     bench.ask(bench.frame(bench.rest))
@@ -613,7 +614,7 @@ def test_pulling_the_cable_stops_no_motor_but_their_protection_does() -> None:
 # --- the grammar of the family
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["overload", "silent:id=7", "drop:side=up", "stall:for=2s", "drop:id=1", "silent:c=3", "fire"],
 )
@@ -630,7 +631,7 @@ def test_sides_are_for_hands_only() -> None:
         parse_fault("drop:side=right")
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [{"queue": 0}, {"command_timeout": 0.0}, {"answer_time": -1.0}, {"model_code": 256}],
 )

@@ -14,6 +14,7 @@ from dexkit.emulators.finger_mechanics import AMBIENT, STEP, MotorModel
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
+from tests.each import each
 
 KP, KD = DEX3_1.client_gains
 THUMB_0, THUMB_1, THUMB_2, MIDDLE_0, MIDDLE_1, INDEX_0, INDEX_1 = range(7)
@@ -47,8 +48,8 @@ def test_thumb_0_has_the_other_gear() -> None:
     assert F_1515_214.holding_loss == pytest.approx(1.069, abs=1e-3)
 
 
-@pytest.mark.parametrize("joint", range(7))
-@pytest.mark.parametrize(("kp", "kd"), [(1.5, 0.2), (0.5, 0.1), (1.5, 0.1)])
+@each("joint", range(7))
+@each(("kp", "kd"), [(1.5, 0.2), (0.5, 0.1), (1.5, 0.1)])
 def test_gains_of_the_clients_settle_at_the_goal(joint: int, kp: float, kd: float) -> None:
     """xr_teleoperate's, and both of the vendor's C++ example."""
     mechanics = Dex3Mechanics(Side.LEFT)
@@ -138,8 +139,8 @@ def test_the_hand_on_the_right_is_the_mirror_of_the_left() -> None:
 # -- stops, brake, limp ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("side", Side)
-@pytest.mark.parametrize("sign", [-1, 1])
+@each("side", Side)
+@each("sign", [-1, 1])
 def test_hard_stops_lie_a_little_beyond_the_limits(side: Side, sign: int) -> None:
     mechanics = Dex3Mechanics(side)
     for joint in range(7):
@@ -281,8 +282,8 @@ def test_33_elements_feel_nothing_without_an_object() -> None:
     )
 
 
-@pytest.mark.parametrize("side", Side)
-@pytest.mark.parametrize(
+@each("side", Side)
+@each(
     ("joint", "place"),
     [
         (THUMB_1, "thumb pad"),
@@ -465,7 +466,7 @@ def test_acceleration_is_the_mean_over_the_last_steps() -> None:
     assert mechanics.ddq[INDEX_0] < 0.0
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"object_at": 0.0},

@@ -22,6 +22,7 @@ from dexkit.hand import Side
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb.page import BLOCKS, PAGE, fill, worked_example
+from tests.each import each
 
 # --- layouts, against the numbers of docs/sources/unitree-dex.md#c
 
@@ -88,7 +89,7 @@ def test_packets_of_the_fact_sheet() -> None:
     assert d.SensorState.parse(sensor) == SENSOR
 
 
-@pytest.mark.parametrize(
+@each(
     ("packet", "expected"),
     [
         # measured from the vendor's library for the M4010 motor, which has the same frame
@@ -196,7 +197,7 @@ def test_every_flipped_bit_is_noticed(packet: Any) -> None:
         data[bit >> 3] ^= 1 << (bit & 7)
 
 
-@pytest.mark.parametrize("packet", [MOTOR, SENSOR, d.MotorCmd(3, 1, True, 1, 2, 3, 4, 5)])
+@each("packet", [MOTOR, SENSOR, d.MotorCmd(3, 1, True, 1, 2, 3, 4, 5)])
 def test_wrong_lengths(packet: Any) -> None:
     data = packet.pack()
     for length in range(len(data)):
@@ -206,7 +207,7 @@ def test_wrong_lengths(packet: Any) -> None:
         type(packet).parse(data + b"\0")
 
 
-@pytest.mark.parametrize(
+@each(
     ("packet", "what"),
     [
         (d.MotorCmd(16, 1, False, 0, 0, 0, 0, 0), "id = 16"),

@@ -33,6 +33,7 @@ from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import units
 from dexkit.wire.dex3_usb.page import worked_example
+from tests.each import each
 
 JOINTS = DEX3_1.joints[Side.LEFT]
 RATIOS = [j.gear_ratio for j in JOINTS]
@@ -190,8 +191,8 @@ def test_encode_is_what_packets_say(
             assert error <= (1 + 1e-6) / scale.factor(ratio)
 
 
-@pytest.mark.parametrize("name", ["q", "dq", "tau", "kp", "kd"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@each("name", ["q", "dq", "tau", "kp", "kd"])
+@each("value", [math.nan, math.inf, -math.inf])
 def test_nan_is_never_sent(name: str, value: float) -> None:
     codec = d.HandCodec(JOINTS)
     good = codec.encode(command())
@@ -400,8 +401,8 @@ def reseal(data: bytes | bytearray) -> bytes:
     return bytes(data[:-4]) + crc32_words(bytes(data[2:-4])).to_bytes(4, "little")
 
 
-@pytest.mark.parametrize("warm", [False, True])
-@pytest.mark.parametrize(
+@each("warm", [False, True])
+@each(
     ("at", "motor", "sensor"),
     [(26 + 10, 0, None), (26 + 26, 1, None), (506 + 26 + 2, 6, None), (746 + 44 + 5, None, 7)],
 )
@@ -511,7 +512,7 @@ def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
 # --- configuration
 
 
-@pytest.mark.parametrize(
+@each(
     ("motors", "sensors", "what"),
     [
         (((5, 0),), (), "motor at bus 5"),

@@ -33,6 +33,7 @@ from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import PRODUCT, PRODUCT_ID, STATE, VENDOR_ID, HandCodec
+from tests.each import each
 from tests.patience import PATIENCE
 
 OUT_EP, IN_EP = 0x02, 0x81
@@ -262,7 +263,7 @@ def test_endpoint_numbers_and_serial_are_options() -> None:
         assert len(device.read(0x83, STATE.size, 1000)) == STATE.size
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"out_endpoint": 0x82},

@@ -15,6 +15,7 @@ from dexkit.hand import CommandGate, HandSpec, HandState, ImuState, JointMode, S
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import DEX1_1, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 SPECS = {side: DEX1_1.spec(side, io_rate=500.0) for side in Side}
@@ -123,7 +124,7 @@ class TestHgCommand:
         assert command is not None
         assert command.q[0] / 5.4 * 100.0 == pytest.approx(self.specified(q))
 
-    @pytest.mark.parametrize(
+    @each(
         ("q", "percent"),
         [
             (0.1, 0.0),
@@ -146,8 +147,8 @@ class TestHgCommand:
         assert (command.kp[0], command.kd[0]) == (5.0, 0.05)
         assert (command.tau[0], command.dq[0]) == (0.0, 0.0)
 
-    @pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
-    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    @each("field", ["q", "dq", "tau", "kp", "kd"])
+    @each("value", [math.nan, math.inf, -math.inf])
     def test_not_finite_is_rejected_and_not_snapped(self, field: str, value: float) -> None:
         message = hg_cmd(3.0)
         setattr(message.motor_cmd[0], field, value)
@@ -187,9 +188,7 @@ class TestGoState:
         motor = one("unitree_go", fill=Fill.VENDOR).state({LEFT: self.FULL}).states[0]
         assert motor == unitree_go.MotorState_(q=1.5, dq=0.25, tau_est=-0.5)
 
-    @pytest.mark.parametrize(
-        ("celsius", "sent"), [(math.nan, 0), (-12.0, 0), (126.6, 127), (200.0, 127)]
-    )
+    @each(("celsius", "sent"), [(math.nan, 0), (-12.0, 0), (126.6, 127), (200.0, 127)])
     def test_temperature_stays_what_the_sdk_can_pack(self, celsius: float, sent: int) -> None:
         motor = one("unitree_go").state({LEFT: view(temperature=celsius)}).states[0]
         assert motor.temperature == sent

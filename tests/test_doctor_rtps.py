@@ -13,6 +13,7 @@ from dexkit.doctor.observer import Observer
 from dexkit.doctor.rtps import AckNack, Data, DataFrag, Heartbeat, Locator
 from dexkit.errors import WireError
 from tests import doctor_packets as packets
+from tests.each import each
 
 ME = bytes(range(12))
 PLACE = Locator("127.0.0.1", 4711)
@@ -311,7 +312,7 @@ def test_it_sends_nothing_malformed_whatever_it_is_told(
     assert grammar.kinds >= {0x15, 0x0E, 0x06}
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, 0), (5, 3), (5, -9), (-1, -1), (1, 2**63 - 1)])
+@each(("first", "last"), [(0, 0), (5, 3), (5, -9), (-1, -1), (1, 2**63 - 1)])
 def test_a_wrong_heartbeat_is_counted_and_not_answered(first: int, last: int) -> None:
     observer = Observer(ME, PLACE)
     observer.receive(_addressed(packets.CYCLONE_0_10_PARTICIPANT), 0.0)

@@ -6,7 +6,6 @@ import dataclasses
 import io
 from pathlib import Path
 
-import pytest
 from rich.console import Console
 
 from dexkit.doctor import DIAGNOSES, Observations, Severity, Wish, diagnose, readiness, verdict
@@ -26,6 +25,7 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.report import print_report
 from dexkit.doctor.topics import nearly
+from tests.each import each
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
@@ -207,7 +207,7 @@ def test_every_diagnosis_can_be_made() -> None:
     assert set(CASES) == set(DIAGNOSES)
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@each("name", list(CASES))
 def test_a_diagnosis(name: str) -> None:
     # what concerns devices only: that no hand is on DDS is another matter
     found = [f for f in diagnose(CASES[name]) if f.id == name]
@@ -229,7 +229,7 @@ def test_nothing_is_wrong_with_what_is_right() -> None:
     assert _ids(_seen(_pair(nonzero=False))) == set()
 
 
-@pytest.mark.parametrize(
+@each(
     "name",
     [
         *("DDS-NOBODY", "DDS-QOS", "DDS-ONE-SIDE", "DDS-SILENT", "DDS-ALL-ZERO", "DDS-TYPE"),
@@ -284,7 +284,7 @@ def test_a_device_that_is_asked_about_is_not_a_client_that_waits() -> None:
     assert found.severity is Severity.NOTE
 
 
-@pytest.mark.parametrize(
+@each(
     ("topic", "meant"),
     [
         ("dex1/left/state", "rt/dex1/left/state"),
@@ -302,7 +302,7 @@ def test_a_slip_of_the_pen(topic: str, meant: str) -> None:
     assert found[0] == meant
 
 
-@pytest.mark.parametrize(
+@each(
     "topic", ["rt/dex1/left/cmd", "rt/dex5/left/state", "rt/lowstate", "rt/inspire/cmd", "rosout"]
 )
 def test_a_name_of_its_own(topic: str) -> None:

@@ -13,7 +13,7 @@ from tests.each import each
 def test_each_runs_all_cases_and_names_those_that_failed() -> None:
     seen = []
 
-    @each("value, limit", [(1, 2), (5, 2), pytest.param(2, 2), (9, 2)])
+    @each(("value", "limit"), [(1, 2), (5, 2), pytest.param(2, 2), (9, 2)])
     def check(value: int, limit: int) -> None:
         seen.append(value)
         if value == 9:
@@ -30,23 +30,23 @@ def test_each_runs_all_cases_and_names_those_that_failed() -> None:
     assert f"{__file__}:" in text
 
 
-def test_each_leaves_fixtures_and_instances_to_pytest() -> None:
-    class Tests:
+def test_each_leaves_fixtures_and_instances_to_pytest(tmp_path: Path) -> None:
+    class Example:
         @each("value", [1, 2], ids=["one", "two"])
         def check(self, value: int, tmp_path: Path) -> None:
-            assert isinstance(self, Tests)
-            assert tmp_path == Path("x")
+            assert isinstance(self, Example)
+            assert not list(tmp_path.iterdir())
+            (tmp_path / "file").touch()
 
-    assert list(inspect.signature(Tests.check).parameters) == ["self", "tmp_path"]
-    Tests().check(tmp_path=Path("x"))  # type: ignore[call-arg]
+    assert list(inspect.signature(Example.check).parameters) == ["self", "tmp_path"]
+    Example().check(tmp_path=tmp_path)  # type: ignore[call-arg]
 
 
 @each("letter", ["a", "b"])
-@each("number", [1, 2])
-def test_each_can_be_stacked(letter: str, number: int, tmp_path: Path) -> None:
-    path = tmp_path / f"{letter}{number}"
-    assert not path.exists()
-    path.touch()
+@each("number, more", [(1, "x"), (2, "y")])
+def test_each_can_be_stacked(letter: str, number: int, more: str, tmp_path: Path) -> None:
+    assert not list(tmp_path.iterdir())
+    (tmp_path / f"{letter}{number}{more}").touch()
 
 
 def test_each_without_cases_is_an_error() -> None:

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
@@ -22,6 +21,7 @@ from dexkit.processes import Tool
 from dexkit.robots import G1
 from dexkit.wire import low_level
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until
+from tests.each import each
 
 __all__ = ["dds_domain", "dds_node"]
 
@@ -158,7 +158,7 @@ def test_it_ends_by_itself_and_says_what_is_next() -> None:
 
 
 class TestArguments:
-    @pytest.mark.parametrize(
+    @each(
         ("domain", "hands", "text"),
         [
             (1, "dex3", "--arm=G1_29 --ee=dex3 --sim"),

@@ -37,6 +37,7 @@ from dexkit.errors import EmulatorError, UsageError
 from dexkit.processes import command_line
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
+from tests.each import each
 from tests.patience import PATIENCE
 
 PING = dxl.encode(1, Instruction.PING)
@@ -193,7 +194,7 @@ def test_somebody_elses_link_is_left_alone(tmp_path: Path) -> None:
     assert os.readlink(link) == "/dev/null"
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "code", "says"),
     [
         ([], 2, "--link"),
@@ -472,7 +473,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     assert b"Traceback" not in err
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "says"),
     [
         (["--serial", "a", "--serial", "b"], "2 serial numbers for 1 hand"),

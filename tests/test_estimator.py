@@ -16,6 +16,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, JointSpec, Side
 from dexkit.models import DEX1_1
 from dexkit.service.estimator import CORRECTION, STALL_THRESHOLD, JointEstimator, StateEstimator
+from tests.each import each
 
 STROKE = 5.4
 JOINT = JointSpec("gripper", q_min=0.0, q_max=STROKE, dq_max=24.0, tau_max=15.0, closing=-1)
@@ -271,7 +272,7 @@ def test_before_the_first_measurement_there_is_nothing() -> None:
     assert e.predict(1.01) > 0.0  # the command is already known
 
 
-@pytest.mark.parametrize("speed", [(0.0, 1.0), (1.0, -1.0), (math.inf, 1.0), (math.nan, 1.0)])
+@each("speed", [(0.0, 1.0), (1.0, -1.0), (math.inf, 1.0), (math.nan, 1.0)])
 def test_speeds_must_be_positive(speed: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="speeds"):
         JointEstimator(JOINT, speed)

@@ -25,6 +25,7 @@ from dexkit.freshness import (
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import HandCore
+from tests.each import each
 
 EPOCH = 1_795_000_000.0
 STEP = 0.01  # seconds between exchanges
@@ -300,7 +301,7 @@ def test_a_steady_client_is_obeyed_again_after_a_fifth_of_a_second(
     assert all(t < again[0] for t in braked)  # and from then on without a break
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "most"),
     [
         (Source(-3600.0), SETTLE),
@@ -382,7 +383,7 @@ def test_a_network_that_has_become_slow_is_not_obeyed_and_is_again_when_it_is_fa
     assert program.driven[-1][0] > 9.9
 
 
-@pytest.mark.parametrize("size", [-7200.0, -5.0, -0.4, -0.1, 0.1, 0.4, 5.0, 7200.0])
+@each("size", [-7200.0, -5.0, -0.4, -0.1, 0.1, 0.4, 5.0, 7200.0])
 def test_a_client_whose_clock_is_set_goes_on(size: float) -> None:
     program = Program()
     source = Source(12.0, jumps=((2.0, size),))

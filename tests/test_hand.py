@@ -22,6 +22,7 @@ from dexkit.hand import (
     Side,
 )
 from dexkit.models import DEX1_1, DIALECTS, MODELS, dialect, model
+from tests.each import each
 from tests.service_helpers import ScriptedHand
 
 THREE = HandSpec(
@@ -70,8 +71,8 @@ class TestGate:
         c = HandCommand.position([0.5, 1.0, -2.0])
         assert gate.admit(c) is c
 
-    @pytest.mark.parametrize("n", [1, 2, 4])
-    @pytest.mark.parametrize("field", [*FIELDS, "mode"])
+    @each("n", [1, 2, 4])
+    @each("field", [*FIELDS, "mode"])
     def test_a_wrong_shape_is_rejected(self, field: str, n: int) -> None:
         c = HandCommand.position([0.5, 1.0, -2.0])
         object.__setattr__(c, field, np.zeros(n))
@@ -125,7 +126,7 @@ class TestState:
 
 
 class TestSpec:
-    @pytest.mark.parametrize(
+    @each(
         "fields",
         [
             {"q_min": 1.0, "q_max": 1.0},
@@ -140,7 +141,7 @@ class TestSpec:
         with pytest.raises(UsageError, match="joint x"):
             JointSpec("x", **{**good, **fields})  # type: ignore[arg-type]
 
-    @pytest.mark.parametrize("io_rate", [0.0, -1.0, math.inf, math.nan])
+    @each("io_rate", [0.0, -1.0, math.inf, math.nan])
     def test_io_rate_must_be_a_rate(self, io_rate: float) -> None:
         with pytest.raises(UsageError, match="io_rate"):
             DEX1_1.spec(Side.LEFT, io_rate=io_rate)
@@ -166,7 +167,7 @@ class TestModels:
         assert DEX1_1.command_timeout == 1.0
         assert DEX1_1.vendor_ids == {Side.RIGHT: 0, Side.LEFT: 1}
 
-    @pytest.mark.parametrize(
+    @each(
         ("name", "side", "topics", "types"),
         [
             ("unitree_go", Side.LEFT, ("rt/dex1/left/cmd", "rt/dex1/left/state"),

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from dexkit.emulators.joint_mechanics import FixedSteps, Joint, Wall
 from dexkit.errors import UsageError
+from tests.each import each
 
 DT = 1e-3
 
@@ -146,7 +147,7 @@ def test_a_motor_is_a_torque_where_its_gains_are_soft() -> None:
     assert driven.q == pytest.approx(pushed.q)
 
 
-@pytest.mark.parametrize("damping", [0.1, 10.0, 1e4])
+@each("damping", [0.1, 10.0, 1e4])
 def test_stiff_gains_are_stable(damping: float) -> None:
     """Taken explicitly, the stiffest of these would grow by a factor of 50000 a step."""
     joint = Joint(inertia=2e-4, coulomb=0.002, dq=5.0)
@@ -158,7 +159,7 @@ def test_stiff_gains_are_stable(damping: float) -> None:
     assert joint.dq == 0.0
 
 
-@pytest.mark.parametrize("damping", [0.1, 1.0, 10.0])
+@each("damping", [0.1, 1.0, 10.0])
 def test_a_blocked_motor_gives_its_whole_torque(damping: float) -> None:
     joint = Joint(inertia=2e-4, coulomb=0.002, walls=(Wall(0.0, -1, 60.0, 0.1),))
     torque = 0.0

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import pytest
+from tests.each import each
 
 ROOT = Path(__file__).parent.parent
 ROOMS = ("drivers", "emulators", "conformance", "traces")
@@ -55,7 +55,7 @@ def files(folder: str) -> list[Path]:
     return found
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@each("room", ROOMS)
 def test_the_room_is_linked_into_the_package(room: str) -> None:
     link = ROOT / "dexkit" / room
     assert link.is_symlink()
@@ -63,7 +63,7 @@ def test_the_room_is_linked_into_the_package(room: str) -> None:
     assert (link / "__init__.py").is_file()
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@each("room", ROOMS)
 def test_rooms_keep_their_distance(room: str) -> None:
     for path in files(room):
         others = rooms_imported(path) - {room} - MAY_IMPORT[room]
@@ -76,14 +76,14 @@ def test_the_core_imports_no_room() -> None:
             assert not rooms_imported(path), f"{path.relative_to(ROOT)}: {rooms_imported(path)}"
 
 
-@pytest.mark.parametrize("folder", ["dexkit", "tests", "benchmarks", *ROOMS])
+@each("folder", ["dexkit", "tests", "benchmarks", *ROOMS])
 def test_nothing_imports_a_room_by_its_bare_name(folder: str) -> None:
     for path in files(folder):
         bare = {name for name in imported(path) if name.split(".")[0] in ROOMS}
         assert not bare, f"{path.relative_to(ROOT)} imports {', '.join(bare)}: say dexkit.…"
 
 
-@pytest.mark.parametrize("folder", ["dexkit", "benchmarks", *ROOMS])
+@each("folder", ["dexkit", "benchmarks", *ROOMS])
 def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))

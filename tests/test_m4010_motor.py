@@ -32,6 +32,7 @@ from dexkit.wire.m4010 import (
     Status,
     calibration_outcome,
 )
+from tests.each import each
 
 ZEROS = MotorCmd.setpoint(0)
 
@@ -245,7 +246,7 @@ def test_calibration_makes_here_the_zero_once() -> None:
     assert "before since power-up" in calibration_outcome(again)
 
 
-@pytest.mark.parametrize(
+@each(
     ("calibration", "firmware", "faults", "says"),
     [
         (Calibration(0, range=0.0, time=1), Firmware(), (), "range"),
@@ -336,7 +337,7 @@ def test_any_command_keeps_it_finite_and_within_the_stops(
 # --- faults
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "first"),
     [
         ("short", lambda data, frame: data == frame[:20]),
@@ -368,7 +369,7 @@ def test_faults_of_answers(spec: str, first: object) -> None:
         assert rest == frame
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "bit"),
     [
         ("overcurrent:for=20ms", MotorError.OVERCURRENT),
@@ -421,7 +422,7 @@ def test_unplugged_loses_what_was_on_its_way_and_not_the_motor() -> None:
     assert one.q > 2.0  # it went on
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "says"),
     [("stall", "no kind 'stall'"), ("silent:id=2", "not an id"), ("drop:side=left", "no key")],
 )
@@ -500,7 +501,7 @@ def test_faults_from_input_and_the_end_of_it(tmp_path: Path) -> None:
         assert motors.process.wait(60) == 0
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "says"),
     [
         (["--link", "left=a", "--link", "left=b"], "which line"),

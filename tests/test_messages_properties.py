@@ -16,6 +16,7 @@ from dexkit.messages import decode, encode, message_type
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.messages.layout import STRUCTS, Primitive, Struct
+from tests.each import each
 from tests.messages_helpers import NAMES, messages
 
 any_message = st.sampled_from(NAMES).flatmap(lambda name: st.tuples(st.just(name), messages(name)))
@@ -232,7 +233,7 @@ def test_columns_of_nothing() -> None:
     assert columns.ok.shape == (0,)
 
 
-@pytest.mark.parametrize(
+@each(
     "path",
     [
         "",

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from dexkit.clock import ManualClock, RealClock
 from dexkit.errors import UsageError
 from dexkit.traces import Player, TraceMessage, open_trace, sample_path
+from tests.each import each
 from tests.trace_helpers import CMD, STATE, T0, Row, cmd, mcap_bytes, rows, write
 
 RIGHT = "rt/dex1/right/cmd"
@@ -160,8 +161,8 @@ def test_in_real_time_no_message_is_early() -> None:
     assert all(at >= due for at, due in zip(sent, player.offsets, strict=True))
 
 
-@pytest.mark.parametrize("suspended", [False, True], ids=["stopped", "suspended"])
-@pytest.mark.parametrize("at", ["while sending", "in a gap"])
+@each("suspended", [False, True], ids=["stopped", "suspended"])
+@each("at", ["while sending", "in a gap"])
 def test_what_fell_due_in_a_pause_is_not_sent_at_once(
     tmp_path: Path, suspended: bool, at: str
 ) -> None:

@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace, sample_path
+from tests.each import each
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
 
 
@@ -185,7 +186,7 @@ def test_a_full_disk_ends_the_recording_with_an_error(tmp_path: Path) -> None:
         recorder.close()
 
 
-@pytest.mark.parametrize("times", [(-1, 0), (0, -1), (2**64, 0)])
+@each("times", [(-1, 0), (0, -1), (2**64, 0)])
 def test_a_time_that_is_none_is_refused_at_once(tmp_path: Path, times: tuple[int, int]) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
         with pytest.raises(UsageError, match="not times"):

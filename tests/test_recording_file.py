@@ -22,6 +22,7 @@ from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.recording_file import ChunkIndexes
 from tests.dds_helpers import wait_until
+from tests.each import each
 from tests.trace_helpers import STATE, STATE_TYPE, T0, state
 
 
@@ -404,8 +405,8 @@ def overwrite(path: Path, at: int) -> None:
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1_000_000_000))
 
 
-@pytest.mark.parametrize("more", [0, 10])
-@pytest.mark.parametrize(
+@each("more", [0, 10])
+@each(
     "change",
     [
         cut,
@@ -445,7 +446,7 @@ def test_a_new_time_alone_is_no_change(tmp_path: Path) -> None:
 # -- what others have put there --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("content", [None, b"", b"V", b"something else altogether"])
+@each("content", [None, b"", b"V", b"something else altogether"])
 def test_a_link_beside_is_not_followed(tmp_path: Path, content: bytes | None) -> None:
     path, victim = tmp_path / "a.mcap", tmp_path / "victim"
     before = old(path)
@@ -468,7 +469,7 @@ def test_what_is_no_file_beside_is_refused(tmp_path: Path, make: Callable[[Path]
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("content", [b"V", b"short", b"a longer text"])
+@each("content", [b"V", b"short", b"a longer text"])
 def test_a_text_beside_is_kept(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.mcap"
     old(path)

@@ -24,6 +24,7 @@ from dexkit.wire.low_level import (
     struct_of_payload,
     verify_payload,
 )
+from tests.each import each
 from tests.robot_helpers import Bench, low_cmd
 
 both = pytest.mark.parametrize("model", list(ROBOTS.values()), ids=list(ROBOTS))
@@ -442,7 +443,7 @@ def test_remote(model: RobotModel) -> None:
     assert not any(bytes(bench.state().wireless_remote))
 
 
-@pytest.mark.parametrize("text", ["C", "lx=2", "lx=left", "lz=0"])
+@each("text", ["C", "lx=2", "lx=left", "lz=0"])
 def test_no_such_key(text: str) -> None:
     with pytest.raises(UsageError):
         Remote.parse(text)

@@ -19,6 +19,7 @@ from dexkit.messages import unitree_go
 from dexkit.models import dialect
 from tests.cli_helpers import Process, running
 from tests.dds_helpers import dds_domain, dds_node, take_until
+from tests.each import each
 
 __all__ = ["dds_domain", "dds_node"]
 
@@ -201,7 +202,7 @@ class TestEmulatedGripper:
 
 
 class TestArguments:
-    @pytest.mark.parametrize(
+    @each(
         ("arguments", "message"),
         [
             (["nope", "--side", "left"], "no backend 'nope'"),

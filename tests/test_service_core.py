@@ -15,6 +15,7 @@ from dexkit.freshness import PAUSE
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import Backoff, Estimation, HandCore
+from tests.each import each
 
 TIMEOUT = DEX1_1.command_timeout
 LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
@@ -88,8 +89,8 @@ def test_state_goes_on_while_braking() -> None:
     assert (view.state.q[0], view.fault) == (1.7, (0,))
 
 
-@pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@each("field", ["q", "dq", "tau", "kp", "kd"])
+@each("value", [math.nan, math.inf, -math.inf])
 def test_a_rejected_command_leaves_the_last_one_in_force(field: str, value: float) -> None:
     bench = Bench()
     assert bench.command(2.0)
@@ -289,14 +290,14 @@ class TestFailedExchanges:
             assert view is not None
             assert view.fault == (0x80,)
 
-    @pytest.mark.parametrize("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
+    @each("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
     def test_anything_else_is_a_loss(self, error: Exception) -> None:
         assert Bench().core.failed(error)
 
     def test_a_rejection_by_the_hand_is_not(self) -> None:
         assert not Bench().core.failed(CommandRejected("it does not like it"))
 
-    @pytest.mark.parametrize("q", [[math.nan], [math.inf], [0.0, 0.0]])
+    @each("q", [[math.nan], [math.inf], [0.0, 0.0]])
     def test_a_state_that_is_none_is_a_failure(self, q: list[float]) -> None:
         bench = Bench()
         with pytest.raises(HandError, match="backend returned"):

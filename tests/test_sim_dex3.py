@@ -12,6 +12,7 @@ from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
 from dexkit.traces import open_trace, sample_path
+from tests.each import each
 
 KP, KD = DEX3_1.client_gains
 
@@ -167,7 +168,7 @@ def test_settings() -> None:
     assert hand.mechanics.supply_v == 36.0
 
 
-@pytest.mark.parametrize(
+@each(
     "settings",
     [
         {"object": "0"},

@@ -15,6 +15,7 @@ from dexkit.clock import ManualClock
 from dexkit.emulators.sim_hand import SimHand, sim_dex1
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
+from tests.each import each
 
 
 def opened(**options: float) -> tuple[SimHand, ManualClock]:
@@ -195,9 +196,7 @@ def test_only_an_open_hand_exchanges() -> None:
         hand.exchange(HandCommand.brake(1))
 
 
-@pytest.mark.parametrize(
-    "settings", [{"object": "0"}, {"object": "many"}, {"start": "101"}, {"colour": "red"}]
-)
+@each("settings", [{"object": "0"}, {"object": "many"}, {"start": "101"}, {"colour": "red"}])
 def test_bad_settings_are_refused(settings: dict[str, str]) -> None:
     with pytest.raises(UsageError):
         sim_dex1.create(BackendOptions(Side.LEFT, settings=settings))

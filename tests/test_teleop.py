@@ -35,6 +35,7 @@ from dexkit.teleop import (
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
 from dexkit.teleop.wire import ClientWire
 from dexkit.traces import open_trace, sample_path
+from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 GO = DIALECTS["unitree_go"]
@@ -413,7 +414,7 @@ def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
         assert data == payloads[i]
 
 
-@pytest.mark.parametrize("name", list(DIALECTS))
+@each("name", list(DIALECTS))
 def test_positions_come_back_from_the_wire(name: str) -> None:
     from dexkit.conformance.wire import Wire
 
@@ -435,7 +436,7 @@ def test_positions_come_back_from_the_wire(name: str) -> None:
 # ----------------------------------------------------------------------- operators and profiles
 
 
-@pytest.mark.parametrize("chosen", PROFILES, ids=lambda p: f"{p.model}-{p.name}")
+@each("chosen", PROFILES, ids=lambda p: f"{p.model}-{p.name}")
 def test_a_profile_stays_within_the_limits_and_begins_without_input(chosen: object) -> None:
     assert isinstance(chosen, type(PROFILES[0]))
     spoken = MODELS[chosen.model].dialects[0]

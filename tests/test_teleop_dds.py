@@ -115,7 +115,7 @@ def test_somebody_else_at_the_hand_is_refused_unless_forced(dex1: int) -> None:
 
 def test_with_one_hand_it_waits_and_says_for_whom_and_where_to_look() -> None:
     with served("sim-dex1", "left") as domain:
-        result = teleop("steps", "--domain", domain, "--wait", 3.0)
+        result = teleop("steps", "--domain", domain, "--wait", 1.5)
         assert "waiting for state of right ..." in result.stderr
         assert isinstance(result.exception, DexkitError)
         assert result.exception.exit_code == 1

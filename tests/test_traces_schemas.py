@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from dexkit.errors import TraceUnsupported
 from dexkit.messages import message_type, message_types
 from dexkit.traces import open_trace, schemas
+from tests.each import each
 from tests.trace_helpers import CMD, STATE_TYPE, T0, cmd, mcap_bytes, state, write
 
 HAND_STATE = "unitree_hg::msg::dds_::HandState_"
@@ -91,7 +92,7 @@ def ours(name: str) -> schemas.Struct:
     return schemas.parse("omgidl", name, message_type(name).omgidl)
 
 
-@pytest.mark.parametrize("kind", message_types(), ids=lambda k: k.ros_name)
+@each("kind", message_types(), ids=lambda k: k.ros_name)
 def test_both_of_our_texts_say_the_same(kind: object) -> None:
     from dexkit.messages import MessageType
 
@@ -140,7 +141,7 @@ def test_an_old_layout_is_named_and_not_decoded(tmp_path: Path, encoding: str) -
             decode(topic)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "said"),
     [
         (("float pressure[12]", "float pressure[10]"), "pressure has 10 elements, not 12"),
@@ -185,7 +186,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+@each("name", BAD)
 def test_a_bad_schema_is_unsupported(name: str) -> None:
     encoding, text = BAD[name]
     with pytest.raises(TraceUnsupported):

@@ -406,9 +406,9 @@ def _client(case: Inputs, hands: Dex3Hands, stream: bytes) -> None:
 def cases() -> list[SeededCase]:
     """Every fuzzer of this module."""
     return [
-        SeededCase("device.mx64", "two emulated MX-64 on a line", mx64_line, size=8_000),
-        SeededCase("device.m4010", "two emulated M4010 on a line", m4010_line, size=20_000),
-        SeededCase("device.dex3", "the emulated Dex3-1 behind its USB endpoints", dex3, size=2_000),
+        SeededCase("device.mx64", "two emulated MX-64 on a line", mx64_line, size=3_000),
+        SeededCase("device.m4010", "two emulated M4010 on a line", m4010_line, size=2_500),
+        SeededCase("device.dex3", "the emulated Dex3-1 behind its USB endpoints", dex3, size=1_000),
         SeededCase("device.robots", "the emulated H1 and G1", robots, size=1_000),
-        SeededCase("usbip.server", "clients of the USB/IP server", usbip_server, size=4_000),
+        SeededCase("usbip.server", "clients of the USB/IP server", usbip_server, size=2_000),
     ]

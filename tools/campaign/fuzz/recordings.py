@@ -87,7 +87,7 @@ def _recording(
         kind = message_type(name)
         schema = writer.register_schema(kind.layout.ros_name, "ros2msg", kind.ros2msg.encode())
         channel = writer.register_channel(topic, "cdr", schema, {"dds.type": kind.name})
-        for number in range(8):
+        for number in range(4):
             stamp = TIME + number * 10_000_000 + at
             writer.add_message(channel, stamp, kind.encode(filled(name, rng)), stamp, number)
     writer.add_metadata(
