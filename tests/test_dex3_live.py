@@ -143,7 +143,7 @@ def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
         assert "Traceback" not in log
 
 
-def test_an_emulator_with_the_priority_of_a_service() -> None:
+def test_emulator_accepts_realtime_priority() -> None:
     with real_time() as permitted:
         pass
     arguments = ["emulate", "dex3-usb", "--port", "0", "--real-time"]

@@ -137,7 +137,7 @@ def test_the_worked_example(layout: d.CommandLayout, crc: int, digest: str) -> N
     ]  # fmt: skip
 
 
-def test_the_page_is_up_to_date() -> None:
+def test_generated_page_is_up_to_date() -> None:
     text = PAGE.read_text(encoding="utf-8")
     for name in BLOCKS:
         assert f"<!-- made: {name} -->" in text, f"docs/dex3-protocol.md has no block {name}"
@@ -182,7 +182,7 @@ packets = st.one_of(motor_cmds, motor_states, sensor_states)
 
 @settings(deadline=None)
 @given(packets)
-def test_packets_survive(packet: Any) -> None:
+def test_packets_survive_a_round_trip(packet: Any) -> None:
     assert type(packet).parse(packet.pack()) == packet
 
 
@@ -226,7 +226,7 @@ def test_values_that_do_not_fit(packet: Any, what: str) -> None:
         packet.pack()
 
 
-def test_a_wrong_head_is_said() -> None:
+def test_wrong_header_is_reported() -> None:
     with pytest.raises(WireError, match="starts with fc ee, these bytes with fe ee"):
         d.MotorState.parse(d.MotorCmd(0, 0, False, 0, 0, 0, 0, 0).pack() + bytes(6))
 
@@ -273,7 +273,7 @@ def test_a_wrong_crc_is_one_problem_and_says_where() -> None:
 
 @settings(deadline=None)
 @given(st.binary(max_size=60), motor_states, st.binary(max_size=60), sensor_states)
-def test_garbage_hides_nothing(a: bytes, motor: Any, b: bytes, sensor: Any) -> None:
+def test_packets_are_found_between_garbage(a: bytes, motor: Any, b: bytes, sensor: Any) -> None:
     found, problems = d.parse_bus(a + motor.pack() + b + sensor.pack())
     assert found[-1] == sensor
     assert motor in found
@@ -325,7 +325,7 @@ def reseal(data: bytearray) -> bytes:
     return bytes(data)
 
 
-def test_state_frames_survive() -> None:
+def test_state_frames_survive_a_round_trip() -> None:
     frame = a_state()
     data = d.pack_state(frame)
     assert len(data) == 1270
@@ -344,7 +344,7 @@ def test_state_frames_survive() -> None:
     st.binary(min_size=4, max_size=4),
     st.integers(0, 2**32 - 1),
 )
-def test_command_frames_survive(
+def test_command_frames_survive_a_round_trip(
     buses: Any, layout: d.CommandLayout, head: bytes, mode: bytes, reserve: int
 ) -> None:
     frame = d.CommandFrame(buses, head, mode, reserve, layout)
@@ -420,7 +420,9 @@ def test_a_damaged_packet_in_a_good_frame() -> None:
     st.integers(26, 1226),
     st.sampled_from(["state", "1234", "734"]),
 )
-def test_nothing_crashes(noise: bytes, sizes: list[int], at: int, kind: str) -> None:
+def test_any_bytes_parse_or_raise_a_typed_error(
+    noise: bytes, sizes: list[int], at: int, kind: str
+) -> None:
     good = {
         "state": d.pack_state(a_state()),
         "1234": worked_example(d.COMMAND_1234),

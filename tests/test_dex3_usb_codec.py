@@ -71,7 +71,7 @@ def test_figures_of_the_fact_sheet() -> None:
 
 @settings(deadline=None)
 @given(scales, ratios, st.integers(-(2**31), 2**31 - 1))
-def test_counts_survive(scale: d.Scale, ratio: float, count: int) -> None:
+def test_counts_survive_conversion(scale: d.Scale, ratio: float, count: int) -> None:
     count = min(max(count, scale.low), scale.high)
     assert scale.encode(scale.decode(count, ratio), ratio) == count
 
@@ -104,7 +104,7 @@ def test_gains_are_never_negative() -> None:
     assert units.DAMPING.encode(-1e9, 108) == 0
 
 
-def test_no_value() -> None:
+def test_missing_pressure_has_its_own_code() -> None:
     assert d.NO_VALUE == 30000
     assert units.encode_pressure(math.nan) == 30000
     assert units.encode_pressure(240_000.0) == 30001, "a reading that looks like none"
@@ -230,7 +230,7 @@ def test_a_broadcast_commands_a_bus_in_silence() -> None:
     assert not decoded.problems
 
 
-def test_a_command_to_nobody() -> None:
+def test_packet_for_an_unknown_motor_is_reported_and_ignored() -> None:
     stray = d.MotorCmd(9, 1, False, 0, 0, 0, 0, 0)
     own = d.MotorCmd(1, 1, False, 0, 0, 0, 0, 0)
     later = d.MotorCmd(1, 0, False, 0, 0, 0, 0, 0)
@@ -465,7 +465,7 @@ def test_packets_that_are_not_this_hand_s() -> None:
     ]
 
 
-def test_ids_that_changed_places() -> None:
+def test_motors_are_matched_by_id_and_not_by_order() -> None:
     """Same sizes, same heads: only the ids tell that two motors stand the other way round."""
     codec = d.HandCodec(JOINTS)
     data = codec.encode_state(a_state())
@@ -477,7 +477,7 @@ def test_ids_that_changed_places() -> None:
     assert not codec.problems
 
 
-def test_what_a_device_cannot_say() -> None:
+def test_nan_position_cannot_be_encoded_but_missing_sensors_can() -> None:
     codec = d.HandCodec(JOINTS)
     with pytest.raises(EncodeError, match="position"):
         codec.encode_state(a_state(q=np.full(7, math.nan)))
@@ -491,7 +491,7 @@ def test_what_a_device_cannot_say() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(2, 1266), st.booleans())
-def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
+def test_any_bytes_decode_or_raise_a_typed_error(noise: bytes, at: int, sealed: bool) -> None:
     codec = d.HandCodec(JOINTS)
     good = codec.encode_state(a_state())
     codec.decode(good, 0.0)
@@ -522,12 +522,12 @@ def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
         ((), ((0, 15),), "sensor at bus 0, id 15"),
     ],
 )
-def test_bus_maps_that_make_no_sense(motors: Any, sensors: Any, what: str) -> None:
+def test_invalid_bus_maps_are_refused(motors: Any, sensors: Any, what: str) -> None:
     with pytest.raises(UsageError, match=what):
         d.BusMap(motors, sensors)
 
 
-def test_a_map_for_another_hand() -> None:
+def test_bus_map_of_another_hand_is_refused() -> None:
     with pytest.raises(UsageError, match=r"6 joint\(s\), but the bus map has 7"):
         d.HandCodec(JOINTS[:6])
     assert len(d.DEFAULT_BUS_MAP.motors) == 7

@@ -238,7 +238,7 @@ def packets(draw: st.DrawFn) -> Packet:
 
 @given(nasty)
 @settings(deadline=None)
-def test_stuffing_is_undone_and_hides_every_header(body: bytes) -> None:
+def test_byte_stuffing_round_trips_and_leaves_no_header(body: bytes) -> None:
     stuffed = dxl.stuff(body)
     assert dxl.unstuff(stuffed) == body
     assert dxl.HEADER not in stuffed
@@ -296,7 +296,7 @@ def test_good_packet_is_found_behind_garbage(noise: bytes, packet: Packet) -> No
     assert packet in got
 
 
-def test_length_lie_costs_only_itself() -> None:
+def test_wrong_length_loses_only_its_own_packet() -> None:
     good = h(A + "03 00 01 19 4E")
     parser = PacketParser()
     lie = dxl.HEADER + h("01 0A 00")  # claims ten bytes: swallows the good packet's first

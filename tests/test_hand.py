@@ -186,7 +186,7 @@ class TestModels:
         assert d.topics(side) == topics
         assert (d.cmd_type, d.state_type) == types
 
-    def test_the_unknown_is_named_with_the_known(self) -> None:
+    def test_unknown_model_error_lists_the_known_ones(self) -> None:
         with pytest.raises(UsageError) as raised:
             model("dex9")
         assert "dex9" in raised.value.message
@@ -196,6 +196,6 @@ class TestModels:
         assert all(name in raised.value.hint for name in DIALECTS)
 
 
-def test_a_hand_is_anything_with_the_four() -> None:
+def test_object_with_the_four_members_is_a_hand() -> None:
     assert isinstance(ScriptedHand(), Hand)
     assert not isinstance(object(), Hand)

@@ -69,7 +69,7 @@ def test_the_longest_fast_read_is_answered() -> None:
     assert len(answer.params) == 2 + longest  # error (no such range), id, and its place
 
 
-def test_a_mistake_in_one_device_is_told_and_the_line_lives(
+def test_exception_in_one_device_is_logged_and_the_line_goes_on(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     bus = fast_bus()
@@ -91,7 +91,7 @@ def test_a_mistake_in_one_device_is_told_and_the_line_lives(
     assert isinstance(motors.failure, IndexError)
 
 
-def test_the_program_survives_the_packet(tmp_path: Path) -> None:
+def test_emulator_process_survives_an_oversized_fast_read(tmp_path: Path) -> None:
     link = tmp_path / "tty"
     with running("emulate", "mx64", "--link", link, "--fast-reads") as emulator:
         emulator.ready()
@@ -110,7 +110,7 @@ def test_the_program_survives_the_packet(tmp_path: Path) -> None:
         assert code == 0, errors
 
 
-def test_a_flood_waits_for_the_line() -> None:
+def test_flood_is_limited_by_the_line_speed() -> None:
     # at 9600 baud a ping and its answer take 25 ms of line time
     bus = Bus([Servo(1, baudrate=9600)], line_time=True)
     clock = ManualClock()
@@ -144,14 +144,14 @@ def test_answers_that_are_held_back_are_bounded() -> None:
     assert mcu.counters.unread == 200 - 64
 
 
-def test_lines_of_input_that_are_no_fault() -> None:
+def test_invalid_fault_lines_are_refused() -> None:
     for text in ("overheat:id=" + "9" * 5000, "drop:p=nan", "drop@1e400", "stuck:id=²", "\0"):
         with pytest.raises(UsageError) as caught:
             parse_fault(text, MX64_FAULTS)
         assert len(str(caught.value)) < 10000
 
 
-def test_nonsense_on_standard_input_is_told(tmp_path: Path) -> None:
+def test_invalid_standard_input_is_reported(tmp_path: Path) -> None:
     lines = b"overheat:id=" + b"9" * 5000 + b"\n\xff\xfe\n" + b"x" * 100_000 + b"\nfoo\n"
     done = subprocess.run(
         [

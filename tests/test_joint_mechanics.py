@@ -20,7 +20,7 @@ def settle(joint: Joint, torque: float, seconds: float = 2.0, dt: float = DT) ->
         joint.step(torque, dt)
 
 
-def test_free_joint_accelerates_as_newton_says() -> None:
+def test_free_joint_accelerates_by_torque_over_inertia() -> None:
     joint = Joint(inertia=0.01)
     settle(joint, 0.5, 1.0)
     assert joint.dq == pytest.approx(0.5 / 0.01)
@@ -194,7 +194,7 @@ def test_gearing_takes_when_driving_and_helps_when_holding() -> None:
     st.floats(0.0, 2.0),
 )
 @settings(deadline=None)
-def test_no_law_drives_it_through_its_stops(
+def test_no_control_law_passes_the_hard_stops(
     laws: list[tuple[float, float]], driving_loss: float, holding_loss: float
 ) -> None:
     joint = Joint(
@@ -224,7 +224,7 @@ def test_steps_keep_up_with_a_clock_without_drift() -> None:
     assert steps.done == lived == 2600
 
 
-def test_a_long_pause_is_skipped() -> None:
+def test_long_pause_is_not_simulated() -> None:
     steps = FixedSteps(1e-3, most=0.5)
     steps.restart(0.0)
     assert steps.due(3600.0) == 500

@@ -56,7 +56,7 @@ def files(folder: str) -> list[Path]:
 
 
 @each("room", ROOMS)
-def test_the_room_is_linked_into_the_package(room: str) -> None:
+def test_top_level_package_is_linked_into_dexkit(room: str) -> None:
     link = ROOT / "dexkit" / room
     assert link.is_symlink()
     assert os.readlink(link) == f"../{room}"
@@ -64,33 +64,33 @@ def test_the_room_is_linked_into_the_package(room: str) -> None:
 
 
 @each("room", ROOMS)
-def test_rooms_keep_their_distance(room: str) -> None:
+def test_packages_do_not_import_each_other(room: str) -> None:
     for path in files(room):
         others = rooms_imported(path) - {room} - MAY_IMPORT[room]
         assert not others, f"{path.relative_to(ROOT)} imports {', '.join(others)}"
 
 
-def test_the_core_imports_no_room() -> None:
+def test_core_does_not_import_linked_packages() -> None:
     for path in files("dexkit"):
         if ROOT / "dexkit" / "cli" not in path.parents:
             assert not rooms_imported(path), f"{path.relative_to(ROOT)}: {rooms_imported(path)}"
 
 
 @each("folder", ["dexkit", "tests", "benchmarks", *ROOMS])
-def test_nothing_imports_a_room_by_its_bare_name(folder: str) -> None:
+def test_linked_packages_are_imported_through_dexkit(folder: str) -> None:
     for path in files(folder):
         bare = {name for name in imported(path) if name.split(".")[0] in ROOMS}
         assert not bare, f"{path.relative_to(ROOT)} imports {', '.join(bare)}: say dexkit.…"
 
 
 @each("folder", ["dexkit", "benchmarks", *ROOMS])
-def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
+def test_only_the_dds_module_imports_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))
         assert not touches or path == ROOT / "dexkit" / "dds.py", path.relative_to(ROOT)
 
 
-def test_help_imports_no_room_and_no_dds() -> None:
+def test_help_imports_no_linked_package_and_no_dds() -> None:
     """``dexkit --help`` is quick, and works where parts are missing."""
     for path in (ROOT / "dexkit" / "cli" / "__init__.py", ROOT / "dexkit" / "__init__.py"):
         tree = ast.parse(path.read_text())

@@ -146,7 +146,7 @@ def test_values_that_do_not_fit(frame: MotorCmd | MotorData | Calibration, says:
         frame.pack()
 
 
-def test_what_is_no_frame() -> None:
+def test_invalid_frames_are_refused() -> None:
     for kind, frame in ((MotorCmd, MotorCmd(1).pack()), (MotorData, MotorData(1).pack())):
         with pytest.raises(TruncatedError):
             kind.parse(frame[:-1])
@@ -295,7 +295,7 @@ def test_parser_does_not_care_how_bytes_are_cut(sent: list[MotorData], draw: st.
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(frames, max_size=6), st.data())
-def test_a_listener_hears_both_ends_and_all_motors(
+def test_parser_separates_commands_and_data_of_all_motors(
     sent: list[MotorCmd | MotorData], draw: st.DataObject
 ) -> None:
     parser = FrameParser((COMMAND, DATA))

@@ -68,7 +68,7 @@ def test_decoding_gives_back_what_was_encoded(pair: tuple[str, Any]) -> None:
 
 
 @given(any_message)
-def test_big_endian_means_the_same(pair: tuple[str, Any]) -> None:
+def test_big_endian_decodes_to_the_same_message(pair: tuple[str, Any]) -> None:
     name, message = pair
     assert decode(name, _swapped(name, encode(message))) == message
 
@@ -226,7 +226,7 @@ def test_columns_of_equal_length_but_other_shape() -> None:
     ]
 
 
-def test_columns_of_nothing() -> None:
+def test_columns_of_no_samples_are_empty() -> None:
     columns = message_type("unitree_go/msg/MotorStates").columns([])
     assert columns["states[0].q"].shape == (0,)
     assert columns["states[].q"].shape == (0, 0)
@@ -248,7 +248,7 @@ def test_columns_of_nothing() -> None:
         "states[-1].q",
     ],
 )
-def test_column_paths_that_make_no_sense(path: str) -> None:
+def test_invalid_column_paths_are_refused(path: str) -> None:
     columns = message_type("unitree_go/msg/MotorStates").columns(
         [encode(go.MotorStates_([go.MotorState_()]))]
     )

@@ -88,7 +88,7 @@ def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
     assert open_trace(path).message_count == 0
 
 
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="cannot create"):
         Recorder(tmp_path / "no" / "a.mcap").open()
 
@@ -187,7 +187,7 @@ def test_a_full_disk_ends_the_recording_with_an_error(tmp_path: Path) -> None:
 
 
 @each("times", [(-1, 0), (0, -1), (2**64, 0)])
-def test_a_time_that_is_none_is_refused_at_once(tmp_path: Path, times: tuple[int, int]) -> None:
+def test_invalid_time_is_refused(tmp_path: Path, times: tuple[int, int]) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
         with pytest.raises(UsageError, match="not times"):
             recorder.put(CMD, CMD_TYPE, cmd(0.0), *times)
@@ -249,7 +249,7 @@ CHILD = textwrap.dedent(
 
 
 @pytest.mark.realtime
-def test_kill_9_costs_at_most_half_a_second(tmp_path: Path) -> None:
+def test_sigkill_loses_at_most_half_a_second(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True

@@ -213,7 +213,7 @@ def killed(path: Path, messages: int, where: str = "") -> Iterator[None]:
     yield
 
 
-def test_killed_before_the_first_message(tmp_path: Path) -> None:
+def test_kill_before_the_first_message_keeps_the_old_recording(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     before = old(path)
     with killed(path, 0):
@@ -334,7 +334,7 @@ def test_a_full_disk_before_the_first_message_keeps_the_old_one(
     assert os.listdir(tmp_path) == ["a.mcap"]
 
 
-def test_the_device_that_is_always_full() -> None:
+def test_dev_full_is_reported_as_a_full_disk() -> None:
     recorder = Recorder("/dev/full", overwrite=True)
     recorder.open()
     wait_until(lambda: recorder.error)
@@ -431,7 +431,7 @@ def test_a_file_that_another_program_writes_to_is_told(
         recorder.close()
 
 
-def test_a_new_time_alone_is_no_change(tmp_path: Path) -> None:
+def test_changed_modification_time_alone_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path) as recorder:
         put(recorder, 0, 10)
@@ -496,7 +496,7 @@ def test_messages_outside_of_chunks_beside_are_kept(tmp_path: Path) -> None:
     assert part(path).read_bytes() == before
 
 
-def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipe_without_a_reader_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     with pytest.raises(TraceError, match="no program reads it"), Recorder(path, overwrite=True):

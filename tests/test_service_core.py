@@ -118,7 +118,7 @@ def test_commands_outside_the_limits_are_clamped_and_counted() -> None:
 
 
 class TestPauses:
-    def test_it_brakes_until_a_command_that_was_sent_later(self) -> None:
+    def test_after_a_pause_it_brakes_until_a_newer_command(self) -> None:
         bench = Bench()
         bench.command(2.0)
         assert not bench.exchange().is_brake
@@ -154,7 +154,7 @@ class TestPauses:
             bench.core.submit(HandCommand.position(2.0), bench.clock.now() - 2.0)
         assert bench.exchange().is_brake
 
-    def test_the_link_is_not_given_up_for_a_pause(self) -> None:
+    def test_pause_does_not_close_the_link(self) -> None:
         bench = Bench()
         bench.clock.advance(5.0)
         bench.core.paused()
@@ -164,7 +164,7 @@ class TestPauses:
 
 
 class TestLostLink:
-    def test_what_is_published_shows_it(self) -> None:
+    def test_lost_link_is_in_the_published_state(self) -> None:
         bench = Bench()
         assert bench.core.failed(HandLost("unplugged"))
         bench.core.closed()
@@ -178,7 +178,7 @@ class TestLostLink:
         assert view is not None
         assert (view.missed, view.fault) == (2, (LINK,))
 
-    def test_after_it_only_a_new_command_moves(self) -> None:
+    def test_after_a_lost_link_only_a_new_command_moves(self) -> None:
         bench = Bench()
         bench.command(3.0)
         assert not bench.exchange().is_brake
@@ -291,7 +291,7 @@ class TestFailedExchanges:
             assert view.fault == (0x80,)
 
     @each("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
-    def test_anything_else_is_a_loss(self, error: Exception) -> None:
+    def test_other_exceptions_close_the_link(self, error: Exception) -> None:
         assert Bench().core.failed(error)
 
     def test_a_rejection_by_the_hand_is_not(self) -> None:
@@ -319,7 +319,7 @@ class TestPrediction:
         assert not Bench(io_rate=300.0).core.predicting
         assert Bench(io_rate=30.0).core.predicting
 
-    def test_auto_sees_a_link_that_is_slower_than_it_says(self) -> None:
+    def test_auto_prediction_measures_the_link_rate(self) -> None:
         bench = Bench(io_rate=300.0)
         bench.clock.advance(0.1)
         bench.exchange()
@@ -334,7 +334,7 @@ class TestPrediction:
             bench.exchange()
         assert not bench.core.predicting
 
-    def test_off_and_predict_are_what_they_say(self) -> None:
+    def test_off_and_predict_force_the_prediction_mode(self) -> None:
         assert not Bench(io_rate=5.0, estimation=Estimation.OFF).core.predicting
         assert Bench(io_rate=900.0, estimation=Estimation.PREDICT).core.predicting
 
@@ -389,7 +389,7 @@ class TestSoftStart:
         # it has caught up: from now on commands go through as they are
         assert self.drive(bench, 0.0, 0.01) == pytest.approx(540.0)
 
-    def test_and_again_after_a_reconnection(self) -> None:
+    def test_soft_start_repeats_after_a_reconnection(self) -> None:
         bench = Bench(simulated=False)
         self.drive(bench, 2.0, 2.0)
         bench.core.failed(HandLost("x"))
@@ -397,7 +397,7 @@ class TestSoftStart:
         bench.core.opened(bench.spec)
         assert self.drive(bench, 5.0, 0.2) <= 5.4 + 1e-6
 
-    def test_a_simulated_hand_does_not(self) -> None:
+    def test_simulated_hand_has_no_soft_start(self) -> None:
         bench = Bench()
         bench.command(5.4)
         assert bench.exchange().q[0] == 5.4

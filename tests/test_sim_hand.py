@@ -175,7 +175,7 @@ def test_is_deterministic() -> None:
     assert traces[0] == traces[1]
 
 
-def test_a_long_pause_is_not_lived_through() -> None:
+def test_long_pause_is_not_simulated() -> None:
     hand, clock = opened()
     hand.exchange(HandCommand.position(0.0, kp=0.0, kd=0.0, tau=0.1))
     clock.advance(3600.0)

@@ -118,12 +118,12 @@ def flips(tmp_path: Path, data: bytes, step: int) -> list[str]:
     return silent
 
 
-def test_a_flipped_byte_is_told(tmp_path: Path) -> None:
+def test_flipped_byte_is_reported(tmp_path: Path) -> None:
     assert flips(tmp_path, recorded(tmp_path / "a.mcap").read_bytes(), 101) == []
 
 
 @pytest.mark.soak
-def test_each_flipped_byte_is_told(tmp_path: Path) -> None:
+def test_each_flipped_byte_is_reported(tmp_path: Path) -> None:
     assert flips(tmp_path, recorded(tmp_path / "a.mcap").read_bytes(), 1) == []
     assert flips(tmp_path, sample_path("dex1_legacy_v1_1").read_bytes(), 997) == []
 
@@ -163,7 +163,7 @@ def test_the_summary_cannot_rename_a_topic(tmp_path: Path) -> None:
     assert any("channel" in d and "defined twice" in d for d in trace.damage)
 
 
-def test_what_lies_behind_nonsense_is_read(tmp_path: Path) -> None:
+def test_records_after_garbage_are_read(tmp_path: Path) -> None:
     for shape in (Shape(chunk_size=700), Shape(chunked=False)):
         whole = mcap_bytes(rows(), shape, data_crc=True)
         for opcode in (6, 7) if shape.chunked else (5,):
@@ -182,7 +182,7 @@ def test_what_lies_behind_nonsense_is_read(tmp_path: Path) -> None:
                     assert len(wrong) <= (not shape.chunked)
 
 
-def test_a_damaged_beginning_does_not_cost_the_rest(tmp_path: Path) -> None:
+def test_rest_is_read_after_a_damaged_beginning(tmp_path: Path) -> None:
     whole = mcap_bytes(rows(), Shape(CompressionType.ZSTD, chunk_size=700), data_crc=True)
     for at in (0, 7, 8, 9, 16, 18):
         data = bytearray(whole)
@@ -386,7 +386,7 @@ def test_work_grows_with_the_file_and_not_with_its_square(tmp_path: Path) -> Non
         assert large < 6 * small, make.__name__
 
 
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+def test_pipe_is_refused(tmp_path: Path) -> None:
     pipe = tmp_path / "a.mcap"
     os.mkfifo(pipe)
     for path in (pipe, tmp_path, Path("/dev/zero")):

@@ -252,7 +252,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Sh
     assert last == len(expected)
 
 
-def test_a_cut_costs_no_more_than_the_record_it_falls_in(tmp_path: Path) -> None:
+def test_truncation_loses_only_the_cut_record(tmp_path: Path) -> None:
     expected = rows(8)
     data = mcap_bytes(expected, Shape(chunked=False))
     for cut in range(header_end(data), len(data), 3):
@@ -297,7 +297,7 @@ def test_zeros_at_the_end_are_not_messages(tmp_path: Path) -> None:
         st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=9)), min_size=1, max_size=6
     ),
 )
-def test_damage_anywhere_is_an_error_of_ours_or_a_warning(
+def test_damage_is_a_typed_error_or_a_warning(
     tmp_path: Path, shape: Shape, edits: list[tuple[float, bytes]]
 ) -> None:
     data = bytearray(mcap_bytes(rows(30), shape))
@@ -352,7 +352,7 @@ HOSTILE = {
 
 
 @each("name", HOSTILE)
-def test_a_hostile_length_costs_neither_memory_nor_an_exception(tmp_path: Path, name: str) -> None:
+def test_hostile_length_allocates_no_memory_and_raises_nothing(tmp_path: Path, name: str) -> None:
     path = write(tmp_path / "a.mcap", HOSTILE[name])
     tracemalloc.start()
     try:
@@ -524,7 +524,7 @@ def test_one_channel_of_an_unknown_kind_leaves_the_others_usable(tmp_path: Path)
         trace.message_type("/image")
 
 
-def test_two_types_on_one_topic_are_told_and_not_mixed(tmp_path: Path) -> None:
+def test_two_types_on_one_topic_are_reported_and_kept_apart(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     out = io.BytesIO()
