@@ -1,4 +1,4 @@
-"""Backends by name and by path: conflicts, broken plug-ins, what may stand behind a path.
+"""Backends by name and by path: conflicts, broken plug-ins, valid and invalid targets of a path.
 
 Plug-ins are distributions on ``sys.path`` with an ``entry_points.txt``, as pip leaves them.
 """

@@ -1,4 +1,4 @@
-"""The bridge's translation and rules: no DDS, a clock that is told the time."""
+"""The bridge's translation and timing rules, without DDS and on a manual clock."""
 
 from __future__ import annotations
 

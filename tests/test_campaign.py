@@ -1,4 +1,4 @@
-"""The campaign itself: it finds what is planted, keeps it, repeats it, ends when it is told to."""
+"""The campaign finds planted faults, keeps and repeats them, and stops on a signal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every citation can be followed: of the facts in docs/sources, and between the pages of docs."""
+"""Citations of docs/sources and relative links between the docs resolve."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Which topics a recording of DDS subscribes to, and as which type."""
+
 from __future__ import annotations
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``dexkit demo``: from the first line to the last process."""
+"""``dexkit demo``: its result, and its processes after a signal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dexkit serve dex3-usb`` and ``dexkit emulate dex3-usb`` as processes; a client on DDS."""
+"""``dexkit serve dex3-usb`` and ``dexkit emulate dex3-usb`` as processes, with a DDS client."""
 
 from __future__ import annotations
 

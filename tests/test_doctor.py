@@ -1,4 +1,4 @@
-"""Each thing that can be wrong on DDS, made with real participants and looked at.
+"""Faults on DDS, made with real participants, get the doctor's diagnosis.
 
 One look sees all situations, each on a domain of its own.
 """

@@ -1,4 +1,4 @@
-"""Devices and surroundings that are wrong, as real as this machine allows."""
+"""The doctor on real and emulated devices, sysfs, and the environment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor's rules on made-up observations: each diagnosis, and what must not be one."""
+"""The doctor's rules on synthetic observations: each diagnosis, and healthy cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every file that a user gives is read or refused with its name; what is written is whole."""
+"""Files given by a user are read or refused with their name; written files are complete."""
 
 from __future__ import annotations
 

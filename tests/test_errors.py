@@ -1,4 +1,4 @@
-"""The error tree is the one drawn in the docstring, and ordinary except clauses work."""
+"""The tree of errors is the one in the docstring, and each has a message and a hint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be old: pauses, the age of samples, and that nothing stale reaches a hand."""
+"""Pauses and the age of samples: no stale command reaches a hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever a peer announces, discovery goes on: in the node, the recorder and the doctor."""
+"""Discovery goes on after any announcement of a peer: in the node, the recorder, the doctor."""
 
 from __future__ import annotations
 

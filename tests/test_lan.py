@@ -1,4 +1,4 @@
-"""What comes in by a network that was not chosen is never seen, and who was chosen is obeyed.
+"""Packets of a network that was not chosen never reach a program; clients on the chosen one do.
 
 A robot has two networks, net0 with a friend and net1 with a stranger, each a network namespace.
 The robot is set up as badly as can be: it routes packets for 127.0.0.1 from net1, believes any

@@ -1,4 +1,4 @@
-"""The rooms, their links, and who may import whom."""
+"""Links of the top-level packages, and which package may import which."""
 
 from __future__ import annotations
 

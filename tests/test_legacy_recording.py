@@ -1,4 +1,4 @@
-"""The genuine session of xr_teleoperate v1.1 is judged as its bytes say.
+"""Verdicts and figures of the genuine recording of xr_teleoperate v1.1.
 
 The figures are taken here with mcap, struct and numpy alone, not with the kit's decoder.
 """

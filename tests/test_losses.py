@@ -1,4 +1,4 @@
-"""What a recording lacks is counted and told: in the status line, the file and the exit code."""
+"""What a recording lacks is counted and reported in the status line, the file and the exit code."""
 
 from __future__ import annotations
 

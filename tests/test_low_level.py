@@ -1,4 +1,4 @@
-"""The CRC of LowCmd_ and LowState_, against vectors and packers that dexkit did not make."""
+"""The CRC of LowCmd_ and LowState_ against foreign vectors and packers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must hold for every message and for any bytes whatsoever."""
+"""Properties of the codec for every message type and for any bytes."""
 
 from __future__ import annotations
 

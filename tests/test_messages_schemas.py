@@ -1,4 +1,4 @@
-"""The schema texts, read by software that nobody here wrote, and the IDL reader."""
+"""Schema texts read by foreign libraries, and the IDL reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever cannot be written is told with an exit code, and what was there before stays."""
+"""Output that cannot be written is an error with an exit code, and old files stay."""
 
 from __future__ import annotations
 

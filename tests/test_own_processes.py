@@ -1,4 +1,4 @@
-"""The processes that dexkit starts: what they import, when they end, and what they leave."""
+"""Child processes of dexkit: what they import, when they end, what they leave behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""After a pause nothing that was sent before moves: service, drivers, bridge, emulated robots."""
+"""No command from before a pause moves a hand: service, drivers, bridge, emulated robots."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Playback of a recording: times, gaps, loops, pauses."""
+
 from __future__ import annotations
 
 import threading

@@ -1,4 +1,4 @@
-"""The kit's own clients after a pause: nothing that fell due meanwhile goes out at once."""
+"""Clients of the conformance kit send no burst after a pause."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""The recorder: round trip, full queues and disks, kills."""
+
 from __future__ import annotations
 
 import errno

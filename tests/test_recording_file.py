@@ -1,4 +1,4 @@
-"""What is said to be recorded is on the disk, under its name, and nobody else writes there."""
+"""The file of a recorder: its name, its lock, its content after a kill or a full disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Emulated robots on a clock that the tests move."""
+"""Emulated robots on a manual clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The service's threads, with a scripted hand and a DDS node that is not DDS."""
+"""The threads of the service, with a scripted hand and a fake DDS node."""
 
 from __future__ import annotations
 

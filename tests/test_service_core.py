@@ -1,4 +1,4 @@
-"""What the service decides about one hand: watchdog, rejection, faults, what is published."""
+"""Decisions of the service about one hand: watchdog, rejection, faults, published state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking for real-time priority never fails, says truly what came of it, and leaves no trace."""
+"""Real-time priority: the reported result is true, and a refusal changes nothing."""
 
 from __future__ import annotations
 

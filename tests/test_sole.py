@@ -1,4 +1,4 @@
-"""One publisher a topic: who gives way, whatever the delays of discovery."""
+"""One publisher a topic: which one gives way, for any delay of discovery."""
 
 from __future__ import annotations
 

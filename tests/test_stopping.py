@@ -1,4 +1,4 @@
-"""Signals that ask for a stop, at bad moments."""
+"""Signals that ask for a stop, during a wait and repeated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests find the same wherever they run, and say what they cannot try."""
+"""Tests run in a fixed environment and list what this machine lacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The model of Unitree's teleoperation clients, sans-IO: its quirks, and the genuine recordings."""
+"""The model of Unitree's teleoperation clients against their recordings, without I/O."""
 
 from __future__ import annotations
 

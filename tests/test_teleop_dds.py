@@ -1,4 +1,4 @@
-"""``dexkit teleop`` against served hands: starting, waiting, refusing, leaving."""
+"""``dexkit teleop`` with served hands: start, wait, refusal, end."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""``dexkit info``, ``record`` and ``replay``."""
+
 from __future__ import annotations
 
 import json

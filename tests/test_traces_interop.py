@@ -1,4 +1,4 @@
-"""Recordings meet software that nobody here wrote: rosbags, mcap-ros2-support, the mcap library."""
+"""Recordings are read by foreign software: rosbags, mcap-ros2-support, the mcap library."""
 
 from __future__ import annotations
 

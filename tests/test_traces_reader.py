@@ -1,3 +1,5 @@
+"""The reader of recordings: shapes, truncation, selection of topics."""
+
 from __future__ import annotations
 
 import io

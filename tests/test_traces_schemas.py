@@ -1,3 +1,5 @@
+"""Schemas in recordings compared with dexkit's own."""
+
 from __future__ import annotations
 
 from pathlib import Path

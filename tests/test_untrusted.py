@@ -1,4 +1,4 @@
-"""Names and notes from outside reach no terminal and no page raw."""
+"""Names and texts from outside reach neither a terminal nor a page unescaped."""
 
 from __future__ import annotations
 

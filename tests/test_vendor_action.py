@@ -1,4 +1,4 @@
-"""The GitHub Action and the container file, as far as they can be run without either.
+"""The GitHub Action and the container file, as far as they run without GitHub or Docker.
 
 The shell scripts of action.yml are run as a runner would: bash with its flags, the steps' ``env``
 with the inputs put in, GITHUB_OUTPUT and GITHUB_STEP_SUMMARY as files. What is not run: the

@@ -1,4 +1,4 @@
-"""The examples for vendors: the invented Acme gripper, and a service that knows no dexkit."""
+"""The examples for vendors: the made-up Acme gripper, and a service without dexkit."""
 
 from __future__ import annotations
 
