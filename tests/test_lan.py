@@ -532,6 +532,7 @@ _SERVERS = re.compile(r"(TCP|UDP|HTTP)Server$")
 # where something listens, each tested above
 _KNOWN = {
     "dexkit/dds.py": {"Domain", "DomainParticipant"},
+    "dexkit/domains.py": {"bind"},  # reserves a port of DDS and reads nothing from it
     "dexkit/doctor/dds.py": {"bind"},
     "emulators/dex3_mcu/server.py": {"bind", "listen"},
 }

@@ -220,9 +220,9 @@ def test_a_held_command_is_not_written_to_the_m4010() -> None:
         with Dex1Serial(LEFT, settings, clock=clock) as hand:
             hand.exchange(HandCommand.brake(1))
             _refuses(hand, clock, HandCommand.position(5.0))
-            assert motors.motor.robot.mode is JointMode.BRAKE
+            assert motors.motor.mechanics.mode is JointMode.BRAKE
             hand.exchange(HandCommand.position(5.0))
-            assert motors.motor.robot.mode is JointMode.FOC
+            assert motors.motor.mechanics.mode is JointMode.FOC
 
 
 def test_a_held_command_is_not_sent_to_the_dex3() -> None:
