@@ -1,4 +1,4 @@
-"""Backends by name and by path: conflicts, broken plug-ins, what may stand behind a path.
+"""Backends by name and by path: conflicts, broken plug-ins, valid and invalid targets of a path.
 
 Plug-ins are distributions on ``sys.path`` with an ``entry_points.txt``, as pip leaves them.
 """
@@ -57,7 +57,7 @@ backend = Backend(summary="A hand of mine", model="dex1-1", make=lambda o: Scrip
 
 
 class TestByName:
-    def test_the_built_in_ones(self) -> None:
+    def test_built_in_backends_are_listed(self) -> None:
         names = {row.name: row for row in list_backends()}
         assert {
             "dex1-serial",
@@ -73,14 +73,14 @@ class TestByName:
                 assert row.backend.model in MODELS
                 assert row.backend.summary
 
-    def test_a_plug_in(self, plugins: Plugins) -> None:
+    def test_plug_in_is_found_by_its_entry_point(self, plugins: Plugins) -> None:
         plugins.install("my-gripper", {"mine": "my_gripper:backend"}, GOOD, "my_gripper")
         hand = backend("mine").create(LEFT)
         assert hand.spec.side is Side.LEFT
         (row,) = [row for row in list_backends() if row.name == "mine"]
         assert (row.origin, row.target) == ("my-gripper 1.2", "my_gripper:backend")
 
-    def test_a_plug_in_cannot_replace_a_built_in(self, plugins: Plugins) -> None:
+    def test_plug_in_cannot_replace_a_built_in_backend(self, plugins: Plugins) -> None:
         plugins.install("evil-twin", {"sim-dex1": "evil:backend"}, GOOD, "evil")
         with pytest.raises(BackendConflict, match=r"built in.*evil-twin 1\.2") as raised:
             backend("sim-dex1")
@@ -90,13 +90,13 @@ class TestByName:
         assert all(row.backend is None and "evil-twin" in row.error for row in rows)
         assert backend("evil:backend").create(LEFT)  # by its path it is to be had
 
-    def test_two_plug_ins_of_one_name(self, plugins: Plugins) -> None:
+    def test_two_plug_ins_with_one_name_are_refused(self, plugins: Plugins) -> None:
         plugins.install("one", {"grip": "one_mod:backend"}, GOOD, "one_mod")
         plugins.install("two", {"grip": "two_mod:backend"}, GOOD, "two_mod")
         with pytest.raises(BackendConflict, match=r"more than one package: .*one 1\.2"):
             backend("grip")
 
-    def test_an_unknown_name_lists_the_known(self) -> None:
+    def test_unknown_backend_error_lists_the_known_ones(self) -> None:
         with pytest.raises(UnknownBackend) as raised:
             backend("nope")
         assert isinstance(raised.value, LookupError)
@@ -113,7 +113,7 @@ class TestByName:
             ("import sys; sys.modules[__name__] = None; this is no python", "SyntaxError"),
         ],
     )
-    def test_a_broken_one_says_why_and_harms_no_other(
+    def test_broken_plug_in_is_reported_and_others_stay_usable(
         self, plugins: Plugins, code: str, why: str
     ) -> None:
         plugins.install("broken", {"broken": "broken_mod:backend"}, code, "broken_mod")
@@ -188,18 +188,18 @@ class WithPort(ScriptedHand):
 
 
 class TestByPath:
-    def test_a_hand_class(self) -> None:
+    def test_hand_class_is_a_backend(self) -> None:
         kind = backend("tests.service_helpers:ScriptedHand")
         assert kind.create(BackendOptions(Side.RIGHT)).spec.side is Side.RIGHT
         assert kind.summary.startswith("Goes to where it is told")
 
-    def test_a_function(self) -> None:
+    def test_function_is_a_backend(self) -> None:
         kind = backend(f"{__name__}:make_hand")
         assert kind.create(LEFT).spec.side is Side.LEFT
         assert kind.summary == "A hand out of a function."
 
     @pytest.mark.parametrize("name", ["make_nothing", "WithoutClose", "WithoutSpec"])
-    def test_what_makes_no_hand(self, name: str) -> None:
+    def test_object_that_creates_no_hand_is_refused(self, name: str) -> None:
         with pytest.raises(BackendBroken, match="not a Hand"):
             backend(f"{__name__}:{name}").create(LEFT)
 
@@ -214,14 +214,14 @@ class TestByPath:
             ("WithPort", "missing 1 required positional argument: 'port'", "with the side alone"),
         ],
     )
-    def test_a_half_written_hand_is_told_what_is_wrong(
+    def test_incomplete_hand_class_error_names_what_is_missing(
         self, name: str, says: str, hint: str
     ) -> None:
         with pytest.raises(BackendBroken, match=says) as raised:
             backend(f"{__name__}:{name}").create(BackendOptions(Side.RIGHT))
         assert hint in raised.value.hint
 
-    def test_the_model_is_the_hands(self) -> None:
+    def test_model_is_taken_from_the_hand(self) -> None:
         kind = backend("tests.service_helpers:ScriptedHand")
         assert kind.model_of(LEFT) == "dex1-1"
         wrong = replace(kind, model="dex3-1")
@@ -231,11 +231,11 @@ class TestByPath:
     @pytest.mark.parametrize(
         "path", ["no_such_package:x", "tests.service_helpers:nope", "tests.service_helpers:", ":x"]
     )
-    def test_a_path_to_nothing(self, path: str) -> None:
+    def test_path_to_nothing_is_refused(self, path: str) -> None:
         with pytest.raises(BackendBroken, match="cannot load"):
             backend(path)
 
-    def test_the_hint_tells_a_missing_module_from_a_misspelt_name(self) -> None:
+    def test_hint_distinguishes_missing_module_from_misspelt_name(self) -> None:
         with pytest.raises(BackendBroken) as missing:
             backend("no_such_package.hand:Hand")
         assert "installed" in (missing.value.hint or "")
@@ -255,12 +255,12 @@ class TestByPath:
         assert kind.create(LEFT).spec.side is Side.LEFT
         assert sys.path[-1] == str(tmp_path)
 
-    def test_a_hand_that_fails_to_be_made_says_where(self) -> None:
+    def test_exception_in_a_hand_constructor_names_file_and_line(self) -> None:
         with pytest.raises(BackendBroken, match="ValueError: no port") as raised:
             backend(f"{__name__}:make_failure").create(LEFT)
         assert raised.value.hint == f"at {__file__}:{make_failure.__code__.co_firstlineno + 1}"
 
-    def test_something_else(self) -> None:
+    def test_object_that_is_no_backend_is_refused(self) -> None:
         with pytest.raises(BackendBroken, match="is a tuple"):
             backend("tests.test_package:ROOMS")
 
@@ -275,16 +275,16 @@ class TestOptions:
         settings={"speed": "how fast"},
     )
 
-    def test_a_device_that_is_needed(self) -> None:
+    def test_missing_device_option_is_refused(self) -> None:
         with pytest.raises(UsageError) as raised:
             self.KIND.create(LEFT)
         assert raised.value.hint == "give --device PATH"
 
-    def test_an_unknown_setting_is_an_error(self) -> None:
+    def test_unknown_setting_is_refused(self) -> None:
         options = BackendOptions(Side.LEFT, "x", {"sped": "1"})
         with pytest.raises(UsageError, match="no setting 'sped'") as raised:
             self.KIND.create(options)
         assert "speed" in raised.value.hint
 
-    def test_a_known_one_passes(self) -> None:
+    def test_known_setting_is_accepted(self) -> None:
         assert self.KIND.create(BackendOptions(Side.LEFT, "x", {"speed": "1"}))

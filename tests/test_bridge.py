@@ -1,4 +1,4 @@
-"""The bridge's translation and rules: no DDS, a clock that is told the time."""
+"""The bridge's translation and timing rules, without DDS and on a manual clock."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import DEX1_1, Dialect, dialect
 from dexkit.teleop.client import LEAD, StickyFilter
+from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 BOTH = tuple(Side)
@@ -72,20 +73,20 @@ def there_and_back(via: Dialect, kind: str, part: Any) -> Any:
 
 class TestTranslation:
     @given(go_commands, go_states)
-    def test_the_same_types_pass_as_they_are(
+    def test_message_of_the_same_type_is_forwarded_unchanged(
         self, command: unitree_go.MotorCmd_, state: unitree_go.MotorState_
     ) -> None:
         assert there_and_back(ACTUATOR, "cmd", command) == command
         assert there_and_back(ACTUATOR, "state", state) == state
 
     @given(st.floats(0.0625, 5.125, width=32).filter(lambda q: 0.1001 < q * SCALE < 5.9999))
-    def test_a_position_is_the_same_after_there_and_back(self, q: float) -> None:
+    def test_position_survives_conversion_in_both_directions(self, q: float) -> None:
         back = there_and_back(HG, "cmd", unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05))
         assert back.q == near(q)
         assert (back.kp, back.kd) == (near(5.0), near(0.05))
 
     @given(go_commands)
-    def test_a_command_presses_as_hard_on_either_scale(self, go: unitree_go.MotorCmd_) -> None:
+    def test_command_gives_the_same_force_in_either_dialect(self, go: unitree_go.MotorCmd_) -> None:
         """The same displacement of the jaws gives the same torque of the same joint."""
         hg = translator(GO, HG, "cmd")(go).motor_cmd[0]
         displacement = 0.3  # rad of 0 .. 5.4
@@ -112,7 +113,9 @@ class TestTranslation:
         assert (go.dq, go.tau, go.kp, go.kd) == (0.0, 0.0, 5.0, 0.05)
 
     @given(go_states)
-    def test_a_state_keeps_what_both_dialects_can_say(self, go: unitree_go.MotorState_) -> None:
+    def test_state_keeps_the_fields_that_both_dialects_have(
+        self, go: unitree_go.MotorState_
+    ) -> None:
         back = there_and_back(HG, "state", go)
         assert (back.q, back.dq, back.ddq) == (near(go.q), near(go.dq), near(go.ddq))
         assert back.tau_est == -abs(go.tau_est)  # grip strength: what closes
@@ -135,7 +138,7 @@ class TestTranslation:
         assert translator(GO, HG, "state")(go).motor_state[0].vol == 12.0
 
     @given(st.floats(allow_nan=False, allow_infinity=False, width=32))
-    def test_what_is_finite_can_be_sent(self, value: float) -> None:
+    def test_finite_value_stays_finite_after_translation(self, value: float) -> None:
         command = unitree_go.MotorCmd_(q=value, dq=value, tau=value, kp=value, kd=value)
         state = unitree_go.MotorState_(q=value, dq=value, ddq=value, tau_est=value)
         for kind, part in (("cmd", command), ("state", state)):
@@ -220,7 +223,7 @@ def motors(out: list[Outgoing]) -> list[Any]:
 
 @pytest.mark.parametrize(("client", "gripper"), PAIRS, ids=lambda d: d.name)
 class TestEveryPair:
-    def test_each_side_arrives_as_itself(self, client: Dialect, gripper: Dialect) -> None:
+    def test_left_and_right_are_not_exchanged(self, client: Dialect, gripper: Dialect) -> None:
         wire = Wire(client, gripper)
         wire.state(*BOTH, q=0.5)
         assert q_of(client, "state", wire.state(*BOTH, q=1.5)) == {LEFT: 1.5, RIGHT: 3.0}
@@ -228,16 +231,16 @@ class TestEveryPair:
         wire.later(PATIENCE)
         assert q_of(gripper, "cmd", wire.command(*BOTH, q=2.0)) == {LEFT: 2.0, RIGHT: 4.0}
 
-    def test_nothing_is_sent_unless_something_came(self, client: Dialect, gripper: Dialect) -> None:
+    def test_bridge_sends_nothing_without_input(self, client: Dialect, gripper: Dialect) -> None:
         wire = Wire(client, gripper)
         for direction, speak in ((wire.commands, wire.command), (wire.states, wire.state)):
             speak(*BOTH)
             assert direction.due is None
             assert wire.later(5.0) == []
 
-    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-    @pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
-    def test_what_is_not_finite_goes_nowhere(
+    @each("bad", [math.nan, math.inf, -math.inf])
+    @each("field", ["q", "dq", "tau", "kp", "kd"])
+    def test_non_finite_command_is_not_forwarded(
         self, client: Dialect, gripper: Dialect, field: str, bad: float
     ) -> None:
         wire = Wire(client, gripper)
@@ -253,7 +256,7 @@ class TestEveryPair:
             out = wire.commands.receive(client.topics(side)[0], payload, wire.now)
             assert side not in q_of(gripper, "cmd", out)
 
-    def test_junk_is_counted(self, client: Dialect, gripper: Dialect) -> None:
+    def test_undecodable_message_is_counted(self, client: Dialect, gripper: Dialect) -> None:
         wire = Wire(client, gripper)
         topic = client.topics(LEFT)[0]
         assert wire.commands.receive(topic, b"junk", wire.now) == []
@@ -276,7 +279,7 @@ class TestTwoTopicsIntoOneMessage:
         right, left = motors(wire.command(RIGHT, q=2.0))
         assert (left.q, right.q) == (2.0, 4.0)
 
-    def test_one_waits_for_the_other_no_longer_than_the_patience(self) -> None:
+    def test_command_waits_for_the_other_side_no_longer_than_the_limit(self) -> None:
         wire = Wire(GO, ACTUATOR)
         wire.command(*BOTH)
         wire.later(0.005)
@@ -286,7 +289,7 @@ class TestTwoTopicsIntoOneMessage:
         right, left = motors(wire.later(PATIENCE))
         assert (left.q, right.q) == (2.0, 2.0)  # the right's own newest: 2 x 1.0
 
-    def test_a_side_that_is_no_longer_commanded_stays_without_pulling(self) -> None:
+    def test_side_without_commands_gets_no_gain(self) -> None:
         wire = Wire(GO, ACTUATOR)
         wire.state(*BOTH, q=1.25)
         wire.command(*BOTH, kp=5.0, kd=0.05)
@@ -306,13 +309,13 @@ class TestTwoTopicsIntoOneMessage:
         right, _ = motors(wire.command(RIGHT, q=0.5, kp=5.0) or wire.later(PATIENCE))
         assert (right.q, right.kp) == (1.0, 5.0)
 
-    def test_without_a_position_of_the_other_nothing_is_sent(self) -> None:
+    def test_command_is_not_sent_while_the_other_position_is_unknown(self) -> None:
         wire = Wire(GO, ACTUATOR)
         assert wire.command(LEFT) + wire.later(PATIENCE) == []
         assert wire.commands.counts.held == 1
         assert len(wire.command(RIGHT)) == 1  # both are commanded now: none needed
 
-    def test_nan_does_not_refresh(self) -> None:
+    def test_nan_does_not_reset_the_age_of_a_command(self) -> None:
         wire = Wire(GO, ACTUATOR)
         wire.state(*BOTH)
         wire.command(*BOTH, kp=5.0)
@@ -332,12 +335,12 @@ class TestTwoTopicsIntoOneMessage:
         assert (left.q, right.q) == (1.0, 2.0)
         assert wire.states.missing() == []
 
-    def test_of_one_gripper_the_other_place_is_blank(self) -> None:
+    def test_state_of_an_absent_gripper_is_the_default(self) -> None:
         wire = Wire(ACTUATOR, GO, (RIGHT,))
         right, left = motors(wire.state(RIGHT))
         assert (right.q, left) == (2.0, unitree_go.MotorState_())
 
-    def test_a_gripper_that_falls_silent_is_marked(self) -> None:
+    def test_silent_gripper_is_marked_as_lost(self) -> None:
         wire = Wire(ACTUATOR, GO)
         wire.state(*BOTH, dq=0.25)
         before = motors(wire.state(*BOTH, dq=0.25))[0]
@@ -359,7 +362,7 @@ class TestTwoTopicsIntoOneMessage:
         assert (motors(out)[0].q, motors(out)[0].lost) == (5.0, 0)  # it is back
         assert wire.states.silent(wire.now) == []
 
-    def test_when_both_are_silent_so_is_the_bridge(self) -> None:
+    def test_bridge_publishes_no_state_while_both_grippers_are_silent(self) -> None:
         wire = Wire(ACTUATOR, GO)
         wire.state(*BOTH)
         wire.later(PATIENCE)
@@ -367,7 +370,9 @@ class TestTwoTopicsIntoOneMessage:
         assert wire.states.due is None
 
     @given(st.lists(st.tuples(st.sampled_from(BOTH), st.floats(0.0, 0.004)), max_size=60))
-    def test_the_newest_goes_out_once_and_in_time(self, arrivals: list[tuple[Side, float]]) -> None:
+    def test_newest_command_is_sent_once_and_in_time(
+        self, arrivals: list[tuple[Side, float]]
+    ) -> None:
         """Whatever order states come in: no message without cause, none later than the patience."""
         wire = Wire(ACTUATOR, GO)
         wire.state(*BOTH)
@@ -402,17 +407,17 @@ class TestReachable:
         return 0.0 if q <= 0.1 else 2 * math.pi if q >= 6.0 else q
 
     @given(st.floats(0.0, 2 * math.pi), st.none() | st.floats(0.0, 2 * math.pi))
-    def test_it_goes_to_the_nearest_that_there_is(self, q: float, position: float | None) -> None:
+    def test_command_goes_to_the_nearest_reachable_position(
+        self, q: float, position: float | None
+    ) -> None:
         sent = Reachable()(q, position, 0.0)
         assert self.goes_to(sent) == pytest.approx(sent)
         reach = (0.0, 2 * math.pi, min(max(q, 0.101), 5.999))
         assert abs(sent - q) == pytest.approx(min(abs(r - q) for r in reach))
 
-    @pytest.mark.parametrize("speed", [1.5, 6.5, 24.0])
-    @pytest.mark.parametrize(
-        ("start", "goal"), [(0.0, 5.4), (5.4, 0.0), (5.412, 0.0), (2.7, 5.4), (5.4, 3.0)]
-    )
-    def test_the_teleoperation_client_gets_through(
+    @each("speed", [1.5, 6.5, 24.0])
+    @each(("start", "goal"), [(0.0, 5.4), (5.4, 0.0), (5.412, 0.0), (2.7, 5.4), (5.4, 3.0)])
+    def test_commands_of_the_teleoperation_client_reach_the_goal(
         self, start: float, goal: float, speed: float
     ) -> None:
         reach, smooth, position = Reachable(), StickyFilter(), start * SCALE
@@ -430,7 +435,7 @@ class TestReachable:
         assert max(places[1000:]) - min(places[1000:]) < 1e-6  # it rests there
 
     @given(st.floats(0.0, 2 * math.pi), st.floats(0.0, 2 * math.pi))
-    def test_a_standing_command_leaves_the_gripper_at_rest(self, q: float, position: float) -> None:
+    def test_constant_command_leaves_the_gripper_at_rest(self, q: float, position: float) -> None:
         reach, places = Reachable(), set()
         for step in range(400):
             position = self.goes_to(reach(q, position, 0.005 * step))
@@ -443,7 +448,7 @@ class TestToTheSpecification:
     """unitree_hg knows no gains."""
 
     @pytest.mark.parametrize("kp", [0.0, -5.0])
-    def test_a_command_that_does_not_pull_leaves_the_gripper_where_it_is(self, kp: float) -> None:
+    def test_command_without_positive_gain_does_not_move_the_gripper(self, kp: float) -> None:
         wire = Wire(GO, HG)
         assert wire.command(LEFT, q=0.0, kp=kp) == []  # where is it?
         wire.state(LEFT, q=2.5)
@@ -452,7 +457,7 @@ class TestToTheSpecification:
         assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=kp, dq=1.0)) == {LEFT: 2.0}
         assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=5.0)) == {LEFT: 0.0}
 
-    def test_its_own_clients_send_none(self) -> None:
+    def test_commands_of_the_specification_reach_both_sides(self) -> None:
         for target in (GO, ACTUATOR):
             wire = Wire(HG, target)
             out = wire.command(*BOTH, q=1.0)
@@ -462,14 +467,14 @@ class TestToTheSpecification:
 class TestOneMessageIntoTwoTopics:
     """From unitree_actuator."""
 
-    def test_a_gripper_that_is_not_there_is_not_invented(self) -> None:
+    def test_no_state_is_published_for_an_absent_gripper(self) -> None:
         wire = Wire(GO, ACTUATOR)
         assert set(q_of(GO, "state", wire.state(LEFT))) == {LEFT}
         assert wire.states.counts.blank == 1
         # it may be commanded all the same: nobody is there to obey
         assert len(wire.command(LEFT) + wire.later(PATIENCE)) == 1
 
-    def test_a_gripper_at_0_that_was_elsewhere_is_there(self) -> None:
+    def test_gripper_at_zero_is_present_after_another_position(self) -> None:
         wire = Wire(GO, ACTUATOR)
         wire.state(*BOTH)
         assert q_of(GO, "state", wire.state(*BOTH, q=0.0)) == {LEFT: 0.0, RIGHT: 0.0}
@@ -491,7 +496,7 @@ class TestOneMessageIntoTwoTopics:
         assert q_of(GO, "cmd", out) == {RIGHT: 1.0}
         assert wire.commands.counts.short == 1
 
-    def test_a_longer_message_is_cut(self) -> None:
+    def test_additional_motors_of_a_message_are_ignored(self) -> None:
         wire = Wire(ACTUATOR, GO)
         payload = message_type(ACTUATOR.cmd_type).encode(
             unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q) for q in (1.0, 2.0, 3.0)])

@@ -154,7 +154,7 @@ def test_other_publishers_are_refused(dds_domain: int, dds_node: DdsNode) -> Non
             pass
 
 
-def test_a_bridge_back_is_refused_and_ends_the_other(dds_domain: int) -> None:
+def test_bridge_in_the_opposite_direction_is_refused_and_ends_the_first(dds_domain: int) -> None:
     with bridging(ACTUATOR, GO, "--domain", dds_domain) as bridge, DdsNode(dds_domain) as node:
         bridge.ready()
         back = End(node, GO), End(node, ACTUATOR)
@@ -166,7 +166,7 @@ def test_a_bridge_back_is_refused_and_ends_the_other(dds_domain: int) -> None:
         assert "answer each other" in log
 
 
-def test_a_refusal_is_an_exit_code(dds_domain: int, dds_node: DdsNode) -> None:
+def test_refused_bridge_has_an_error_exit_code(dds_domain: int, dds_node: DdsNode) -> None:
     arguments = ("bridge", "--from", "unitree_go", "--to", "unitree_actuator")
     with dds_node.writer(GO.topics(LEFT)[1], GO.state_type):
         code, _, log = Process(*arguments, "--domain", dds_domain).end()
@@ -191,7 +191,7 @@ def test_both_types_of_one_topic_on_one_domain(dds_domain: int, dds_node: DdsNod
         assert bridge.end(signal.SIGTERM)[0] == 0
 
 
-def test_it_ends_by_itself(dds_domain: int) -> None:
+def test_bridge_ends_after_its_duration(dds_domain: int) -> None:
     with bridging(GO, ACTUATOR, "--domain", dds_domain, "--duration", 0.1) as bridge:
         bridge.ready()
         code, _, log = bridge.end()
@@ -199,7 +199,7 @@ def test_it_ends_by_itself(dds_domain: int) -> None:
     assert counters(log)["states"]["sent"] == 0
 
 
-def test_ends_that_make_no_sense(dds_node: DdsNode) -> None:
+def test_bridge_between_equal_ends_is_refused(dds_node: DdsNode) -> None:
     with pytest.raises(UsageError, match="would answer itself"):
         Bridge(End(dds_node, GO), End(dds_node, GO))
     with pytest.raises(UsageError, match="of a dex3-1"):
@@ -208,7 +208,7 @@ def test_ends_that_make_no_sense(dds_node: DdsNode) -> None:
         Bridge(*(End(dds_node, dialect("dex3")),) * 2)
 
 
-def test_a_bridge_in_a_program(dds_node: DdsNode) -> None:
+def test_bridge_can_be_used_from_python(dds_node: DdsNode) -> None:
     client, gripper = End(dds_node, ACTUATOR), End(dds_node, GO)
     with Bridge(client, gripper, sides=[RIGHT]) as bridge:
         assert (bridge.clients, bridge.grippers) == (0, 0)

@@ -1,4 +1,4 @@
-"""The campaign itself: it finds what is planted, keeps it, repeats it, ends when it is told to."""
+"""The campaign finds planted faults, keeps and repeats them, and stops on a signal."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def result(out: Path) -> dict[str, Any]:
     return content
 
 
-def test_it_finds_what_is_planted_and_repeats_it(tmp_path: Path) -> None:
+def test_campaign_finds_planted_faults_and_repeats_them(tmp_path: Path) -> None:
     options = ("--sample", "--jobs", "2", "--minutes", "10")
     code, output, errors = run(tmp_path, [*PLANTED, "CLEAN", "Skipped"], *options)
     assert code == 1, errors
@@ -84,7 +84,7 @@ def test_it_finds_what_is_planted_and_repeats_it(tmp_path: Path) -> None:
         assert "again" in again.stdout
 
 
-def test_it_goes_on_where_it_ended_and_fails_by_itself_with_another_code(tmp_path: Path) -> None:
+def test_campaign_resumes_and_has_its_own_exit_code_for_its_own_failure(tmp_path: Path) -> None:
     two = ("--batches", "2", "--jobs", "1")
     code, _, errors = run(tmp_path, ["CLEAN"], *two, "--seed", "7")
     assert code == 0, errors
@@ -101,7 +101,7 @@ def test_it_goes_on_where_it_ended_and_fails_by_itself_with_another_code(tmp_pat
     assert "--fresh" in errors
 
 
-def test_ctrl_c_prints_the_table_and_leaves_nothing(tmp_path: Path) -> None:
+def test_sigint_prints_the_table_and_leaves_no_process_or_file(tmp_path: Path) -> None:
     process = start(tmp_path, ["Slow"], "--minutes", "5", "--jobs", "1")
     try:
         log = tmp_path / "workers.log"
@@ -160,7 +160,7 @@ def test_a_traceback_is_seen_in_a_log_and_a_message_is_not() -> None:
     assert traceback_in("error: no such file\n  give another\n") is None
 
 
-def test_what_grows_is_told_from_what_does_not() -> None:
+def test_growth_of_memory_and_descriptors_is_distinguished_from_noise() -> None:
     steady, leaky, files = (Watched(name, 0) for name in ("steady", "leaky", "files"))
     for number in range(360):
         for one, memory, descriptors in (

@@ -22,14 +22,14 @@ def check(*arguments: object) -> int:
 
 
 @pytest.mark.parametrize("name", ["dex1_pick_place", "dex1_idle_then_startle", "dex1_legacy_v1_1"])
-def test_good_recordings_pass(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_good_recording_passes(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path(name)) == 0
     out = capsys.readouterr().out
     assert "PASS: every MUST that could be judged is met" in out
     assert "(-v says why)" in out
 
 
-def test_the_dropout_fails_and_is_explained(
+def test_recording_with_a_dropout_fails_with_an_explanation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = [tmp_path / name for name in ("r.json", "r.xml", "r.html")]
@@ -65,14 +65,14 @@ def test_a_dialect_that_is_not_in_the_recording(capsys: pytest.CaptureFixture[st
     assert "rt/dex3/left/state" in capsys.readouterr().err
 
 
-def test_what_is_no_recording_is_not_usable(tmp_path: Path) -> None:
+def test_file_that_is_no_recording_has_exit_code_2(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(b"not a recording")
     assert check(path) == 2
     assert check(tmp_path / "missing.mcap") == 2
 
 
-def test_nothing_judged_is_not_a_pass(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_without_a_verdict_does_not_pass(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-MOVE") == 2
     assert "nothing was judged, which is not a pass" in capsys.readouterr().err
 
@@ -117,13 +117,13 @@ def test_claims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "about a dex3-1" in capsys.readouterr().err
 
 
-def test_verbose_says_what_was_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbose_lists_requirements_without_a_verdict(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path("dex1_pick_place"), "-v") == 0
     out = capsys.readouterr().out
     assert "DEX1-WDOG-01 left and right: needs the stimulus 'silence'" in " ".join(out.split())
 
 
-def test_a_result_file_that_cannot_be_written_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unwritable_result_file_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     name = "/no/such/directory/r.json"
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--json", name) == 2
     assert f"error: cannot write {name}: No such file or directory" in capsys.readouterr().err
@@ -139,7 +139,7 @@ _UNUSED = (
 
 
 @pytest.mark.parametrize("name", ["dex1_pick_place", "dex3_pinch"])
-def test_a_check_loads_no_more_than_it_needs(name: str) -> None:
+def test_check_imports_no_unneeded_modules(name: str) -> None:
     code = (
         "import sys\nfrom dexkit.cli import main\ntry:\n    main()\nexcept SystemExit as end:\n"
         f"    print('loaded', end.code, [m for m in {_UNUSED!r} if m in sys.modules])"

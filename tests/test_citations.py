@@ -1,4 +1,4 @@
-"""Every citation can be followed: of the facts in docs/sources, and between the pages of docs."""
+"""Citations of docs/sources and relative links between the docs resolve."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
 
-import pytest
-
 from dexkit.conformance.requirements import catalogue
+from tests.each import each
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "docs" / "sources"
@@ -72,7 +71,7 @@ def places(pattern: re.Pattern[str], text: str) -> Iterator[tuple[int, re.Match[
         yield text.count("\n", 0, match.start()) + 1, match
 
 
-def test_every_citation_leads_to_a_section() -> None:
+def test_every_citation_resolves_to_a_section() -> None:
     seen, lost = 0, []
     for name, text in texts().items():
         for line, match in places(CITATION, text):
@@ -83,7 +82,7 @@ def test_every_citation_leads_to_a_section() -> None:
     assert seen > 300
 
 
-def test_nothing_is_cited_that_only_the_authors_can_read() -> None:
+def test_no_citation_names_an_internal_document() -> None:
     found = []
     for name, text in texts().items():
         if name.startswith("docs/sources/") or not name.endswith(PROSE):
@@ -94,7 +93,7 @@ def test_nothing_is_cited_that_only_the_authors_can_read() -> None:
     assert not found, "\n".join(found)
 
 
-def test_every_link_of_the_pages_leads_somewhere() -> None:
+def test_every_relative_link_resolves() -> None:
     lost = []
     for name, text in texts().items():
         if not name.endswith(".md"):
@@ -111,7 +110,7 @@ def test_every_link_of_the_pages_leads_somewhere() -> None:
     assert not lost, "\n".join(lost)
 
 
-def test_anchors_are_given_once() -> None:
+def test_anchors_are_unique() -> None:
     for path in SOURCES.glob("*.md"):
         ids = re.findall(r'<a id="([^"]+)"', path.read_text(encoding="utf-8"))
         assert len(ids) == len(set(ids)), path.name
@@ -125,13 +124,13 @@ def test_the_list_of_sections_is_complete() -> None:
             assert f"]({path.name}#{anchor})" in listed
 
 
-def test_every_source_of_the_catalogue_has_words() -> None:
+def test_every_source_of_the_catalogue_has_text() -> None:
     """A citation alone means nothing to a vendor: who says so stands beside it."""
     for requirement in catalogue(None, None):
         assert re.search(r"[A-Za-z]{3,}", CITATION.sub("", requirement.source)), requirement.id
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "(facts/unitree-dex B.1)", "facts/mx64 D2", "# F A.5", "seed 002", "(facts G)", "(D5)",
@@ -142,10 +141,10 @@ def test_internal_names_are_found(text: str) -> None:
     assert INTERNAL.search(text)
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["docs/sources/unitree-dex.md#b1", "[B.1](sources/unitree-dex.md#b1)", "FE 0D 1F [D 2]"[:8],
      "the facts are these", "--seed 7", "F 2.5"],
 )  # fmt: skip
-def test_other_words_are_not(text: str) -> None:
+def test_other_names_are_not_reported_as_internal(text: str) -> None:
     assert not INTERNAL.search(text)

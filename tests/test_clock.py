@@ -10,21 +10,22 @@ from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, Rate, RealClock
 from dexkit.errors import UsageError
+from tests.each import each
 
 
 class TestManualClock:
-    def test_it_moves_when_told(self) -> None:
+    def test_manual_clock_advances_only_on_request(self) -> None:
         clock = ManualClock(10.0)
         assert clock.advance(0.5) == clock.now() == 10.5
 
-    def test_sleeping_is_jumping_and_never_back(self) -> None:
+    def test_sleep_on_a_manual_clock_advances_it(self) -> None:
         clock = ManualClock(10.0)
         clock.sleep_until(12.0)
         assert clock.now() == 12.0
         clock.sleep_until(11.0)
         assert clock.now() == 12.0
 
-    def test_time_does_not_go_back(self) -> None:
+    def test_manual_clock_refuses_negative_steps(self) -> None:
         with pytest.raises(UsageError, match="cannot go back"):
             ManualClock().advance(-1.0)
 
@@ -41,7 +42,7 @@ class TestRate:
         assert (rate.misses, rate.loops) == (0, len(work))
 
     @given(st.lists(st.floats(0.0, 0.1), min_size=1, max_size=100))
-    def test_deadlines_stay_on_the_grid_whatever_happens(self, work: list[float]) -> None:
+    def test_deadlines_stay_on_the_grid_for_any_delays(self, work: list[float]) -> None:
         clock = ManualClock()
         rate = Rate(100.0, clock)
         last = 0.0
@@ -68,7 +69,7 @@ class TestRate:
         assert clock.now() == pytest.approx(0.07)
         assert rate.misses == 4
 
-    def test_an_hour_adds_no_error(self) -> None:
+    def test_rate_accumulates_no_error_in_an_hour(self) -> None:
         clock = ManualClock()
         rate = Rate(500.0, clock)
         for _ in range(500 * 60):
@@ -89,18 +90,18 @@ class TestRate:
         rate.wait()
         assert clock.now() == pytest.approx(0.01)
 
-    @pytest.mark.parametrize("hz", [0.0, -5.0, float("inf"), float("nan")])
+    @each("hz", [0.0, -5.0, float("inf"), float("nan")])
     def test_a_rate_is_positive(self, hz: float) -> None:
         with pytest.raises(UsageError, match="positive"):
             Rate(hz)
 
-    def test_spin_is_not_negative(self) -> None:
+    def test_spin_time_must_not_be_negative(self) -> None:
         with pytest.raises(UsageError, match="spin"):
             Rate(1.0, spin=-0.1)
 
 
 @pytest.mark.realtime
-def test_the_real_clock_is_the_systems_monotonic_one() -> None:
+def test_real_clock_is_the_monotonic_clock() -> None:
     clock = RealClock()
     before, now, start = time.monotonic(), clock.now(), time.monotonic()
     assert before <= now <= start

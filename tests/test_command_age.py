@@ -1,4 +1,4 @@
-"""What may be old: pauses, the age of samples, and that nothing stale reaches a hand."""
+"""Pauses and the age of samples: no stale command reaches a hand."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from dexkit.errors import HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import HandCore
+from tests.each import each
 
 EPOCH = 1_795_000_000.0
 STEP = 0.01  # seconds between exchanges
@@ -32,7 +33,7 @@ STARVED = 0.8  # seconds that CycloneDDS's own thread may stay behind after a pa
 
 
 class TestPauseWatch:
-    def test_what_is_in_time_is_no_pause(self) -> None:
+    def test_interval_below_the_limit_is_no_pause(self) -> None:
         clock = ManualClock()
         watch = PauseWatch(clock)
         clock.advance(10.0)  # before the first look
@@ -41,7 +42,7 @@ class TestPauseWatch:
             clock.advance(PAUSE)
 
     @pytest.mark.parametrize("suspended", [False, True], ids=["stopped", "suspended"])
-    def test_a_pause_is_found_once(self, suspended: bool) -> None:
+    def test_pause_is_reported_once(self, suspended: bool) -> None:
         clock = ManualClock()
         watch = PauseWatch(clock)
         watch.measure_pause()
@@ -49,7 +50,7 @@ class TestPauseWatch:
         assert watch.measure_pause() == 3.0
         assert watch.measure_pause() == 0.0
 
-    def test_being_away_on_purpose_is_no_pause(self) -> None:
+    def test_restarted_watch_reports_no_pause(self) -> None:
         clock = ManualClock()
         watch = PauseWatch(clock)
         watch.measure_pause()
@@ -300,7 +301,7 @@ def test_a_steady_client_is_obeyed_again_after_a_fifth_of_a_second(
     assert all(t < again[0] for t in braked)  # and from then on without a break
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "most"),
     [
         (Source(-3600.0), SETTLE),
@@ -382,7 +383,7 @@ def test_a_network_that_has_become_slow_is_not_obeyed_and_is_again_when_it_is_fa
     assert program.driven[-1][0] > 9.9
 
 
-@pytest.mark.parametrize("size", [-7200.0, -5.0, -0.4, -0.1, 0.1, 0.4, 5.0, 7200.0])
+@each("size", [-7200.0, -5.0, -0.4, -0.1, 0.1, 0.4, 5.0, 7200.0])
 def test_a_client_whose_clock_is_set_goes_on(size: float) -> None:
     program = Program()
     source = Source(12.0, jumps=((2.0, size),))
@@ -393,7 +394,7 @@ def test_a_client_whose_clock_is_set_goes_on(size: float) -> None:
     assert not [t for t in program.braked if t > 0.6]
 
 
-def test_a_clock_that_jumps_again_and_again_makes_no_client_deaf() -> None:
+def test_client_with_a_jumping_clock_is_obeyed_again() -> None:
     jumps = tuple((1.0 + i * 0.05, 3.0 if i % 2 else -3.0) for i in range(100))
     program = Program()
     program.run(stream(1, Source(jumps=jumps), every(0.01, 0.2, 6.0), lambda i: 0.001), 6.0)
@@ -401,7 +402,7 @@ def test_a_clock_that_jumps_again_and_again_makes_no_client_deaf() -> None:
 
 
 @pytest.mark.parametrize("drift", [-0.5, 3.0], ids=["slow", "fast"])
-def test_a_clock_of_another_pace_makes_no_client_deaf(drift: float) -> None:
+def test_client_with_a_drifting_clock_is_obeyed(drift: float) -> None:
     """Timestamps in other units, say: obeyed at least after a time that no network lags."""
     program = Program()
     program.run(stream(1, Source(drift=drift), every(0.1, 0.5, 40.0), lambda i: 0.001), 40.0)
@@ -440,7 +441,7 @@ class TestLongSilence:
         assert ages[:3] == [math.inf] * 3
         assert [math.isfinite(age) for age in ages[3:]].index(True) in (20, 21)  # 0.2 s
 
-    def test_nor_is_it_deaf_for_ever_to_a_clock_that_was_set_meanwhile(self) -> None:
+    def test_client_with_a_changed_clock_is_obeyed_again(self) -> None:
         source = Source(9.0, jumps=((1800.0, -10.0),))
         ages = self.ages(source, every(0.01, 3600.0, 3601.0), {})
         assert ages[0] == math.inf

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from dexkit.errors import EncodeError
 from dexkit.wire.crc32 import crc32_swapped, crc32_words
+from tests.each import each
 
 # docs/sources/unitree-dex.md#c8; the last four are all-zero LowCmd_/LowState_ images, go and hg
 # (docs/sources/unitree-dex.md#a7)
@@ -41,7 +42,7 @@ def bitwise(data: bytes) -> int:
     return crc
 
 
-@pytest.mark.parametrize(("data", "crc"), VECTORS)
+@each(("data", "crc"), VECTORS)
 def test_vectors(data: bytes, crc: int) -> None:
     assert crc32_words(data) == crc
     assert bitwise(data) == crc
@@ -64,7 +65,7 @@ def test_swapped_words(data: bytes) -> None:
     assert crc32_swapped(swapped) == crc32_words(data)
 
 
-@pytest.mark.parametrize("length", [1, 2, 3, 5, 1270])
+@each("length", [1, 2, 3, 5, 1270])
 def test_only_whole_words(length: int) -> None:
     with pytest.raises(EncodeError, match="whole 32-bit words"):
         crc32_words(bytes(length))

@@ -24,7 +24,7 @@ CMDS = "unitree_go::msg::dds_::MotorCmds_"
 STATES = "unitree_go::msg::dds_::MotorStates_"
 
 
-def test_a_sample_travels_unchanged_with_its_timestamp(dds_node: DdsNode) -> None:
+def test_sample_arrives_unchanged_with_its_timestamp(dds_node: DdsNode) -> None:
     with DdsNode(dds_node.domain, "lo") as other:
         reader = other.reader("rt/t1", STATES)
         writer = dds_node.writer("rt/t1", STATES)
@@ -111,7 +111,7 @@ def test_a_callback_may_close_its_reader_and_its_node(dds_domain: int) -> None:
         node.close()
 
 
-def test_a_failing_callback_is_logged_and_the_node_lives_on(
+def test_failing_callback_is_logged_and_the_node_goes_on(
     dds_node: DdsNode, caplog: pytest.LogCaptureFixture
 ) -> None:
     called = threading.Semaphore(0)
@@ -131,7 +131,7 @@ def test_a_failing_callback_is_logged_and_the_node_lives_on(
     assert "on purpose" in caplog.text
 
 
-def test_discovery_tells_who_what_and_how(dds_node: DdsNode) -> None:
+def test_discovery_reports_process_topic_type_and_qos(dds_node: DdsNode) -> None:
     events: list[DiscoveryEvent] = []
     unsubscribe = dds_node.discovery.subscribe(events.append)
 
@@ -193,7 +193,7 @@ def test_incompatible_qos_does_not_match(dds_node: DdsNode) -> None:
     assert not writer.wait_matched(0.05)
 
 
-def test_two_domains_in_one_process_do_not_mix() -> None:
+def test_two_domains_in_one_process_are_separate() -> None:
     with DdsNode(free_domain()) as a, DdsNode(free_domain()) as b:
         reader = b.reader("rt/t7", STATES)
         near = a.reader("rt/t7", STATES)
@@ -239,7 +239,7 @@ def test_a_node_that_closes_frees_waiters(dds_domain: int) -> None:
     assert all(r is False for r in results)
 
 
-def test_setup_errors_name_what_there_is(dds_domain: int) -> None:
+def test_setup_errors_name_the_available_interfaces(dds_domain: int) -> None:
     with pytest.raises(DdsSetupError, match="no network interface 'nope0'") as caught:
         DdsNode(free_domain(), "nope0")
     assert "lo" in caught.value.hint
@@ -252,7 +252,7 @@ def test_setup_errors_name_what_there_is(dds_domain: int) -> None:
             DdsNode(dds_domain, other)
 
 
-def test_bad_use_is_refused(dds_node: DdsNode) -> None:
+def test_invalid_calls_are_refused(dds_node: DdsNode) -> None:
     writer = dds_node.writer("rt/t10", CMDS)
     with pytest.raises(EncodeError):
         writer.write(MotorStates_([]))
@@ -266,7 +266,7 @@ def test_bad_use_is_refused(dds_node: DdsNode) -> None:
         dds_node.reader("no spaces allowed", CMDS)
 
 
-def test_bytes_that_are_no_message_travel_and_raise_when_decoded(dds_node: DdsNode) -> None:
+def test_invalid_payload_is_delivered_and_raises_on_decoding(dds_node: DdsNode) -> None:
     reader = dds_node.reader("rt/t12", CMDS)
     writer = dds_node.writer("rt/t12", CMDS)
     assert writer.wait_matched(60)
@@ -284,7 +284,7 @@ def _run(script: str, *, quiet: bool = True) -> str:
     return done.stdout
 
 
-def test_a_domain_that_other_code_configured_is_used_and_kept() -> None:
+def test_domain_configured_by_other_code_is_used_and_kept() -> None:
     script = f"""
 import logging
 from cyclonedds.domain import Domain, DomainParticipant
@@ -318,7 +318,7 @@ with DdsNode(number) as node:
     assert _run(script) == "True\n0\n"
 
 
-def test_a_peer_with_an_older_layout_is_seen_and_told_apart(dds_node: DdsNode) -> None:
+def test_peer_with_an_older_type_layout_is_identified(dds_node: DdsNode) -> None:
     """HandState_ of 2024-08
     (docs/sources/unitree-dex.md#a3) has the same name and does not match.
     """
@@ -357,7 +357,7 @@ with dds.DdsNode({dds_node.domain}) as node:
     assert output == "up\n0\n"
 
 
-def test_without_cyclonedds_the_import_works_and_use_says_what_to_do() -> None:
+def test_missing_cyclonedds_is_reported_on_use_and_not_on_import() -> None:
     script = """
 import sys
 sys.modules["cyclonedds"] = None

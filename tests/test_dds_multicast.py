@@ -45,7 +45,7 @@ with SdkClient(1) as sdk, DdsNode(1, "lo") as node:
 
 @pytest.mark.skipif(not namespaces(), reason="needs unshare, ip and user namespaces")
 @pytest.mark.parametrize("flag", ["on", "off"])
-def test_a_node_and_the_sdk_meet_on_loopback(flag: str) -> None:
+def test_node_and_unitree_sdk_discover_each_other_on_loopback(flag: str) -> None:
     setup = f'ip link set lo up && ip link set lo multicast {flag} && exec "$0" -c "$1"'
     done = subprocess.run(
         [*UNSHARE, "sh", "-c", setup, sys.executable, _SCRIPT],

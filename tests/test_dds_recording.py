@@ -1,3 +1,5 @@
+"""Which topics a recording of DDS subscribes to, and as which type."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -14,7 +16,7 @@ def types_read(node: DdsNode) -> set[tuple[str, str]]:
     return {(e.topic, e.type_name) for e in node.endpoints() if e.kind == "reader" and not e.own}
 
 
-def test_a_topic_in_use_is_read_as_the_type_that_it_has(tmp_path: Path) -> None:
+def test_topic_is_recorded_with_the_type_its_writer_announces(tmp_path: Path) -> None:
     """A reader of another dialect's type would look to the service like a peer that errs."""
     domain = free_domain()
     with DdsNode(domain) as hand, DdsNode(domain) as node, Recorder(tmp_path / "a.mcap") as out:
@@ -27,7 +29,7 @@ def test_a_topic_in_use_is_read_as_the_type_that_it_has(tmp_path: Path) -> None:
         assert recording.subscribed == [CMD, STATE]
 
 
-def test_a_topic_of_a_model_is_read_before_anybody_is_there(tmp_path: Path) -> None:
+def test_known_topic_is_subscribed_before_it_has_a_writer(tmp_path: Path) -> None:
     domain = free_domain()
     expected = {(CMD, DIALECTS[name].cmd_type) for name in ("unitree_go", "unitree_hg")}
     with (
@@ -40,7 +42,7 @@ def test_a_topic_of_a_model_is_read_before_anybody_is_there(tmp_path: Path) -> N
         assert other.discovery.wait(lambda _: types_read(other) == expected, timeout=60)
 
 
-def test_a_type_that_is_told_is_not_guessed(tmp_path: Path) -> None:
+def test_given_type_overrides_discovery(tmp_path: Path) -> None:
     domain = free_domain()
     with (
         DdsNode(domain) as other,

@@ -60,7 +60,7 @@ def sdk(dds_domain: int) -> Iterator[SdkClient]:
 
 
 @pytest.mark.parametrize(("name", "message"), COMMANDS, ids=lambda v: str(v)[-10:])
-def test_the_sdk_commands_and_we_receive(
+def test_commands_of_the_unitree_sdk_are_received(
     dds_node: DdsNode, sdk: SdkClient, name: str, message: Any
 ) -> None:
     topic = f"rt/{name[8:10]}/cmd"
@@ -72,7 +72,7 @@ def test_the_sdk_commands_and_we_receive(
 
 
 @pytest.mark.parametrize(("name", "message"), STATES, ids=lambda v: str(v)[-10:])
-def test_we_publish_and_the_sdk_receives(
+def test_states_are_received_by_the_unitree_sdk(
     dds_node: DdsNode, sdk: SdkClient, name: str, message: Any
 ) -> None:
     topic = f"rt/{name[8:10]}/state"
@@ -84,7 +84,7 @@ def test_we_publish_and_the_sdk_receives(
     assert sample.data == message_type(name).encode(message)
 
 
-def test_the_sdks_types_and_qos_are_ours(dds_node: DdsNode, sdk: SdkClient) -> None:
+def test_types_and_qos_equal_those_of_the_unitree_sdk(dds_node: DdsNode, sdk: SdkClient) -> None:
     name = GO + "MotorCmds_"
     topic = "rt/types"
     reader = dds_node.reader(topic, name)
@@ -101,7 +101,7 @@ def test_the_sdks_types_and_qos_are_ours(dds_node: DdsNode, sdk: SdkClient) -> N
     assert sdk.stop(topic) >= 10
 
 
-def test_the_sdk_reads_best_effort(dds_node: DdsNode, sdk: SdkClient) -> None:
+def test_unitree_sdk_reads_best_effort(dds_node: DdsNode, sdk: SdkClient) -> None:
     topic = "rt/qos"
     sdk.subscribe(topic, GO + "MotorStates_")
     assert dds_node.discovery.wait(lambda found: any(e.topic == topic for e in found), 60)

@@ -1,4 +1,4 @@
-"""``dexkit demo``: from the first line to the last process."""
+"""``dexkit demo``: its result, and its processes after a signal."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_ending_it_leaves_no_process(how: signal.Signals, tmp_path: Path) -> None:
+def test_signal_during_the_demo_leaves_no_process(how: signal.Signals, tmp_path: Path) -> None:
     demo = start("--out", tmp_path)
     assert demo.stdout is not None
     seen = ""
@@ -63,7 +63,7 @@ def test_ending_it_leaves_no_process(how: signal.Signals, tmp_path: Path) -> Non
 
 
 @pytest.mark.soak
-def test_the_whole_story(tmp_path: Path) -> None:
+def test_demo_passes_and_writes_its_files(tmp_path: Path) -> None:
     demo = start("--out", tmp_path)
     out, _ = demo.communicate(timeout=600)
     assert demo.returncode == 0, out

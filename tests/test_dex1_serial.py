@@ -28,6 +28,7 @@ from dexkit.emulators.m4010 import Dex1Motors, Dex1Process, Firmware
 from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.wire.m4010 import MotorCmd
+from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
 BRAKE = HandCommand.brake(1)
@@ -75,7 +76,7 @@ def moving(state: HandState) -> bool:
 # --- driving
 
 
-def test_it_follows_measures_and_brakes_at_the_end() -> None:
+def test_driver_moves_measures_and_brakes_on_close() -> None:
     with Dex1Motors() as motors:
         with opened(motors) as hand:
             assert isinstance(hand, Hand)
@@ -101,7 +102,7 @@ def test_it_follows_measures_and_brakes_at_the_end() -> None:
             hand.exchange(BRAKE)
 
 
-def test_opening_and_closing_move_nothing_and_limp_neither() -> None:
+def test_open_close_and_limp_do_not_move_the_hand() -> None:
     with Dex1Motors() as motors:
         before = motors.motor.mechanics.joint.q
         with opened(motors) as hand:
@@ -111,7 +112,7 @@ def test_opening_and_closing_move_nothing_and_limp_neither() -> None:
         assert motors.motor.mechanics.joint.q == before
 
 
-def test_both_hands_on_one_line_take_turns() -> None:
+def test_two_hands_share_one_line() -> None:
     with Dex1Motors(tuple(Side)) as motors:
         with opened(motors, Side.LEFT) as left, opened(motors, Side.RIGHT) as right:
             targets = {left: 4.0, right: 2.0}
@@ -159,7 +160,7 @@ def test_without_protection_its_frames_are_those_of_the_vendors_service() -> Non
 # --- finding it
 
 
-def test_it_is_looked_for_on_every_port(tmp_path: Path) -> None:
+def test_auto_device_searches_every_port(tmp_path: Path) -> None:
     links = {Side.LEFT: tmp_path / "ttyB", Side.RIGHT: tmp_path / "ttyA"}
     (tmp_path / "ttyC").write_text("no port")
     ports = (str(tmp_path / "tty*"), str(tmp_path / "none*"))
@@ -170,7 +171,7 @@ def test_it_is_looked_for_on_every_port(tmp_path: Path) -> None:
         assert line_module._lines == {}
 
 
-def test_what_is_not_there_is_said(tmp_path: Path) -> None:
+def test_missing_motor_error_lists_what_was_tried(tmp_path: Path) -> None:
     nothing = Dex1Settings(ports=(str(tmp_path / "tty*"),), timeout=0.05)
     with pytest.raises(HandNotFound, match="nothing matches"):
         Dex1Serial(Side.LEFT, nothing).open()
@@ -197,7 +198,7 @@ def test_what_is_not_there_is_said(tmp_path: Path) -> None:
         assert "no intact frames" in garbled.value.hint
 
 
-def test_two_motors_with_one_id_are_not_chosen_from(tmp_path: Path) -> None:
+def test_two_motors_with_one_id_are_refused(tmp_path: Path) -> None:
     link, other = {Side.LEFT: tmp_path / "tty1"}, {Side.LEFT: tmp_path / "tty2"}
     with Dex1Motors(links=link), Dex1Motors(links=other):
         settings = Dex1Settings(ports=(str(tmp_path / "tty*"),), timeout=TIMEOUT)
@@ -210,7 +211,7 @@ def test_two_motors_with_one_id_are_not_chosen_from(tmp_path: Path) -> None:
     assert line_module._lines == {}
 
 
-def test_a_port_that_another_program_has(tmp_path: Path) -> None:
+def test_port_used_by_another_program_is_refused(tmp_path: Path) -> None:
     links = {Side.LEFT: tmp_path / "tty1"}
     with Dex1Motors(links=links) as motors:
         code = (
@@ -233,7 +234,7 @@ def test_a_port_that_another_program_has(tmp_path: Path) -> None:
             holder.communicate()
 
 
-def test_it_tries_three_times_with_pauses_as_the_vendors_service() -> None:
+def test_open_retries_three_times_like_the_vendor_service() -> None:
     pauses: list[float] = []
     with Dex1Motors((Side.RIGHT,)) as motors:
         with pytest.raises(HandNotFound):
@@ -241,7 +242,7 @@ def test_it_tries_three_times_with_pauses_as_the_vendors_service() -> None:
         assert pauses == [discovery.PAUSE] * 2 == [0.05] * 2
 
 
-def test_a_motor_that_wakes_up_late_is_found() -> None:
+def test_motor_that_answers_late_is_found() -> None:
     with Dex1Motors(faults=("silent:for=100ms",)) as motors, opened(motors, timeout=0.1) as hand:
         hand.exchange(BRAKE)
 
@@ -249,7 +250,7 @@ def test_a_motor_that_wakes_up_late_is_found() -> None:
 # --- what goes wrong on the line
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "fails"),
     [
         ("short:for=150ms", True),
@@ -296,7 +297,7 @@ def test_a_damaged_answer_costs_its_own_exchange_only(spec: str, fails: bool) ->
             assert hand.exchange(command).mode[0] == mode
 
 
-def test_an_answer_that_is_late_is_not_taken_for_the_next() -> None:
+def test_late_answer_is_not_taken_for_the_next_one() -> None:
     with Dex1Motors() as motors, opened(motors) as hand:
         patient = hand.configuration
         hand.configuration = replace(patient, timeout=0.03)
@@ -326,7 +327,7 @@ def test_an_exchange_is_bounded_in_time(monkeypatch: pytest.MonkeyPatch) -> None
 # --- errors, protection
 
 
-def test_errors_are_in_the_state_and_pass(caplog: pytest.LogCaptureFixture) -> None:
+def test_motor_errors_are_in_the_state_until_they_end(caplog: pytest.LogCaptureFixture) -> None:
     with Dex1Motors() as motors, opened(motors) as hand:
         with caplog.at_level(logging.WARNING):
             motors.inject("overcurrent:for=100ms")
@@ -342,7 +343,7 @@ def test_errors_are_in_the_state_and_pass(caplog: pytest.LogCaptureFixture) -> N
         assert "no error any more" in caplog.text
 
 
-def test_a_pause_trips_the_protection_and_work_goes_on() -> None:
+def test_timeout_protection_trips_in_a_pause_and_is_cleared() -> None:
     quick = Firmware(command_timeout=0.2)
     with Dex1Motors(firmware=quick) as motors, opened(motors) as hand:
         drive(hand, OPEN, moving)
@@ -366,7 +367,7 @@ def test_protection_can_be_left_off() -> None:
 
 
 @pytest.mark.parametrize("where", ["write", "read"])
-def test_ctrl_c_in_an_exchange_brakes(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+def test_sigint_during_an_exchange_brakes(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     with Dex1Motors(start_pct=100.0) as motors:
         with opened(motors) as hand:
             drive(hand, CLOSE, moving)
@@ -386,7 +387,7 @@ def test_ctrl_c_in_an_exchange_brakes(monkeypatch: pytest.MonkeyPatch, where: st
         assert motors.motor.mechanics.mode is JointMode.BRAKE
 
 
-def test_a_killed_driver_leaves_nothing_moving() -> None:
+def test_motor_stops_after_the_driver_is_killed() -> None:
     code = (
         "import sys, time\n"
         "from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings\n"
@@ -432,7 +433,7 @@ def test_unplugged_in_motion_and_plugged_in_again() -> None:
     assert line_module._lines == {}
 
 
-def test_a_shared_line_is_lost_and_found_by_both() -> None:
+def test_both_hands_recover_a_lost_shared_line() -> None:
     with Dex1Motors(tuple(Side)) as motors:
         hands = [
             Dex1Serial(side, Dex1Settings(device=motors.path, timeout=TIMEOUT)) for side in Side
@@ -456,7 +457,7 @@ def test_a_shared_line_is_lost_and_found_by_both() -> None:
     assert line_module._lines == {}
 
 
-def test_closing_a_hand_that_is_gone_says_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_close_of_a_lost_hand_reports_it(caplog: pytest.LogCaptureFixture) -> None:
     for protect, says in ((True, "stops by itself"), (False, "cut its power")):
         with Dex1Motors() as motors:
             hand = Dex1Serial(
@@ -482,7 +483,7 @@ def test_calibration_makes_closed_the_zero_once() -> None:
             hand.calibrate()
 
 
-def test_silence_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibration_without_an_answer_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """The vendor's library says "successful" (docs/sources/unitree-dex.md#g)."""
     monkeypatch.setattr("dexkit.drivers.dex1_serial.hand._FLASH_TIME", 0.05)
     with Dex1Motors() as motors, opened(motors) as hand:
@@ -529,7 +530,7 @@ def test_the_backend_reads_its_settings() -> None:
     assert spec.exchange_timeout <= 0.1
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"ports": ""},
@@ -541,12 +542,12 @@ def test_the_backend_reads_its_settings() -> None:
         {"speed": "1"},
     ],
 )
-def test_senseless_settings_are_refused(wrong: dict[str, str]) -> None:
+def test_invalid_settings_are_refused(wrong: dict[str, str]) -> None:
     with pytest.raises(UsageError):
         find_backend("dex1-serial").create(BackendOptions(Side.LEFT, None, wrong))
 
 
-def test_what_is_no_port_of_a_motor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unusable_serial_port_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(HandNotFound, match="not a serial port"):
         MotorLine(str(tmp_path / "file"), 6_000_000)
@@ -559,7 +560,7 @@ def test_what_is_no_port_of_a_motor(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         MotorLine("/dev/null", 6_000_000)
 
 
-def test_asking_who_else_is_there_leaves_a_hand_alone_that_is_driven() -> None:
+def test_search_does_not_disturb_a_driven_hand() -> None:
     with Dex1Motors(tuple(Side)) as motors, opened(motors, Side.RIGHT) as right:
         drive(right, OPEN, moving)
         motors.inject("silent:id=1")
@@ -604,7 +605,7 @@ def test_calibration_on_the_command_line() -> None:
         assert "before since power-up" in said
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "says"),
     [
         (["dex1-serial"], "say which hand"),

@@ -34,7 +34,7 @@ def newest(node: FakeNode, side: Side) -> unitree_go.MotorState_:
     return STATES.decode(payload).states[0]  # type: ignore[no-any-return]
 
 
-def test_unplugged_in_motion_it_says_so_and_moves_for_nothing_stale() -> None:
+def test_unplugged_hand_is_reported_and_ignores_stale_commands_on_return() -> None:
     node = FakeNode()
     side = Side.LEFT
     command = GO.topics(side)[0]

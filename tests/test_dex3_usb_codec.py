@@ -32,6 +32,7 @@ from dexkit.models import DEX3_1
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import units
+from tests.each import each
 from tools.generate.dex3_protocol_page import worked_example
 
 JOINTS = DEX3_1.joints[Side.LEFT]
@@ -70,7 +71,7 @@ def test_figures_of_the_fact_sheet() -> None:
 
 @settings(deadline=None)
 @given(scales, ratios, st.integers(-(2**31), 2**31 - 1))
-def test_counts_survive(scale: d.Scale, ratio: float, count: int) -> None:
+def test_counts_survive_conversion(scale: d.Scale, ratio: float, count: int) -> None:
     count = min(max(count, scale.low), scale.high)
     assert scale.encode(scale.decode(count, ratio), ratio) == count
 
@@ -103,7 +104,7 @@ def test_gains_are_never_negative() -> None:
     assert units.DAMPING.encode(-1e9, 108) == 0
 
 
-def test_no_value() -> None:
+def test_missing_pressure_has_its_own_code() -> None:
     assert d.NO_VALUE == 30000
     assert units.encode_pressure(math.nan) == 30000
     assert units.encode_pressure(240_000.0) == 30001, "a reading that looks like none"
@@ -190,8 +191,8 @@ def test_encode_is_what_packets_say(
             assert error <= (1 + 1e-6) / scale.factor(ratio)
 
 
-@pytest.mark.parametrize("name", ["q", "dq", "tau", "kp", "kd"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@each("name", ["q", "dq", "tau", "kp", "kd"])
+@each("value", [math.nan, math.inf, -math.inf])
 def test_nan_is_never_sent(name: str, value: float) -> None:
     codec = d.HandCodec(JOINTS)
     good = codec.encode(command())
@@ -229,7 +230,7 @@ def test_a_broadcast_commands_a_bus_in_silence() -> None:
     assert not decoded.problems
 
 
-def test_a_command_to_nobody() -> None:
+def test_packet_for_an_unknown_motor_is_reported_and_ignored() -> None:
     stray = d.MotorCmd(9, 1, False, 0, 0, 0, 0, 0)
     own = d.MotorCmd(1, 1, False, 0, 0, 0, 0, 0)
     later = d.MotorCmd(1, 0, False, 0, 0, 0, 0, 0)
@@ -400,8 +401,8 @@ def reseal(data: bytes | bytearray) -> bytes:
     return bytes(data[:-4]) + crc32_words(bytes(data[2:-4])).to_bytes(4, "little")
 
 
-@pytest.mark.parametrize("warm", [False, True])
-@pytest.mark.parametrize(
+@each("warm", [False, True])
+@each(
     ("at", "motor", "sensor"),
     [(26 + 10, 0, None), (26 + 26, 1, None), (506 + 26 + 2, 6, None), (746 + 44 + 5, None, 7)],
 )
@@ -464,7 +465,7 @@ def test_packets_that_are_not_this_hand_s() -> None:
     ]
 
 
-def test_ids_that_changed_places() -> None:
+def test_motors_are_matched_by_id_and_not_by_order() -> None:
     """Same sizes, same heads: only the ids tell that two motors stand the other way round."""
     codec = d.HandCodec(JOINTS)
     data = codec.encode_state(a_state())
@@ -476,7 +477,7 @@ def test_ids_that_changed_places() -> None:
     assert not codec.problems
 
 
-def test_what_a_device_cannot_say() -> None:
+def test_nan_position_cannot_be_encoded_but_missing_sensors_can() -> None:
     codec = d.HandCodec(JOINTS)
     with pytest.raises(EncodeError, match="position"):
         codec.encode_state(a_state(q=np.full(7, math.nan)))
@@ -490,7 +491,7 @@ def test_what_a_device_cannot_say() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(2, 1266), st.booleans())
-def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
+def test_any_bytes_decode_or_raise_a_typed_error(noise: bytes, at: int, sealed: bool) -> None:
     codec = d.HandCodec(JOINTS)
     good = codec.encode_state(a_state())
     codec.decode(good, 0.0)
@@ -511,7 +512,7 @@ def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
 # --- configuration
 
 
-@pytest.mark.parametrize(
+@each(
     ("motors", "sensors", "what"),
     [
         (((5, 0),), (), "motor at bus 5"),
@@ -521,12 +522,12 @@ def test_nothing_crashes(noise: bytes, at: int, sealed: bool) -> None:
         ((), ((0, 15),), "sensor at bus 0, id 15"),
     ],
 )
-def test_bus_maps_that_make_no_sense(motors: Any, sensors: Any, what: str) -> None:
+def test_invalid_bus_maps_are_refused(motors: Any, sensors: Any, what: str) -> None:
     with pytest.raises(UsageError, match=what):
         d.BusMap(motors, sensors)
 
 
-def test_a_map_for_another_hand() -> None:
+def test_bus_map_of_another_hand_is_refused() -> None:
     with pytest.raises(UsageError, match=r"6 joint\(s\), but the bus map has 7"):
         d.HandCodec(JOINTS[:6])
     assert len(d.DEFAULT_BUS_MAP.motors) == 7

@@ -33,6 +33,7 @@ from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import PRODUCT, PRODUCT_ID, STATE, VENDOR_ID, HandCodec
+from tests.each import each
 from tests.patience import PATIENCE
 
 OUT_EP, IN_EP = 0x02, 0x81
@@ -106,7 +107,7 @@ def both() -> Iterator[Dex3Process]:
         yield hands
 
 
-def test_descriptors_are_the_manuals(both: Dex3Process) -> None:
+def test_descriptors_equal_those_of_the_manual(both: Dex3Process) -> None:
     with host(both.port) as computer:
         found = list(usb.core.find(backend=computer.backend, find_all=True))
         assert [(d.idVendor, d.idProduct) for d in found] == [(0x34B7, 0x1010), (0x34B7, 0x1011)]
@@ -262,7 +263,7 @@ def test_endpoint_numbers_and_serial_are_options() -> None:
         assert len(device.read(0x83, STATE.size, 1000)) == STATE.size
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"out_endpoint": 0x82},
@@ -276,7 +277,7 @@ def test_endpoint_numbers_and_serial_are_options() -> None:
         {"firmware": Firmware(), "process": True},
     ],
 )
-def test_options_that_cannot_be(wrong: dict[str, Any]) -> None:
+def test_invalid_options_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError), emulated_dex3(**wrong):
         pass
 
@@ -396,7 +397,7 @@ def reply(sock: socket.socket) -> tuple[int, int, int, int]:
     return command, seqnum, status, actual
 
 
-def test_a_waiting_read_is_called_back() -> None:
+def test_pending_read_can_be_unlinked() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
         submit(sock, 1, IN, 1, b"")
         sock.sendall(struct.pack(">IIIIII24x", protocol.CMD_UNLINK, 2, 0x10002, 0, 0, 1))
@@ -424,7 +425,7 @@ def test_an_exchange_in_one_message() -> None:
         assert len(seen[1] or b"") == STATE.size
 
 
-def test_a_hand_has_one_client_and_the_next_may_follow() -> None:
+def test_hand_has_one_client_at_a_time() -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
         with imported(port) as first:
@@ -485,7 +486,7 @@ def test_setting_the_configuration_ends_what_waits() -> None:
         assert held(inside(hands)) == 0
 
 
-def test_a_number_in_use_is_no_conversation() -> None:
+def test_duplicate_sequence_number_ends_the_connection() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
         submit(sock, 7, IN, 1, b"")
         submit(sock, 7, IN, 1, b"")
@@ -518,7 +519,7 @@ def test_connections_are_bounded_and_the_newest_is_served() -> None:
             assert reply(other)[:3] == (protocol.RET_SUBMIT, 1, 0)
 
 
-def test_who_never_comes_to_the_point_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_client_that_sends_no_request_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "GREETING", 0.05)
     with emulated_dex3() as hands:
         port = inside(hands).port
@@ -529,7 +530,7 @@ def test_who_never_comes_to_the_point_is_dropped(monkeypatch: pytest.MonkeyPatch
             assert reply(quiet)[:3] == (protocol.RET_SUBMIT, 1, 0)
 
 
-def test_no_file_descriptor_left_is_no_busy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_server_does_not_spin_without_file_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     with emulated_dex3() as hands:
         machine = inside(hands)._server
         tries = []
@@ -559,7 +560,7 @@ def test_no_file_descriptor_left_is_no_busy_loop(monkeypatch: pytest.MonkeyPatch
         assert len(tries) <= 5  # one for each pause, not thousands
 
 
-def test_a_mistake_in_the_device_costs_one_client(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_in_the_device_ends_one_connection_only(monkeypatch: pytest.MonkeyPatch) -> None:
     with emulated_dex3(BOTH) as hands:
         port = inside(hands).port
         monkeypatch.setattr(inside(hands).device(Side.LEFT), "exchange", broken)
@@ -572,7 +573,7 @@ def test_a_mistake_in_the_device_costs_one_client(monkeypatch: pytest.MonkeyPatc
         assert inside(hands).error is None
 
 
-def test_no_such_bus() -> None:
+def test_unknown_bus_id_is_refused() -> None:
     with (
         emulated_dex3() as hands,
         pytest.raises(usbip.core.NotFound),
@@ -591,7 +592,7 @@ def test_no_such_bus() -> None:
         b"\xff" * 5000,
     ],
 )
-def test_who_does_not_speak_usbip_is_cut_off(garbage: bytes) -> None:
+def test_client_of_another_protocol_is_disconnected(garbage: bytes) -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
         with socket.create_connection(("127.0.0.1", port), timeout=60.0) as sock:
@@ -611,7 +612,7 @@ def test_who_does_not_speak_usbip_is_cut_off(garbage: bytes) -> None:
     ],
     ids=["unknown command", "two gigabytes", "less than nothing"],
 )
-def test_nonsense_after_the_import_is_cut_off(command: bytes) -> None:
+def test_invalid_data_after_the_import_disconnects_the_client(command: bytes) -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
         with imported(port) as sock, contextlib.suppress(ConnectionResetError):

@@ -15,6 +15,7 @@ from dexkit.hand import CommandGate, HandSpec, HandState, ImuState, JointMode, S
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import DEX1_1, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 SPECS = {side: DEX1_1.spec(side, io_rate=500.0) for side in Side}
@@ -73,7 +74,7 @@ class TestGoCommand:
     def test_an_empty_sequence_holds_no_command(self) -> None:
         assert one("unitree_go").command(go_cmd(), LEFT) is None
 
-    def test_of_a_long_one_the_first_counts(self) -> None:
+    def test_first_motor_of_a_long_message_counts(self) -> None:
         """As the vendor's service reads cmds()[0] (docs/sources/unitree-dex.md#b2)."""
         message = go_cmd(*(unitree_go.MotorCmd_(q=q) for q in (1.0, 2.0, 3.0)))
         mapping = one("unitree_go")
@@ -118,12 +119,12 @@ class TestHgCommand:
             return (q_radians / (2.0 * math.pi)) * 100.0
 
     @given(st.floats(-10.0, 10.0))
-    def test_the_seeds_formula(self, q: float) -> None:
+    def test_position_formula_is_that_of_the_specification(self, q: float) -> None:
         command = one("unitree_hg").command(hg_cmd(q), LEFT)
         assert command is not None
         assert command.q[0] / 5.4 * 100.0 == pytest.approx(self.specified(q))
 
-    @pytest.mark.parametrize(
+    @each(
         ("q", "percent"),
         [
             (0.1, 0.0),
@@ -133,21 +134,21 @@ class TestHgCommand:
             (6.0, 100),
         ],
     )
-    def test_at_the_snaps(self, q: float, percent: float | None) -> None:
+    def test_positions_near_the_limits_snap_to_them(self, q: float, percent: float | None) -> None:
         command = one("unitree_hg").command(hg_cmd(q), LEFT)
         assert command is not None
         expected = percent if percent is not None else q / math.tau * 100
         assert command.q[0] / 5.4 * 100 == pytest.approx(expected)
 
-    def test_gains_are_the_services_own(self) -> None:
+    def test_gains_are_those_of_the_service(self) -> None:
         """Clients of this interface send kp = kd = 0 and expect to be obeyed."""
         command = one("unitree_hg").command(hg_cmd(3.0, kp=0.0, kd=9.0, tau=1.0, dq=1.0), LEFT)
         assert command is not None
         assert (command.kp[0], command.kd[0]) == (5.0, 0.05)
         assert (command.tau[0], command.dq[0]) == (0.0, 0.0)
 
-    @pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
-    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    @each("field", ["q", "dq", "tau", "kp", "kd"])
+    @each("value", [math.nan, math.inf, -math.inf])
     def test_not_finite_is_rejected_and_not_snapped(self, field: str, value: float) -> None:
         message = hg_cmd(3.0)
         setattr(message.motor_cmd[0], field, value)
@@ -187,9 +188,7 @@ class TestGoState:
         motor = one("unitree_go", fill=Fill.VENDOR).state({LEFT: self.FULL}).states[0]
         assert motor == unitree_go.MotorState_(q=1.5, dq=0.25, tau_est=-0.5)
 
-    @pytest.mark.parametrize(
-        ("celsius", "sent"), [(math.nan, 0), (-12.0, 0), (126.6, 127), (200.0, 127)]
-    )
+    @each(("celsius", "sent"), [(math.nan, 0), (-12.0, 0), (126.6, 127), (200.0, 127)])
     def test_temperature_stays_what_the_sdk_can_pack(self, celsius: float, sent: int) -> None:
         motor = one("unitree_go").state({LEFT: view(temperature=celsius)}).states[0]
         assert motor.temperature == sent
@@ -212,12 +211,12 @@ class TestHgState:
         assert message == unitree_hg.HandState_([motor])
 
     @given(st.floats(0.0, 5.4))
-    def test_the_seeds_position(self, q: float) -> None:
+    def test_hg_position_is_that_of_the_specification(self, q: float) -> None:
         percent = q / 5.4 * 100
         motor = one("unitree_hg").state({LEFT: view(q)}).motor_state[0]
         assert motor.q == pytest.approx((percent / 100.0) * 2.0 * math.pi)
 
-    def test_there_and_back(self) -> None:
+    def test_position_survives_conversion_in_both_directions(self) -> None:
         mapping = one("unitree_hg")
         sent = mapping.state({LEFT: view(2.0)}).motor_state[0].q
         command = mapping.command(hg_cmd(sent), LEFT)
@@ -256,7 +255,7 @@ class TestHgState:
         assert message.imu_state.temperature == 31
         assert (message.power_v, message.power_a) == (24.0, 0.0)
 
-    def test_without_it_is_as_the_seed_says(self) -> None:
+    def test_state_without_vendor_fill_follows_the_specification(self) -> None:
         message = one("unitree_hg").state({LEFT: view()})
         assert message.press_sensor_state == []
         assert message.imu_state == unitree_hg.IMUState_()

@@ -1,4 +1,4 @@
-"""Each thing that can be wrong on DDS, made with real participants and looked at.
+"""Faults on DDS, made with real participants, get the doctor's diagnosis.
 
 One look sees all situations, each on a domain of its own.
 """
@@ -182,7 +182,7 @@ def looked() -> _Looked:
     return _Looked(world.domains, Observations(domains=views))
 
 
-def test_a_good_pair_is_found_good(looked: _Looked) -> None:
+def test_working_client_and_service_have_no_finding(looked: _Looked) -> None:
     # 100 states a second is what this test publishes: too slow, and nothing else
     assert set(looked.findings("good")) == {"DDS-RATE"}
     assert looked.ready("good") == {"unitree_go": ""}
@@ -190,7 +190,7 @@ def test_a_good_pair_is_found_good(looked: _Looked) -> None:
     assert looked.ready("dex3") == {"dex3": ""}
 
 
-def test_what_is_seen_is_what_dds_itself_says(looked: _Looked) -> None:
+def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> None:
     (view,) = [v for v in looked.seen.domains if v.number == looked.domains["good"]]
     assert len(view.participants) == 2
     assert {p.version[:5] for p in view.participants} == {"0.10."}
@@ -222,7 +222,9 @@ def test_what_is_seen_is_what_dds_itself_says(looked: _Looked) -> None:
         ("unheard", "DDS-UNHEARD", "rt/dex3/left/cmd"),
     ],
 )
-def test_what_is_wrong_is_named(looked: _Looked, situation: str, name: str, says: str) -> None:
+def test_each_fault_gets_its_diagnosis(
+    looked: _Looked, situation: str, name: str, says: str
+) -> None:
     found = looked.findings(situation)
     assert name in found, sorted(found)
     assert says in found[name].seen
@@ -231,7 +233,7 @@ def test_what_is_wrong_is_named(looked: _Looked, situation: str, name: str, says
         assert all(looked.ready(situation).values())
 
 
-def test_what_explains_the_rest_keeps_the_rest_quiet(looked: _Looked) -> None:
+def test_root_cause_suppresses_its_consequences(looked: _Looked) -> None:
     for situation in ("other stack", "name", "type"):
         assert "DDS-NOBODY" not in looked.findings(situation)
 
@@ -291,7 +293,7 @@ def test_a_participant_of_cyclonedds_11() -> None:
     assert str(found.severity) == "error"
 
 
-def test_a_look_leaves_nothing_behind() -> None:
+def test_observation_leaves_no_reader_behind() -> None:
     domain = free_domain()
     with DdsNode(domain, "lo") as node:
         writer = node.writer("rt/dex1/left/state", STATES)
@@ -350,7 +352,7 @@ def test_the_command_line(service: int) -> None:
     assert "dexkit serve sim-dex1 --side both" in domain["participants"][0]["command"]
 
 
-def test_what_cannot_be_looked_at_is_no_verdict() -> None:
+def test_unobservable_domain_gives_no_verdict() -> None:
     done = subprocess.run(
         command_line("doctor", "--scan", "5", "--interface", "nosuch0"),
         capture_output=True,
@@ -362,7 +364,7 @@ def test_what_cannot_be_looked_at_is_no_verdict() -> None:
     assert "lo (127.0.0.1)" in done.stderr
 
 
-def test_watching_says_when_a_client_would_start() -> None:
+def test_watch_reports_when_a_client_would_start() -> None:
     domain = free_domain()
     with subprocess.Popen(
         [

@@ -1,4 +1,4 @@
-"""Devices and surroundings that are wrong, as real as this machine allows."""
+"""The doctor on real and emulated devices, sysfs, and the environment."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _line(
         yield port.path
 
 
-def test_a_servo_that_is_well() -> None:
+def test_healthy_servo_has_no_finding() -> None:
     with _line(1_000_000) as path:
         port = doctor_devices.look_at(path)
     assert [(s.id, s.baudrate, s.protocol) for s in port.servos] == [(1, 1_000_000, 2)]
@@ -65,7 +65,7 @@ def test_a_servo_of_protocol_1() -> None:
     assert _ids(port) == {"SERIAL-PROTOCOL-1"}
 
 
-def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_port_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     # every baud rate takes half a second in vain
     monkeypatch.setattr(doctor_devices, "SCAN_BAUD_RATES", (1_000_000, 57_600))
     with _line(57_600, servo_id=200) as path:  # none of the ids that are asked for
@@ -180,7 +180,7 @@ def test_a_configuration_that_can_be_read(tmp_path: Path) -> None:
         assert "cannot be read" in uri_problem(odd) or "not XML" in uri_problem(odd), odd
 
 
-def test_this_python(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_environment_is_described_and_diagnosed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", "file:///nowhere.xml")
     env = environment()
     assert env.python.split(".")[:2] == [str(n) for n in sys.version_info[:2]]

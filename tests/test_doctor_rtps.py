@@ -13,6 +13,7 @@ from dexkit.doctor.observer import Observer
 from dexkit.doctor.rtps import AckNack, Data, DataFrag, Heartbeat, Locator
 from dexkit.errors import WireError
 from tests import doctor_packets as packets
+from tests.each import each
 
 ME = bytes(range(12))
 PLACE = Locator("127.0.0.1", 4711)
@@ -70,7 +71,7 @@ def test_the_two_versions_describe_one_type_differently() -> None:
     assert all(len(text) == 28 for text in hashes)
 
 
-def test_an_observer_asks_whom_it_finds_and_learns() -> None:
+def test_observer_requests_missing_discovery_data() -> None:
     wanted: list[tuple[str, str]] = []
     samples: list[tuple[str, int, bytes]] = []
     observer = Observer(
@@ -109,7 +110,7 @@ def test_an_observer_asks_whom_it_finds_and_learns() -> None:
     assert samples == [("rt/dex1/left/cmd", 7, b"abc")]
 
 
-def test_what_is_addressed_to_others_is_none_of_its_business() -> None:
+def test_submessages_for_other_participants_are_ignored() -> None:
     observer = Observer(ME, PLACE)
     assert observer.receive(packets.CYCLONE_0_10_PARTICIPANT, 0.0) == []
     assert not observer.participants
@@ -158,7 +159,7 @@ _REAL = [
     st.integers(0, 600),
 )
 @settings(max_examples=200)
-def test_a_damaged_packet_harms_nothing(
+def test_damaged_packet_is_ignored(
     packet: bytes, damage: list[tuple[int, int]], length: int
 ) -> None:
     observer = Observer(ME, PLACE, wanted=lambda topic, type_name: True)
@@ -286,7 +287,7 @@ _SUBMESSAGES = st.one_of(
 
 @given(st.lists(st.one_of(_SUBMESSAGES, st.floats(0.0, 0.5), st.sampled_from(_REAL)), max_size=12))
 @settings(max_examples=100)
-def test_it_sends_nothing_malformed_whatever_it_is_told(
+def test_observer_sends_only_valid_packets_for_any_input(
     events: list[bytes | float],
 ) -> None:
     """It is run beside robots: no reply to any peer, right or wrong, may break the protocol."""
@@ -311,7 +312,7 @@ def test_it_sends_nothing_malformed_whatever_it_is_told(
     assert grammar.kinds >= {0x15, 0x0E, 0x06}
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, 0), (5, 3), (5, -9), (-1, -1), (1, 2**63 - 1)])
+@each(("first", "last"), [(0, 0), (5, 3), (5, -9), (-1, -1), (1, 2**63 - 1)])
 def test_a_wrong_heartbeat_is_counted_and_not_answered(first: int, last: int) -> None:
     observer = Observer(ME, PLACE)
     observer.receive(_addressed(packets.CYCLONE_0_10_PARTICIPANT), 0.0)
@@ -323,7 +324,7 @@ def test_a_wrong_heartbeat_is_counted_and_not_answered(first: int, last: int) ->
 
 
 @given(st.binary(max_size=80))
-def test_garbage_is_no_packet(data: bytes) -> None:
+def test_garbage_is_rejected(data: bytes) -> None:
     try:
         rtps.parse_message(data)
     except WireError:

@@ -1,11 +1,10 @@
-"""The doctor's rules on made-up observations: each diagnosis, and what must not be one."""
+"""The doctor's rules on synthetic observations: each diagnosis, and healthy cases."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
 
-import pytest
 from rich.console import Console
 
 from dexkit.doctor import DIAGNOSES, Observations, Severity, Wish, diagnose, readiness, verdict
@@ -24,6 +23,7 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.report import print_report
 from dexkit.doctor.topics import nearly
+from tests.each import each
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
@@ -201,11 +201,11 @@ def _ids(seen: Observations, wish: Wish | None = None) -> set[str]:
     return {f.id for f in diagnose(seen, wish)}
 
 
-def test_every_diagnosis_can_be_made() -> None:
+def test_every_diagnosis_has_a_test() -> None:
     assert set(CASES) == set(DIAGNOSES)
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@each("name", list(CASES))
 def test_a_diagnosis(name: str) -> None:
     # what concerns devices only: that no hand is on DDS is another matter
     found = [f for f in diagnose(CASES[name]) if f.id == name]
@@ -216,7 +216,7 @@ def test_a_diagnosis(name: str) -> None:
         assert not verdict(CASES[name], found).healthy
 
 
-def test_nothing_is_wrong_with_what_is_right() -> None:
+def test_healthy_observation_has_no_finding() -> None:
     usual = _seen(GOOD, environment=ENV, serial=(PORT,), usb=(HAND,))
     assert diagnose(usual) == []
     said = verdict(usual, [])
@@ -227,7 +227,7 @@ def test_nothing_is_wrong_with_what_is_right() -> None:
     assert _ids(_seen(_pair(nonzero=False))) == set()
 
 
-@pytest.mark.parametrize(
+@each(
     "name",
     [
         *("DDS-NOBODY", "DDS-QOS", "DDS-ONE-SIDE", "DDS-SILENT", "DDS-ALL-ZERO", "DDS-TYPE"),
@@ -241,7 +241,7 @@ def test_a_client_waits(name: str) -> None:
     assert all(s.missing for s in states if not s.ready)
 
 
-def test_dexkit_on_either_side_does_without_multicast() -> None:
+def test_missing_multicast_is_no_fault_with_dexkit_or_static_peers() -> None:
     view = _pair(hand=_who("hand", command="dexkit serve sim-dex1 --side both"))
     assert _ids(Observations(domains=(view,), interfaces=(DEAF,))) == set()
     view = _pair(client=_who("client", dds_config="<Peers><Peer address='127.0.0.1'/></Peers>"))
@@ -262,13 +262,13 @@ def test_a_process_that_does_not_answer_is_on_another_interface() -> None:
     assert "NET-INTERFACE" not in _ids(known)
 
 
-def test_commands_that_arrive_late_are_no_trap() -> None:
+def test_restarted_hand_is_not_reported_as_late_joiner() -> None:
     """A hand younger than a client whose commands do arrive is a hand that was restarted."""
     view = _pair(hand=_who("hand", started=9.0), client=_who("client", started=5.0))
     assert "DDS-LATE-JOINER" not in _ids(_seen(view))
 
 
-def test_a_port_that_a_service_uses_is_in_use_and_well() -> None:
+def test_port_in_use_by_a_service_is_no_finding() -> None:
     (found,) = diagnose(_port(holders=("dexkit serve ezgripper (pid 5)",), asked=False))[-1:]
     assert (found.id, found.severity) == ("SERIAL-BUSY", Severity.NOTE)
 
@@ -282,7 +282,7 @@ def test_a_device_that_is_asked_about_is_not_a_client_that_waits() -> None:
     assert found.severity is Severity.NOTE
 
 
-@pytest.mark.parametrize(
+@each(
     ("topic", "meant"),
     [
         ("dex1/left/state", "rt/dex1/left/state"),
@@ -294,16 +294,16 @@ def test_a_device_that_is_asked_about_is_not_a_client_that_waits() -> None:
         ("rt/unitree_actuators/cmd", "rt/unitree_actuator/cmd"),
     ],
 )
-def test_a_slip_of_the_pen(topic: str, meant: str) -> None:
+def test_misspelt_topic_is_recognised(topic: str, meant: str) -> None:
     found = nearly(topic)
     assert found is not None
     assert found[0] == meant
 
 
-@pytest.mark.parametrize(
+@each(
     "topic", ["rt/dex1/left/cmd", "rt/dex5/left/state", "rt/lowstate", "rt/inspire/cmd", "rosout"]
 )
-def test_a_name_of_its_own(topic: str) -> None:
+def test_unrelated_topic_name_is_no_misspelling(topic: str) -> None:
     assert nearly(topic) is None
 
 

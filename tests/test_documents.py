@@ -1,4 +1,4 @@
-"""Every file that a user gives is read or refused with its name; what is written is whole."""
+"""Files given by a user are read or refused with their name; written files are complete."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def refused(read: Callable[[Path], Any], path: Path, what: str) -> bool:
     return True
 
 
-def test_whatever_a_file_holds_is_read_or_refused_by_name(tmp_path: Path) -> None:
+def test_any_file_content_is_read_or_refused_with_its_name(tmp_path: Path) -> None:
     path = tmp_path / "given.file"
     count = 0
     for what, content in hostile.broken_files():
@@ -63,7 +63,7 @@ def test_whatever_a_file_holds_is_read_or_refused_by_name(tmp_path: Path) -> Non
     assert count > 200
 
 
-def test_what_is_no_ordinary_file_is_refused_at_once(tmp_path: Path) -> None:
+def test_special_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "around").symlink_to("around")
@@ -77,7 +77,7 @@ def test_what_is_no_ordinary_file_is_refused_at_once(tmp_path: Path) -> None:
         documents.read_text(tmp_path / "none")
 
 
-def test_a_file_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
+def test_oversized_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "large"
     with path.open("wb") as file:
         file.truncate(documents.LARGEST + 1)
@@ -85,7 +85,7 @@ def test_a_file_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
         documents.read_text(path)
 
 
-def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
+def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b'\xef\xbb\xbf{"a": 1}')
     assert documents.read_json(path) == {"a": 1}
@@ -93,7 +93,7 @@ def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
     assert documents.read_toml(path) == {"a": 1}
 
 
-def test_a_key_twice_and_a_number_that_is_none_are_refused() -> None:
+def test_duplicate_key_and_non_finite_number_are_refused() -> None:
     for text, why in (
         ('{"a": 1, "a": 2}', "the key 'a' is there twice"),
         ('{"a": NaN}', "NaN is not a number"),
@@ -205,7 +205,7 @@ def test_a_file_is_written_with_the_usual_rights_and_keeps_those_it_has(tmp_path
 
 
 @pytest.mark.parametrize("where", ["write", "fsync", "replace"])
-def test_what_cannot_be_written_leaves_what_was_there(
+def test_failed_write_keeps_the_old_file(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "report"

@@ -17,6 +17,7 @@ from dexkit.errors import (
 )
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import ErrorNumber, Instruction, Packet, PacketParser
+from tests.each import each
 
 A = "FF FF FD 00 01 "  # the start of every packet to or from id 1
 
@@ -173,7 +174,7 @@ def test_crc_check_value() -> None:
     assert dxl.crc16(b"123456789") == 0xFEE8
 
 
-@pytest.mark.parametrize(
+@each(
     ("packet_id", "code", "params", "wire"),
     [v[1:] for v in INSTRUCTIONS],
     ids=[v[0] for v in INSTRUCTIONS],
@@ -183,7 +184,7 @@ def test_instruction_vectors(packet_id: int, code: int, params: str, wire: str) 
     assert dxl.decode(h(wire)) == Packet(packet_id, code, h(params))
 
 
-@pytest.mark.parametrize(
+@each(
     ("packet_id", "error", "data", "wire"),
     [v[1:] for v in STATUSES],
     ids=[v[0] for v in STATUSES],
@@ -237,7 +238,7 @@ def packets(draw: st.DrawFn) -> Packet:
 
 @given(nasty)
 @settings(deadline=None)
-def test_stuffing_is_undone_and_hides_every_header(body: bytes) -> None:
+def test_byte_stuffing_round_trips_and_leaves_no_header(body: bytes) -> None:
     stuffed = dxl.stuff(body)
     assert dxl.unstuff(stuffed) == body
     assert dxl.HEADER not in stuffed
@@ -295,7 +296,7 @@ def test_good_packet_is_found_behind_garbage(noise: bytes, packet: Packet) -> No
     assert packet in got
 
 
-def test_length_lie_costs_only_itself() -> None:
+def test_wrong_length_loses_only_its_own_packet() -> None:
     good = h(A + "03 00 01 19 4E")
     parser = PacketParser()
     lie = dxl.HEADER + h("01 0A 00")  # claims ten bytes: swallows the good packet's first
@@ -304,7 +305,7 @@ def test_length_lie_costs_only_itself() -> None:
     assert parser.skipped == len(lie)
 
 
-@pytest.mark.parametrize("length", ["FF FF", "02 00", "00 00", "FA 03"])
+@each("length", ["FF FF", "02 00", "00 00", "FA 03"])
 def test_absurd_length_is_skipped_at_once(length: str) -> None:
     parser = PacketParser()
     assert parser.feed(h(A + length) + h(A + "03 00 01 19 4E")) == [Packet(1, 1)]
@@ -325,7 +326,7 @@ def test_bad_crc_is_reported_only_when_asked() -> None:
     assert PacketParser(keep_bad=True).feed(bad) == [Packet(1, 1, b"", crc_ok=False)]
 
 
-@pytest.mark.parametrize(
+@each(
     ("wire", "error"),
     [
         ("", TruncatedError),

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
 from click.testing import CliRunner
 
 from dexkit.child_processes import Tool
@@ -22,6 +21,7 @@ from dexkit.models import DEX3_1, dialect
 from dexkit.robots import G1
 from dexkit.wire import low_level
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until
+from tests.each import each
 
 __all__ = ["dds_domain", "dds_node"]
 
@@ -75,7 +75,7 @@ def whole_robot(*arguments: object) -> Iterator[Robot]:
         one.tool.stop()
 
 
-def test_a_g1_with_two_dex3_moves_and_ends_whole(dds_domain: int, dds_node: DdsNode) -> None:
+def test_g1_with_two_dex3_moves_and_stops_cleanly(dds_domain: int, dds_node: DdsNode) -> None:
     states = dds_node.reader(G1.state_topic, G1.state_type)
     hands = {s: dds_node.reader(DEX3.topics(s)[1], DEX3.state_type) for s in Side}
     orders = dds_node.writer(G1.cmd_topic, G1.cmd_type)
@@ -119,7 +119,7 @@ def test_a_g1_with_two_dex3_moves_and_ends_whole(dds_domain: int, dds_node: DdsN
     assert not any("Traceback" in line for line in whole.lines)
 
 
-def test_a_part_that_dies_ends_the_whole() -> None:
+def test_program_ends_when_one_of_its_processes_dies() -> None:
     with whole_robot("--robot", "h1", "--hands", "dex1", "--domain", free_domain()) as whole:
         parts = children(whole.pid)
         assert whole.end(signal.SIGKILL, whole.part("sim-dex1")) == 1
@@ -127,7 +127,7 @@ def test_a_part_that_dies_ends_the_whole() -> None:
         wait_until(lambda: all(gone(pid) for pid in parts))
 
 
-def test_no_part_survives_the_whole() -> None:
+def test_no_process_outlives_the_program() -> None:
     with whole_robot("--hands", "none", "--domain", free_domain(), "--quiet") as whole:
         parts = children(whole.pid)
         assert whole.end(signal.SIGKILL) == -signal.SIGKILL
@@ -147,7 +147,7 @@ def test_topics_that_are_taken_are_refused(dds_domain: int, dds_node: DdsNode) -
         assert "another --domain" in whole.lines[whole.lines.index(error) + 1]
 
 
-def test_it_ends_by_itself_and_says_what_is_next() -> None:
+def test_program_ends_after_its_duration_with_a_hint() -> None:
     domain = str(free_domain())
     result = CliRunner().invoke(
         cli, ["emulate", "all", "--hands", "none", "--domain", domain, "--duration", "0.1"]
@@ -158,7 +158,7 @@ def test_it_ends_by_itself_and_says_what_is_next() -> None:
 
 
 class TestArguments:
-    @pytest.mark.parametrize(
+    @each(
         ("domain", "hands", "text"),
         [
             (1, "dex3", "--arm=G1_29 --ee=dex3 --sim"),

@@ -37,6 +37,7 @@ from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
+from tests.each import each
 from tests.patience import PATIENCE
 
 PING = dxl.encode(1, Instruction.PING)
@@ -111,7 +112,7 @@ def emulate(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_ready_answer_stop_and_nothing_left(tmp_path: Path, signum: signal.Signals) -> None:
+def test_emulator_answers_stops_and_leaves_no_files(tmp_path: Path, signum: signal.Signals) -> None:
     link = tmp_path / "gripper"
     process = emulate("--link", str(link), "--id", "7", "--baudrate", "57600")
     assert process.stdout is not None
@@ -185,7 +186,7 @@ def test_process_ends_with_its_parent(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_somebody_elses_link_is_left_alone(tmp_path: Path) -> None:
+def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
     link = tmp_path / "gripper"
     with emulated_ezgripper(link=link):
         link.unlink()
@@ -193,7 +194,7 @@ def test_somebody_elses_link_is_left_alone(tmp_path: Path) -> None:
     assert os.readlink(link) == "/dev/null"
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "code", "says"),
     [
         ([], 2, "--link"),
@@ -230,7 +231,7 @@ def test_helper_reports_why_it_did_not_start() -> None:
     assert all(kind in caught.value.hint for kind in FAULT_KINDS)
 
 
-def test_helper_does_not_wait_for_ever() -> None:
+def test_helper_gives_up_waiting_for_a_silent_emulator() -> None:
     with pytest.raises(EmulatorError, match="did not start"):
         EmulatedProcess([], timeout=0.01)
     with pytest.raises(EmulatorError, match="did not start"):
@@ -472,7 +473,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
     assert b"Traceback" not in err
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "says"),
     [
         (["--serial", "a", "--serial", "b"], "2 serial numbers for 1 hand"),
@@ -483,7 +484,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
         (["--side", "middle"], "middle"),
     ],
 )
-def test_hand_that_cannot_be(arguments: list[str], says: str) -> None:
+def test_invalid_hand_options_are_refused(arguments: list[str], says: str) -> None:
     _, err = emulate_dex3(*arguments).communicate(timeout=60)
     assert says in err.decode()
     assert "Traceback" not in err.decode()

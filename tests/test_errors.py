@@ -1,4 +1,4 @@
-"""The error tree is the one drawn in the docstring, and ordinary except clauses work."""
+"""The tree of errors is the one in the docstring, and each has a message and a hint."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def drawn() -> dict[str, tuple[str | None, str | None]]:
     return tree
 
 
-def test_the_drawing_is_complete() -> None:
+def test_docstring_tree_lists_every_error() -> None:
     assert drawn().keys() == CLASSES.keys() == set(errors.__all__)
 
 
-def test_each_class_is_where_it_is_drawn() -> None:
+def test_error_bases_match_the_docstring_tree() -> None:
     for name, (parent, builtin) in drawn().items():
         bases = [base.__name__ for base in CLASSES[name].__bases__]
         assert bases == [b for b in (parent or "Exception", builtin) if b], name

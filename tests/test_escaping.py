@@ -1,4 +1,4 @@
-"""Names and notes from outside reach no terminal and no page raw."""
+"""Names and texts from outside reach neither a terminal nor a page unescaped."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_guarded_stream_shows_escapes_and_lets_a_status_line_go_back() -> None
         assert stream.getvalue() == f"{begin}status \\r\\x1b[K\\x1b[31m"
 
 
-def test_what_an_encoding_lacks_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unencodable_characters_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="ascii"))
     with guarded():
@@ -112,7 +112,7 @@ def test_a_log_message_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert err.count("\n") == 1
 
 
-def test_an_error_cannot_look_like_something_else(
+def test_error_text_is_escaped(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from dexkit import cli
@@ -255,7 +255,7 @@ _ALONE = {
 }
 
 
-def test_there_is_one_way_out() -> None:
+def test_only_listed_modules_write_to_the_terminal() -> None:
     for pattern, allowed in _ALONE.items():
         for folder in ("dexkit", "conformance", "drivers", "emulators", "traces"):
             for path in (ROOT / folder).rglob("*.py"):

@@ -16,6 +16,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, JointSpec, Side
 from dexkit.models import DEX1_1
 from dexkit.service.estimator import CORRECTION, STALL_THRESHOLD, JointEstimator, StateEstimator
+from tests.each import each
 
 STROKE = 5.4
 JOINT = JointSpec("gripper", q_min=0.0, q_max=STROKE, dq_max=24.0, tau_max=15.0, closing=-1)
@@ -92,7 +93,7 @@ def test_never_teleports_overshoots_or_reverses(
 
 @given(st.floats(0.0, STROKE), positions, speeds)
 @settings(deadline=None)
-def test_without_measurements_it_is_the_seeds_model(
+def test_estimate_without_measurements_is_the_model_of_the_source(
     start: float, command: float, speed: tuple[float, float]
 ) -> None:
     """Phase 2 of the note on predictive state, its 200 Hz loop written out."""
@@ -112,7 +113,7 @@ def test_without_measurements_it_is_the_seeds_model(
         assert e.predict(step * dt) == pytest.approx(predicted, abs=1e-6)
 
 
-def test_the_seeds_step_is_4_76_percent_at_200_hz() -> None:
+def test_model_step_is_4_76_percent_at_200_hz() -> None:
     speed = 952.43 / 100 * STROKE
     e = JointEstimator(JOINT, (speed, speed))
     e.measure(0.0, 0.0)
@@ -156,7 +157,7 @@ def test_a_large_difference_puts_it_on_the_measurement(fraction: float, side: in
     assert e.resyncs == 1
 
 
-def test_a_lagging_hand_makes_it_wait_and_not_turn_round() -> None:
+def test_prediction_waits_for_a_lagging_hand_without_reversing() -> None:
     e = JointEstimator(JOINT, (5.0, 5.0))
     e.measure(0.0, 0.0)
     e.follow(STROKE, 0.0)
@@ -195,7 +196,7 @@ def test_an_object_stops_the_prediction_at_the_object() -> None:
 
 
 @pytest.mark.parametrize("goal", [3.0, 1.0])
-def test_a_hand_that_overshoots_does_not_take_the_prediction_along(goal: float) -> None:
+def test_overshoot_of_the_hand_does_not_move_the_prediction_past_the_goal(goal: float) -> None:
     e = JointEstimator(JOINT, (5.0, 5.0))
     e.measure(2.0, 0.0)
     e.follow(goal, 0.0)
@@ -236,7 +237,7 @@ def test_a_speed_that_is_too_high_is_not_a_stall() -> None:
         assert e.q == true
 
 
-def test_no_command_no_prediction() -> None:
+def test_without_a_command_there_is_no_prediction() -> None:
     e = JointEstimator(JOINT, (5.0, 5.0))
     e.measure(1.0, 0.0)
     e.follow(5.0, 0.0)
@@ -271,7 +272,7 @@ def test_before_the_first_measurement_there_is_nothing() -> None:
     assert e.predict(1.01) > 0.0  # the command is already known
 
 
-@pytest.mark.parametrize("speed", [(0.0, 1.0), (1.0, -1.0), (math.inf, 1.0), (math.nan, 1.0)])
+@each("speed", [(0.0, 1.0), (1.0, -1.0), (math.inf, 1.0), (math.nan, 1.0)])
 def test_speeds_must_be_positive(speed: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="speeds"):
         JointEstimator(JOINT, speed)
@@ -280,7 +281,7 @@ def test_speeds_must_be_positive(speed: tuple[float, float]) -> None:
 class TestStateEstimator:
     spec = DEX1_1.spec(Side.LEFT, io_rate=5.0)
 
-    def test_a_prediction_says_so_and_keeps_the_rest(self) -> None:
+    def test_predicted_state_is_marked_and_keeps_other_fields(self) -> None:
         e = StateEstimator(self.spec, [(2.0, 2.0)])
         assert e.predict(0.0) is None
         e.measure(HandState.from_values(1.0, stamp=0.0, tau_est=-0.5, temperature=31.0), 0.0)

@@ -40,7 +40,7 @@ def test_two_writers_keep_each_others_keys(tmp_path: Path) -> None:
     assert sorted(Store(path).keys()) == sorted(f"{n}{i}" for n in "ab" for i in range(100))
 
 
-def test_threads_of_one_process_as_well(tmp_path: Path) -> None:
+def test_two_threads_keep_each_others_keys(tmp_path: Path) -> None:
     path = tmp_path / "count"
 
     def count() -> None:
@@ -57,7 +57,7 @@ def test_threads_of_one_process_as_well(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("step", ["fchmod", "fsync", "replace"])
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), SystemExit()])
-def test_whatever_fails_leaves_the_old_file(
+def test_failed_update_keeps_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, error: BaseException
 ) -> None:
     path = tmp_path / "f.json"
@@ -77,7 +77,7 @@ def test_whatever_fails_leaves_the_old_file(
     assert {p.name for p in tmp_path.iterdir()} == {"f.json", ".f.json.lock"}
 
 
-def test_killed_at_any_step_leaves_old_or_new(tmp_path: Path) -> None:
+def test_killed_update_leaves_the_old_or_the_new_file(tmp_path: Path) -> None:
     path = tmp_path / "f.json"
     for step in ("open", "write", "fsync", "replace", "close"):
         for after in (False, True):
@@ -151,7 +151,7 @@ def test_what_cannot_be_locked_or_read_is_said(
     assert not (tmp_path / "nfs").exists()
 
 
-def test_a_file_that_makes_no_sense_is_not_overwritten(tmp_path: Path) -> None:
+def test_invalid_file_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "ezgripper.json"
     path.write_text("{")
     with pytest.raises(UsageError, match="not valid JSON"):

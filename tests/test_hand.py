@@ -22,6 +22,7 @@ from dexkit.hand import (
     Side,
 )
 from dexkit.models import DEX1_1, DIALECTS, MODELS, dialect, model
+from tests.each import each
 from tests.service_helpers import ScriptedHand
 
 THREE = HandSpec(
@@ -70,8 +71,8 @@ class TestGate:
         c = HandCommand.position([0.5, 1.0, -2.0])
         assert gate.admit(c) is c
 
-    @pytest.mark.parametrize("n", [1, 2, 4])
-    @pytest.mark.parametrize("field", [*FIELDS, "mode"])
+    @each("n", [1, 2, 4])
+    @each("field", [*FIELDS, "mode"])
     def test_a_wrong_shape_is_rejected(self, field: str, n: int) -> None:
         c = HandCommand.position([0.5, 1.0, -2.0])
         object.__setattr__(c, field, np.zeros(n))
@@ -125,7 +126,7 @@ class TestState:
 
 
 class TestSpec:
-    @pytest.mark.parametrize(
+    @each(
         "fields",
         [
             {"q_min": 1.0, "q_max": 1.0},
@@ -140,7 +141,7 @@ class TestSpec:
         with pytest.raises(UsageError, match="joint x"):
             JointSpec("x", **{**good, **fields})  # type: ignore[arg-type]
 
-    @pytest.mark.parametrize("io_rate", [0.0, -1.0, math.inf, math.nan])
+    @each("io_rate", [0.0, -1.0, math.inf, math.nan])
     def test_io_rate_must_be_a_rate(self, io_rate: float) -> None:
         with pytest.raises(UsageError, match="io_rate"):
             DEX1_1.spec(Side.LEFT, io_rate=io_rate)
@@ -166,7 +167,7 @@ class TestModels:
         assert DEX1_1.command_timeout == 1.0
         assert DEX1_1.vendor_ids == {Side.RIGHT: 0, Side.LEFT: 1}
 
-    @pytest.mark.parametrize(
+    @each(
         ("name", "side", "topics", "types"),
         [
             ("unitree_go", Side.LEFT, ("rt/dex1/left/cmd", "rt/dex1/left/state"),
@@ -185,7 +186,7 @@ class TestModels:
         assert d.topics(side) == topics
         assert (d.cmd_type, d.state_type) == types
 
-    def test_the_unknown_is_named_with_the_known(self) -> None:
+    def test_unknown_model_error_lists_the_known_ones(self) -> None:
         with pytest.raises(UsageError) as raised:
             model("dex9")
         assert "dex9" in raised.value.message
@@ -195,6 +196,6 @@ class TestModels:
         assert all(name in raised.value.hint for name in DIALECTS)
 
 
-def test_a_hand_is_anything_with_the_four() -> None:
+def test_object_with_the_four_members_is_a_hand() -> None:
     assert isinstance(ScriptedHand(), Hand)
     assert not isinstance(object(), Hand)

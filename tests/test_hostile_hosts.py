@@ -1,4 +1,4 @@
-"""Emulated devices under hosts that send anything: samples of the fuzzers, and what they found."""
+"""Emulated devices with hosts that send invalid or far too much data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from dexkit.clock import ManualClock
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.usb import Dex3Usb
-from dexkit.emulators.faults import MX64_FAULTS, parse_fault
+from dexkit.emulators.faults import DEX3_FAULTS, MX64_FAULTS, parse_fault
 from dexkit.emulators.m4010.bus import Bus as MotorBus
 from dexkit.emulators.m4010.motor import Motor
 from dexkit.emulators.mx64 import Bus, Firmware, Port, Servo
@@ -27,12 +27,7 @@ from dexkit.wire import dynamixel as dxl
 from dexkit.wire import m4010
 from dexkit.wire.dynamixel import Instruction
 from tests.cli_helpers import running
-from tests.fuzz import devices
-
-
-@pytest.mark.parametrize("name", sorted(devices.FUZZERS))
-def test_whatever_comes(name: str) -> None:
-    assert devices.FUZZERS[name](0, 2000) == 2000
+from tools.campaign.fuzz.devices import packet
 
 
 def broken(*_: object) -> None:
@@ -55,11 +50,11 @@ PING = dxl.encode(1, Instruction.PING)
 def test_a_fast_read_that_no_packet_can_hold_is_not_answered() -> None:
     for asked in (
         bytes.fromhex("fffffd00fe08008a0000f50301c034"),  # 1013 bytes of servo 1
-        devices.packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1"),
-        devices.packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1\2\3"),
-        devices.packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\2\0\0\xf5\3"),
+        packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1"),
+        packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1\2\3"),
+        packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\2\0\0\xf5\3"),
         # servo 9 is not there: the first would announce a length for it all the same
-        devices.packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\x09\0\0\xff\xff"),
+        packet(254, Instruction.FAST_BULK_READ, b"\1\0\0\4\0\x09\0\0\xff\xff"),
     ):
         bus = fast_bus()
         assert ask(bus, asked) == [], asked.hex()
@@ -70,11 +65,11 @@ def test_a_fast_read_that_no_packet_can_hold_is_not_answered() -> None:
 def test_the_longest_fast_read_is_answered() -> None:
     longest = dxl.MAX_LENGTH - 5
     bus = fast_bus()
-    (answer,) = ask(bus, devices.packet(254, 0x8A, b"\0\0" + longest.to_bytes(2, "little") + b"\1"))
+    (answer,) = ask(bus, packet(254, 0x8A, b"\0\0" + longest.to_bytes(2, "little") + b"\1"))
     assert len(answer.params) == 2 + longest  # error (no such range), id, and its place
 
 
-def test_a_mistake_in_one_device_is_told_and_the_line_lives(
+def test_exception_in_one_device_is_logged_and_the_line_goes_on(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     bus = fast_bus()
@@ -96,7 +91,7 @@ def test_a_mistake_in_one_device_is_told_and_the_line_lives(
     assert isinstance(motors.failure, IndexError)
 
 
-def test_the_program_survives_the_packet(tmp_path: Path) -> None:
+def test_emulator_process_survives_an_oversized_fast_read(tmp_path: Path) -> None:
     link = tmp_path / "tty"
     with running("emulate", "mx64", "--link", link, "--fast-reads") as emulator:
         emulator.ready()
@@ -115,7 +110,7 @@ def test_the_program_survives_the_packet(tmp_path: Path) -> None:
         assert code == 0, errors
 
 
-def test_a_flood_waits_for_the_line() -> None:
+def test_flood_is_limited_by_the_line_speed() -> None:
     # at 9600 baud a ping and its answer take 25 ms of line time
     bus = Bus([Servo(1, baudrate=9600)], line_time=True)
     clock = ManualClock()
@@ -141,7 +136,7 @@ def test_answers_that_are_held_back_are_bounded() -> None:
     clock = ManualClock()
     mcu = Dex3Mcu(Side.LEFT, clock=clock)
     usb = Dex3Usb(mcu, clock)
-    mcu.inject(parse_fault("delay:ms=900000", devices.DEX3_FAULTS))
+    mcu.inject(parse_fault("delay:ms=900000", DEX3_FAULTS))
     clock.advance(0.01)
     for _ in range(200):
         usb._received(usb._out, b"no frame")
@@ -149,14 +144,14 @@ def test_answers_that_are_held_back_are_bounded() -> None:
     assert mcu.counters.unread == 200 - 64
 
 
-def test_lines_of_input_that_are_no_fault() -> None:
+def test_invalid_fault_lines_are_refused() -> None:
     for text in ("overheat:id=" + "9" * 5000, "drop:p=nan", "drop@1e400", "stuck:id=²", "\0"):
         with pytest.raises(UsageError) as caught:
             parse_fault(text, MX64_FAULTS)
         assert len(str(caught.value)) < 10000
 
 
-def test_nonsense_on_standard_input_is_told(tmp_path: Path) -> None:
+def test_invalid_standard_input_is_reported(tmp_path: Path) -> None:
     lines = b"overheat:id=" + b"9" * 5000 + b"\n\xff\xfe\n" + b"x" * 100_000 + b"\nfoo\n"
     done = subprocess.run(
         [

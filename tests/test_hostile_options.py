@@ -1,4 +1,4 @@
-"""No option of any command ends in a traceback, whatever is written there."""
+"""No value of any command-line option ends in a traceback."""
 
 from __future__ import annotations
 

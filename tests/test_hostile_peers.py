@@ -1,4 +1,4 @@
-"""Whatever a peer announces, discovery goes on: in the node, the recorder and the doctor."""
+"""Discovery goes on after any announcement of a peer: in the node, the recorder, the doctor."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_a_recorder_goes_on_recording(tmp_path: Path) -> None:
     assert len(open_trace(tmp_path / "a.mcap").samples(STATE)) == 5
 
 
-def test_topics_without_end_are_not_all_subscribed(tmp_path: Path) -> None:
+def test_number_of_subscribed_topics_is_bounded(tmp_path: Path) -> None:
     """A peer that announces topic after topic costs no more than a bounded number of readers."""
     domain = free_domain()
     with DdsNode(domain) as node, Recorder(tmp_path / "a.mcap") as recorder:
@@ -184,7 +184,7 @@ def test_topics_without_end_are_not_all_subscribed(tmp_path: Path) -> None:
             assert all("5 topics" in why for why in recording.unknown.values())
 
 
-def test_the_doctor_looks_at_them_all() -> None:
+def test_doctor_reads_every_hostile_announcement() -> None:
     domain = free_domain()
     with HostilePeer(domain) as peer, DdsNode(domain) as node:
         peer.announce(PROPERTIES[0])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from dexkit.emulators.joint_mechanics import FixedSteps, Joint, Wall
 from dexkit.errors import UsageError
+from tests.each import each
 
 DT = 1e-3
 
@@ -19,7 +20,7 @@ def settle(joint: Joint, torque: float, seconds: float = 2.0, dt: float = DT) ->
         joint.step(torque, dt)
 
 
-def test_free_joint_accelerates_as_newton_says() -> None:
+def test_free_joint_accelerates_by_torque_over_inertia() -> None:
     joint = Joint(inertia=0.01)
     settle(joint, 0.5, 1.0)
     assert joint.dq == pytest.approx(0.5 / 0.01)
@@ -146,7 +147,7 @@ def test_a_motor_is_a_torque_where_its_gains_are_soft() -> None:
     assert driven.q == pytest.approx(pushed.q)
 
 
-@pytest.mark.parametrize("damping", [0.1, 10.0, 1e4])
+@each("damping", [0.1, 10.0, 1e4])
 def test_stiff_gains_are_stable(damping: float) -> None:
     """Taken explicitly, the stiffest of these would grow by a factor of 50000 a step."""
     joint = Joint(inertia=2e-4, coulomb=0.002, dq=5.0)
@@ -158,7 +159,7 @@ def test_stiff_gains_are_stable(damping: float) -> None:
     assert joint.dq == 0.0
 
 
-@pytest.mark.parametrize("damping", [0.1, 1.0, 10.0])
+@each("damping", [0.1, 1.0, 10.0])
 def test_a_blocked_motor_gives_its_whole_torque(damping: float) -> None:
     joint = Joint(inertia=2e-4, coulomb=0.002, walls=(Wall(0.0, -1, 60.0, 0.1),))
     torque = 0.0
@@ -193,7 +194,7 @@ def test_gearing_takes_when_driving_and_helps_when_holding() -> None:
     st.floats(0.0, 2.0),
 )
 @settings(deadline=None)
-def test_no_law_drives_it_through_its_stops(
+def test_no_control_law_passes_the_hard_stops(
     laws: list[tuple[float, float]], driving_loss: float, holding_loss: float
 ) -> None:
     joint = Joint(
@@ -223,7 +224,7 @@ def test_steps_keep_up_with_a_clock_without_drift() -> None:
     assert steps.done == lived == 2600
 
 
-def test_a_long_pause_is_skipped() -> None:
+def test_long_pause_is_not_simulated() -> None:
     steps = FixedSteps(1e-3, most=0.5)
     steps.restart(0.0)
     assert steps.due(3600.0) == 500

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import pytest
+from tests.each import each
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("drivers", "emulators", "conformance", "traces")
@@ -55,7 +55,7 @@ def files(folder: str) -> list[Path]:
     return found
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@each("package", PACKAGES)
 def test_each_package_is_linked_into_dexkit(package: str) -> None:
     link = ROOT / "dexkit" / package
     assert link.is_symlink()
@@ -63,7 +63,7 @@ def test_each_package_is_linked_into_dexkit(package: str) -> None:
     assert (link / "__init__.py").is_file()
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@each("package", PACKAGES)
 def test_packages_do_not_import_each_other(package: str) -> None:
     for path in files(package):
         others = packages_imported(path) - {package} - MAY_IMPORT[package]
@@ -78,14 +78,14 @@ def test_the_core_imports_none_of_them() -> None:
             )
 
 
-@pytest.mark.parametrize("folder", ["dexkit", "tests", "benchmarks", *PACKAGES])
+@each("folder", ["dexkit", "tests", "benchmarks", *PACKAGES])
 def test_nothing_imports_a_package_by_its_bare_name(folder: str) -> None:
     for path in files(folder):
         bare = {name for name in imported(path) if name.split(".")[0] in PACKAGES}
         assert not bare, f"{path.relative_to(ROOT)} imports {', '.join(bare)}: say dexkit.…"
 
 
-@pytest.mark.parametrize("folder", ["dexkit", "benchmarks", *PACKAGES])
+@each("folder", ["dexkit", "benchmarks", *PACKAGES])
 def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))

@@ -1,4 +1,4 @@
-"""The genuine session of xr_teleoperate v1.1 is judged as its bytes say.
+"""Verdicts and figures of the genuine recording of xr_teleoperate v1.1.
 
 The figures are taken here with mcap, struct and numpy alone, not with the kit's decoder.
 """
@@ -142,7 +142,7 @@ def test_the_figures_are_those_of_the_bytes() -> None:
         assert figure("DEX1-TRACK-02", side) == pytest.approx(1e3 * delay, abs=5)
 
 
-def test_the_right_one_holds_the_object() -> None:
+def test_right_gripper_holds_the_object() -> None:
     """Index 0, whatever the enum of that release says (docs/sources/unitree-dex.md#a1)."""
     s = session()
     q, tau = s.states[:, INDEX[Side.RIGHT], 1], s.states[:, INDEX[Side.RIGHT], 4]
@@ -175,7 +175,9 @@ def without(side: Side, path: Path, *, driven: bool) -> Path:
 
 
 @pytest.mark.parametrize("missing", list(Side))
-def test_of_a_service_of_one_gripper_the_other_is_not_judged(missing: Side, tmp_path: Path) -> None:
+def test_absent_gripper_of_a_one_gripper_service_is_not_judged(
+    missing: Side, tmp_path: Path
+) -> None:
     there = Side.LEFT if missing is Side.RIGHT else Side.RIGHT
     recording = Recording.of(open_trace(without(missing, tmp_path / "one.mcap", driven=False)))
     assert recording.judged == (there,)
@@ -185,7 +187,7 @@ def test_of_a_service_of_one_gripper_the_other_is_not_judged(missing: Side, tmp_
     assert of(result, "DEX1-TRACK-01", there).verdict is Verdict.PASS
 
 
-def test_one_that_is_driven_and_says_nothing_is_judged(tmp_path: Path) -> None:
+def test_commanded_gripper_without_state_is_judged(tmp_path: Path) -> None:
     path = without(Side.LEFT, tmp_path / "dead.mcap", driven=True)
     result = judge(Recording.of(open_trace(path)))
     assert of(result, "DEX1-TRACK-01", Side.LEFT).verdict is Verdict.FAIL

@@ -17,6 +17,7 @@ from dexkit.hand import Side
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import Instruction
+from tests.each import each
 from tests.mx64_helpers import servo, write
 
 BAUD_RATES = sorted(mx64.BAUD_RATES.values())
@@ -163,7 +164,7 @@ def test_no_byte_comes_early_and_none_late(
     assert came == size + 11
 
 
-@pytest.mark.parametrize("baudrate", BAUD_RATES)
+@each("baudrate", BAUD_RATES)
 def test_the_driver_claims_a_rate_that_a_paced_loop_keeps(baudrate: int) -> None:
     """At every phase of the timer, for a host as slow as the driver assumes one to be."""
     spec = EZGripper("/dev/null", Side.LEFT, GripperSettings(baudrate=baudrate)).spec

@@ -1,4 +1,4 @@
-"""What a recording lacks is counted and told: in the status line, the file and the exit code."""
+"""What a recording lacks is counted and reported in the status line, the file and the exit code."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_gap_that_shows_later_still_counts_and_much_later_does_not() -> None:
     assert losses.about == {"rt/a": 30}
 
 
-def test_samples_without_a_time_and_out_of_order_harm_nothing() -> None:
+def test_untimed_and_unordered_samples_are_accepted() -> None:
     losses = Losses()
     for source in (0, 0, 5, 3, 0, T0, T0, 0, T0 + 1, 2**62):
         for _ in range(9):
@@ -87,7 +87,7 @@ def test_samples_without_a_time_and_out_of_order_harm_nothing() -> None:
     assert sum(losses.about.values()) <= 2
 
 
-def test_pauses_are_told_with_their_time() -> None:
+def test_pauses_are_reported_with_their_time() -> None:
     losses = Losses()
     assert losses.turn(10.0, T0) is None
     assert losses.turn(10.0 + PAUSE - 0.01, T0) is None
@@ -242,7 +242,7 @@ def test_a_recorder_that_was_stopped_says_what_it_lost(tmp_path: Path, buffer: s
         assert about["lost_datagrams"] == "0"
 
 
-def test_a_full_disk_is_told_as_it_is(tmp_path: Path) -> None:
+def test_full_disk_is_reported_with_the_numbers(tmp_path: Path) -> None:
     """What it says was written is what can be read, and the exit code is an error."""
     domain = free_domain()
     out = tmp_path / "out.mcap"
@@ -269,7 +269,7 @@ def test_a_full_disk_is_told_as_it_is(tmp_path: Path) -> None:
     assert f"  {count} messages were written and can be read" in stderr
 
 
-def test_a_deleted_file_is_told(tmp_path: Path) -> None:
+def test_deleted_file_is_reported(tmp_path: Path) -> None:
     domain = free_domain()
     out = tmp_path / "out.mcap"
     with recorder("default", out, "--topic", STATE, "--domain", domain) as process:

@@ -1,4 +1,4 @@
-"""The CRC of LowCmd_ and LowState_, against vectors and packers that dexkit did not make."""
+"""The CRC of LowCmd_ and LowState_ against foreign vectors and packers."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from dexkit.wire.low_level import (
     verify,
     verify_payload,
 )
+from tests.each import each
 from tests.messages_helpers import messages
 
 GO_CMD, GO_STATE, HG_CMD, HG_STATE = LOW_LEVEL_TYPES
@@ -89,7 +90,7 @@ def test_which_types_carry_one() -> None:
     assert [name.rsplit(":", 1)[1] for name in LOW_LEVEL_TYPES] == ["LowCmd_", "LowState_"] * 2
 
 
-@pytest.mark.parametrize(("message", "crc"), VECTORS)
+@each(("message", "crc"), VECTORS)
 def test_measured_crcs(message: Any, crc: int) -> None:
     assert crc_of(message) == crc
     package = type(message).__module__.rsplit(".", 1)[1]

@@ -29,6 +29,7 @@ from dexkit.wire.m4010 import (
     Status,
     calibration_outcome,
 )
+from tests.each import each
 
 
 def _drive(number: int, q: float) -> MotorCmd:
@@ -36,7 +37,7 @@ def _drive(number: int, q: float) -> MotorCmd:
 
 
 # docs/sources/unitree-dex.md#g: bytes read from the vendor's library
-@pytest.mark.parametrize(
+@each(
     ("command", "wire"),
     [
         (MotorCmd.setpoint(0), "feee1000 0000 0000 00000000 0000 0000 73d71398"),
@@ -88,7 +89,7 @@ def test_calibration_is_that_of_the_vendors_library() -> None:
 
 
 # docs/sources/unitree-dex.md#g: codes that were read at single values, rotor side
-@pytest.mark.parametrize(
+@each(
     ("name", "value", "code"),
     [
         ("tau", 0.1, 256),
@@ -119,14 +120,14 @@ def test_what_is_beyond_the_wire_saturates() -> None:
     assert (small.k_pos, small.k_spd) == (0, 0)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", ["q", "dq", "tau", "kp", "kd"])
+@each("value", [math.nan, math.inf, -math.inf])
+@each("name", ["q", "dq", "tau", "kp", "kd"])
 def test_not_a_number_cannot_be_sent(name: str, value: float) -> None:
     with pytest.raises(EncodeError, match=r"cannot be sent"):
         MotorCmd.setpoint(0, **{name: value})
 
 
-@pytest.mark.parametrize(
+@each(
     ("frame", "says"),
     [
         (MotorCmd(16), "id = 16"),
@@ -145,7 +146,7 @@ def test_values_that_do_not_fit(frame: MotorCmd | MotorData | Calibration, says:
         frame.pack()
 
 
-def test_what_is_no_frame() -> None:
+def test_invalid_frames_are_refused() -> None:
     for kind, frame in ((MotorCmd, MotorCmd(1).pack()), (MotorData, MotorData(1).pack())):
         with pytest.raises(TruncatedError):
             kind.parse(frame[:-1])
@@ -294,7 +295,7 @@ def test_parser_does_not_care_how_bytes_are_cut(sent: list[MotorData], draw: st.
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(frames, max_size=6), st.data())
-def test_a_listener_hears_both_ends_and_all_motors(
+def test_parser_separates_commands_and_data_of_all_motors(
     sent: list[MotorCmd | MotorData], draw: st.DataObject
 ) -> None:
     parser = FrameParser((COMMAND, DATA))

@@ -32,6 +32,7 @@ from dexkit.wire.m4010 import (
     Status,
     calibration_outcome,
 )
+from tests.each import each
 
 ZEROS = MotorCmd.setpoint(0)
 
@@ -97,7 +98,7 @@ def test_it_answers_any_probe_with_what_it_measures() -> None:
     assert (data.temp, data.winding, data.voltage) == (25, 25, 24.0)
 
 
-def test_it_goes_where_it_is_told_and_reports_the_way() -> None:
+def test_motor_reaches_its_goal_and_reports_its_motion() -> None:
     host = Host(motor())
     seen = [host.drive(0.02, q=5.4, kp=5.0, kd=0.05) for _ in range(60)]
     assert seen[-1].joint().q == pytest.approx(5.4, abs=0.05)
@@ -105,12 +106,12 @@ def test_it_goes_where_it_is_told_and_reports_the_way() -> None:
     assert seen[0].status == Status.FOC
 
 
-def test_zero_gains_leave_it_alone() -> None:
+def test_zero_gains_make_no_torque() -> None:
     host = Host(motor())
     assert host.drive(0.3, q=5.0).joint().q == pytest.approx(1.08, abs=1e-3)
 
 
-def test_gains_below_a_count_are_no_gains() -> None:
+def test_gains_below_one_count_are_zero() -> None:
     """kd 0.0487 is 0 on the wire (docs/sources/unitree-dex.md#g): the resolution is part of the
     product.
     """
@@ -213,7 +214,7 @@ def test_the_protection_trips_after_a_second_and_waits_for_a_clear_bit(brakes: b
     assert host.drive(1.0, q=1.0, kp=5.0, kd=0.05).joint().q == pytest.approx(1.0, abs=0.05)
 
 
-def test_without_the_bit_it_goes_on_for_ever() -> None:
+def test_motor_without_the_protection_bit_keeps_its_command() -> None:
     """What the vendor's service asks for while it drives (docs/sources/unitree-dex.md#b2)."""
     one = motor()
     host = Host(one)
@@ -245,7 +246,7 @@ def test_calibration_makes_here_the_zero_once() -> None:
     assert "before since power-up" in calibration_outcome(again)
 
 
-@pytest.mark.parametrize(
+@each(
     ("calibration", "firmware", "faults", "says"),
     [
         (Calibration(0, range=0.0, time=1), Firmware(), (), "range"),
@@ -286,7 +287,7 @@ def test_a_client_at_another_rate_is_not_understood() -> None:
     assert host.ask(ZEROS) is not None
 
 
-def test_half_a_frame_is_dropped_after_a_gap() -> None:
+def test_partial_frame_is_dropped_after_a_gap() -> None:
     host = Host(motor())
     frame = ZEROS.pack()
     host.send(frame[:11], 0.001)
@@ -296,7 +297,7 @@ def test_half_a_frame_is_dropped_after_a_gap() -> None:
     assert len(host.send(frame)) == 26
 
 
-def test_a_damaged_command_is_met_with_silence() -> None:
+def test_damaged_command_is_not_answered() -> None:
     host = Host(motor())
     frame = bytearray(ZEROS.pack())
     frame[9] ^= 4
@@ -336,7 +337,7 @@ def test_any_command_keeps_it_finite_and_within_the_stops(
 # --- faults
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "first"),
     [
         ("short", lambda data, frame: data == frame[:20]),
@@ -368,7 +369,7 @@ def test_faults_of_answers(spec: str, first: object) -> None:
         assert rest == frame
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "bit"),
     [
         ("overcurrent:for=20ms", MotorError.OVERCURRENT),
@@ -390,7 +391,7 @@ def test_an_error_brakes_it_and_passes(spec: str, bit: MotorError) -> None:
     assert host.drive(0.02, q=1.1, kp=5.0).merror == 0
 
 
-def test_faults_strike_the_motor_they_name() -> None:
+def test_fault_applies_to_the_motor_with_its_id() -> None:
     left, right = motor(1), motor(0)
     host = Host(left, right, faults=("overcurrent:id=1", "stuck:id=0"))
     host.listen(0.001)
@@ -421,7 +422,7 @@ def test_unplugged_loses_what_was_on_its_way_and_not_the_motor() -> None:
     assert one.q > 2.0  # it went on
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "says"),
     [("stall", "no kind 'stall'"), ("silent:id=2", "not an id"), ("drop:side=left", "no key")],
 )
@@ -500,7 +501,7 @@ def test_faults_from_input_and_the_end_of_it(tmp_path: Path) -> None:
         assert motors.process.wait(60) == 0
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "says"),
     [
         (["--link", "left=a", "--link", "left=b"], "which line"),
@@ -521,7 +522,7 @@ def test_wrong_usage(tmp_path: Path, arguments: list[str], says: str) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_settings_that_cannot_be() -> None:
+def test_invalid_settings_are_refused() -> None:
     for wrong in (
         lambda: Firmware(command_timeout=0.0),
         lambda: Firmware(baudrate=0),

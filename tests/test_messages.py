@@ -9,6 +9,7 @@ from dexkit.messages import decode, encode, message_type, message_types
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.messages.layout import MAX_ELEMENTS
+from tests.each import each
 
 # docs/sources/unitree-dex.md#a4, measured there on Unitree's SDK classes
 GOLDEN_CMDS = bytes.fromhex(
@@ -43,7 +44,7 @@ def test_golden_states() -> None:
     assert decode("unitree_go.msg.dds_.MotorStates_", GOLDEN_STATES) == message
 
 
-@pytest.mark.parametrize(
+@each(
     ("message", "size"),
     [
         (go.MotorCmds_([go.MotorCmd_()]), 44),
@@ -110,7 +111,7 @@ def test_trailing_bytes() -> None:
             imu.decode(data + bytes(rest))
 
 
-@pytest.mark.parametrize(
+@each(
     ("message", "text"),
     [
         (go.MotorCmds_([go.MotorCmd_(mode=300)]), r"cmds\[0\].mode = 300 does not fit uint8"),

@@ -1,4 +1,4 @@
-"""What must hold for every message and for any bytes whatsoever."""
+"""Properties of the codec for every message type and for any bytes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dexkit.messages import decode, encode, message_type
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.messages.layout import STRUCTS, Primitive, Struct
+from tests.each import each
 from tests.messages_helpers import NAMES, messages
 
 any_message = st.sampled_from(NAMES).flatmap(lambda name: st.tuples(st.just(name), messages(name)))
@@ -67,7 +68,7 @@ def test_decoding_gives_back_what_was_encoded(pair: tuple[str, Any]) -> None:
 
 
 @given(any_message)
-def test_big_endian_means_the_same(pair: tuple[str, Any]) -> None:
+def test_big_endian_decodes_to_the_same_message(pair: tuple[str, Any]) -> None:
     name, message = pair
     assert decode(name, _swapped(name, encode(message))) == message
 
@@ -225,14 +226,14 @@ def test_columns_of_equal_length_but_other_shape() -> None:
     ]
 
 
-def test_columns_of_nothing() -> None:
+def test_columns_of_no_samples_are_empty() -> None:
     columns = message_type("unitree_go/msg/MotorStates").columns([])
     assert columns["states[0].q"].shape == (0,)
     assert columns["states[].q"].shape == (0, 0)
     assert columns.ok.shape == (0,)
 
 
-@pytest.mark.parametrize(
+@each(
     "path",
     [
         "",
@@ -247,7 +248,7 @@ def test_columns_of_nothing() -> None:
         "states[-1].q",
     ],
 )
-def test_column_paths_that_make_no_sense(path: str) -> None:
+def test_invalid_column_paths_are_refused(path: str) -> None:
     columns = message_type("unitree_go/msg/MotorStates").columns(
         [encode(go.MotorStates_([go.MotorState_()]))]
     )

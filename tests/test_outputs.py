@@ -48,7 +48,7 @@ def _outputs() -> Iterator[tuple[tuple[str, ...], str]]:
                 yield name, next(o for o in parameter.opts if o.startswith("--"))
 
 
-def test_every_option_that_names_a_file_to_write(
+def test_unwritable_output_file_of_any_option_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, recording = hostile.judged_result(tmp_path)
@@ -84,7 +84,7 @@ def test_every_option_that_names_a_file_to_write(
     assert seen >= 9
 
 
-def test_standard_output_that_is_full_or_read_no_more(
+def test_full_or_closed_standard_output_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, recording = hostile.judged_result(tmp_path)
@@ -124,7 +124,7 @@ def test_standard_output_that_is_full_or_read_no_more(
     os.close(full)
 
 
-def test_the_interpreter_says_no_more_about_it_at_its_end() -> None:
+def test_interpreter_prints_nothing_about_it_on_exit() -> None:
     no_reader, pipe = os.pipe()
     os.close(no_reader)
     for place, code in ((os.open("/dev/full", os.O_WRONLY), 2), (pipe, 141)):
@@ -210,7 +210,7 @@ def test_no_file_gets_the_number_of_a_standard_stream(tmp_path: Path, closed: st
 
 
 @pytest.mark.parametrize("gripper", [("ezgripper",), ("dex1-serial", "--side", "left")])
-def test_who_has_no_input_is_not_asked(tmp_path: Path, gripper: tuple[str, ...]) -> None:
+def test_closed_standard_input_asks_no_question(tmp_path: Path, gripper: tuple[str, ...]) -> None:
     command = command_line("calibrate", *gripper, "--device", str(tmp_path))
     done = subprocess.run(
         ["sh", "-c", 'exec "$@" <&-', "sh", *command],

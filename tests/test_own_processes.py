@@ -1,4 +1,4 @@
-"""The processes that dexkit starts: what they import, when they end, and what they leave."""
+"""Child processes of dexkit: what they import, when they end, what they leave behind."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def hostile_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_nothing_in_the_working_folder_is_imported(hostile_folder: Path) -> None:
+def test_programs_import_nothing_from_the_working_directory(hostile_folder: Path) -> None:
     commands = (
         ("check", "--list", "--dialect", "dex3"),
         ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.2"),
@@ -64,7 +64,7 @@ def test_nothing_in_the_working_folder_is_imported(hostile_folder: Path) -> None
 
 
 @pytest.mark.soak
-def test_workers_import_nothing_from_it_either(hostile_folder: Path) -> None:
+def test_workers_import_nothing_from_the_working_directory(hostile_folder: Path) -> None:
     command = command_line("mutants", "--require", "DEX1-RATE-03", "--jobs", "1", "--json", "out")
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr
@@ -110,7 +110,7 @@ sys.stdin.read()
 
 
 @pytest.mark.parametrize("when", ["ready", "at once"])
-def test_a_process_ends_with_its_parent_however_that_ends(when: str, tmp_path: Path) -> None:
+def test_child_process_ends_with_its_parent(when: str, tmp_path: Path) -> None:
     parent = subprocess.Popen(
         [sys.executable, "-c", _PARENT, str(tmp_path / "link"), when],
         stdin=subprocess.PIPE,
@@ -130,7 +130,7 @@ def test_a_process_ends_with_its_parent_however_that_ends(when: str, tmp_path: P
     assert not os.path.lexists(tmp_path / "link")
 
 
-def test_a_process_that_does_not_end_when_told_is_killed(tmp_path: Path) -> None:
+def test_process_that_ignores_sigterm_is_killed(tmp_path: Path) -> None:
     code = (
         "import signal, time, dexkit.child_processes as p\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
@@ -225,7 +225,7 @@ def test_a_folder_that_was_swept_before_its_lock_is_made_again(
 # ------------------------------------------------------------------------------- descriptors
 
 
-def test_without_require_open_files_nothing_begins() -> None:
+def test_too_few_file_descriptors_are_refused_at_start() -> None:
     commands = {
         ("doctor", "--seconds", "0.2"): "examining 11 domain(s) needs",
         ("serve", "sim-dex1", "--side", "left", "--domain", "1"): "DDS needs 16 more",
@@ -251,7 +251,7 @@ def test_without_require_open_files_nothing_begins() -> None:
         assert "ulimit -n" in err
 
 
-def test_a_limit_that_may_be_raised_is_raised() -> None:
+def test_descriptor_limit_is_raised_where_permitted() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     used = len(os.listdir("/proc/self/fd"))
     try:

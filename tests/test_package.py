@@ -58,7 +58,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     return Installed(tmp_path_factory.mktemp("clean"), sys.executable, wheel, "[conformance]")
 
 
-def test_wheel_holds_every_room_whole_and_once(wheel: Path) -> None:
+def test_wheel_holds_every_package_completely_and_once(wheel: Path) -> None:
     packed = [n for n in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in n]
     assert len(packed) == len(set(packed))
     # resolved, because dexkit/ holds links to the rooms

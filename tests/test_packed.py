@@ -139,7 +139,7 @@ def test_a_member_that_never_changes_is_known_to() -> None:
     assert columns["power_v"].tolist() == [24.0] * 1500
 
 
-def test_words_that_begin_to_change_in_any_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_are_right_when_a_value_begins_to_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dexkit.messages.packed, "_SEGMENT", 100)
     mt = message_type("unitree_hg::msg::dds_::HandState_")
     payloads = []

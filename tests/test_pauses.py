@@ -1,4 +1,4 @@
-"""After a pause nothing that was sent before moves: service, drivers, bridge, emulated robots."""
+"""No command from before a pause moves a hand: service, drivers, bridge, emulated robots."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_the_state_says_that_the_hand_brakes() -> None:
         wait_until(lambda: mode() == 0)
 
 
-def test_an_exchange_that_hangs_is_a_pause_of_that_hand_only() -> None:
+def test_hanging_exchange_is_a_pause_of_that_hand_only() -> None:
     hands = {side: ScriptedHand(side) for side in Side}
     node, clock = FakeNode(), Suspendable()
     topic = ACTUATOR.cmd_topic
@@ -220,9 +220,9 @@ def test_a_held_command_is_not_written_to_the_m4010() -> None:
         with Dex1Serial(LEFT, settings, clock=clock) as hand:
             hand.exchange(HandCommand.brake(1))
             _refuses(hand, clock, HandCommand.position(5.0))
-            assert motors.motor.robot.mode is JointMode.BRAKE
+            assert motors.motor.mechanics.mode is JointMode.BRAKE
             hand.exchange(HandCommand.position(5.0))
-            assert motors.motor.robot.mode is JointMode.FOC
+            assert motors.motor.mechanics.mode is JointMode.FOC
 
 
 def test_a_held_command_is_not_sent_to_the_dex3() -> None:
@@ -247,7 +247,7 @@ def _refuses(hand: Hand, clock: Slow, command: HandCommand) -> None:
         clock.armed = False
 
 
-def test_a_simulated_hand_is_braked_while_its_caller_is_away() -> None:
+def test_simulated_hand_brakes_during_a_pause_of_its_caller() -> None:
     clock = ManualClock()
     hand = SimHand(LEFT, clock=clock)
     hand.open()
@@ -266,7 +266,7 @@ def test_a_simulated_hand_is_braked_while_its_caller_is_away() -> None:
 
 
 class TestBridge:
-    def test_what_waits_for_the_other_side_is_dropped(self) -> None:
+    def test_pause_drops_a_command_that_waits_for_the_other_side(self) -> None:
         states = States(ACTUATOR, GO, tuple(Side))
         commands = Commands(GO, ACTUATOR, tuple(Side), states)
         self._seen(states, 2.0)
@@ -276,7 +276,7 @@ class TestBridge:
         assert commands.due is None
         assert commands.flush(10.0) == []
 
-    def test_the_other_side_is_not_told_again_what_it_was_told_before(self) -> None:
+    def test_pause_does_not_repeat_the_last_command_of_the_other_side(self) -> None:
         states = States(ACTUATOR, GO, tuple(Side))
         commands = Commands(GO, ACTUATOR, tuple(Side), states)
         self._seen(states, 2.0)
@@ -395,10 +395,10 @@ def stop_live(tries: int, *backends: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_stopped_in_motion_and_continued_without_a_client() -> None:
+def test_sigstop_in_motion_and_sigcont_do_not_move_the_hand_back() -> None:
     stop_live(2, "ezgripper", "sim-dex3")
 
 
 @pytest.mark.soak
-def test_every_backend_and_the_bridge_fifty_times() -> None:
+def test_fifty_stops_of_every_backend_do_not_move_the_hand_back() -> None:
     stop_live(50, *BACKENDS)

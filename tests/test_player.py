@@ -1,3 +1,5 @@
+"""Playback of a recording: times, gaps, loops, pauses."""
+
 from __future__ import annotations
 
 import threading
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from dexkit.clock import ManualClock, RealClock
 from dexkit.errors import UsageError
 from dexkit.traces import Player, TraceMessage, open_trace, sample_path
+from tests.each import each
 from tests.trace_helpers import CMD, STATE, T0, Row, cmd, mcap_bytes, rows, write
 
 RIGHT = "rt/dex1/right/cmd"
@@ -160,9 +163,9 @@ def test_in_real_time_no_message_is_early() -> None:
     assert all(at >= due for at, due in zip(sent, player.offsets, strict=True))
 
 
-@pytest.mark.parametrize("suspended", [False, True], ids=["stopped", "suspended"])
-@pytest.mark.parametrize("at", ["while sending", "in a gap"])
-def test_what_fell_due_in_a_pause_is_not_sent_at_once(
+@each("suspended", [False, True], ids=["stopped", "suspended"])
+@each("at", ["while sending", "in a gap"])
+def test_messages_due_during_a_pause_are_not_sent_in_a_burst(
     tmp_path: Path, suspended: bool, at: str
 ) -> None:
     clock = ManualClock()
@@ -220,7 +223,7 @@ def test_a_listener_that_blocks_makes_no_backlog(tmp_path: Path) -> None:
     assert np.diff(log.times)[-4:] == pytest.approx([0.2] * 4)
 
 
-def test_a_pause_ends_with_what_is_to_be_looked_at_first(tmp_path: Path) -> None:
+def test_stop_set_by_the_pause_callback_ends_the_playback(tmp_path: Path) -> None:
     clock = ManualClock()
     log = Log(clock)
     stop = threading.Event()

@@ -1,4 +1,4 @@
-"""The kit's own clients after a pause: nothing that fell due meanwhile goes out at once."""
+"""Clients of the conformance kit send no burst after a pause."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def positions(rows: list[tuple[str, int, Send]], side: str) -> list[float]:
     ]
 
 
-def test_the_kit_holds_the_session_while_it_stands_still() -> None:
+def test_conformance_run_waits_during_a_pause() -> None:
     rows = [row for row in driven("replay", 100) if row[0] == "replay"]
     times = [now for _, now, _ in rows]
     calm = [row for row in driven("replay", -1) if row[0] == "replay"]
@@ -75,14 +75,14 @@ def test_the_kit_holds_the_session_while_it_stands_still() -> None:
     assert sum(found) >= sum(expected) + 2_900_000_000
 
 
-def test_the_kit_does_not_leap_on_its_first_way() -> None:
+def test_approach_of_the_conformance_run_is_limited_in_speed() -> None:
     rows = [row for row in driven("approach", 20) if row[0] == "approach"]
     for side in ("left", "right"):
         q = positions(rows, side)
         assert max(abs(b - a) for a, b in itertools.pairwise(q)) <= 0.6 * 5.4 * 0.25 + 1e-6
 
 
-def test_a_client_that_begins_again_knows_nothing_of_before() -> None:
+def test_restarted_client_forgets_its_earlier_state() -> None:
     client = Dex1Client()
     for k in range(10):
         client.receive(k * 0.01, {Side.LEFT: (0.3,)})

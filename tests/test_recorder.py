@@ -1,3 +1,5 @@
+"""The recorder: round trip, full queues and disks, kills."""
+
 from __future__ import annotations
 
 import errno
@@ -17,6 +19,7 @@ from mcap.reader import make_reader
 
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace, sample_path
+from tests.each import each
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
 
 
@@ -87,7 +90,7 @@ def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
     assert open_trace(path).message_count == 0
 
 
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="cannot create"):
         Recorder(tmp_path / "no" / "a.mcap").open()
 
@@ -185,8 +188,8 @@ def test_a_full_disk_ends_the_recording_with_an_error(tmp_path: Path) -> None:
         recorder.close()
 
 
-@pytest.mark.parametrize("times", [(-1, 0), (0, -1), (2**64, 0)])
-def test_a_time_that_is_none_is_refused_at_once(tmp_path: Path, times: tuple[int, int]) -> None:
+@each("times", [(-1, 0), (0, -1), (2**64, 0)])
+def test_invalid_time_is_refused(tmp_path: Path, times: tuple[int, int]) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
         with pytest.raises(UsageError, match="not times"):
             recorder.put(CMD, CMD_TYPE, cmd(0.0), *times)
@@ -248,7 +251,7 @@ CHILD = textwrap.dedent(
 
 
 @pytest.mark.realtime
-def test_kill_9_costs_at_most_half_a_second(tmp_path: Path) -> None:
+def test_sigkill_loses_at_most_half_a_second(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True

@@ -1,4 +1,4 @@
-"""What is said to be recorded is on the disk, under its name, and nobody else writes there."""
+"""The file of a recorder: its name, its lock, its content after a kill or a full disk."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.recording_file import ChunkIndexes
 from tests.dds_helpers import wait_until
+from tests.each import each
 from tests.trace_helpers import STATE, STATE_TYPE, T0, state
 
 
@@ -212,7 +213,7 @@ def killed(path: Path, messages: int, where: str = "") -> Iterator[None]:
     yield
 
 
-def test_killed_before_the_first_message(tmp_path: Path) -> None:
+def test_kill_before_the_first_message_keeps_the_old_recording(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     before = old(path)
     with killed(path, 0):
@@ -333,7 +334,7 @@ def test_a_full_disk_before_the_first_message_keeps_the_old_one(
     assert os.listdir(tmp_path) == ["a.mcap"]
 
 
-def test_the_device_that_is_always_full() -> None:
+def test_dev_full_is_reported_as_a_full_disk() -> None:
     recorder = Recorder("/dev/full", overwrite=True)
     recorder.open()
     wait_until(lambda: recorder.error)
@@ -404,8 +405,8 @@ def overwrite(path: Path, at: int) -> None:
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1_000_000_000))
 
 
-@pytest.mark.parametrize("more", [0, 10])
-@pytest.mark.parametrize(
+@each("more", [0, 10])
+@each(
     "change",
     [
         cut,
@@ -430,7 +431,7 @@ def test_a_file_that_another_program_writes_to_is_told(
         recorder.close()
 
 
-def test_a_new_time_alone_is_no_change(tmp_path: Path) -> None:
+def test_changed_modification_time_alone_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path) as recorder:
         put(recorder, 0, 10)
@@ -445,7 +446,7 @@ def test_a_new_time_alone_is_no_change(tmp_path: Path) -> None:
 # -- what others have put there --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("content", [None, b"", b"V", b"something else altogether"])
+@each("content", [None, b"", b"V", b"something else altogether"])
 def test_a_link_beside_is_not_followed(tmp_path: Path, content: bytes | None) -> None:
     path, victim = tmp_path / "a.mcap", tmp_path / "victim"
     before = old(path)
@@ -468,7 +469,7 @@ def test_what_is_no_file_beside_is_refused(tmp_path: Path, make: Callable[[Path]
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("content", [b"V", b"short", b"a longer text"])
+@each("content", [b"V", b"short", b"a longer text"])
 def test_a_text_beside_is_kept(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.mcap"
     old(path)
@@ -495,7 +496,7 @@ def test_messages_outside_of_chunks_beside_are_kept(tmp_path: Path) -> None:
     assert part(path).read_bytes() == before
 
 
-def test_a_pipe_that_nobody_reads_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipe_without_a_reader_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     with pytest.raises(TraceError, match="no program reads it"), Recorder(path, overwrite=True):

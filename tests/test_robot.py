@@ -1,4 +1,4 @@
-"""Emulated robots on a clock that the tests move."""
+"""Emulated robots on a manual clock."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from dexkit.wire.low_level import (
     struct_of_payload,
     verify_payload,
 )
+from tests.each import each
 from tests.robot_helpers import Bench, low_cmd
 
 both = pytest.mark.parametrize("model", list(ROBOTS.values()), ids=list(ROBOTS))
@@ -34,7 +35,7 @@ FIELDS = ("q", "dq", "tau", "kp", "kd")
 # ------------------------------------------------------------------------------------ data
 
 
-def test_slots() -> None:
+def test_motor_slots_are_those_of_the_sdk() -> None:
     """A few of the indices that Unitree's examples name (docs/sources/unitree-dex.md#a8)."""
     assert (H1.slots, len(H1.used), H1.joints[9]) == (20, 19, None)
     assert (G1.slots, G1.used) == (35, tuple(range(29)))
@@ -49,7 +50,7 @@ def test_slots() -> None:
 
 
 @both
-def test_joints_make_sense(model: RobotModel) -> None:
+def test_joint_limits_are_consistent(model: RobotModel) -> None:
     for slot in model.used:
         joint = model.joint(slot)
         assert joint.q_min < model.rest_q[slot] < joint.q_max
@@ -60,7 +61,7 @@ def test_joints_make_sense(model: RobotModel) -> None:
             assert (other.q_min, other.q_max) == limits
 
 
-def test_no_such() -> None:
+def test_unknown_robot_slot_or_joint_is_refused() -> None:
     with pytest.raises(UsageError, match="no robot 'h3'"):
         robot("h3")
     with pytest.raises(UsageError, match="slot 9 of the h1 has no joint"):
@@ -73,7 +74,7 @@ def test_no_such() -> None:
 
 
 @both
-def test_joints_go_where_they_are_told(model: RobotModel) -> None:
+def test_joints_reach_their_goal_positions(model: RobotModel) -> None:
     bench = Bench(model)
     goal = {}
     for slot in model.used:
@@ -201,7 +202,9 @@ def test_stop_constants(model: RobotModel) -> None:
 @both
 @settings(max_examples=60)
 @given(st.data(), st.sampled_from(FIELDS), st.sampled_from([math.nan, math.inf, -math.inf]))
-def test_one_number_that_is_none(model: RobotModel, data: Any, field: str, value: float) -> None:
+def test_non_finite_value_rejects_the_command(
+    model: RobotModel, data: Any, field: str, value: float
+) -> None:
     bench = Bench(model)
     slot = data.draw(st.sampled_from(model.used))
     assert not bench.send(low_cmd(model, change={slot: {field: value}}))
@@ -230,7 +233,7 @@ def test_no_flipped_bit_is_obeyed(model: RobotModel, data: Any) -> None:
 @both
 @settings(max_examples=50)
 @given(st.binary(max_size=1100))
-def test_garbage(model: RobotModel, data: bytes) -> None:
+def test_garbage_is_rejected(model: RobotModel, data: bytes) -> None:
     bench = Bench(model)
     assert not bench.robot.command(data, 0.0)
     assert bench.robot.counters.malformed == 1
@@ -270,7 +273,7 @@ def test_head_of_a_go_command() -> None:
 
 
 @both
-def test_silence_damps(model: RobotModel) -> None:
+def test_missing_commands_damp_the_joints(model: RobotModel) -> None:
     slot = model.slot("waist_yaw")
     bench = Bench(model)
     spin = {slot: {"kp": 0.0, "kd": 50.0, "dq": 1.0, "q": 0.0}}
@@ -352,7 +355,7 @@ def test_arm_topic_refuses_what_is_wrong(model: RobotModel) -> None:
 @both
 @settings(max_examples=20, deadline=None)
 @given(st.data())
-def test_nothing_that_is_sent_breaks_it(model: RobotModel, data: Any) -> None:
+def test_any_command_keeps_the_state_finite(model: RobotModel, data: Any) -> None:
     """States stay finite, within the limits, with a right CRC, whatever finite is commanded."""
     bench = Bench(model)
     number = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -396,7 +399,7 @@ def test_noise_of_the_imu() -> None:
 
 
 @both
-def test_work_warms_and_drains(model: RobotModel) -> None:
+def test_work_heats_motors_and_drains_the_battery(model: RobotModel) -> None:
     slot = model.slot("left_knee")
     bench = Bench(model, Settings(warm_up=5.0, capacity=1.0))
     before = bench.state()
@@ -419,7 +422,7 @@ def test_settings_keep_temperatures_in_range() -> None:
 
 
 @both
-def test_a_long_pause_is_not_lived_through(model: RobotModel) -> None:
+def test_long_pause_is_not_simulated(model: RobotModel) -> None:
     bench = Bench(model)
     slot = model.slot("waist_yaw")
     bench.run(0.2, low_cmd(model, change={slot: {"kp": 0.0, "kd": 50.0, "dq": 1.0}}))
@@ -442,8 +445,8 @@ def test_remote(model: RobotModel) -> None:
     assert not any(bytes(bench.state().wireless_remote))
 
 
-@pytest.mark.parametrize("text", ["C", "lx=2", "lx=left", "lz=0"])
-def test_no_such_key(text: str) -> None:
+@each("text", ["C", "lx=2", "lx=left", "lz=0"])
+def test_unknown_remote_key_is_refused(text: str) -> None:
     with pytest.raises(UsageError):
         Remote.parse(text)
 

@@ -1,4 +1,4 @@
-"""``dexkit emulate h1`` and ``g1``, and robots on topics of a test's own."""
+"""``dexkit emulate h1`` and ``g1``, and robots on topics of their own."""
 
 from __future__ import annotations
 

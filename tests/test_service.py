@@ -1,4 +1,4 @@
-"""The service's threads, with a scripted hand and a DDS node that is not DDS."""
+"""The threads of the service, with a scripted hand and a fake DDS node."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_silence_brakes_after_a_second() -> None:
     assert core.counters.brakes == 1
 
 
-def test_bad_commands_do_no_harm_and_are_counted() -> None:
+def test_invalid_commands_are_counted_and_ignored() -> None:
     hand, node = ScriptedHand(), FakeNode()
     motor = unitree_go.MotorCmd_
     with serve(hand, node) as service:
@@ -119,7 +119,7 @@ def test_bad_commands_do_no_harm_and_are_counted() -> None:
 
 
 class TestLink:
-    def test_unplugged_and_back(self) -> None:
+    def test_unplugged_hand_is_reopened(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         with serve(hand, node) as service:
             node.deliver(CMD, cmd(2.0))
@@ -196,7 +196,7 @@ class TestLink:
             wait_until(lambda: counters.exchanges > 20)
             assert (counters.losses, hand.opens) == (0, 1)
 
-    def test_a_hang_shows_while_state_goes_on(self) -> None:
+    def test_hanging_exchange_is_visible_in_the_published_state(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         with serve(hand, node) as service:
             hand.hang.clear()
@@ -224,7 +224,7 @@ class TestLink:
             serve(Unfinished(), FakeNode(), wait_for_device=True).start()
         assert f"at {__file__}:" in raised.value.hint
 
-    def test_what_is_no_state_is_named(self) -> None:
+    def test_invalid_state_type_is_named(self) -> None:
         class Bare(ScriptedHand):
             def exchange(self, command: HandCommand) -> HandState:
                 return 2.7  # type: ignore[return-value]
@@ -245,9 +245,7 @@ class TestLink:
 
 
 @pytest.mark.parametrize("thread", ["receive", "publish"])
-def test_a_thread_that_dies_leaves_no_hand_driven(
-    thread: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hands_brake_when_a_thread_dies(thread: str, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, node = ScriptedHand(), FakeNode()
     with serve(hand, node) as service:
         core = service.cores[Side.LEFT]
@@ -268,7 +266,7 @@ def test_a_thread_that_dies_leaves_no_hand_driven(
 
 
 class TestStop:
-    def test_it_brakes_says_so_and_leaves(self) -> None:
+    def test_stop_brakes_publishes_and_ends(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         service = serve(hand, node)
         service.start()
@@ -338,7 +336,7 @@ class TestTwoHands:
             wait_until(lambda: [m.q for m in states(node, d.state_topic)] == [1.0, 2.0])
         assert {topic for topic, _ in node.sent} == {d.state_topic}
 
-    def test_one_lost_hand_leaves_the_other_alone(self) -> None:
+    def test_lost_hand_does_not_affect_the_other(self) -> None:
         right, left, node = ScriptedHand(Side.RIGHT), ScriptedHand(Side.LEFT), FakeNode()
         d = dialect("unitree_actuator")
         motors = [unitree_go.MotorCmd_(q=q, kp=5.0) for q in (1.0, 2.0)]
@@ -372,7 +370,7 @@ def test_counters_are_one_line_of_json(caplog: pytest.LogCaptureFixture) -> None
     assert counters["hands"]["left"]["accepted"] == 1
 
 
-def test_an_endless_state_is_not_sent() -> None:
+def test_state_beyond_float32_is_not_published() -> None:
     """What the wire cannot hold is a backend's fault, not the end of the service."""
 
     class Broken(ScriptedHand):
@@ -409,7 +407,7 @@ class TestConflict:
 class TestDiagnose:
     GO, HG, LEGACY = (dialect(n) for n in ("unitree_go", "unitree_hg", "unitree_actuator"))
 
-    def test_all_is_well(self) -> None:
+    def test_matching_client_has_no_finding(self) -> None:
         peers = [
             FakeEndpoint(STATE, self.GO.state_type, "reader"),
             FakeEndpoint(CMD, self.GO.cmd_type, "writer"),

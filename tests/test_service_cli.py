@@ -19,6 +19,7 @@ from dexkit.models import dialect
 from dexkit.stop_signals import stop_on_signals
 from tests.cli_helpers import Process, running
 from tests.dds_helpers import dds_domain, dds_node, take_until
+from tests.each import each
 
 __all__ = ["dds_domain", "dds_node"]
 
@@ -55,7 +56,7 @@ def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int)
     assert last["published"]
 
 
-def test_under_nohup_a_hangup_is_nothing() -> None:
+def test_sighup_under_nohup_is_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with stop_on_signals() as request:
@@ -137,7 +138,7 @@ def test_two_grippers_each_with_its_device_and_settings(dds_domain: int, dds_nod
         assert q == [pytest.approx(0.2 * 5.4, abs=0.1), pytest.approx(0.8 * 5.4, abs=0.1)]
 
 
-def test_a_client_of_another_dialect_is_told(dds_domain: int, dds_node: DdsNode) -> None:
+def test_client_of_another_dialect_is_reported(dds_domain: int, dds_node: DdsNode) -> None:
     dds_node.writer("rt/unitree_actuator/cmd", GO.cmd_type)
     with serving("sim-dex1", "--side", "left", "--domain", dds_domain) as process:
         process.ready()
@@ -151,7 +152,7 @@ class TestEmulatedGripper:
 
     ZERO = ("--set", "zero=1510")
 
-    def test_it_is_driven_and_survives_the_loss_of_its_device(
+    def test_emulated_gripper_is_driven_and_recovers_after_unplugging(
         self, dds_domain: int, dds_node: DdsNode
     ) -> None:
         cmd, state = GO.topics(Side.LEFT)
@@ -201,7 +202,7 @@ class TestEmulatedGripper:
 
 
 class TestArguments:
-    @pytest.mark.parametrize(
+    @each(
         ("arguments", "message"),
         [
             (["nope", "--side", "left"], "no backend 'nope'"),
@@ -230,7 +231,7 @@ class TestArguments:
             (["sim-dex1", "--side", "left", "--interface", "nix0"], "no network interface"),
         ],
     )
-    def test_what_makes_no_sense_is_said(self, arguments: list[str], message: str) -> None:
+    def test_contradicting_arguments_are_refused(self, arguments: list[str], message: str) -> None:
         result = CliRunner().invoke(cli, ["serve", *arguments])
         assert result.exit_code != 0
         hint = getattr(result.exception, "hint", "")

@@ -1,4 +1,4 @@
-"""What the service decides about one hand: watchdog, rejection, faults, what is published."""
+"""Decisions of the service about one hand: watchdog, rejection, faults, published state."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandT
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.service.core import Backoff, Estimation, HandCore
+from tests.each import each
 
 TIMEOUT = DEX1_1.command_timeout
 LINK = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
@@ -88,8 +89,8 @@ def test_state_goes_on_while_braking() -> None:
     assert (view.state.q[0], view.fault) == (1.7, (0,))
 
 
-@pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@each("field", ["q", "dq", "tau", "kp", "kd"])
+@each("value", [math.nan, math.inf, -math.inf])
 def test_a_rejected_command_leaves_the_last_one_in_force(field: str, value: float) -> None:
     bench = Bench()
     assert bench.command(2.0)
@@ -117,7 +118,7 @@ def test_commands_outside_the_limits_are_clamped_and_counted() -> None:
 
 
 class TestPauses:
-    def test_it_brakes_until_a_command_that_was_sent_later(self) -> None:
+    def test_after_a_pause_it_brakes_until_a_newer_command(self) -> None:
         bench = Bench()
         bench.command(2.0)
         assert not bench.exchange().is_brake
@@ -153,7 +154,7 @@ class TestPauses:
             bench.core.submit(HandCommand.position(2.0), bench.clock.now() - 2.0)
         assert bench.exchange().is_brake
 
-    def test_the_link_is_not_given_up_for_a_pause(self) -> None:
+    def test_pause_does_not_close_the_link(self) -> None:
         bench = Bench()
         bench.clock.advance(5.0)
         bench.core.paused()
@@ -163,7 +164,7 @@ class TestPauses:
 
 
 class TestLostLink:
-    def test_what_is_published_shows_it(self) -> None:
+    def test_lost_link_is_in_the_published_state(self) -> None:
         bench = Bench()
         assert bench.core.failed(HandLost("unplugged"))
         bench.core.closed()
@@ -177,7 +178,7 @@ class TestLostLink:
         assert view is not None
         assert (view.missed, view.fault) == (2, (LINK,))
 
-    def test_after_it_only_a_new_command_moves(self) -> None:
+    def test_after_a_lost_link_only_a_new_command_moves(self) -> None:
         bench = Bench()
         bench.command(3.0)
         assert not bench.exchange().is_brake
@@ -289,14 +290,14 @@ class TestFailedExchanges:
             assert view is not None
             assert view.fault == (0x80,)
 
-    @pytest.mark.parametrize("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
-    def test_anything_else_is_a_loss(self, error: Exception) -> None:
+    @each("error", [HandLost("x"), HandError("x"), OSError("x"), KeyError("x")])
+    def test_other_exceptions_close_the_link(self, error: Exception) -> None:
         assert Bench().core.failed(error)
 
     def test_a_rejection_by_the_hand_is_not(self) -> None:
         assert not Bench().core.failed(CommandRejected("it does not like it"))
 
-    @pytest.mark.parametrize("q", [[math.nan], [math.inf], [0.0, 0.0]])
+    @each("q", [[math.nan], [math.inf], [0.0, 0.0]])
     def test_a_state_that_is_none_is_a_failure(self, q: list[float]) -> None:
         bench = Bench()
         with pytest.raises(HandError, match="backend returned"):
@@ -318,7 +319,7 @@ class TestPrediction:
         assert not Bench(io_rate=300.0).core.predicting
         assert Bench(io_rate=30.0).core.predicting
 
-    def test_auto_sees_a_link_that_is_slower_than_it_says(self) -> None:
+    def test_auto_prediction_measures_the_link_rate(self) -> None:
         bench = Bench(io_rate=300.0)
         bench.clock.advance(0.1)
         bench.exchange()
@@ -333,7 +334,7 @@ class TestPrediction:
             bench.exchange()
         assert not bench.core.predicting
 
-    def test_off_and_predict_are_what_they_say(self) -> None:
+    def test_off_and_predict_force_the_prediction_mode(self) -> None:
         assert not Bench(io_rate=5.0, estimation=Estimation.OFF).core.predicting
         assert Bench(io_rate=900.0, estimation=Estimation.PREDICT).core.predicting
 
@@ -388,7 +389,7 @@ class TestSoftStart:
         # it has caught up: from now on commands go through as they are
         assert self.drive(bench, 0.0, 0.01) == pytest.approx(540.0)
 
-    def test_and_again_after_a_reconnection(self) -> None:
+    def test_soft_start_repeats_after_a_reconnection(self) -> None:
         bench = Bench(simulated=False)
         self.drive(bench, 2.0, 2.0)
         bench.core.failed(HandLost("x"))
@@ -396,7 +397,7 @@ class TestSoftStart:
         bench.core.opened(bench.spec)
         assert self.drive(bench, 5.0, 0.2) <= 5.4 + 1e-6
 
-    def test_a_simulated_hand_does_not(self) -> None:
+    def test_simulated_hand_has_no_soft_start(self) -> None:
         bench = Bench()
         bench.command(5.4)
         assert bench.exchange().q[0] == 5.4

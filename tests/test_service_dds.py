@@ -119,7 +119,7 @@ def test_the_qos_is_that_of_unitrees_software(service: HandService, dds_node: Dd
     assert (writer.topic, writer.type_name, writer.qos) == (STATE, GO.state_type, Qos("reliable"))
 
 
-def test_nan_and_far_away_do_no_harm(service: HandService, client: Client) -> None:
+def test_nan_and_out_of_range_commands_are_ignored(service: HandService, client: Client) -> None:
     client.drive_to(3.0)
     counters = service.cores[Side.LEFT].counters
 
@@ -187,7 +187,7 @@ def test_unplugged_in_mid_motion_and_back(dds_domain: int) -> None:
         client.close()
 
 
-def test_leaving_leaves_nothing(dds_domain: int, dds_node: DdsNode) -> None:
+def test_closed_service_leaves_no_endpoint(dds_domain: int, dds_node: DdsNode) -> None:
     def there() -> bool:
         return any(e.topic in (CMD, STATE) for e in dds_node.endpoints())
 

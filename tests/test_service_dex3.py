@@ -34,6 +34,7 @@ from dexkit.service import HandService, Publisher
 from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.finger_state import FingerStateEncoder
+from tests.each import each
 from tests.service_helpers import FakeNode, wait_until
 
 DEX3 = dialect("dex3")
@@ -77,7 +78,7 @@ class TestModeByte:
         assert ("wrong_ids" in counters) == any(m & 15 != i for i, m in enumerate(modes))
         assert ("unknown_status" in counters) == any((m >> 4) & 7 > 1 for m in modes)
 
-    @pytest.mark.parametrize("high", [0x00, 0x10, 0x80, 0x90])
+    @each("high", [0x00, 0x10, 0x80, 0x90])
     def test_nothing_is_odd_about_the_right_ids(self, high: int) -> None:
         assert mapping().remarks(message([high | i for i in range(N)]), LEFT) == ()
 
@@ -109,7 +110,7 @@ class TestModeByte:
 
 
 class TestCommand:
-    @pytest.mark.parametrize("count", range(N))
+    @each("count", range(N))
     def test_fewer_motors_than_seven_hold_no_command(self, count: int) -> None:
         assert mapping().command(message([0x10] * count), LEFT) is None
 
@@ -121,8 +122,8 @@ class TestCommand:
         assert command.q.shape == (N,)
         assert m.motors(commands) > m.length == N
 
-    @pytest.mark.parametrize("side", list(Side))
-    @pytest.mark.parametrize("end", ["q_min", "q_max"])
+    @each("side", list(Side))
+    @each("end", ["q_min", "q_max"])
     def test_a_limit_as_float32_is_within_it(self, side: Side, end: str) -> None:
         joints = DEX3_1.joints[side]
         commands = message()
@@ -220,7 +221,7 @@ class TestState:
         assert m.imu_state == unitree_hg.IMUState_()
         assert (m.power_v, m.power_a, m.system_v, m.device_v) == (0.0,) * 4
 
-    @pytest.mark.parametrize("reading", [30000.0, 30000.0009, 29999.9995])
+    @each("reading", [30000.0, 30000.0009, 29999.9995])
     def test_a_reading_never_looks_like_no_value(self, reading: float) -> None:
         m = sent(StateView(full_state(pressure=np.full((SENSORS, 12), reading)), (0,) * N))
         for packet in m.press_sensor_state:

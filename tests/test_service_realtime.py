@@ -1,4 +1,4 @@
-"""Asking for real-time priority never fails, says truly what came of it, and leaves no trace."""
+"""Real-time priority: the reported result is true, and a refusal changes nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def policy_of_new_thread() -> int:
     return seen[0]
 
 
-def test_the_answer_is_the_policy_of_this_thread_and_those_it_starts() -> None:
+def test_result_equals_the_scheduling_policy_of_the_thread() -> None:
     before = policy()
     with real_time() as granted:
         assert (policy() == os.SCHED_RR) == granted
@@ -31,7 +31,7 @@ def test_the_answer_is_the_policy_of_this_thread_and_those_it_starts() -> None:
     assert policy() == before
 
 
-def test_where_it_is_not_permitted_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused_priority_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(pid: int, policy: int, param: os.sched_param) -> None:
         raise PermissionError(1, "Operation not permitted")
 

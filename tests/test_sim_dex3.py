@@ -12,6 +12,7 @@ from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
 from dexkit.traces import open_trace, sample_path
+from tests.each import each
 
 KP, KD = DEX3_1.client_gains
 
@@ -43,7 +44,7 @@ def test_is_a_hand() -> None:
 
 
 @pytest.mark.parametrize("side", Side)
-def test_rests_where_no_client_waits_for_ever(side: Side) -> None:
+def test_initial_position_is_nonzero_on_every_joint(side: Side) -> None:
     hand, clock = opened(side)
     state = hold(hand, clock, HandCommand.brake(7), 0.5)
     assert state.q.tolist() == list(DEX3_1.rest_q[side])
@@ -53,7 +54,7 @@ def test_rests_where_no_client_waits_for_ever(side: Side) -> None:
     assert state.stamp == clock.now()
 
 
-def test_every_joint_goes_where_it_is_told() -> None:
+def test_every_joint_reaches_its_goal_position() -> None:
     hand, clock = opened(Side.RIGHT)
     goal = hand.spec.q_min + 0.7 * (hand.spec.q_max - hand.spec.q_min)
     state = hold(hand, clock, HandCommand.position(goal, kp=KP, kd=KD), 2.0)
@@ -167,7 +168,7 @@ def test_settings() -> None:
     assert hand.mechanics.supply_v == 36.0
 
 
-@pytest.mark.parametrize(
+@each(
     "settings",
     [
         {"object": "0"},

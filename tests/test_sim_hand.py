@@ -15,6 +15,7 @@ from dexkit.clock import ManualClock
 from dexkit.emulators.sim_hand import SimHand, sim_dex1
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
+from tests.each import each
 
 
 def opened(**options: float) -> tuple[SimHand, ManualClock]:
@@ -174,7 +175,7 @@ def test_is_deterministic() -> None:
     assert traces[0] == traces[1]
 
 
-def test_a_long_pause_is_not_lived_through() -> None:
+def test_long_pause_is_not_simulated() -> None:
     hand, clock = opened()
     hand.exchange(HandCommand.position(0.0, kp=0.0, kd=0.0, tau=0.1))
     clock.advance(3600.0)
@@ -195,9 +196,7 @@ def test_only_an_open_hand_exchanges() -> None:
         hand.exchange(HandCommand.brake(1))
 
 
-@pytest.mark.parametrize(
-    "settings", [{"object": "0"}, {"object": "many"}, {"start": "101"}, {"colour": "red"}]
-)
+@each("settings", [{"object": "0"}, {"object": "many"}, {"start": "101"}, {"colour": "red"}])
 def test_bad_settings_are_refused(settings: dict[str, str]) -> None:
     with pytest.raises(UsageError):
         sim_dex1.create(BackendOptions(Side.LEFT, settings=settings))

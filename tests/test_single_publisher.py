@@ -1,4 +1,4 @@
-"""One publisher a topic: who gives way, whatever the delays of discovery."""
+"""One publisher a topic: which one gives way, for any delay of discovery."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class Program:
         return not self.gone
 
 
-def test_of_any_number_that_start_at_once_exactly_one_remains() -> None:
+def test_one_of_many_simultaneous_publishers_remains() -> None:
     for seed in range(1500):
         rnd = random.Random(seed)
         net = Network(rnd, slow=rnd.choice((0.1, 1.0, 5.0)))
@@ -148,7 +148,7 @@ def test_of_any_number_that_start_at_once_exactly_one_remains() -> None:
         assert len(left) == 1, f"seed {seed}: {left} remain"
 
 
-def test_who_is_there_stays_and_who_comes_leaves() -> None:
+def test_running_publisher_stays_and_new_one_leaves() -> None:
     for seed in range(300):
         rnd = random.Random(seed)
         net = Network(rnd, slow=0.1)
@@ -159,7 +159,7 @@ def test_who_is_there_stays_and_who_comes_leaves() -> None:
         assert first.sole.rivals == 0, "the second never announced itself"
 
 
-def test_forced_ones_stay_and_both_say_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_forced_publishers_stay_and_log_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     net = Network(random.Random(0), slow=0.1)
     first = Program(net, "first", 0.0, 0.0)
     second = Program(net, "second", 2.0, 0.0, force=True)
@@ -174,7 +174,7 @@ def test_forced_ones_stay_and_both_say_so(caplog: pytest.LogCaptureFixture) -> N
     ]
 
 
-def test_publishers_that_know_nothing_of_claims() -> None:
+def test_publisher_without_a_claim_is_respected() -> None:
     vendor = Seen("v", process="vendor")
 
     def sole(**options: bool) -> tuple[FakeNode, SolePublisher]:
@@ -211,7 +211,7 @@ def test_publishers_that_know_nothing_of_claims() -> None:
             assert one.company() is None
 
 
-def test_what_is_no_claim() -> None:
+def test_invalid_claims_are_ignored() -> None:
     mine = Claim.now()
     assert Claim.decode(mine.encode()) == mine
     for data in (
@@ -245,7 +245,7 @@ def service(node: DdsNode, **options: bool) -> HandService:
     return HandService(SimHand(Side.LEFT), node=node, domain=node.domain, **options)
 
 
-def test_services_started_together_leave_one() -> None:
+def test_one_of_two_simultaneous_services_remains() -> None:
     dds_domain = free_domain()
     with DdsNode(dds_domain) as a, DdsNode(dds_domain) as b, DdsNode(dds_domain) as watcher:
         nodes = [a, b]
@@ -295,7 +295,7 @@ def test_a_service_that_finds_an_earlier_one_late_brakes_and_ends() -> None:
             assert served.failure is None  # the vendor's came later: told, and no more
 
 
-def test_a_recording_gives_way_to_whoever_comes() -> None:
+def test_replay_gives_way_to_a_new_publisher() -> None:
     domain = free_domain()
     topic = GO.topics(Side.LEFT)[0]
     arguments = ("--no-wait", "--loop", "--domain", domain)
@@ -310,7 +310,7 @@ def test_a_recording_gives_way_to_whoever_comes() -> None:
     assert "Traceback" not in errors
 
 
-def test_the_teleoperation_client_gives_way_without_a_last_word() -> None:
+def test_teleoperation_gives_way_without_a_final_command() -> None:
     domain = free_domain()
     topic = GO.topics(Side.LEFT)[0]
     steps = profile("steps", "dex1-1")
@@ -328,7 +328,7 @@ def test_the_teleoperation_client_gives_way_without_a_last_word() -> None:
             assert sent == []
 
 
-def test_robots_started_together_leave_one() -> None:
+def test_one_of_two_simultaneous_robots_remains() -> None:
     domain = free_domain()
     stop = threading.Event()
     ended: list[TopicConflict] = []

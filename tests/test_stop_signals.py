@@ -1,4 +1,4 @@
-"""Signals that ask for a stop, at bad moments."""
+"""Signals that ask for a stop, during a wait and repeated."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_second_interrupt_interrupts_at_once() -> None:
         assert request.signum == signal.SIGTERM
 
 
-def test_a_stop_from_the_program_itself() -> None:
+def test_program_can_request_its_own_stop() -> None:
     with stop_on_signals() as request:
         assert not request
         request.set()

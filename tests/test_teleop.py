@@ -1,4 +1,4 @@
-"""The model of Unitree's teleoperation clients, sans-IO: its quirks, and the genuine recordings."""
+"""The model of Unitree's teleoperation clients against their recordings, without I/O."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ from dexkit.teleop import (
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
 from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces import open_trace, sample_path
+from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 GO = DIALECTS["unitree_go"]
@@ -162,7 +163,7 @@ def ready(client: Dex1Client, left: float = 1.0, right: float = 1.0, now: float 
     client.receive(now, {RIGHT: (right,)})
 
 
-def test_no_command_before_both_hands_have_spoken() -> None:
+def test_no_command_before_both_states_arrived() -> None:
     client = Dex1Client()
     assert client.missing == {LEFT: "", RIGHT: ""}
     assert client.step(0.0, {LEFT: (1.0,)}, {}) == {}
@@ -412,7 +413,7 @@ def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
         assert data == payloads[i]
 
 
-@pytest.mark.parametrize("name", list(DIALECTS))
+@each("name", list(DIALECTS))
 def test_positions_come_back_from_the_wire(name: str) -> None:
     from dexkit.conformance.wire import Wire
 
@@ -434,7 +435,7 @@ def test_positions_come_back_from_the_wire(name: str) -> None:
 # ----------------------------------------------------------------------- operators and profiles
 
 
-@pytest.mark.parametrize("chosen", PROFILES, ids=lambda p: f"{p.model}-{p.name}")
+@each("chosen", PROFILES, ids=lambda p: f"{p.model}-{p.name}")
 def test_a_profile_stays_within_the_limits_and_begins_without_input(chosen: object) -> None:
     assert isinstance(chosen, type(PROFILES[0]))
     spoken = MODELS[chosen.model].dialects[0]
@@ -546,7 +547,7 @@ def test_a_hand_that_stays_gives_an_infinite_stroke_and_no_lag() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))
-def test_any_hand_has_figures_that_are_not_negative(values: list[float], goal: float) -> None:
+def test_figures_are_never_negative(values: list[float], goal: float) -> None:
     t: Floats = np.asarray(np.arange(len(values)) * 0.05)
     found = feel(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
     assert all(x >= 0.0 for x in found.figures().values())
@@ -558,7 +559,7 @@ def test_any_hand_has_figures_that_are_not_negative(values: list[float], goal: f
 @pytest.mark.parametrize(
     ("rate", "seconds"), [(30.0, 2.24), (200.0, 0.565)], ids=["30 Hz", "200 Hz"]
 )
-def test_a_stroke_takes_as_long_as_an_earlier_study_found(rate: float, seconds: float) -> None:
+def test_stroke_time_equals_the_published_measurement(rate: float, seconds: float) -> None:
     """The emulated EZGripper behind the service, in virtual time; docs/service.md."""
     feedback = pytest.importorskip("benchmarks.bench_feedback")
     from dexkit.clock import ManualClock

@@ -1,4 +1,4 @@
-"""``dexkit teleop`` against served hands: starting, waiting, refusing, leaving."""
+"""``dexkit teleop`` with served hands: start, wait, refusal, end."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_stroke_of_both_grippers_is_measured_and_recorded(dex1: int, tmp_path:
         assert np.median(np.abs(commands.q[:, 0] - states.q[at, 0])) < 0.3
 
 
-def test_a_dex3_makes_a_fist(dex3: int) -> None:
+def test_fist_profile_moves_a_dex3(dex3: int) -> None:
     result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()
@@ -98,7 +98,7 @@ def test_a_dex3_makes_a_fist(dex3: int) -> None:
     assert any("middle_0: " in line for line in lines)
 
 
-def test_somebody_else_at_the_hand_is_refused_unless_forced(dex1: int) -> None:
+def test_other_publisher_is_refused_unless_forced(dex1: int) -> None:
     topic = DIALECTS["unitree_go"].topics(LEFT)[0]
     with DdsNode(domain=dex1, interface="lo") as other:
         other.writer(topic, DIALECTS["unitree_go"].cmd_type)
@@ -113,9 +113,9 @@ def test_somebody_else_at_the_hand_is_refused_unless_forced(dex1: int) -> None:
         assert forced.returncode == 0, forced.stderr
 
 
-def test_with_one_hand_it_waits_and_says_for_whom_and_where_to_look() -> None:
+def test_missing_side_is_named_with_a_hint() -> None:
     with served("sim-dex1", "left") as domain:
-        result = teleop("steps", "--domain", domain, "--wait", 3.0)
+        result = teleop("steps", "--domain", domain, "--wait", 1.5)
         assert "waiting for state of right ..." in result.stderr
         assert isinstance(result.exception, DexkitError)
         assert result.exception.exit_code == 1
@@ -235,7 +235,7 @@ def test_the_profiles_are_listed_without_any_hand() -> None:
     assert str(caught.value.hint).startswith("--dialect dex3 has it; there are: full-stroke, ")
 
 
-def test_a_recording_is_an_operator(dex1: int) -> None:
+def test_recording_can_be_played_as_operator_input(dex1: int) -> None:
     from dexkit.traces import sample_path
 
     result = teleop(sample_path("dex1_pick_place"), "--domain", dex1, "--duration", 1.0)

@@ -38,7 +38,7 @@ def die(*args: object, **options: object) -> None:
 # -- the mechanism ---------------------------------------------------------------------------------
 
 
-def test_a_worker_that_dies_tells_everybody(caplog: pytest.LogCaptureFixture) -> None:
+def test_dying_worker_raises_in_every_waiter(caplog: pytest.LogCaptureFixture) -> None:
     owner: list[Exception] = []
     heard: list[Worker] = []
     threads.forget()
@@ -72,7 +72,7 @@ def test_a_foreseen_error_is_raised_as_it_is(caplog: pytest.LogCaptureFixture) -
     threads.forget()
 
 
-def test_a_worker_that_ends_well_is_not_told() -> None:
+def test_worker_that_returns_raises_nothing() -> None:
     done = threading.Event()
     threads.forget()
     with stop_on_signals() as stop:
@@ -188,7 +188,7 @@ def test_a_node_whose_dispatcher_died_frees_its_waiters(monkeypatch: pytest.Monk
     threads.forget()
 
 
-def test_an_emulated_line_and_a_tool_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dying_thread_of_an_emulator_or_tool_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Tool, "_listen", die)
     heard: list[Worker] = []
     with threads.on_death(heard.append), Tool("--version"):

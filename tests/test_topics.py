@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
-
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.topics import HAND_TOPICS, roles, topics_of
+from tests.each import each
 
 
-@pytest.mark.parametrize("name", list(DIALECTS))
+@each("name", list(DIALECTS))
 def test_every_topic_of_a_dialect_is_known(name: str) -> None:
     dialect = DIALECTS[name]
     table = dict(topics_of(dialect))

@@ -1,3 +1,5 @@
+"""``dexkit info``, ``record`` and ``replay``."""
+
 from __future__ import annotations
 
 import json
@@ -239,7 +241,7 @@ def test_replay_names_the_topics_that_nobody_subscribes() -> None:
     assert "dexkit serve" in done.stderr
 
 
-def test_replay_refuses_company_on_its_topics() -> None:
+def test_replay_refuses_other_publishers_on_its_topics() -> None:
     from dexkit.dds import DdsNode
 
     domain = free_domain()

@@ -1,4 +1,4 @@
-"""Recordings meet software that nobody here wrote: rosbags, mcap-ros2-support, the mcap library."""
+"""Recordings are read by foreign software: rosbags, mcap-ros2-support, the mcap library."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_the_mcap_library_validates_what_we_write(recorded: dict[str, Path]) -> 
     assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
 
 
-def test_a_ros_2_bag_is_the_same_thing(tmp_path: Path) -> None:
+def test_ros_2_bag_reads_the_same(tmp_path: Path) -> None:
     """A bag written by rosbags: /dex1/left/cmd, ros2msg, its own type store and CDR encoder."""
     store = get_typestore(Stores.EMPTY)
     for name in (CMD_TYPE, STATE_TYPE):

@@ -1,3 +1,5 @@
+"""The reader of recordings: shapes, truncation, selection of topics."""
+
 from __future__ import annotations
 
 import io
@@ -20,6 +22,7 @@ from dexkit.errors import TraceError, TraceUnreadable, TraceUnsupported, UsageEr
 from dexkit.traces import SAMPLES, open_trace, sample_labels, sample_path
 from dexkit.traces import reader as reader_module
 from dexkit.traces.names import dds_topic, dds_type, select_topics
+from tests.each import each
 from tests.trace_helpers import (
     CMD,
     CMD_TYPE,
@@ -69,7 +72,7 @@ def readme_tables() -> dict[str, dict[str, list[float]]]:
     return tables
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@each("name", SAMPLES)
 def test_a_sample_holds_what_its_readme_says(name: str) -> None:
     table = readme_tables()[name]
     trace = open_trace(sample_path(name))
@@ -93,7 +96,7 @@ def test_a_sample_holds_what_its_readme_says(name: str) -> None:
         assert (times[0] - trace.first_ns) / 1e9 == pytest.approx(first, abs=0.006)
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@each("name", SAMPLES)
 def test_every_payload_of_a_sample_decodes(name: str) -> None:
     trace = open_trace(sample_path(name))
     for topic, samples in trace.load().items():
@@ -104,7 +107,7 @@ def test_every_payload_of_a_sample_decodes(name: str) -> None:
         assert kind.encode(kind.decode(middle)) == middle
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@each("name", SAMPLES)
 def test_a_sample_names_its_provenance_and_its_endpoints(name: str) -> None:
     trace = open_trace(sample_path(name))
     assert trace.metadata["provenance"]["controller_commit"]
@@ -140,7 +143,7 @@ def test_an_unknown_sample_names_the_known_ones() -> None:
 # -- the same content in every shape ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@each("shape", SHAPES, ids=str)
 def test_every_shape_reads_the_same(tmp_path: Path, shape: Shape) -> None:
     expected = rows()
     path = write(tmp_path / "a.mcap", mcap_bytes(expected, shape, metadata={"a": {"b": "c"}}))
@@ -237,7 +240,7 @@ def check_cut(tmp_path: Path, data: bytes, cut: int, expected: list[Row]) -> int
     return len(got)
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@each("shape", SHAPES, ids=str)
 def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Shape) -> None:
     expected = rows(20)
     data = mcap_bytes(expected, shape, metadata={"m": {"k": "v"}})
@@ -251,7 +254,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Sh
     assert last == len(expected)
 
 
-def test_a_cut_costs_no_more_than_the_record_it_falls_in(tmp_path: Path) -> None:
+def test_truncation_loses_only_the_cut_record(tmp_path: Path) -> None:
     expected = rows(8)
     data = mcap_bytes(expected, Shape(chunked=False))
     for cut in range(header_end(data), len(data), 3):
@@ -296,7 +299,7 @@ def test_zeros_at_the_end_are_not_messages(tmp_path: Path) -> None:
         st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=9)), min_size=1, max_size=6
     ),
 )
-def test_damage_anywhere_is_an_error_of_ours_or_a_warning(
+def test_damage_is_a_typed_error_or_a_warning(
     tmp_path: Path, shape: Shape, edits: list[tuple[float, bytes]]
 ) -> None:
     data = bytearray(mcap_bytes(rows(30), shape))
@@ -350,8 +353,8 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_length_costs_neither_memory_nor_an_exception(tmp_path: Path, name: str) -> None:
+@each("name", HOSTILE)
+def test_hostile_length_allocates_no_memory_and_raises_nothing(tmp_path: Path, name: str) -> None:
     path = write(tmp_path / "a.mcap", HOSTILE[name])
     tracemalloc.start()
     try:
@@ -404,7 +407,7 @@ def test_the_order_buffer_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyP
 # -- what is not a recording -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("content", "hint"),
     [
         (b"", "empty"),
@@ -448,14 +451,12 @@ def test_ros_names_are_the_same_thing(tmp_path: Path) -> None:
     assert len(trace.samples("/dex1/left/cmd")) == len(trace.samples("dex1/left/cmd")) == 5
 
 
-@pytest.mark.parametrize(
-    "name", ["/dex1/left/cmd", "dex1/left/cmd", "rt/dex1/left/cmd", "/rt/dex1/left/cmd"]
-)
+@each("name", ["/dex1/left/cmd", "dex1/left/cmd", "rt/dex1/left/cmd", "/rt/dex1/left/cmd"])
 def test_every_spelling_of_a_topic(name: str) -> None:
     assert dds_topic(name) == CMD
 
 
-@pytest.mark.parametrize(
+@each(
     "name",
     [
         CMD_TYPE,
@@ -525,7 +526,7 @@ def test_one_channel_of_an_unknown_kind_leaves_the_others_usable(tmp_path: Path)
         trace.message_type("/image")
 
 
-def test_two_types_on_one_topic_are_told_and_not_mixed(tmp_path: Path) -> None:
+def test_two_types_on_one_topic_are_reported_and_kept_apart(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     out = io.BytesIO()
@@ -565,7 +566,7 @@ def with_offsets(data: bytes, change: Callable[[int, int], int]) -> bytes:
     return bytes(out)
 
 
-@pytest.mark.parametrize(
+@each(
     "change",
     [
         lambda number, offset: offset,
@@ -577,7 +578,7 @@ def with_offsets(data: bytes, change: Callable[[int, int], int]) -> bytes:
         lambda number, offset: offset if number % 20 else 2**40,
     ],
 )
-@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
+@each("compression", [CompressionType.NONE, CompressionType.ZSTD])
 def test_a_message_index_is_only_believed_where_it_fits(
     tmp_path: Path, change: Callable[[int, int], int], compression: CompressionType
 ) -> None:

@@ -1,3 +1,5 @@
+"""Schemas in recordings compared with dexkit's own."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from dexkit.errors import TraceUnsupported
 from dexkit.messages import message_type, message_types
 from dexkit.traces import open_trace, schemas
+from tests.each import each
 from tests.trace_helpers import CMD, STATE_TYPE, T0, cmd, mcap_bytes, state, write
 
 HAND_STATE = "unitree_hg::msg::dds_::HandState_"
@@ -91,8 +94,8 @@ def ours(name: str) -> schemas.Struct:
     return schemas.parse("omgidl", name, message_type(name).omgidl)
 
 
-@pytest.mark.parametrize("kind", message_types(), ids=lambda k: k.ros_name)
-def test_both_of_our_texts_say_the_same(kind: object) -> None:
+@each("kind", message_types(), ids=lambda k: k.ros_name)
+def test_ros2msg_and_omgidl_schemas_are_equivalent(kind: object) -> None:
     from dexkit.messages import MessageType
 
     assert isinstance(kind, MessageType)
@@ -107,7 +110,7 @@ def test_ros2idl_is_read() -> None:
     assert schemas.differences(parsed, ours("unitree_go::msg::dds_::MotorCmds_")) == ([], [])
 
 
-def test_another_sign_is_said_but_does_no_harm(tmp_path: Path) -> None:
+def test_different_signedness_is_reported_and_read(tmp_path: Path) -> None:
     data = mcap_bytes(
         [("/dex1/left/state", T0, 0, state(1.25))],
         types={"/dex1/left/state": STATE_TYPE},
@@ -140,7 +143,7 @@ def test_an_old_layout_is_named_and_not_decoded(tmp_path: Path, encoding: str) -
             decode(topic)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "said"),
     [
         (("float pressure[12]", "float pressure[10]"), "pressure has 10 elements, not 12"),
@@ -158,7 +161,7 @@ def test_each_breaking_difference_is_named(change: tuple[str, str], said: str) -
     assert said in breaking[0]
 
 
-def test_another_name_alone_is_harmless() -> None:
+def test_different_field_name_is_accepted() -> None:
     text = message_type(HAND_STATE).omgidl.replace("float power_v", "float volts")
     recorded = schemas.parse("omgidl", HAND_STATE, text)
     assert schemas.differences(recorded, ours(HAND_STATE)) == ([], ["power_v is called volts"])
@@ -185,7 +188,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+@each("name", BAD)
 def test_a_bad_schema_is_unsupported(name: str) -> None:
     encoding, text = BAD[name]
     with pytest.raises(TraceUnsupported):
@@ -214,7 +217,7 @@ def test_any_text_is_read_or_unsupported(encoding: str, text: str) -> None:
         pass
 
 
-def test_a_bad_schema_spoils_only_its_own_channel(tmp_path: Path) -> None:
+def test_invalid_schema_affects_only_its_channel(tmp_path: Path) -> None:
     data = mcap_bytes([(CMD, T0, 0, cmd(1.0))], schema_text="complete nonsense, this")
     trace = open_trace(write(tmp_path / "a.mcap", data))
     assert not trace.channels[0].supported

@@ -1,4 +1,4 @@
-"""The GitHub Action and the container file, as far as they can be run without either.
+"""The GitHub Action and the container file, as far as they run without GitHub or Docker.
 
 The shell scripts of action.yml are run as a runner would: bash with its flags, the steps' ``env``
 with the inputs put in, GITHUB_OUTPUT and GITHUB_STEP_SUMMARY as files. What is not run: the
@@ -97,7 +97,7 @@ def command(path: Path, text: str) -> None:
 # ---------------------------------------------------------------------- what it is made of
 
 
-def test_it_is_a_composite_action_as_the_metadata_syntax_has_it() -> None:
+def test_action_follows_the_metadata_syntax_of_composite_actions() -> None:
     assert set(ACTION) == {"name", "description", "branding", "inputs", "outputs", "runs"}
     assert ACTION["runs"]["using"] == "composite"
     assert set(ACTION["branding"]) == {"icon", "color"}
@@ -232,7 +232,7 @@ def test_a_quote_without_end_is_a_wrong_option_and_nothing_runs(pretended: Runne
     assert not (pretended.home / "arguments").exists()
 
 
-def test_a_success_without_a_result_is_none(pretended: Runner) -> None:
+def test_success_without_a_result_file_fails(pretended: Runner) -> None:
     (pretended.home / "result").unlink()
     ran = pretended("Judge the hand", backend="acme", arguments="--list")
     assert ran.returncode == 2
@@ -295,7 +295,7 @@ def test_a_half_written_hand_is_told_what_is_missing(tmp_path: Path) -> None:
     assert "nothing was judged" in runner.summary
 
 
-def test_a_list_of_the_requirements_is_no_verdict(tmp_path: Path) -> None:
+def test_listing_requirements_is_not_a_pass(tmp_path: Path) -> None:
     runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     ran = runner("Judge the hand", backend="sim-dex1", arguments="--list")
     assert "DEX1-TOPIC-01" in ran.stdout

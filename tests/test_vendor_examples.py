@@ -1,4 +1,4 @@
-"""The examples for vendors: the invented Acme gripper, and a service that knows no dexkit."""
+"""The examples for vendors: the made-up Acme gripper, and a service without dexkit."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_it_feels_an_object_with_the_force_that_was_set(acme: ModuleType) -> Non
         hand.close()
 
 
-def test_a_gripper_that_goes_is_lost_and_comes_back(acme: ModuleType) -> None:
+def test_disconnected_gripper_is_lost_and_reopened(acme: ModuleType) -> None:
     with emulated(acme) as address:
         hand = opened(acme, address)
         hand._socket.shutdown(2)  # type: ignore[attr-defined]
@@ -119,7 +119,9 @@ def test_a_gripper_that_goes_is_lost_and_comes_back(acme: ModuleType) -> None:
     assert "switched on" in caught.value.hint
 
 
-def test_what_it_refuses(acme: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_options_and_devices_are_refused(
+    acme: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import acme_gripper.emulator as emulator
 
     with pytest.raises(UsageError, match="needs a device"):
@@ -176,7 +178,7 @@ def judged(domain: int, folder: Path, *arguments: str) -> dict[str, str]:
     return {row["id"]: row["verdict"] for row in document["results"]}
 
 
-def test_the_service_shares_nothing_with_dexkit() -> None:
+def test_example_service_does_not_import_dexkit() -> None:
     assert "dexkit" not in SERVICE.read_text().partition('"""\n')[2].replace("dexkit:", "", 1)
 
 
@@ -206,7 +208,7 @@ def test_a_hand_class_needs_no_name_to_be_judged() -> None:
     assert {r.model for r in options.requirements} == {"dex1-1"}
 
 
-def test_a_kit_that_fails_says_so_once_and_blames_nobody(tmp_path: Path) -> None:
+def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "spoilt.py").write_text(
         "import dexkit.conformance.session as session\n"
         "def run_suite(*args): raise IndexError('a bug of the kit')\n"

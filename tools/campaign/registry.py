@@ -15,10 +15,13 @@ __all__ = ["all_cases", "case", "select"]
 def all_cases() -> tuple[Case, ...]:
     """Every case, fuzzers first."""
     from tools.campaign import devices, disk, options, peers, programs, soak
-    from tools.campaign.fuzz import files, messages, wire
+    from tools.campaign.fuzz import devices as fuzzed_devices
+    from tools.campaign.fuzz import drivers, files, messages, recordings, wire
 
     found: list[Case] = []
-    for module in (wire, messages, files, devices, programs, peers, disk, options, soak):
+    for fuzzers in (wire, messages, fuzzed_devices, drivers, recordings, files):
+        found += fuzzers.cases()
+    for module in (devices, programs, peers, disk, options, soak):
         found += module.cases()
     return tuple(found)
 

@@ -17,7 +17,7 @@ from typing import Any
 from dexkit.errors import DexkitError
 from tools.campaign.case import Batch, Case, Lane
 
-__all__ = ["Difference", "FuzzCase", "Hang", "Target"]
+__all__ = ["Difference", "FuzzCase", "Hang", "Inputs", "SeededCase", "Target"]
 
 HANG = 2.0
 """Seconds of processor time that one input may take; wall time would blame a busy machine."""
@@ -85,7 +85,6 @@ class FuzzCase(Case):
         self._prepare = prepare
 
     def run(self, batch: Batch) -> None:  # noqa: D102
-        logging.disable()
         target = self._prepare(batch.random, batch.scratch)
         size = max(1, self.size // 20) if batch.sample else self.size
         with _limited(self.hang) as watch:
@@ -131,7 +130,6 @@ class FuzzCase(Case):
 
     def repeat(self, batch: Batch, data: bytes) -> None:
         """Try one input; text targets take UTF-8."""
-        logging.disable()
         target = self._prepare(batch.random, batch.scratch)
         given: Any = data
         if isinstance(target.make(), str):
@@ -149,6 +147,116 @@ class FuzzCase(Case):
                 watch.index = -1
                 target.close()
         batch.units += 1
+
+
+_EDGES: tuple[int, ...] = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    127,
+    128,
+    255,
+    256,
+    512,
+    660,
+    661,
+    1016,
+    1017,
+    1024,
+    32767,
+    32768,
+)
+_EDGES += (65534, 65535, 2**31 - 1, 2**31, 2**32 - 1)
+
+
+class Inputs:
+    """Random inputs to a device or driver that keeps its state between them.
+
+    :ivar random: the only source of chance.
+    :ivar number: inputs so far.
+    :ivar data: the last input.
+    """
+
+    def __init__(self, rng: random.Random, watch: _Watch | None = None) -> None:
+        self.random, self.number, self.data = rng, 0, b""
+        self._watch = watch
+
+    def run(self, data: bytes, function: Callable[[], object]) -> None:
+        """Call ``function`` for the next input; whatever it raises is a finding."""
+        self.data = data
+        self.number += 1
+        if self._watch is not None:
+            self._watch.index = self.number
+        function()
+
+    def expect(self, holds: bool, what: str) -> None:
+        """A condition after an input.
+
+        :raises AssertionError: it does not hold.
+        """
+        if not holds:
+            raise AssertionError(what)
+
+    def number_of(self, size: int) -> int:
+        """An unsigned integer of ``size`` bytes, half of the time at a limit of something."""
+        most = 1 << 8 * size
+        if self.random.random() < 0.5:
+            return self.random.choice(_EDGES) % most
+        return self.random.randrange(most)
+
+    def spoil(self, data: bytes) -> bytes:
+        """``data``, in one of five inputs damaged, cut, doubled, or behind noise."""
+        rnd = self.random
+        chance = rnd.random()
+        if chance < 0.8 or not data:
+            return data
+        if chance < 0.86:
+            spoilt = bytearray(data)
+            spoilt[rnd.randrange(len(spoilt))] ^= 1 << rnd.randrange(8)
+            return bytes(spoilt)
+        if chance < 0.9:
+            return data[: rnd.randrange(len(data))]
+        if chance < 0.94:
+            return data + data
+        if chance < 0.98:
+            return rnd.randbytes(rnd.randrange(40)) + data
+        return rnd.randbytes(rnd.choice((1, 10, 300, 4096)))
+
+
+class SeededCase(Case):
+    """A fuzzer whose inputs depend on what came before: a batch is repeated as a whole.
+
+    :param feed: makes and tries so many inputs, each with :meth:`Inputs.run`.
+    :param size: inputs in a batch; some half a second of them.
+    """
+
+    unit = "inputs"
+    lane = Lane.COMPUTE
+    limit = 120.0
+    aim = 300_000
+
+    def __init__(
+        self, name: str, what: str, feed: Callable[[Inputs, int], None], *, size: int
+    ) -> None:
+        self.name = f"fuzz:{name}"
+        self.what = what
+        self.size = size
+        self._feed = feed
+
+    def run(self, batch: Batch) -> None:  # noqa: D102
+        size = max(1, self.size // 20) if batch.sample else self.size
+        with _limited(HANG) as watch:
+            inputs = Inputs(batch.random, watch)
+            try:
+                self._feed(inputs, size)
+            except (Exception, Hang) as error:
+                watch.index = -1
+                batch.failed(error, index=inputs.number, data=inputs.data)
+            watch.index = -1
+        batch.units += size
 
 
 def as_bytes(data: Any) -> bytes:
@@ -183,15 +291,18 @@ class _Watch:
 @contextlib.contextmanager
 def _limited(hang: float) -> Iterator[_Watch]:
     watch = _Watch(hang)
+    quiet = logging.root.manager.disable
     before = signal.signal(signal.SIGPROF, watch.tick)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, hard))
     signal.setitimer(signal.ITIMER_PROF, hang / 2, hang / 2)
+    logging.disable()
     try:
         yield watch
     finally:
+        logging.disable(quiet)
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, before)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import zstandard
-from mcap.writer import CompressionType, Writer
 
 from dexkit.backends import BackendOptions
 from dexkit.conformance.claims import Claims
@@ -49,47 +48,22 @@ from dexkit.traces import open_trace
 from dexkit.traces.recorder import Recorder
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
+from tools.campaign.fuzz.recordings import TIME, TYPES, content
 from tools.campaign.mutate import TextMutator, mutator
 
 __all__ = ["cases", "damaged_json"]
 
-_TIME = 1_795_251_429_000_000_000
-_TYPES = {
-    "rt/dex1/left/cmd": "unitree_go::msg::dds_::MotorCmds_",
-    "rt/dex1/left/state": "unitree_go::msg::dds_::MotorStates_",
-    "rt/dex3/left/state": "unitree_hg::msg::dds_::HandState_",
-}
-
 
 # --- recordings
-
-
-def _foreign(compression: CompressionType, chunked: bool, rng: random.Random) -> bytes:
-    """A recording by the mcap library, with our topics and schemas."""
-    out = io.BytesIO()
-    writer = Writer(out, chunk_size=400, compression=compression, use_chunking=chunked)
-    writer.start(profile="ros2", library="campaign")
-    for at, (topic, name) in enumerate(_TYPES.items()):
-        kind = message_type(name)
-        schema = writer.register_schema(kind.layout.ros_name, "ros2msg", kind.ros2msg.encode())
-        channel = writer.register_channel(topic.removeprefix("rt"), "cdr", schema, {"a": "b"})
-        for number in range(6):
-            stamp = _TIME + number * 10_000_000 + at
-            writer.add_message(channel, stamp, kind.encode(filled(name, rng)), stamp, number)
-    writer.add_metadata(
-        "dds_endpoints", {"rt/dex1/left/cmd writer": "Reliable, Durability.Volatile"}
-    )
-    writer.finish()  # type: ignore[no-untyped-call]
-    return out.getvalue()
 
 
 def _own(path: Path, compression: str, rng: random.Random) -> bytes:
     """A recording by dexkit's recorder."""
     with Recorder(path, compression=compression) as recorder:
         for number in range(12):
-            for topic, name in _TYPES.items():
+            for topic, name in TYPES.items():
                 data = message_type(name).encode(filled(name, rng))
-                stamp = _TIME + number * 10_000_000
+                stamp = TIME + number * 10_000_000
                 recorder.put(topic, name, data, stamp, stamp)
         recorder.add_metadata("campaign", {"key": "value"})
     data = path.read_bytes()
@@ -132,44 +106,6 @@ def _zeros(size: int) -> bytes:
     return zstandard.compress(bytes(size))
 
 
-def _content(path: Path) -> tuple[Any, bool]:
-    """Everything that is read from a recording, and whether something odd was told."""
-    trace = open_trace(path)
-    rows = [
-        (m.topic, m.type_name, m.log_time_ns, m.publish_time_ns, m.data) for m in trace.messages()
-    ]
-    columns = trace.load()
-    sizes = {topic: len(array.log_time_ns) for topic, array in columns.items()}
-    told = bool(trace.warnings) or trace.truncated or any(c.problem for c in trace.channels)
-    kept = [(c.topic, c.type_name, c.message_count, c.metadata) for c in trace.channels]
-    about = {k: v for k, v in trace.metadata.items() if k != "dexkit_recorder"}
-    return (rows, sizes, kept, about, trace.endpoints), told
-
-
-def _recording(rng: random.Random, scratch: Path) -> Target:
-    """Open it, read it, say what is in it."""
-    corpus = [
-        _foreign(CompressionType.NONE, True, rng),
-        _foreign(CompressionType.ZSTD, True, rng),
-        _foreign(CompressionType.LZ4, True, rng),
-        _foreign(CompressionType.NONE, False, rng),
-        _own(scratch / "own.mcap", "none", rng),
-        _own(scratch / "zstd.mcap", "zstd", rng),
-    ]
-    damaged = mutator(corpus, rng)
-    path = scratch / "x.mcap"
-
-    def run(data: bytes) -> None:
-        path.write_bytes(data)
-        trace = open_trace(path)
-        list(trace.messages())
-        for samples in trace.load(decode=True).values():
-            len(samples.columns().ok)
-        str((trace.warnings, trace.channels, trace.endpoints))
-
-    return Target(damaged, run)
-
-
 def _greedy(rng: random.Random, scratch: Path) -> Target:
     """Small recordings that ask for much memory or time."""
     hostile = _hostile(rng)
@@ -194,7 +130,7 @@ def _flips(rng: random.Random, scratch: Path) -> Target:
     good = _own(scratch / "own.mcap", kind, rng)
     path = scratch / "x.mcap"
     path.write_bytes(good)
-    wanted, odd = _content(path)
+    wanted, odd = content(path)
     assert not odd
 
     def make() -> bytes:
@@ -204,7 +140,7 @@ def _flips(rng: random.Random, scratch: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        found, told = _content(path)
+        found, told = content(path)
         if found != wanted and not told:
             at = next(i for i, (a, b) in enumerate(zip(data, good, strict=True)) if a != b)
             raise Difference(f"byte {at} of {len(good)} ({kind}) changes what is read, untold")
@@ -217,10 +153,10 @@ def _judged(rng: random.Random, scratch: Path) -> Target:
     path = scratch / "x.mcap"
 
     def make() -> bytes:
-        topic, name = rng.choice(list(_TYPES.items()))
+        topic, name = rng.choice(list(TYPES.items()))
         kind = message_type(name)
         with Recorder(path, overwrite=True) as recorder:
-            stamp = _TIME
+            stamp = TIME
             for _ in range(rng.choice((1, 2, 3, 40))):
                 message = filled(name, rng)
                 if rng.random() < 0.3:
@@ -487,7 +423,6 @@ def cases() -> list[FuzzCase]:
     """Every fuzzer of this module."""
     slow = 300_000
     return [
-        FuzzCase("mcap", "recordings, opened and read", _recording, size=400, aim=slow, weight=4),
         FuzzCase("mcap.flip", "one bit of a recording of dexkit's own", _flips, size=300,
                  aim=slow, weight=3),
         FuzzCase("mcap.greedy", "small recordings that want much", _greedy, size=12, aim=2_000),

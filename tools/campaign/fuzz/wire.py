@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import random
-import socket
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,12 +12,7 @@ from typing import Any
 import fastcrc
 
 from dexkit.clock import ManualClock
-from dexkit.drivers.dex3_usb import usbip
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
-from dexkit.emulators.m4010.bus import Bus as DexBus
-from dexkit.emulators.m4010.motor import Motor
-from dexkit.emulators.mx64 import Bus, Firmware, Servo
-from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX3_1
 from dexkit.wire import dex3_usb, dynamixel, low_level, m4010, mx64, ris
@@ -353,132 +347,6 @@ def _scale(rng: random.Random, scratch: Path) -> Target:
 # --- emulated devices, without a line
 
 
-def _servo(fast: bool) -> Prepare:
-    def prepare(rng: random.Random, scratch: Path) -> Target:
-        firmware = Firmware(fast_reads=fast, backup=fast)
-
-        def bus() -> Bus:
-            return Bus([Servo(1, firmware=firmware), Servo(2, firmware=firmware)], line_time=False)
-
-        state: list[Any] = [bus(), 0.0, 0]
-
-        def run(data: bytes) -> None:
-            line, now, used = state
-            if used >= 200:  # a servo that was told to be silent is no test of anything
-                line, used = bus(), 0
-            state[:] = line, now + 1e-4, used + 1
-            line.advance_to(now)
-            line.receive(data, now)
-            line.due(now + 1.0)
-
-        return Target(mutator(instruction_packets(), rng, fix_dynamixel), run, ())
-
-    return prepare
-
-
-def _protocol_1(rng: random.Random, scratch: Path) -> Target:
-    def frame(body: bytes) -> bytes:
-        return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
-
-    def fix(data: bytearray) -> None:
-        if len(data) > 5:
-            data[0:2] = b"\xff\xff"
-            data[3] = len(data) - 4 & 0xFF
-            data[-1] = ~sum(data[2:-1]) & 0xFF
-
-    corpus = [frame(b"\x01\x02\x01"), frame(b"\x01\x04\x02\x00\x03"), frame(b"\xfe\x02\x01")]
-    servo = Protocol1Servo(1)
-    return Target(mutator(corpus, rng, fix), servo.feed, ())
-
-
-def _dex1_motor(rng: random.Random, scratch: Path) -> Target:
-    state: list[Any] = [DexBus([Motor(0), Motor(1)], line_time=False), 0.0]
-
-    def run(data: bytes) -> None:
-        line, now = state
-        line.advance_to(now)
-        line.receive(data, now)
-        line.due(now + 1.0)
-        state[1] = now + 1e-4
-
-    return Target(mutator(_motor_commands(), rng, fix_words(0, m4010.COMMAND.head)), run, ())
-
-
-def _mcu(rng: random.Random, scratch: Path) -> Target:
-    clock = ManualClock()
-    device = Dex3Mcu(Side.LEFT, clock=clock)
-
-    def run(data: bytes) -> None:
-        clock.advance(1e-4)
-        device.exchange(data)
-
-    return Target(mutator(_dex3_commands(), rng, _fix_command), run, ())
-
-
-# --- USB/IP
-
-
-def _usbip_client(rng: random.Random, scratch: Path) -> Target:
-    """Replies of a server that is not one, to a read that waits."""
-    from usb.core import USBError
-
-    reply = struct.pack(">II12xii20x", 3, 1, 0, 18) + bytes(18)
-    unlinked = struct.pack(">II12xii20x", 4, 2, -104, 0)
-    corpus = [reply, reply[:48], unlinked, unlinked + reply, reply + reply]
-
-    def run(data: bytes) -> None:
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            connection = usbip._Connection(ours, 0x10002)
-            theirs.sendall(data)
-            theirs.shutdown(socket.SHUT_WR)
-            _, got = connection.submit(
-                direction=1, ep=0, setup=bytes(8), transfer_buffer_length=18, timeout_ms=200
-            )
-            assert len(got) <= 18
-            connection.close()
-
-    return Target(mutator(corpus, rng), run, (USBError,))
-
-
-def _usbip_server(rng: random.Random, scratch: Path) -> Target:
-    """What clients send that do not speak the protocol; afterwards a good one is served."""
-    from dexkit.emulators.dex3_mcu import emulated_dex3
-
-    context = emulated_dex3(port=0)
-    hands: Any = context.__enter__()
-    place = ("127.0.0.1", hands.port)
-    enter = struct.pack(">HHI", 0x0111, 0x8003, 0) + b"1-1".ljust(32, b"\0")
-    listing = struct.pack(">HHI", 0x0111, 0x8005, 0)
-    submit = struct.pack(">IIIIIIiiii8s", 1, 1, 0x10002, 1, 1, 0, 64, 0, 0, 0, bytes(8))
-    control = struct.pack(
-        ">IIIIIIiiii8s", 1, 2, 0x10002, 1, 0, 0, 18, 0, 0, 0, bytes.fromhex("8006000100001200")
-    )
-    unlink = struct.pack(">IIIIII24x", 2, 3, 0x10002, 0, 0, 1)
-    corpus = [listing, enter + submit, enter + control, enter + submit + unlink, enter]
-    count = [0]
-
-    def run(data: bytes) -> None:
-        with socket.create_connection(place, timeout=5.0) as sock:
-            try:
-                sock.sendall(data)
-                sock.shutdown(socket.SHUT_WR)
-                while sock.recv(65536):
-                    pass
-            except ConnectionError:
-                pass
-        if hands.error is not None:
-            raise hands.error
-        count[0] += 1
-        if count[0] % 50 == 0:
-            with socket.create_connection(place, timeout=5.0) as sock:
-                sock.sendall(listing)
-                if sock.recv(12)[:4] != b"\x01\x11\x00\x05":
-                    raise Difference("a good client is not served any more")
-
-    return Target(mutator(corpus, rng), run, (), lambda: context.__exit__(None, None, None))
-
-
 def cases() -> list[FuzzCase]:
     """Every fuzzer of this module."""
     instructions, statuses = instruction_packets(), _status_packets()
@@ -658,29 +526,4 @@ def cases() -> list[FuzzCase]:
             "unitree_hg::msg::dds_::LowState_",
         )
     ]
-    devices = [
-        FuzzCase(
-            "device.mx64", "the emulated MX-64, on its line", _servo(False), size=15_000, aim=slow
-        ),
-        FuzzCase(
-            "device.mx64-fast",
-            "the same with fast reads and backup",
-            _servo(True),
-            size=15_000,
-            aim=slow,
-        ),
-        FuzzCase(
-            "device.protocol-1", "the old firmware of it", _protocol_1, size=120_000, aim=fast
-        ),
-        FuzzCase(
-            "device.m4010", "the emulated M4010, on its line", _dex1_motor, size=25_000, aim=slow
-        ),
-        FuzzCase("device.dex3", "the emulated Dex3-1, behind USB", _mcu, size=10_000, aim=slow),
-        FuzzCase(
-            "usbip.client", "what a USB/IP server answers", _usbip_client, size=15_000, aim=slow
-        ),
-        FuzzCase(
-            "usbip.server", "what a USB/IP client sends", _usbip_server, size=2_000, aim=slow // 3
-        ),
-    ]
-    return serial + dex3 + low + devices
+    return serial + dex3 + low

@@ -1,6 +1,6 @@
-"""Hostile devices: replies for the drivers, most of them in good frames.
+"""Hostile devices: replies to the drivers, most of them in frames with a valid checksum.
 
-Whatever a device answers, a driver raises an error of dexkit's or works, and comes back in time.
+A finding is an exception that is not dexkit's own, or a hand that close() leaves driven.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from dexkit.wire import dynamixel as dxl
 from dexkit.wire import m4010
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import STATE
-from tests.fuzz.devices import _Case
+from tools.campaign.fuzz.case import Inputs, SeededCase
 
-__all__ = ["FUZZERS", "dex3_usb", "ezgripper", "motor_line", "usbip_client"]
+__all__ = ["cases"]
 
 _BLOCK = 100
 
@@ -50,12 +50,12 @@ def _spoilt(rnd: random.Random, data: bytes, seal: Callable[[bytes], bytes]) -> 
     if chance < 0.3 or len(data) < 12:
         return data
     if chance < 0.7:
-        mechanics = bytearray(data)
+        changed = bytearray(data)
         for _ in range(rnd.choice((1, 3, 30))):
-            mechanics[rnd.randrange(2, len(mechanics))] = rnd.choice(
+            changed[rnd.randrange(2, len(changed))] = rnd.choice(
                 (0, 0x7F, 0x80, 0xFF, rnd.randrange(256))
             )
-        return seal(bytes(mechanics))
+        return seal(bytes(changed))
     if chance < 0.8:
         return data[: rnd.randrange(len(data))]
     if chance < 0.9:
@@ -69,7 +69,7 @@ def _spoilt(rnd: random.Random, data: bytes, seal: Callable[[bytes], bytes]) -> 
 class _HostilePort(ezgripper_bus.DevicePort):
     """The driver's port with an emulated servo on it, whose answers are tampered with."""
 
-    def __init__(self, case: _Case, line: Bus, clock: ManualClock) -> None:
+    def __init__(self, case: Inputs, line: Bus, clock: ManualClock) -> None:
         super().__init__("fuzz", 1_000_000, 0.03)
         self._case, self._bus, self._time = case, line, clock
         self.honest = True
@@ -77,7 +77,7 @@ class _HostilePort(ezgripper_bus.DevicePort):
     def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
         self.is_open = True
         self.tx_time_per_byte = 0.01
-        self.ser = SimpleNamespace(
+        self.ser = SimpleNamespace(  # type: ignore[assignment]
             reset_input_buffer=self._received.clear, close=lambda: None, flush=lambda: None
         )
         return True
@@ -112,9 +112,8 @@ def _sealed_status(data: bytes) -> bytes:
     return data + dxl.crc16(data).to_bytes(2, "little")
 
 
-def ezgripper(seed: int, count: int) -> int:
+def ezgripper(case: Inputs, count: int) -> None:
     """The EZGripper driver with a servo that answers anything."""
-    case = _Case("EZGripper driver", seed)
     rnd = case.random
     clock = ManualClock(100.0)
     commands = [HandCommand.brake(1), HandCommand.position(0.0), HandCommand.position(5.4)]
@@ -146,14 +145,11 @@ def ezgripper(seed: int, count: int) -> int:
             line.due(clock.advance(2.0))
             line.advance_to(clock.now())
             for servo in line.servos:
-                assert not servo.torque or servo.drive.demand.stopped or _is_still(servo), (
-                    f"{case.name}, seed {seed}: a hand was left driven"
+                still = abs(servo.drive.velocity) < 1.0
+                case.expect(
+                    not servo.torque or servo.drive.demand.stopped or still,
+                    "close() left the servo driven",
                 )
-    return count
-
-
-def _is_still(servo: Servo) -> bool:
-    return abs(servo.drive.velocity) < 1.0
 
 
 def _typed(function: Callable[[], object]) -> None:
@@ -190,14 +186,13 @@ class _Peer:
         self.near.close()
 
 
-def motor_line(seed: int, count: int) -> int:
+def motor_line(case: Inputs, count: int) -> None:
     """A serial line whose motor answers anything."""
-    case = _Case("M4010 line", seed)
     rnd = case.random
 
     def seal(data: bytes) -> bytes:
-        mechanics = m4010.DATA.head + data[2:22]
-        return mechanics + crc32_words(mechanics[2:]).to_bytes(4, "little")
+        frame = m4010.DATA.head + data[2:22]
+        return frame + crc32_words(frame[2:]).to_bytes(4, "little")
 
     def reply(command: bytes) -> bytes:
         number = rnd.choice((0, 0, 0, 1, 15))
@@ -233,10 +228,9 @@ def motor_line(seed: int, count: int) -> int:
         for _ in range(count):
             with mock.patch("dexkit.drivers.dex1_serial.line.LATE", 0.001):
                 case.run(b"", lambda: _typed(lambda: line.exchange(frame, 0, 0.0005)))
-            assert line._parser.pending < 100
+            case.expect(line._parser.pending < 100, "the parser holds more than a frame")
     finally:
         peer.close()
-    return count
 
 
 def _statistics() -> Any:
@@ -251,7 +245,7 @@ def _statistics() -> Any:
 class _HostileBackend:
     """A PyUSB backend with one hand, which answers anything."""
 
-    def __init__(self, case: _Case, mcu: Dex3Mcu) -> None:
+    def __init__(self, case: Inputs, mcu: Dex3Mcu) -> None:
         self._case, self._mcu = case, mcu
         self.honest = True
 
@@ -296,9 +290,8 @@ def _sealed_state(data: bytes) -> bytes:
     return data + crc32_words(data[2:]).to_bytes(4, "little")
 
 
-def dex3_usb(seed: int, count: int) -> int:
+def dex3_usb(case: Inputs, count: int) -> None:
     """The Dex3-1 driver with a hand that answers anything."""
-    case = _Case("Dex3-1 driver", seed)
     rnd = case.random
     clock = ManualClock(100.0)
     for i in range(count):
@@ -321,20 +314,14 @@ def dex3_usb(seed: int, count: int) -> int:
             case.run(b"", hand.close)
             clock.advance(2.0)
             mcu.advance()
-            assert (
-                not mcu.mechanics.mode.any()
-                if hasattr(mcu.mechanics.mode, "any")
-                else not any(mcu.mechanics.mode)
-            ), f"{case.name}, seed {seed}: a hand was left driven"
-    return count
+            case.expect(not any(mcu.mechanics.mode), "close() left a motor driven")
 
 
 # --- USB/IP client
 
 
-def usbip_client(seed: int, count: int) -> int:
+def usbip_client(case: Inputs, count: int) -> None:
     """The client's transfers, and its list and import, with a server that answers anything."""
-    case = _Case("USB/IP client", seed)
     rnd = case.random
     for i in range(count):
         if i % 20 == 0:
@@ -361,10 +348,9 @@ def usbip_client(seed: int, count: int) -> int:
             case.run(stream, lambda stream=stream: _list(listener, stream))  # type: ignore[misc]
     finally:
         listener.close()
-    return count
 
 
-def _replies(case: _Case, data: bytes) -> bytes:
+def _replies(case: Inputs, data: bytes) -> bytes:
     rnd = case.random
     out = b""
     for at in range(0, len(data) - 47, 48):
@@ -379,7 +365,7 @@ def _replies(case: _Case, data: bytes) -> bytes:
     return case.spoil(out)
 
 
-def _greeting(case: _Case) -> bytes:
+def _greeting(case: Inputs) -> bytes:
     rnd = case.random
     device = struct.pack(
         ">256s32sIIIHHHBBBBBB",
@@ -416,10 +402,11 @@ def _list(listener: socket.socket, stream: bytes) -> None:
         thread.join()
 
 
-FUZZERS: dict[str, Callable[[int, int], int]] = {
-    "ezgripper-driver": ezgripper,
-    "motor-line-driver": motor_line,
-    "dex3-usb-driver": dex3_usb,
-    "usbip-client": usbip_client,
-}
-"""All of this module, by name: ``FUZZERS[name](seed, count)``."""
+def cases() -> list[SeededCase]:
+    """Every fuzzer of this module."""
+    return [
+        SeededCase("driver.ezgripper", "answers to the EZGripper driver", ezgripper, size=500),
+        SeededCase("driver.m4010", "answers to the serial line of Dex1-1", motor_line, size=300),
+        SeededCase("driver.dex3-usb", "answers to the Dex3-1 driver", dex3_usb, size=1_000),
+        SeededCase("usbip.client", "answers of a USB/IP server", usbip_client, size=300),
+    ]

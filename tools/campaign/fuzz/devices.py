@@ -1,31 +1,22 @@
-"""Hostile hosts: bytes for the emulated devices, most of them in good frames.
+"""Hostile hosts: bytes for the emulated devices, most of them in frames with a valid checksum.
 
-Whatever comes, a device answers as its wire format says or is silent; it never raises, and holds
-no more than a bounded number of bytes. Virtual time throughout.
+A finding is an exception, an answer that the wire format does not allow, or a buffer that grows.
+Time is virtual, except in the USB/IP server.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-import random
 import select
 import socket
 import struct
-from collections.abc import Callable
 
 from dexkit.clock import ManualClock
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.settings import Firmware as Dex3Firmware
 from dexkit.emulators.dex3_mcu.usb import Dex3Usb
-from dexkit.emulators.faults import (
-    DEX3_FAULTS,
-    M4010_FAULTS,
-    MX64_FAULTS,
-    FaultFamily,
-    parse_fault,
-)
 from dexkit.emulators.m4010.bus import Bus as MotorBus
 from dexkit.emulators.m4010.motor import Motor
 from dexkit.emulators.mx64 import Bus, Firmware, Servo
@@ -41,67 +32,11 @@ from dexkit.wire import low_level, m4010, mx64
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, MOTOR_CMD, N_BUSES
 from dexkit.wire.dynamixel import Instruction
+from tools.campaign.fuzz.case import Inputs, SeededCase
 
-__all__ = [
-    "FUZZERS",
-    "dex3",
-    "faults",
-    "m4010_line",
-    "mx64_line",
-    "packet",
-    "robots",
-    "usbip_server",
-]
+__all__ = ["cases", "packet"]
 
 _BLOCK = 200  # inputs to one device, then there is a new one
-_EDGES = (0, 1, 2, 3, 4, 5, 127, 128, 255, 256, 512, 660, 661, 1016, 1017, 1024, 32767, 32768)
-_EDGES += (65534, 65535, 2**31 - 1, 2**31, 2**32 - 1)
-
-
-class _Case:
-    """The random choices of one input, and how to say what went wrong with it."""
-
-    def __init__(self, name: str, seed: int) -> None:
-        self.name, self.seed, self.number = name, seed, 0
-        self.random = random.Random(f"{name} {seed}")
-        self.data = b""
-
-    def run(self, data: bytes, function: Callable[[], object]) -> None:
-        self.data = data
-        self.number += 1
-        try:
-            function()
-        except Exception as error:
-            raise AssertionError(
-                f"{self.name}, seed {self.seed}, input {self.number}: {type(error).__name__}: "
-                f"{error}; input {data.hex()}"
-            ) from error
-
-    def number_of(self, size: int) -> int:
-        """An integer of so many bytes, often at an edge of something."""
-        chance = self.random.random()
-        most = 1 << 8 * size
-        if chance < 0.5:
-            return self.random.choice(_EDGES) % most
-        return self.random.randrange(most)
-
-    def spoil(self, data: bytes) -> bytes:
-        """Mostly ``data``; sometimes damaged, cut, doubled, or behind noise."""
-        rnd = self.random
-        chance = rnd.random()
-        if chance < 0.8 or not data:
-            return data
-        if chance < 0.86:
-            spoilt = bytearray(data)
-            spoilt[rnd.randrange(len(spoilt))] ^= 1 << rnd.randrange(8)
-            return bytes(spoilt)
-        if chance < 0.9:
-            return data[: rnd.randrange(len(data))]
-        if chance < 0.94:
-            return data + data
-        if chance < 0.98:
-            return rnd.randbytes(rnd.randrange(40)) + data
-        return rnd.randbytes(rnd.choice((1, 10, 300, 4096)))
 
 
 # --- MX-64
@@ -112,13 +47,13 @@ _ITEMS = list(mx64.TABLE.values())
 
 def packet(packet_id: int, instruction: int, params: bytes) -> bytes:
     """An instruction packet with a true length and CRC, whatever its id and size."""
-    robot = dxl.stuff(bytes((instruction,)) + params)
-    length = len(robot) + 2
-    data = dxl.HEADER + bytes((packet_id, length & 0xFF, length >> 8 & 0xFF)) + robot
+    body = dxl.stuff(bytes((instruction,)) + params)
+    length = len(body) + 2
+    data = dxl.HEADER + bytes((packet_id, length & 0xFF, length >> 8 & 0xFF)) + body
     return data + dxl.crc16(data).to_bytes(2, "little")
 
 
-def _instruction(case: _Case) -> bytes:
+def _instruction(case: Inputs) -> bytes:
     rnd = case.random
     code = rnd.choice(_CODES) if rnd.random() < 0.95 else rnd.randrange(256)
     single = rnd.random() < 0.5
@@ -177,14 +112,14 @@ def _instruction(case: _Case) -> bytes:
     return packet(target, code, params)
 
 
-def _protocol_1(case: _Case) -> bytes:
+def _protocol_1(case: Inputs) -> bytes:
     rnd = case.random
     params = rnd.randbytes(rnd.choice((0, 1, 2, 2, 2, 3, 20)))
-    robot = bytes((rnd.choice((3, 254, 1)), len(params) + 2, rnd.choice((1, 2, 3, 0x83)))) + params
-    return b"\xff\xff" + robot + bytes((~sum(robot) & 0xFF,))
+    body = bytes((rnd.choice((3, 254, 1)), len(params) + 2, rnd.choice((1, 2, 3, 0x83)))) + params
+    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
 
 
-def _servos(case: _Case, now: float) -> Bus:
+def _servos(case: Inputs, now: float) -> Bus:
     rnd = case.random
 
     def flip() -> bool:
@@ -211,9 +146,8 @@ def _servos(case: _Case, now: float) -> Bus:
     )
 
 
-def mx64_line(seed: int, count: int) -> int:
+def mx64_line(case: Inputs, count: int) -> None:
     """Two MX-64 with Protocol 2.0 firmware, and at times one with 1.0, on one line."""
-    case = _Case("mx64 line", seed)
     now = 100.0
     for i in range(count):
         if i % _BLOCK == 0:
@@ -222,14 +156,13 @@ def mx64_line(seed: int, count: int) -> int:
         data = _protocol_1(case) if chance < 0.05 else _instruction(case)
         data = case.spoil(data)
         now += case.random.choice((0.0, 1e-4, 1e-3, 2e-3, 5e-3, 0.02))
-        case.run(data, lambda bus=bus, data=data, now=now: _talk(case, bus, data, now))  # type: ignore[misc]
+        case.run(data, lambda bus=bus, data=data, now=now: _exchange(case, bus, data, now))  # type: ignore[misc]
         if (i + 1) % _BLOCK == 0:
             now += bus.behind(now) + 2.0  # 4 KiB at 9600 baud take 4 s
-            case.run(b"", lambda bus=bus, now=now: _still_there(bus, now))  # type: ignore[misc]
-    return count
+            case.run(b"", lambda bus=bus, now=now: _answer_a_broadcast_ping(bus, now))  # type: ignore[misc]
 
 
-def _talk(case: _Case, bus: Bus | MotorBus, data: bytes, now: float) -> bytes:
+def _exchange(case: Inputs, bus: Bus | MotorBus, data: bytes, now: float) -> bytes:
     bus.advance_to(now)
     bus.receive(data, now)
     assert bus._parser.pending <= dxl.MAX_PACKET, "the parser holds more than a packet"
@@ -241,7 +174,7 @@ def _talk(case: _Case, bus: Bus | MotorBus, data: bytes, now: float) -> bytes:
     return out
 
 
-def _still_there(bus: Bus, now: float) -> None:
+def _answer_a_broadcast_ping(bus: Bus, now: float) -> None:
     bus.due(now)
     for servo in bus.servos:  # a fuzzed id may be anybody's; a delay of 0.5 ms at most is not
         assert servo.id <= dxl.MAX_ID
@@ -252,47 +185,11 @@ def _still_there(bus: Bus, now: float) -> None:
     assert any(p.is_status for p in found), "nobody answers a broadcast ping"
 
 
-def faults(seed: int, count: int) -> int:
-    """Lines of standard input for the emulators: parsed, or refused with a typed error."""
-    case = _Case("faults", seed)
-    families = (MX64_FAULTS, M4010_FAULTS, DEX3_FAULTS)
-    for _ in range(count):
-        family = case.random.choice(families)
-        text = _fault_text(case, family)
-        case.run(text.encode(errors="surrogateescape"), lambda f=family, t=text: _parsed(t, f))  # type: ignore[misc]
-    return count
-
-
-def _parsed(text: str, family: FaultFamily) -> None:
-    with contextlib.suppress(DexkitError):
-        parse_fault(text, family)
-
-
-def _fault_text(case: _Case, family: FaultFamily) -> str:
-    rnd = case.random
-    words = ["drop", "corrupt", "delay", "unplug", "overload", "silent", "stuck", "short", "stray"]
-    words += ["brown-out", "overheat", "pause", "stall"]
-    values = ["0", "1", "0.5", "-1", "nan", "inf", "1e400", "9" * 5000, "²", "٣", "", "1e5", "x"]
-    keys = ["p", "ms", "id", "side", "for", "c", "volts", "before", "after", "bytes", "q"]
-    text = rnd.choice(words)
-    if rnd.random() < 0.4:
-        text += "@" + rnd.choice(values) + rnd.choice(("", "s", "ms", "m"))
-    if rnd.random() < 0.7:
-        pairs = [f"{rnd.choice(keys)}={rnd.choice(values)}" for _ in range(rnd.randrange(1, 4))]
-        text += ":" + ",".join(pairs)
-    if rnd.random() < 0.1:
-        text = "".join(
-            chr(rnd.choice((0, 10, 27, 0xB2, 0x1F600))) if rnd.random() < 0.1 else c for c in text
-        )
-    return text
-
-
 # --- M4010
 
 
-def m4010_line(seed: int, count: int) -> int:
+def m4010_line(case: Inputs, count: int) -> None:
     """Both motors of a pair of Dex1-1 on one line."""
-    case = _Case("m4010 line", seed)
     now = 100.0
     for i in range(count):
         if i % _BLOCK == 0:
@@ -303,25 +200,24 @@ def m4010_line(seed: int, count: int) -> int:
             )
         data = case.spoil(_motor_frame(case))
         now += case.random.choice((0.0, 1e-4, 1e-3, 5e-3, 0.05))
-        case.run(data, lambda bus=bus, data=data, now=now: _talk(case, bus, data, now))  # type: ignore[misc]
+        case.run(data, lambda bus=bus, data=data, now=now: _exchange(case, bus, data, now))  # type: ignore[misc]
         if (i + 1) % _BLOCK == 0:
             now += 2.0
             case.run(b"", lambda bus=bus, now=now: _motors_answer(bus, now))  # type: ignore[misc]
-    return count
 
 
-def _motor_frame(case: _Case) -> bytes:
+def _motor_frame(case: Inputs) -> bytes:
     rnd = case.random
     number = rnd.choice((0, 1, 2, 15))
     mode = number | rnd.choice((0, 1, 1, 1, 2, 5, 6, 7)) << 4 | rnd.choice((0, 0x80))
-    robot = b"\xfe\xee" + bytes((mode, rnd.randrange(256)))
+    body = b"\xfe\xee" + bytes((mode, rnd.randrange(256)))
     if rnd.random() < 0.1:  # a calibration is told by these
-        robot += struct.pack("<h", -0x400)
+        body += struct.pack("<h", -0x400)
     else:
-        robot += case.number_of(2).to_bytes(2, "little")
-    robot += case.number_of(2).to_bytes(2, "little") + case.number_of(4).to_bytes(4, "little")
-    robot += case.number_of(2).to_bytes(2, "little") + case.number_of(2).to_bytes(2, "little")
-    return robot + crc32_words(robot).to_bytes(4, "little")
+        body += case.number_of(2).to_bytes(2, "little")
+    body += case.number_of(2).to_bytes(2, "little") + case.number_of(4).to_bytes(4, "little")
+    body += case.number_of(2).to_bytes(2, "little") + case.number_of(2).to_bytes(2, "little")
+    return body + crc32_words(body).to_bytes(4, "little")
 
 
 def _motors_answer(bus: MotorBus, now: float) -> None:
@@ -336,9 +232,8 @@ def _motors_answer(bus: MotorBus, now: float) -> None:
 # --- Dex3-1
 
 
-def dex3(seed: int, count: int) -> int:
+def dex3(case: Inputs, count: int) -> None:
     """A Dex3-1's processor behind its USB endpoints."""
-    case = _Case("dex3", seed)
     clock = ManualClock(100.0)
     for i in range(count):
         if i % _BLOCK == 0:
@@ -353,10 +248,9 @@ def dex3(seed: int, count: int) -> int:
         data = case.spoil(_hand_frame(case))
         clock.advance(case.random.choice((0.0, 1e-4, 1e-3, 5e-3)))
         case.run(data, lambda usb=usb, data=data: _transfer(usb, data))  # type: ignore[misc]
-    return count
 
 
-def _hand_frame(case: _Case) -> bytes:
+def _hand_frame(case: Inputs) -> bytes:
     rnd = case.random
     layout = rnd.choice(COMMAND_LAYOUTS)
     buses = []
@@ -364,9 +258,9 @@ def _hand_frame(case: _Case) -> bytes:
     for _ in range(N_BUSES):
         packets = b""
         for _ in range(rnd.choice((0, 1, 2, 3, 7))):
-            robot = MOTOR_CMD.head + bytes((rnd.randrange(256), rnd.randrange(256)))
-            robot += b"".join(case.number_of(n).to_bytes(n, "little") for n in (2, 2, 4, 2, 2))
-            packets += case.spoil(robot + crc32_words(robot).to_bytes(4, "little"))
+            body = MOTOR_CMD.head + bytes((rnd.randrange(256), rnd.randrange(256)))
+            body += b"".join(case.number_of(n).to_bytes(n, "little") for n in (2, 2, 4, 2, 2))
+            packets += case.spoil(body + crc32_words(body).to_bytes(4, "little"))
         packets = packets[: layout.bus_size]
         sizes.append(len(packets) if rnd.random() < 0.9 else case.number_of(4))
         buses.append(packets.ljust(layout.bus_size, b"\0"))
@@ -385,9 +279,8 @@ def _transfer(usb: Dex3Usb, data: bytes) -> None:
 # --- robots
 
 
-def robots(seed: int, count: int) -> int:
+def robots(case: Inputs, count: int) -> None:
     """An H1 and a G1: samples of their command topics, most of them with a good CRC."""
-    case = _Case("robots", seed)
     now = 100.0
     for i in range(count):
         rnd = case.random
@@ -413,13 +306,12 @@ def robots(seed: int, count: int) -> int:
             robot.state(now)
 
         case.run(payload, act)
-    return count
 
 
 _FLOATS = (0.0, 1.0, -1.0, 1e3, 1e-30, 2.1e9, 3.4e38, -3.4e38, math.inf, math.nan, 16000.0)
 
 
-def _robot_command(case: _Case, model: RobotModel) -> bytes:
+def _robot_command(case: Inputs, model: RobotModel) -> bytes:
     """A command that is obeyed, of gains that may be monstrous."""
     rnd = case.random
     kind = message_type(model.cmd_type)
@@ -457,20 +349,18 @@ _REQUESTS = (
 )
 
 
-def usbip_server(seed: int, count: int) -> int:
+def usbip_server(case: Inputs, count: int) -> None:
     """Clients of the USB/IP server: valid, hostile and broken messages, in any pieces."""
-    case = _Case("USB/IP server", seed)
-    with Dex3Hands((Side.LEFT, Side.RIGHT), seed=seed) as hands:
+    with Dex3Hands((Side.LEFT, Side.RIGHT), seed=case.random.getrandbits(32)) as hands:
         made = 0
         while made < count:
             stream = b"".join(_message(case) for _ in range(min(40, count - made)))
             made += min(40, count - made)
             case.number = made
             case.run(stream, lambda stream=stream: _client(case, hands, stream))  # type: ignore[misc]
-    return made
 
 
-def _message(case: _Case) -> bytes:
+def _message(case: Inputs) -> bytes:
     rnd = case.random
     number = rnd.choice((1, 2, rnd.randrange(1, 1000), case.number_of(4)))
     endpoint = rnd.choice((0, 1, 2, 2, 1, 15, case.number_of(4)))
@@ -489,7 +379,7 @@ def _message(case: _Case) -> bytes:
     return case.spoil(header + data) if rnd.random() < 0.1 else header + data
 
 
-def _client(case: _Case, hands: Dex3Hands, stream: bytes) -> None:
+def _client(case: Inputs, hands: Dex3Hands, stream: bytes) -> None:
     rnd = case.random
     address = ("127.0.0.1", hands.port)
     with contextlib.suppress(OSError), socket.create_connection(address, 5.0) as sock:
@@ -513,12 +403,12 @@ def _client(case: _Case, hands: Dex3Hands, stream: bytes) -> None:
         assert answer[:12] == struct.pack(">HHII", 0x111, 5, 0, 2), answer[:12]
 
 
-FUZZERS: dict[str, Callable[[int, int], int]] = {
-    "mx64-line": mx64_line,
-    "m4010-line": m4010_line,
-    "dex3": dex3,
-    "robots": robots,
-    "faults": faults,
-    "usbip-server": usbip_server,
-}
-"""All of this module, by name: ``FUZZERS[name](seed, count)``."""
+def cases() -> list[SeededCase]:
+    """Every fuzzer of this module."""
+    return [
+        SeededCase("device.mx64", "two emulated MX-64 on a line", mx64_line, size=3_000),
+        SeededCase("device.m4010", "two emulated M4010 on a line", m4010_line, size=2_500),
+        SeededCase("device.dex3", "the emulated Dex3-1 behind its USB endpoints", dex3, size=1_000),
+        SeededCase("device.robots", "the emulated H1 and G1", robots, size=1_000),
+        SeededCase("usbip.server", "clients of the USB/IP server", usbip_server, size=2_000),
+    ]

@@ -1,35 +1,40 @@
-"""A fuzzer for recordings that knows what they are made of.
+"""Damaged and hostile recordings from a seed.
 
-:func:`run` makes files, changes them and reads them. What must hold is in :func:`check`: no error
-but dexkit's own, work that follows the file's size, and no loss that is not told. The same seed
-gives the same files. ``python -m tests.mcap_fuzz SEED INPUTS`` runs it by itself.
+Three of ten have records made up and checksums made right again, the others are damaged without. A
+finding is an error that is not dexkit's own, work out of proportion to the size of the file, or a
+change of what is read that the reader does not report.
 """
 
 from __future__ import annotations
 
+import io
 import random
 import struct
 import sys
-import tempfile
-import time
 import zlib
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType, IndexType, Writer
 
 from dexkit.cli.info import summary
-from dexkit.errors import DexkitError
+from dexkit.messages import message_type
 from dexkit.traces import open_trace
-from tests.trace_helpers import Shape, mcap_bytes, rows
+from tools.campaign.fuzz.case import Difference, FuzzCase, Target
+from tools.campaign.fuzz.messages import filled
+from tools.campaign.mutate import mutator
 
-__all__ = ["Finding", "Result", "check", "content", "run"]
+__all__ = ["TIME", "TYPES", "cases", "content", "count_calls"]
+
+TIME = 1_795_251_429_000_000_000
+TYPES = {
+    "rt/dex1/left/cmd": "unitree_go::msg::dds_::MotorCmds_",
+    "rt/dex1/left/state": "unitree_go::msg::dds_::MotorStates_",
+    "rt/dex3/left/state": "unitree_hg::msg::dds_::HandState_",
+}
 
 # Calls that reading may take: for the file's bytes, for those that its chunks unpack to, and for
 # anything at all (types are compared with dexkit's own).
@@ -51,52 +56,63 @@ _TEXTS = (
 )
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A file that was not read as it must be. :attr:`data` repeats it."""
+def _recording(
+    rng: random.Random,
+    compression: CompressionType = CompressionType.NONE,
+    *,
+    index: IndexType = IndexType.ALL,
+    chunked: bool = True,
+    summary: bool = True,
+    sums: bool = True,
+) -> bytes:
+    """A recording by the mcap library, with dexkit's topics and schemas.
 
-    seed: int
-    number: int
-    what: str
-    data: bytes = field(repr=False)
-
-
-@dataclass
-class Result:
-    """What a run did.
-
-    :param told: how files were answered: ``same``, ``told``, ``refused``.
-    :param slowest: most processor time that one file took, seconds (told, not judged).
-    :param calls: most calls that one took, as a part of what is allowed.
+    :param sums: whether all bytes are under a checksum.
     """
+    out = io.BytesIO()
+    writer = Writer(
+        out,
+        chunk_size=700,
+        compression=compression,
+        index_types=index,
+        use_chunking=chunked,
+        repeat_channels=summary,
+        repeat_schemas=summary,
+        use_statistics=summary,
+        use_summary_offsets=summary,
+        enable_data_crcs=sums,
+    )
+    writer.start(profile="ros2", library="campaign")
+    for at, (topic, name) in enumerate(TYPES.items()):
+        kind = message_type(name)
+        schema = writer.register_schema(kind.layout.ros_name, "ros2msg", kind.ros2msg.encode())
+        channel = writer.register_channel(topic, "cdr", schema, {"dds.type": kind.name})
+        for number in range(4):
+            stamp = TIME + number * 10_000_000 + at
+            writer.add_message(channel, stamp, kind.encode(filled(name, rng)), stamp, number)
+    writer.add_metadata(
+        "dds_endpoints", {"rt/dex1/left/cmd writer": "Reliable, Durability.Volatile"}
+    )
+    writer.finish()  # type: ignore[no-untyped-call]
+    return out.getvalue()
 
-    inputs: int = 0
-    told: Counter[str] = field(default_factory=Counter)
-    findings: list[Finding] = field(default_factory=list)
-    slowest: float = 0.0
-    calls: float = 0.0
 
-
-@cache
-def _bases() -> list[tuple[bytes, bool]]:
-    """Small files of each shape, and whether each of their bytes is under a checksum."""
-    found = []
-    shapes = [
-        (Shape(chunk_size=700), True),
-        (Shape(CompressionType.ZSTD, chunk_size=700), True),
-        (Shape(CompressionType.LZ4, chunk_size=700), True),
-        (Shape(chunked=False), True),
-        (Shape(CompressionType.ZSTD, chunk_size=700), False),
-        (Shape(index=IndexType.NONE), False),
-        (Shape(chunked=False, summary=False), False),
+def _bases(rng: random.Random) -> list[tuple[bytes, bool]]:
+    """Small recordings of each shape, and whether all of their bytes are under a checksum."""
+    zstd, lz4_ = CompressionType.ZSTD, CompressionType.LZ4
+    return [
+        (_recording(rng), True),
+        (_recording(rng, zstd), True),
+        (_recording(rng, lz4_), True),
+        (_recording(rng, chunked=False), True),
+        (_recording(rng, zstd, sums=False), False),
+        (_recording(rng, index=IndexType.NONE, sums=False), False),
+        (_recording(rng, chunked=False, summary=False, sums=False), False),
     ]
-    for shape, sums in shapes:
-        found.append((mcap_bytes(rows(24), shape, metadata={"m": {"k": "v"}}, data_crc=sums), sums))
-    return found
 
 
 def content(path: Path) -> tuple[Any, bool]:
-    """(all that is read of a file, whether it is said to be incomplete or damaged)."""
+    """(all that is read of a file, whether the reader reports damage or a missing end)."""
     trace = open_trace(path)
     messages = [tuple(m) for m in trace.messages()]
     loaded = {
@@ -113,8 +129,8 @@ def content(path: Path) -> tuple[Any, bool]:
             assert len(samples.decoded) == len(samples)
     summary(trace)
     assert isinstance(trace.endpoints, list)
-    told = bool(trace.damage or trace.truncated)
-    if not told:
+    reported = bool(trace.damage or trace.truncated)
+    if not reported:
         assert trace.message_count == len(messages), "counted other messages than it gave"
         given = sum(len(times) for _, times, _, _ in loaded.values())
         if len(trace.channels) == len(trace.topics):
@@ -127,7 +143,7 @@ def content(path: Path) -> tuple[Any, bool]:
         for c in trace.channels
     ]
     about = (trace.metadata, trace.library, trace.profile)
-    return (messages, loaded, channels, about), told
+    return (messages, loaded, channels, about), reported
 
 
 def _records(data: bytes, at: int, end: int) -> list[tuple[int, bytes]]:
@@ -143,7 +159,7 @@ def _joined(found: list[tuple[int, bytes]]) -> bytes:
     return b"".join(_HEAD.pack(opcode, len(body)) + body for opcode, body in found)
 
 
-# -- changes that nobody covers up: whatever they lose must be told ------------------------------
+# -- damage without new checksums: the reader must report what is lost ----------------------------
 
 
 def _flip(rng: random.Random, data: bytes) -> bytes:
@@ -182,7 +198,7 @@ def _move(rng: random.Random, data: bytes) -> bytes:
 
 
 def _field(rng: random.Random, data: bytes) -> bytes:
-    """A head, or eight bytes of a body, that say something else."""
+    """Another opcode, length, or eight other bytes of a record."""
     out = bytearray(data)
     at, places = 8, []
     while at + 9 <= len(out) - 8:
@@ -202,14 +218,14 @@ def _field(rng: random.Random, data: bytes) -> bytes:
     return bytes(out)
 
 
-# -- changes with checksums made right again: somebody wants to be believed ----------------------
+# -- records made up, with valid checksums ----------------------
 
 
 def _chunk(rng: random.Random, inner: bytes, start: int = 0, end: int = 2**63) -> bytes:
     name, pack = rng.choice(
         [(b"", bytes), (b"zstd", zstandard.compress), (b"lz4", lz4.frame.compress)]
     )
-    packed = pack(inner)
+    packed: bytes = pack(inner)
     size = rng.choice((len(inner),) * 5 + _NUMBERS)
     crc = rng.choice((0, zlib.crc32(inner)))
     head = struct.pack("<QQQII", start, end, size, crc, len(name)) + name
@@ -291,7 +307,7 @@ _PLAIN: tuple[Callable[[random.Random, bytes], bytes], ...] = (
 )
 
 
-def _calls(function: Callable[[], Any]) -> tuple[Any, int]:
+def count_calls(function: Callable[[], Any]) -> tuple[Any, int]:
     """What ``function`` gives, and how many calls it took: work, whatever the machine's speed."""
     count = 0
 
@@ -307,80 +323,59 @@ def _calls(function: Callable[[], Any]) -> tuple[Any, int]:
         sys.setprofile(before)
 
 
-def check(path: Path, original: Any | None) -> tuple[str, int]:
-    """Read a file; returns how it was answered, and how many calls that took.
+def _read(path: Path, original: Any | None) -> None:
+    """Read a file, and hold what it takes against its size.
 
-    :param original: what must be read if nothing is told; None if that is not known.
-    :raises AssertionError: it was not read as it must be.
+    :param original: what must be read if no damage is reported; None if that is not known.
+    :raises Difference: the content has changed, or reading takes too many calls.
     """
-    try:
-        (got, told), calls = _calls(lambda: content(path))
-    except DexkitError:
-        return "refused", 0
-    except RecursionError as error:
-        raise AssertionError(f"RecursionError: {error}") from None
-    except AssertionError:
-        raise
-    except Exception as error:
-        raise AssertionError(f"{type(error).__name__}: {error}") from error
-    if not told and original is not None and got != original:
-        raise AssertionError("what is read has changed, and nothing is said")
-    return ("told" if told else "same"), calls
+    (found, reported), calls = count_calls(lambda: content(path))
+    if original is not None and found != original and not reported:
+        raise Difference("what is read has changed, and no damage is reported")
+    size = path.stat().st_size
+    unpacked = sum(segment.size for segment in open_trace(path)._file.segments)
+    if calls > _FIXED + _PER_BYTE * size + _PER_UNPACKED * unpacked:
+        raise Difference(f"{calls} calls for {size} bytes that unpack to {unpacked}")
 
 
-def run(
-    seed: int, inputs: int, say: Callable[[str], None] = lambda text: None, *, folder: str = ""
-) -> Result:
-    """Read ``inputs`` files made from ``seed``.
+def _damaged(rng: random.Random, scratch: Path) -> Target:
+    """Recordings of each shape, damaged or with records made up."""
+    path = scratch / "x.mcap"
+    bases = _bases(rng)
+    originals = []
+    for data, _ in bases:
+        path.write_bytes(data)
+        found, reported = content(path)
+        assert not reported
+        originals.append(found)
+    mutated = mutator([data for data, _ in bases], rng)
+    expected: Any = None
 
-    :param say: is told each finding at once.
-    :param folder: where the files are written; else a temporary folder.
-    """
-    result = Result()
-    with tempfile.TemporaryDirectory(dir=folder or None) as place:
-        path = Path(place) / "a.mcap"
-        originals = []
-        for data, _ in _bases():
-            path.write_bytes(data)
-            got, told = content(path)
-            assert not told
-            originals.append(got)
-        for number in range(inputs):
-            rng = random.Random(f"{seed}/{number}")
-            which = rng.randrange(len(originals))
-            data, sums = _bases()[which]
-            crafted = rng.random() < 0.4
-            data = _craft(rng, data) if crafted else rng.choice(_PLAIN)(rng, data)
-            path.write_bytes(data)
-            begin = time.process_time()
-            try:
-                # a file without checksums cannot tell everything
-                how, calls = check(path, originals[which] if sums and not crafted else None)
-                allowed = _FIXED + _PER_BYTE * len(data) + _PER_UNPACKED * unpacked(path)
-                result.calls = max(result.calls, calls / allowed)
-                assert calls <= allowed, f"{calls} calls for {len(data)} bytes"
-                result.told[how] += 1
-            except AssertionError as error:
-                finding = Finding(seed, number, str(error), data)
-                result.findings.append(finding)
-                say(f"recordings: seed {seed}, input {number}: {error}")
-            result.slowest = max(result.slowest, time.process_time() - begin)
-            result.inputs += 1
-    return result
+    def make() -> bytes:
+        nonlocal expected
+        expected = None
+        chance = rng.random()
+        if chance < 0.2:
+            return mutated()
+        which = rng.randrange(len(bases))
+        data, sums = bases[which]
+        if chance < 0.5:
+            return _craft(rng, data)
+        # a recording without checksums cannot show each change
+        expected = originals[which] if sums else None
+        return rng.choice(_PLAIN)(rng, data)
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        _read(path, expected)
+
+    return Target(make, run)
 
 
-def unpacked(path: Path) -> int:
-    """Bytes that the chunks of a file unpack to, as far as they are read."""
-    try:
-        return sum(segment.size for segment in open_trace(path)._file.segments)
-    except DexkitError:
-        return 0
-
-
-if __name__ == "__main__":
-    found = run(int(sys.argv[1]), int(sys.argv[2]), print)
-    print(
-        f"{found.inputs} files, {dict(found.told)}, {len(found.findings)} findings, slowest "
-        f"{found.slowest:.2f} s, at most {found.calls:.0%} of the calls allowed"
-    )
-    sys.exit(bool(found.findings))
+def cases() -> list[FuzzCase]:
+    """Every fuzzer of this module."""
+    return [
+        FuzzCase(
+            "mcap", "recordings, damaged or made up", _damaged, size=200, aim=300_000, weight=4
+        )
+    ]
