@@ -15,7 +15,7 @@ import click
 from dexkit.cli.common import Number, dds_options, stop_on_signals
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
+from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 from dexkit.teleop import (
@@ -51,7 +51,9 @@ _MS = 1e3
     type=click.Choice(list(DIALECTS)),
     default="unitree_go",
     show_default=True,
-    help="How the hands speak; dex3 is the Dex3-1's, dex5 the Dex5-1's.",
+    help="Dialect of the hands: "
+    + "; ".join(f"{', '.join(d.name for d in m.dialects)} for a {m.name}" for m in MODELS.values())
+    + ".",
 )
 @dds_options(default_domain=1)
 @click.option(
@@ -316,7 +318,7 @@ def _report(session: Session, operator: Operator, nominal: float, *, as_json: bo
             click.echo("  no occasion to measure anything")
         for name, values in measured["joints"].items():
             text = sentence(values) or "no occasion to measure anything"
-            click.echo(f"  {text}" if model.name == DEX1_1.name else f"  {name}: {text}")
+            click.echo(f"  {text}" if len(model.joints[Side.LEFT]) == 1 else f"  {name}: {text}")
 
 
 def _finite(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 =====================  =========================================================================
 :mod:`~.facts`         a model as JSON-ready data, the one input of the command line and the page
-:mod:`~.layout`        where the drawings put joints and sensors: schematic, not measured
+:mod:`~.robot_layout`  how robots are drawn; a hand's layout is in its profile
 :mod:`~.drawing`       the drawings, as SVG
 :mod:`~.page`          docs/models.md and docs/images/model-*.svg:
                        ``python -m dexkit.family.page``

@@ -26,7 +26,7 @@ from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
 from dexkit.freshness import PAUSE, SETTLE, PauseWatch
 from dexkit.hand import Floats, Side
-from dexkit.models import DEX1_1, Dialect, model
+from dexkit.models import Dialect, model
 from dexkit.sole import Place, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.feel import Feel, feel
@@ -79,7 +79,7 @@ class Session:
         spoken = operator.dialect
         found = {}
         for i, joint in enumerate(model(spoken.model).joints[side]):
-            stroke = spoken.q_open if spoken.model == DEX1_1.name else joint.stroke
+            stroke = spoken.q_open if spoken.is_gripper else joint.stroke
             figures = feel(t, q[:, i], lambda at, i=i: _of(operator.intent(at, side), i), stroke)  # type: ignore[misc]
             if figures.figures():
                 found[i] = figures
