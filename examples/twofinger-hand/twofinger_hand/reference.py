@@ -15,7 +15,7 @@ __all__ = ["TwoFingerService"]
 
 
 class TwoFingerHand(FingerHand):
-    """Four joints; mode byte 1 drives one."""
+    """Six joints; mode byte 1 drives one."""
 
     model = TWOFINGER_1
     inertia = 0.001  # kg m²

@@ -19,7 +19,7 @@ class SwapsFingers(TwoFingerService):
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        motors["values"] = motors["values"][[2, 3, 0, 1]]
+        motors["values"] = motors["values"][[3, 4, 5, 0, 1, 2]]
 
 
 class Degrees(TwoFingerService):
