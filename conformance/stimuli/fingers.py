@@ -1,4 +1,4 @@
-"""The stimulus for hands of several joints, the Dex3-1 and the Dex5-1.
+"""The stimulus for hands of several joints.
 
 Both hands do the same at once, except where their independence is the subject. Poses are told by
 how far the flexing joints are closed, in percent, as the object is. The phases of the mode byte's
@@ -19,7 +19,7 @@ foreign
 burst          hundreds of commands at once, of which the last one counts
 stiff, soft    the same step with the client's gains and with a tenth of its stiffness
 limp           zero gains, with a q far towards closed
-lock           the same with the client's gains and status 0 (Dex3-1), or mode 0 (Dex5-1)
+lock           the same with the client's gains and status 0 or mode 0
 replay         a recorded session, as recorded
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old

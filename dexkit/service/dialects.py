@@ -11,11 +11,11 @@ unitree_hg         the interface specification: q runs to 2 pi; a command at or 
                    closes, at or above 6.0 opens; dq, tau, kp and kd of a command are unused
                    (clients send 0), the gains are those of xr_teleoperate; tau_est of the
                    state is grip strength, not signed.
-dex3               seven motors in the order of the IDL, all values as they are; the mode byte is
-                   RIS_Mode (the Dex3-1 manual): id, status (0 lock, 1 FOC) and the time-out bit.
-dex5               20 joints in the order of the IDL; mode 1 is position control, 0 brakes
-                   (docs/sources/unitree-dex.md#b5); the fingers' tau and tau_est are in mN·m,
-                   as a comment in the only client says.
+RIS_Mode           hands of several joints: all values as they are, in the order of the IDL; the
+                   mode byte has the id, the status (0 lock, 1 FOC) and the time-out bit (the
+                   Dex3-1 manual).
+status             the same; mode 1 is position control, 0 brakes
+                   (docs/sources/unitree-dex.md#b5); tau and tau_est in the dialect's units.
 =================  ================================================================================
 
 **What a state holds.** ``Fill.VENDOR`` fills what the reference fills and leaves the rest 0:
@@ -38,7 +38,7 @@ the last good one
 q is predicted          reserve[1] = 1               reserve[0] = 1
 ======================  ===========================  ==============================================
 
-The states of dex3 and dex5 are described in docs/dex3.md and docs/dex5.md;
+The state of a hand of several joints is described on the page of the hand;
 :mod:`dexkit.service.finger_state` encodes them.
 
 ``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more

@@ -225,7 +225,7 @@ class LiveClient:
 
         The genuine one just stops sending. A Dex1-1's service then brakes within a second; a
         Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
-        to stay where it is, a Dex3-1 or Dex5-1 with its motors locked (status 0 of the mode byte).
+        to stay where it is, with its motors locked where the dialect has a mode byte (status 0).
         """
         if self._watch.away() > PAUSE:  # ended in a pause: the hands may be elsewhere by now
             time.sleep(SETTLE)
