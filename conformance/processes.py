@@ -15,7 +15,7 @@ from pathlib import Path
 from dexkit import child_processes
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
-from dexkit.models import Dialect
+from dexkit.models import MODELS, Dialect
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import TemporaryFolder
 
@@ -67,8 +67,8 @@ EMULATED: dict[str, Emulation] = {
 
 ON_USB = ("dex3-usb",)
 """Backends whose device is judged on USB as well."""
-SIMULATED = ("sim-dex1", "sim-dex3", "sim-dex5")
-"""Backends without a device, which are told of an object by the setting ``object``."""
+SIMULATED = tuple(m.simulator for m in MODELS.values() if m.simulator)
+"""Backends without a device, which have a setting ``object``."""
 
 
 BODY_EMULATORS = {f"sim-{name}": name for name in ROBOTS}

@@ -8,33 +8,29 @@ from functools import cache
 from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
-from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
-from dexkit.robots import G1, H1, ROBOTS
+from dexkit.models import model
+from dexkit.robots import ROBOTS
 
-__all__ = ["QUICK", "length", "print_selection", "quick"]
-
-QUICK = {DEX1_1.name: 7.0, DEX3_1.name: 15.0, DEX5_1.name: 20.0, H1.name: 13.0, G1.name: 17.0}
-"""Seconds of stimulus of a quick run; starting a pair of hands and judging take some more."""
+__all__ = ["length", "print_selection", "quick"]
 
 
 @cache
 def length(model_name: str, phases: frozenset[str]) -> float:
     """Seconds that a pair of hands which obey at once takes for these phases."""
     if model_name in ROBOTS:
-        return SCRIPTS[model_name](
-            Plan(robot_dialect(model_name), (ROBOT,), phases=phases)
-        ).length()
+        plan = Plan(robot_dialect(model_name), (ROBOT,), phases=phases)
+        return script_class(model_name)(plan).length()
     dialect = model(model_name).dialects[0]
-    return SCRIPTS[model_name](Plan(dialect, tuple(Side), phases=phases)).length()
+    return script_class(model_name)(Plan(dialect, tuple(Side), phases=phases)).length()
 
 
 def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
     """The MUSTs that need no long observation.
 
     Those stimuli that serve the most MUSTs for their length, as long as all together take no more
-    than :data:`QUICK` seconds. What needs a recorded session takes too long.
+    than the profile's ``quick_seconds``. What needs a recorded session takes too long.
     """
     chosen: set[str] = set()
     for name in dict.fromkeys(r.model for r in requirements):
@@ -44,10 +40,11 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
                 own = phases_for([r])
                 if "replay" not in own:
                     needs.setdefault(own, []).append(r.id)
+        budget = (ROBOTS.get(name) or model(name)).quick_seconds
         least = length(name, frozenset()) - 0.1  # s; what needs no stimulus comes first
         phases: frozenset[str] = frozenset()
         for own in sorted(needs, key=lambda o: (length(name, o) - least) / len(needs[o])):
-            if length(name, phases | own) <= QUICK[name]:
+            if length(name, phases | own) <= budget:
                 phases |= own
         chosen |= {id_ for own, ids in needs.items() if own <= phases for id_ in ids}
     return tuple(r for r in requirements if r.id in chosen)

@@ -26,7 +26,6 @@ from dexkit.conformance.results import RunResult
 from dexkit.conformance.robot import recording_of, robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
 from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import Recording, sides_of
 from dexkit.documents import write_file
@@ -158,7 +157,7 @@ class SuiteOptions:
                 )
         started = backend in EMULATED or backend in SIMULATED
         if not objects and started and not devices:
-            by_side = {s: pct for s, pct in DEFAULT_OBJECTS[chosen.model].items() if s in sides}
+            by_side = {s: p for s, p in model(chosen.model).objects.items() if s in sides}
         if domain is None and (backend == EXTERNAL or devices):
             domain = 0
         if domain is not None and not 0 <= domain <= 230:

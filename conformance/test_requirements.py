@@ -7,6 +7,7 @@ import warnings
 import pytest
 
 from dexkit.conformance.plugin import OPTIONS_KEY, REPORTED_KEY
+from dexkit.conformance.processes import SIMULATED
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.hand import Side
@@ -15,7 +16,7 @@ pytestmark = pytest.mark.conformance
 
 HOW = (
     "name the hand to judge: --backend ezgripper or dex3-usb (emulated unless --device is given), "
-    "--backend sim-dex1, sim-dex3 or sim-dex5, --backend package.module:Class, or "
+    f"--backend {', '.join(SIMULATED)}, --backend package.module:Class, or "
     "--backend external"
 )
 

@@ -7,7 +7,6 @@ units; columns of joints have shape (n, n_joints).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -321,7 +320,7 @@ def detect_dialect(trace: TraceLike) -> Dialect:
 def joints_of(dialect: Dialect, side: Side) -> tuple[JointSpec, ...]:
     """A hand's joints in the dialect's radians."""
     joints = model(dialect.model).joints[side]
-    if math.isnan(dialect.q_open):
+    if not dialect.is_gripper:
         return joints
     return tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dexkit.hand import JointMode, Side
 from dexkit.messages import MessageType, message_type
-from dexkit.models import DEX1_1, DEX3_1, Dialect, model
+from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
 __all__ = ["Motor", "Motors", "Wire", "mode_byte"]
 
@@ -70,15 +70,15 @@ class Wire:
         others = (DEX1_1.dialects[0].cmd_type, DEX3_1.dialects[0].cmd_type)
         self.foreign: MessageType = message_type(next(t for t in others if t != dialect.cmd_type))
         self._states: dict[int, Any] = {}
-        self._ids = dialect.name == "dex3"
-        self._modes = dialect.name in ("dex3", "dex5")
+        self._ids = dialect.mode_byte is ModeByte.RIS
+        self._modes = dialect.mode_byte is not ModeByte.UNUSED
         self.command_topics = {s: dialect.topics(s)[0] for s in Side}
         self.state_topics = {s: dialect.topics(s)[1] for s in Side}
         self.shared = len(set(self.command_topics.values())) == 1
 
     def mode(self, index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
-        """The mode byte of a motor: RIS_Mode for a Dex3-1; for a Dex5-1 just 1, position control
-        (docs/sources/unitree-dex.md#b5); 0 where it has no meaning.
+        """The mode byte of a motor: RIS_Mode, a status (1 is position control,
+        docs/sources/unitree-dex.md#b5), or 0 where the dialect does not use it.
         """
         if self._ids:
             return mode_byte(index, status, timeout)

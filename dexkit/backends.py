@@ -13,14 +13,13 @@ constructor takes the side. The module is installed, or lies in the working dire
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from importlib import metadata
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from dexkit.errors import (
@@ -31,11 +30,11 @@ from dexkit.errors import (
     UsageError,
 )
 from dexkit.hand import Hand, HandSpec, Side
+from dexkit.plugins import entry_points, import_object, is_own, origin, where
 
 __all__ = ["GROUP", "Backend", "BackendInfo", "BackendOptions", "backend", "list_backends"]
 
 GROUP = "dexkit.backends"
-_OWN_DISTRIBUTION = "dexkit"
 
 
 @dataclass(frozen=True)
@@ -129,31 +128,19 @@ class BackendInfo:
     error: str = ""
 
 
-def _entry_points() -> list[metadata.EntryPoint]:
-    return list(metadata.entry_points(group=GROUP))
-
-
-def _origin(entry: metadata.EntryPoint) -> str:
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "unknown"
-
-
-def _is_own(entry: metadata.EntryPoint) -> bool:
-    return entry.dist is not None and entry.dist.name.lower() == _OWN_DISTRIBUTION
-
-
-def _select(name: str) -> metadata.EntryPoint | None:
-    unique = {(e.value, _origin(e)): e for e in _entry_points() if e.name == name}
+def _select(name: str) -> EntryPoint | None:
+    unique = {(e.value, origin(e)): e for e in entry_points(GROUP) if e.name == name}
     entries = list(unique.values())
-    own = [e for e in entries if _is_own(e)]
+    own = [e for e in entries if is_own(e)]
     if own and len(entries) > len(own):
-        others = ", ".join(_origin(e) for e in entries if not _is_own(e))
+        others = ", ".join(origin(e) for e in entries if not is_own(e))
         raise BackendConflict(
             f"backend {name!r} is built in, and {others} registers the same name",
             hint=f"uninstall that package, or name its hand as package.module:Object "
             f"instead of {name!r}",
         )
     if len(entries) > 1 and not own:
-        owners = ", ".join(_origin(e) for e in entries)
+        owners = ", ".join(origin(e) for e in entries)
         raise BackendConflict(
             f"backend {name!r} is registered by more than one package: {owners}",
             hint="uninstall one, or name the hand as package.module:Object",
@@ -223,41 +210,20 @@ def _check(hand: object, side: Side, model: str) -> None:
 
 
 def _where(error: BaseException) -> str:
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    if frame.filename == __file__:  # its own code was not even reached
-        return (
+    if traceback.extract_tb(error.__traceback__)[-1].filename == __file__:
+        return (  # the backend's own code was not even reached
             "a Hand class is called with the side alone, a function with BackendOptions "
             "(docs/backends.md)"
         )
-    return f"at {frame.filename}:{frame.lineno}"
-
-
-def _load_hint(error: Exception, module_name: str) -> str:
-    if isinstance(error, ModuleNotFoundError):
-        missing = error.name or ""
-        if module_name == missing or module_name.startswith(f"{missing}."):
-            return "is it installed in this environment, or in the working directory?"
-        return f"{module_name} needs it: is it installed in this environment?"
-    return _where(error)
+    return where(error)
 
 
 def _load(target: str) -> Backend:
-    module_name, _, attribute = target.partition(":")
-    try:
-        value: object = importlib.import_module(module_name)
-    except Exception as error:  # a plug-in may raise anything while it is imported
-        raise BackendBroken(
-            f"cannot load {target}: {type(error).__name__}: {error}",
-            hint=_load_hint(error, module_name),
-        ) from error
-    for part in attribute.split("."):
-        if not hasattr(value, part):
-            raise BackendBroken(
-                f"cannot load {target}: there is no {part!r} in {module_name}",
-                hint="package.module:Object names a Backend, a Hand class, or a function that "
-                "makes a Hand",
-            )
-        value = getattr(value, part)
+    value = import_object(
+        target,
+        BackendBroken,
+        hint="package.module:Object names a Backend, a Hand class, or a function that makes a Hand",
+    )
     return _coerce(target, value)
 
 
@@ -277,7 +243,7 @@ def backend(name: str) -> Backend:
         return _load(name)
     entry = _select(name)
     if entry is None:
-        known = ", ".join(sorted({e.name for e in _entry_points()})) or "none"
+        known = ", ".join(sorted({e.name for e in entry_points(GROUP)})) or "none"
         raise UnknownBackend(
             f"no backend {name!r}",
             hint=f"installed: {known}; see 'dexkit backends', or give package.module:Object",
@@ -289,8 +255,8 @@ def list_backends() -> list[BackendInfo]:
     """Every registered backend, built-in and plug-in, with what is wrong with it, if anything."""
     rows = []
     for entry in sorted(
-        {(e.name, e.value, _origin(e)): e for e in _entry_points()}.values(),
-        key=lambda e: (not _is_own(e), e.name),
+        {(e.name, e.value, origin(e)): e for e in entry_points(GROUP)}.values(),
+        key=lambda e: (not is_own(e), e.name),
     ):
         loaded: Backend | None = None
         error = ""
@@ -299,5 +265,5 @@ def list_backends() -> list[BackendInfo]:
             loaded = _load(entry.value)
         except (BackendBroken, BackendConflict) as exc:
             error = exc.message
-        rows.append(BackendInfo(entry.name, _origin(entry), entry.value, loaded, error))
+        rows.append(BackendInfo(entry.name, origin(entry), entry.value, loaded, error))
     return rows

@@ -27,6 +27,7 @@
     │   ├── UnknownBackend (LookupError)    no backend has that name
     │   ├── BackendConflict                 two installed packages claim one name
     │   └── BackendBroken                   the plug-in cannot be imported or is not a backend
+    ├── ModelBroken                     a hand model of another package cannot be used
     ├── EmulatorError                   an emulated device cannot be set up as asked
     ├── ConformanceError                the kit itself cannot judge (not a verdict on the hand)
     ├── OutputError (OSError)           a file or stream cannot be written: disk full, pipe closed
@@ -59,6 +60,7 @@ __all__ = [
     "HandNotFound",
     "HandRefused",
     "HandTimeout",
+    "ModelBroken",
     "OutputError",
     "OversizeError",
     "TopicConflict",
@@ -197,6 +199,12 @@ class BackendConflict(BackendError):
 
 class BackendBroken(BackendError):
     """The plug-in cannot be imported, or what it names is not a backend."""
+
+
+class ModelBroken(DexkitError):
+    """A hand model, or code that its profile refers to, cannot be imported or is not one."""
+
+    exit_code = 2
 
 
 class EmulatorError(DexkitError):

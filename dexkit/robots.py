@@ -10,9 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec
+from dexkit.lazy import Lazy
+
+if TYPE_CHECKING:
+    from dexkit.conformance.stimuli.script import Script
+    from dexkit.robot_layout import RobotLayout
 
 __all__ = ["DQ_STOP", "G1", "H1", "Q_STOP", "ROBOTS", "RobotModel", "robot"]
 
@@ -23,11 +29,22 @@ DQ_STOP = 16000.0
 """A ``dq`` that means "no velocity" (docs/sources/unitree-dex.md#a8)."""
 
 
+_SCRIPT: Lazy[type[Script]] = Lazy("dexkit.conformance.stimuli.robot:RobotScript")
+
+
 @dataclass(frozen=True)
 class RobotModel:
-    """One robot robot.
+    """One robot.
 
     :param family: message family, ``"unitree_go"`` or ``"unitree_hg"``.
+    :param motor_temperatures: values in the temperature of a motor's state.
+    :param has_battery: whether its state has the battery, the supply and a frame header.
+    :param battery_cells: of the battery, in series.
+    :param teleop_name: its name in xr_teleoperate (``--arm``).
+    :param requirements: its requirement files, in dexkit's own folder.
+    :param script: its stimulus script in the conformance kit.
+    :param quick_seconds: seconds of stimulus of a quick conformance run.
+    :param layout: how it is drawn.
     :param joints: by motor slot; None where the slot is not used.
     :param enable: mode byte that lets the motor of a slot follow commands; 0 turns it off.
     :param client_gains: by slot, kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends.
@@ -47,6 +64,13 @@ class RobotModel:
     name: str
     title: str
     family: str
+    motor_temperatures: int
+    has_battery: bool
+    battery_cells: int
+    teleop_name: str
+    requirements: tuple[str, ...]
+    quick_seconds: float
+    layout: Lazy[RobotLayout]
     joints: tuple[JointSpec | None, ...]
     enable: tuple[int, ...]
     client_gains: tuple[tuple[float, float], ...]
@@ -67,6 +91,7 @@ class RobotModel:
     # inferred: the sources are silent; the protection of the hands' motors trips after 1 s
     # (docs/sources/unitree-dex.md#b4)
     command_timeout: float = 1.0
+    script: Lazy[type[Script]] = _SCRIPT
 
     @property
     def slots(self) -> int:
@@ -180,6 +205,13 @@ H1 = RobotModel(
     name="h1",
     title="H1 robot",
     family="unitree_go",
+    motor_temperatures=1,
+    has_battery=True,
+    battery_cells=15,  # as many as its state has room for (docs/sources/unitree-dex.md#a2)
+    teleop_name="H1",
+    requirements=("h1.toml",),
+    quick_seconds=13.0,
+    layout=Lazy("dexkit.robot_layout:H1"),
     joints=_h1_joints,
     # docs/sources/unitree-dex.md#a8: 0x01 for weak motors (ankles, arms), 0x0A for the others
     enable=tuple(0x01 if i in _H1_WEAK else 0x0A for i in range(len(_H1_ORDER))),
@@ -242,6 +274,13 @@ G1 = RobotModel(
     name="g1",
     title="G1 robot (29 joints)",
     family="unitree_hg",
+    motor_temperatures=2,
+    has_battery=False,
+    battery_cells=13,  # the G1's datasheet
+    teleop_name="G1_29",
+    requirements=("g1.toml",),
+    quick_seconds=17.0,
+    layout=Lazy("dexkit.robot_layout:G1"),
     joints=_g1_joints,
     enable=(1,) * len(_G1_ORDER),  # docs/sources/unitree-dex.md#a8: 1 enable, 0 disable
     client_gains=tuple(_g1_gains(name) for name in _G1_ORDER),

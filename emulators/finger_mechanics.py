@@ -1,8 +1,7 @@
 """The mechanics of a hand of several joints: a motor for each, and what it runs into.
 
 Pure: no clock, no wire, no DDS. Whoever owns it calls :meth:`FingerMechanics.step` as time passes.
-:mod:`dexkit.emulators.dex3_mechanics` and :mod:`dexkit.emulators.dex5_mechanics` say which motors
-a hand has, and what else there is of it.
+The module of each hand (:mod:`dexkit.emulators.dex3_mechanics`) has its motors and the rest of it.
 
 Stops, objects and heat are assumed. Not modelled: gravity on the fingers, links and their
 collisions (every joint moves alone), the coupling of a finger's joints through an object,

@@ -13,7 +13,7 @@ from dexkit.conformance.mutants import MUTANTS
 from dexkit.conformance.requirements import LAYERS, Level, catalogue, models, parse, select
 from dexkit.conformance.selection import quick
 from dexkit.conformance.session import SuiteOptions
-from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.documents import parse_toml
 from dexkit.errors import DexkitError, UsageError
@@ -134,7 +134,7 @@ def test_every_stimulus_that_is_needed_exists(name: str) -> None:
     needed = phases_for(catalogue(name))
     dialect = model(name).dialects[0]
     plan = Plan(dialect, tuple(Side), default_objects(dialect, tuple(Side)), phases=needed)
-    script = SCRIPTS[name](plan)
+    script = script_class(name)(plan)
     script.length()
     assert needed - {p.name for p in script.phases} == {"replay"}  # there is no session here
 

@@ -37,7 +37,7 @@ from dexkit.conformance.robot import (
     robot_recording,
 )
 from dexkit.conformance.session import SuiteOptions
-from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.conformance.wire import Motor
@@ -146,7 +146,7 @@ def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_stimulus_that_is_needed_exists(name: str) -> None:
-    script = SCRIPTS[name](plan(name, everything(name)))
+    script = script_class(name)(plan(name, everything(name)))
     assert 15 < script.length() < 40
     assert everything(name) <= {p.name for p in script.phases}
 

@@ -22,7 +22,7 @@ from dexkit.conformance.processes import EXTERNAL, RigOptions
 from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements
 from dexkit.conformance.results import RunResult
-from dexkit.conformance.selection import QUICK, length, quick
+from dexkit.conformance.selection import length, quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.view import Recording
@@ -30,7 +30,7 @@ from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
-from dexkit.models import dialect
+from dexkit.models import dialect, model
 from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import failed
 from tests.dds_helpers import DdsNode, free_domain
@@ -143,7 +143,7 @@ def test_what_is_quick_is_derived_from_the_stimuli(name: str) -> None:
     chosen = quick(every)
     phases = phases_for(chosen)
     assert {r.level for r in chosen} == {Level.MUST}
-    assert length(name, phases) <= QUICK[name]
+    assert length(name, phases) <= model(name).quick_seconds
     assert "replay" not in phases
     # it is about motion, and nothing that comes without a further stimulus is left out
     assert any(r.area == "Motion" for r in chosen)

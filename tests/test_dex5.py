@@ -1,4 +1,7 @@
-"""The Dex5-1: its joints, its dialect, its simulated hand, its client and its synthetic session."""
+"""The Dex5-1: its joints, its dialect, its simulated hand, its client and its synthetic session.
+
+``python -m tests.test_dex5`` writes the session to traces/samples again.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,10 @@ from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX5_1, dialect
 from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
-from dexkit.teleop import Dex5Client
+from dexkit.teleop import Operator, client_for, profile
+from dexkit.teleop.client_codec import ClientWire
 from dexkit.topics import roles
-from dexkit.traces import open_trace, sample_path
-from tests.dex5_helpers import write
+from dexkit.traces import Recorder, open_trace, sample_path
 
 DEX5 = dialect("dex5")
 STATES, COMMANDS = message_type(DEX5.state_type), message_type(DEX5.cmd_type)
@@ -34,6 +37,13 @@ LEFT, RIGHT = Side.LEFT, Side.RIGHT
 N, THUMB = 20, slice(16, 20)
 KP, KD = np.array(DEX5_1.gains).T
 CLOSING = {s: np.array([j.closing for j in DEX5_1.joints[s]]) for s in Side}
+
+EPOCH_NS = 1_795_000_000_000_000_000
+PROFILE = "sine"
+MOST = {Side.RIGHT: 0.6}  # of the profile: clear of where the conformance kit puts an object
+STATE_NS = 2_000_000
+CLIENT_STEPS = 5  # of the state's period
+CLIENT_STARTS = 0.5  # seconds after the hands
 
 
 # --------------------------------------------------------------------------------------- the model
@@ -226,7 +236,7 @@ def test_it_brakes_a_second_after_the_last_command() -> None:
 
 
 def test_the_client_sends_what_the_genuine_one_does() -> None:
-    client = Dex5Client()
+    client = client_for("dex5")
     rest = {s: DEX5_1.rest_q[s] for s in Side}
     assert client.step(0.0, {LEFT: (0.0,) * N, RIGHT: rest[RIGHT]}, {}) == {}
     assert client.missing == {LEFT: "every q is exactly 0"}
@@ -235,8 +245,59 @@ def test_the_client_sends_what_the_genuine_one_does() -> None:
         assert {m.mode for m in motors} == {1}
         assert [(m.q, m.kp, m.kd) for m in motors] == [(0.2, kp, kd) for kp, kd in DEX5_1.gains]
     assert {m.mode for m in client.parting(rest[LEFT])} == {0}
-    with pytest.raises(UsageError, match="not of a Dex5-1"):
-        Dex5Client(dialect("dex3"))
+    with pytest.raises(UsageError, match="the client of a Dex5-1 hand is the same"):
+        client_for("dex5", simulated=True)
+
+
+def write(path: Path, seconds: float = 6.0) -> None:
+    """The synthetic session, or the beginning of it.
+
+    Neither a client of a Dex5-1 nor such a hand could be recorded. dexkit's model of the client, an
+    operator profile and the simulated hands run on one virtual clock; no DDS takes part, so that
+    there are no endpoints either.
+    """
+    dialect = DEX5_1.dialects[0]
+    clock = ManualClock()
+    hands = {s: SimDex5(s, clock=clock) for s in Side}
+    maps = {s: dialect_map(dialect, {s: hand.spec}) for s, hand in hands.items()}
+    client, wire = client_for(dialect), ClientWire(dialect)
+    operator = Operator(profile(PROFILE, DEX5_1.name), dialect, most=MOST)
+    decode = message_type(dialect.cmd_type).decode
+    commands = {s: HandCommand.brake(hand.spec.n_joints) for s, hand in hands.items()}
+    about = {
+        "controller_commit": "none: dexkit's model of xr_teleoperate's Dex5_1_Controller",
+        "states": "dexkit's simulated hands (sim-dex5)",
+        "operator": f"dexkit's profile {PROFILE!r}",
+        "network": "none: one virtual clock",
+    }
+    with Recorder(path, overwrite=True) as recorder:
+        recorder.add_metadata("provenance", about)
+        for hand in hands.values():
+            hand.open()
+        for step in range(round(seconds * 1e9 / STATE_NS)):
+            now_ns = EPOCH_NS + step * STATE_NS
+            states = {}
+            for s, hand in hands.items():
+                state = hand.exchange(commands[s])
+                states[s] = tuple(state.q.tolist())
+                payload = maps[s].encode({s: StateView(state, (0,) * len(state.q))})
+                recorder.put(
+                    wire.state_topics[s], dialect.state_type, payload, now_ns + 200_000, now_ns
+                )
+            now = clock.now() - CLIENT_STARTS
+            if now >= 0.0 and step % CLIENT_STEPS == 0:
+                told = client.step(now, states, operator.inputs(now, Side))
+                for topic, payload in wire.encode(told):
+                    recorder.put(
+                        topic, dialect.cmd_type, payload, now_ns + 500_000, now_ns + 300_000
+                    )
+                for s, (_, payload) in zip(told, wire.encode(told), strict=True):
+                    command = maps[s].command(decode(payload), s)
+                    assert command is not None
+                    commands[s] = command
+            clock.advance(STATE_NS / 1e9)
+        for hand in hands.values():
+            hand.close()
 
 
 def test_the_synthetic_session_is_what_its_helper_writes(tmp_path: Path) -> None:
@@ -259,3 +320,7 @@ def test_the_synthetic_session_is_judged_as_a_dex5() -> None:
     assert {"DEX5-FIELD-01", "DEX5-FIELD-03", "DEX5-TRACK-01", "DEX5-FORCE-02"} <= passed
     # the fingers' mN m are N m to the checks
     assert np.nanmax(np.abs(recording.sides[LEFT].states.tau[:, :16])) < 0.5
+
+
+if __name__ == "__main__":
+    write(sample_path("dex5_synthetic"))

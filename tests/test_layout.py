@@ -30,9 +30,16 @@ def modules(folder: Path) -> Iterator[Path]:
 
 @cache
 def imported(path: Path) -> frozenset[str]:
-    """Every module that a file imports, at the top or inside a function, as absolute names."""
+    """Every module that a file imports, at the top or inside a function, as absolute names.
+
+    What is imported for type checking only is left out: a program never loads it.
+    """
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+    tree = ast.parse(path.read_text(), str(path))
+    for block in [n for n in ast.walk(tree) if isinstance(n, ast.If)]:
+        if isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING":
+            block.body = [ast.Pass()]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -18,10 +18,9 @@ from dexkit.cli.emulate import command as emulate
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, Side
 from dexkit.model_facts import describe, indices, names
-from dexkit.models import DEX3_1, MODELS
+from dexkit.models import BUILT_IN, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
 from tools.generate import DOCS
-from tools.generate import drawing_layout as layout
 from tools.generate.model_drawing import draw_hand, draw_robot
 from tools.generate.models_page import drawing
 from tools.generate.svg_sheet import Box, Sheet
@@ -178,12 +177,14 @@ def test_sensors_are_drawn_where_the_model_has_them() -> None:
 
 
 def test_fingers_hold_the_joints_that_bear_their_names() -> None:
-    for finger in layout.HANDS["dex3-1"].fingers:
+    assert DEX3_1.layout is not None
+    for finger in DEX3_1.layout.fingers:
         for i in finger.joints:
             assert DEX3_1.joints[Side.LEFT][i].name.startswith(f"{finger.name}_")
-    for name, hand in layout.HANDS.items():
-        covered = sorted(i for finger in hand.fingers for i in finger.joints)
-        assert covered == list(range(len(MODELS[name].joints[Side.LEFT])))
+    for hand in BUILT_IN:
+        fingers = hand.layout.fingers if hand.layout else ()
+        covered = sorted(i for finger in fingers for i in finger.joints)
+        assert covered == (list(range(len(hand.joints[Side.LEFT]))) if fingers else [])
 
 
 def test_sides_are_mirror_images() -> None:

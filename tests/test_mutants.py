@@ -10,12 +10,13 @@ from click.testing import CliRunner
 
 from dexkit.cli.mutants import command
 from dexkit.conformance.checks import all_checks
-from dexkit.conformance.mutants import REFERENCES, plan_for, run_mutant
+from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import Outcome, Score, Trial, chosen, essential, try_one
 from dexkit.conformance.mutants.matrix import trials as all_trials
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.hand import Side
+from dexkit.models import model
 
 LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
 
@@ -33,7 +34,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
 )
 def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
     plan = plan_for(dialect, sides=sides)
-    result = run_mutant(REFERENCES[plan.dialect.model], plan)
+    result = run_mutant(model(plan.dialect.model).reference.load(), plan)
     bad = [r.explain() for r in result.results if r.verdict not in GOOD]
     assert not bad, "\n".join(bad)
     assert result.overall is Overall.PASS

@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
-from dexkit.models import DEX3_1, DIALECTS, MODELS
+from dexkit.models import BUILT_IN, DEX3_1, DIALECTS, MODELS
 from dexkit.teleop import (
-    PROFILES,
     Dex1Client,
-    Dex3Client,
     JointCommand,
     Operator,
     Pose,
+    Profile,
     Release,
     StateReceiver,
     StickyFilter,
@@ -39,6 +38,7 @@ from tests.each import each
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 GO = DIALECTS["unitree_go"]
+SHIPPED = [each for hand in BUILT_IN for each in profiles_for(hand.name)]
 angles = st.floats(0.0, 5.4)
 pinches = st.floats(0.0, 12.0)
 
@@ -360,7 +360,7 @@ def pose(value: float) -> tuple[float, ...]:
 
 
 def test_a_dex3_client_waits_for_a_position_that_is_not_zero_on_both_sides() -> None:
-    client = Dex3Client()
+    client = client_for("dex3")
     client.receive(0.0, {LEFT: pose(0.0)})
     client.receive(0.0, {RIGHT: pose(0.1)})
     assert client.missing == {LEFT: "every q is exactly 0"}
@@ -371,7 +371,7 @@ def test_a_dex3_client_waits_for_a_position_that_is_not_zero_on_both_sides() -> 
 
 
 def test_its_commands_are_the_targets_with_mode_and_gains_whatever_the_state_is() -> None:
-    client = Dex3Client()
+    client = client_for("dex3")
     client.receive(0.0, {LEFT: pose(0.1)})
     client.receive(0.0, {RIGHT: pose(0.1)})
     first = client.step(0.01, {}, {LEFT: pose(9.0)})  # one hand alone is no input
@@ -390,7 +390,7 @@ def test_the_recorded_dex3_commands_are_those_of_the_model() -> None:
     for side in (LEFT, RIGHT):
         topic = wire.command_topics[side]
         payloads = open_trace(sample_path("dex3_pinch")).load([topic])[topic].payloads
-        client = Dex3Client(sides=[side])
+        client = client_for("dex3", [side])
         client.receive(0.0, {side: pose(0.1)})
         for i in range(0, len(payloads), 50):
             targets = tuple(float(x) for x in rec.sides[side].commands.q[i])
@@ -435,9 +435,9 @@ def test_positions_come_back_from_the_wire(name: str) -> None:
 # ----------------------------------------------------------------------- operators and profiles
 
 
-@each("chosen", PROFILES, ids=lambda p: f"{p.model}-{p.name}")
+@each("chosen", SHIPPED, ids=lambda p: f"{p.model}-{p.name}")
 def test_a_profile_stays_within_the_limits_and_begins_without_input(chosen: object) -> None:
-    assert isinstance(chosen, type(PROFILES[0]))
+    assert isinstance(chosen, Profile)
     spoken = MODELS[chosen.model].dialects[0]
     operator = Operator(chosen, spoken)
     assert operator.inputs(0.0, Side) == {LEFT: None, RIGHT: None}

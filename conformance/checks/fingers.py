@@ -14,10 +14,9 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
-from dexkit.conformance.parts import PARTS, Parts
 from dexkit.conformance.wire import Wire
 from dexkit.hand import Floats, JointMode
-from dexkit.models import model
+from dexkit.models import JointRoles, model
 
 _SLOTS = 12  # of a PressSensorState_
 
@@ -190,9 +189,11 @@ def attitude(ctx: Context) -> Outcome:
 # ---------------------------------------------------------------------------------- mode byte
 
 
-def _parts(ctx: Context) -> Parts:
-    """Which joints the stimulus uses for what."""
-    return PARTS[ctx.recording.model.name]
+def _roles(ctx: Context) -> JointRoles:
+    """The joints that the stimulus uses."""
+    roles = ctx.recording.model.roles
+    assert roles is not None  # a profile of several joints has them
+    return roles
 
 
 def _modes(ctx: Context, rows: slice = slice(None)) -> NDArray[np.intp]:
@@ -281,7 +282,7 @@ def locked(ctx: Context) -> Outcome:
 @check("DEX3-MODE-04")
 def wrong_id(ctx: Context) -> Outcome:
     """A motor whose place in the sequence says to hold, while another one bears its id."""
-    first, other = _parts(ctx).crossed
+    first, other = _roles(ctx).crossed
     names = [ctx.joints[i].name for i in (first, other)]
     quiet = [j for j in range(len(ctx.joints)) if j != first]
     return stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
@@ -486,13 +487,13 @@ def nothing_left_moving(ctx: Context) -> Outcome:
     """Joints that were driven by a velocity, without protection."""
     if ctx.object_at is not None:
         return ctx.skipped("this hand held an object when the commands stopped")
-    return _stops(ctx, _parts(ctx).driven)
+    return _stops(ctx, _roles(ctx).driven)
 
 
 @check("DEX3-GUARD-01")
 def brakes(ctx: Context) -> Outcome:
     """Joints on their way, by velocity or to a position, with protection."""
-    return _stops(ctx, (*_parts(ctx).driven, *_parts(ctx).slow))
+    return _stops(ctx, (*_roles(ctx).driven, *_roles(ctx).slow))
 
 
 @check("DEX3-GUARD-02")
@@ -553,7 +554,7 @@ def holds(ctx: Context) -> Outcome:
     if not len(ctx.states.q[rows]):
         return ctx.skipped("no state in the silence")
     here = np.median(ctx.states.q[rows], axis=0)
-    slow = _parts(ctx).slow
+    slow = _roles(ctx).slow
     moved = _moved(ctx, slow, late, end)
     least = ctx.requirement.tolerance("min_travel_stroke")
     for i, joint in enumerate(slow):

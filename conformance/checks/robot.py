@@ -234,7 +234,7 @@ def byte_temperatures(ctx: Context) -> Outcome:
 def motor_temperatures(ctx: Context) -> Outcome:
     """Temperatures of the used motors."""
     robot = _recording(ctx).robot
-    path = "temperature" if robot.family == "unitree_go" else "temperature[0]"
+    path = "temperature" if robot.motor_temperatures == 1 else "temperature[0]"
     values = _low(ctx)[f"motor_state[].{path}"][:, list(robot.used)]
     bad = ~((values >= ctx.tolerance("min_c")) & (values <= ctx.tolerance("max_c")))
     if not bad.any():

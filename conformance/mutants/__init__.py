@@ -7,7 +7,7 @@ requirement may fail or warn: it would be caught for the wrong reason.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -15,17 +15,16 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import fingers, gripper, operator, shared
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import RunResult, Verdict
-from dexkit.conformance.stimuli import SCRIPTS, Plan, Session, phases_for
+from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import Service, run_virtual
-from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service
-from dexkit.conformance.virtual.gripper import ReferenceService
+from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, dialect, model
+from dexkit.models import DEX1_1, HandModel, dialect, model, model_plugins
 
-__all__ = ["MUTANTS", "Mutant", "plan_for", "run_mutant", "trial"]
+__all__ = ["MUTANTS", "Mutant", "mutants", "plan_for", "run_mutant", "trial"]
 
 SESSION_SECONDS = 4.0
 LEFT = (Side.LEFT,)
@@ -68,7 +67,7 @@ class Mutant:
         """No more than what shows it."""
         full = plan_for(self.dialect or model(self.model).dialects[0].name, sides=self.sides)
         wanted = select(catalogue(self.model), prefixes=[self.kills, *self.also])
-        return replace(full, phases=phases_for(wanted) | {SCRIPTS[self.model].motion})
+        return replace(full, phases=phases_for(wanted) | {script_class(self.model).motion})
 
     @property
     def summary(self) -> str:
@@ -98,16 +97,38 @@ MUTANTS: tuple[Mutant, ...] = (
         for entry in (*zoo, *operator.ZOO[hand])
     ),
 )
-REFERENCES: dict[str, type[Service]] = {
-    DEX1_1.name: ReferenceService,
-    DEX3_1.name: Dex3Service,
-    DEX5_1.name: Dex5Service,
-}
-"""The good hand of each model."""
+"""Those of dexkit's own models."""
 
 
 @cache
-def _session(model_name: str) -> Session:
+def mutants() -> tuple[Mutant, ...]:
+    """Those of every model, other packages' included.
+
+    :raises ModelBroken: the wrong hands of another package's model cannot be loaded.
+    """
+    others = [
+        _fingers(plugin.model.name, *entry)
+        for plugin in model_plugins()
+        if plugin.model
+        for entry in _of_plugin(plugin.model)
+    ]
+    return MUTANTS + tuple(others)
+
+
+def _of_plugin(hand: HandModel) -> Iterator[tuple[type[Service], str, tuple[str, ...]]]:
+    """The wrong hands of its package, and those of dexkit that break what it is like."""
+    if hand.wrong_hands is not None:
+        yield from hand.wrong_hands.load()
+    reference = hand.reference.load()
+    requirements = catalogue(hand.name)
+    if requirements and issubclass(reference, FingerService):
+        yield from fingers.zoo(requirements[0].id.partition("-")[0], reference, (), {})
+
+
+@cache
+def _session(model_name: str) -> Session | None:
+    if not model(model_name).session:
+        return None
     return Session.default(model_name).first_seconds(SESSION_SECONDS)
 
 

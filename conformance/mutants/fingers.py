@@ -19,9 +19,9 @@ from dexkit.conformance.mutants import shared
 from dexkit.conformance.mutants.shared import of
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.virtual.dex5 import Dex5Service
 from dexkit.conformance.virtual.fingers import (
     Dex3Service,
-    Dex5Service,
     FingerHand,
     FingerService,
     Flags,

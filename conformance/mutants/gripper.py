@@ -213,7 +213,7 @@ class CountsInReserve(_Fields):
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         self.count += 1
-        reserve = (self.count, *(0,) * (3 if self.dialect.name == "unitree_hg" else 1))
+        reserve = (self.count, *(0,) * (3 if self.dialect.interface_specification else 1))
         return {**fields, "reserve": reserve}
 
 

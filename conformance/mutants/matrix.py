@@ -22,7 +22,7 @@ from dexkit.conformance.requirements import Level, Requirement, catalogue, selec
 from dexkit.conformance.usb import mutants as usb
 from dexkit.console import Console
 from dexkit.documents import write_file
-from dexkit.models import DEX1_1, DEX3_1
+from dexkit.models import DEX3_1, model
 
 __all__ = ["Outcome", "Score", "Trial", "chosen", "essential", "trials", "try_one"]
 
@@ -67,6 +67,11 @@ class Outcome:
         return not self.missed and not self.wrongly
 
 
+def _cost(mutant: dds.Mutant) -> float:
+    per_phase = 1 if model(mutant.model).dialects[0].is_gripper else 2
+    return len(mutant.sides) * (1 if mutant.brief else 3) * per_phase
+
+
 def trials() -> tuple[Trial, ...]:
     """Every wrong hand, on the topics and on USB, and every wrong robot."""
     found = [
@@ -77,9 +82,9 @@ def trials() -> tuple[Trial, ...]:
             m.kills,
             m.also,
             m.summary,
-            len(m.sides) * (1 if m.brief else 3) * (1 if m.model == DEX1_1.name else 2),
+            _cost(m),
         )
-        for m in dds.MUTANTS
+        for m in dds.mutants()
     ]
     return (
         *found,
@@ -122,7 +127,7 @@ def try_one(trial: Trial, *, short: bool = False) -> Outcome:
     if trial.layer == "robot":
         bad = next(m for m in robot.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
         return _outcome(trial, bad.blamed(short=short))
-    mutant = next(m for m in dds.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
+    mutant = next(m for m in dds.mutants() if (m.model, m.name) == (trial.model, trial.name))
     plan = mutant.short_plan if short and mutant.name not in shared.DILUTED else mutant.plan
     found = dds.trial(mutant, dds.run_mutant(mutant.service, plan))
     return Outcome(trial, tuple(sorted(found["missed"])), tuple(sorted(found["wrongly"])))

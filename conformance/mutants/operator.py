@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 
 from dexkit.conformance.mutants import shared
 from dexkit.conformance.virtual import Service
-from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service, FingerService
+from dexkit.conformance.virtual.dex5 import Dex5Service
+from dexkit.conformance.virtual.fingers import Dex3Service, FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
@@ -45,7 +46,7 @@ class _PerJoint(Service):
     def stroke(self, joint: tuple[Side, int]) -> float:
         """The joint's range, rad."""
         side, index = joint
-        if self.dialect.model == DEX1_1.name:
+        if self.dialect.is_gripper:
             return self.dialect.q_open
         return model(self.dialect.model).joints[side][index].stroke
 

@@ -217,7 +217,7 @@ class Frozen(ReferenceRobot):
     """Leaves the motors' temperatures 0."""
 
     def warmth(self) -> Any:
-        return 0 if self.robot.family == "unitree_go" else (0, 0)
+        return 0 if self.robot.motor_temperatures == 1 else (0, 0)
 
 
 class NoAttitude(ReferenceRobot):

@@ -12,6 +12,7 @@ selection, reports and the catalogue in docs/conformance.md.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -22,8 +23,8 @@ from typing import Any
 
 from dexkit.documents import parse_toml, read_toml
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.models import DIALECTS, HandModel, model
-from dexkit.robots import RobotModel, robot
+from dexkit.models import BUILT_IN, DIALECTS, HandModel, model, model_plugins
+from dexkit.robots import ROBOTS, RobotModel, robot
 
 __all__ = [
     "CAPABILITIES",
@@ -358,12 +359,46 @@ def _parse(
 
 @cache
 def _files() -> dict[str, tuple[str, str]]:
-    """Model and layer of each file that ships, by its name."""
-    found = {}
-    for path in sorted(Path(__file__).parent.glob("*.toml")):
-        head = parse_toml(path.read_text(encoding="utf-8").partition("[[")[0], path.name)
-        found[path.name] = _model_of(head).name, str(head.get("layer", "dds"))
+    """Model and layer of each requirement file, by its path, which is a name for dexkit's own.
+
+    Those of dexkit come first, by name. A file of another package that cannot be read is left out:
+    it must not affect the others. :func:`catalogue` of its model raises what is wrong with it.
+    """
+    found = {name: _head(name) for name in _own_files()}
+    for plugin in model_plugins():
+        if plugin.model is not None:
+            with contextlib.suppress(UsageError):
+                found |= _plugin_files(plugin.model)
     return found
+
+
+def _own_files() -> list[str]:
+    hands = [str(file) for hand in BUILT_IN for file in hand.requirements]
+    return sorted([*hands, *(file for robot in ROBOTS.values() for file in robot.requirements)])
+
+
+def _plugin_files(hand: HandModel) -> dict[str, tuple[str, str]]:
+    """The same of a model of another package.
+
+    :raises UsageError: a file cannot be read, or is wrong.
+    """
+    files = [str(file) for file in hand.requirements]
+    for name in files:
+        for r in _requirements(name):
+            if not r.like or r.model != hand.name:
+                raise UsageError(
+                    f"{name}: {r.id} is of {r.model} and like {r.like or 'nothing'}",
+                    hint=f"each is of {hand.name} and like a requirement of dexkit, whose check "
+                    "judges it",
+                )
+    return {name: _head(name) for name in files}
+
+
+def _head(name: str) -> tuple[str, str]:
+    """Model and layer of a file."""
+    path = Path(__file__).parent / name
+    head = parse_toml(path.read_text(encoding="utf-8").partition("[[")[0], path.name)
+    return _model_of(head).name, str(head.get("layer", "dds"))
 
 
 @cache
@@ -379,7 +414,7 @@ def _requirements(name: str) -> tuple[Requirement, ...]:
     if any("like" in entry for entry in document["requirement"]):
         others = {
             entry["id"]: entry
-            for other in _files()
+            for other in _own_files()
             for entry in _document(other)["requirement"]
             if "like" not in entry
         }
@@ -388,11 +423,15 @@ def _requirements(name: str) -> tuple[Requirement, ...]:
 
 @cache
 def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requirement, ...]:
-    """The requirements that ship with dexkit, in their order.
+    """The requirements of every model, in their order; those of dexkit's own models first.
 
     :param model: only those of that hand model; None for all.
     :param layer: only those judged there; None for all.
+    :raises UsageError: the requirement file of that model, of another package, is wrong.
     """
+    for plugin in model_plugins():
+        if plugin.name == model and plugin.model is not None:
+            _plugin_files(plugin.model)
     return tuple(
         requirement
         for name, about in _files().items()

@@ -12,9 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.stimuli.fingers import FingerScript
-from dexkit.conformance.stimuli.gripper import GripperScript
-from dexkit.conformance.stimuli.robot import RobotScript
 from dexkit.conformance.stimuli.script import (
     Action,
     Join,
@@ -29,11 +26,10 @@ from dexkit.conformance.stimuli.script import (
     StopService,
 )
 from dexkit.conformance.stimuli.session import Session
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1
-from dexkit.robots import G1, H1
+from dexkit.models import model
+from dexkit.robots import ROBOTS
 
 __all__ = [
-    "SCRIPTS",
     "Action",
     "Join",
     "Leave",
@@ -47,22 +43,19 @@ __all__ = [
     "StartService",
     "StopService",
     "phases_for",
+    "script_class",
     "script_for",
 ]
 
-SCRIPTS: dict[str, type[Script]] = {
-    DEX1_1.name: GripperScript,
-    DEX3_1.name: FingerScript,
-    DEX5_1.name: FingerScript,
-    H1.name: RobotScript,
-    G1.name: RobotScript,
-}
-"""The script of each model."""
+
+def script_class(model_name: str) -> type[Script]:
+    """The script of a hand model or robot."""
+    return (ROBOTS.get(model_name) or model(model_name)).script.load()
 
 
 def script_for(plan: Plan, say: Callable[[str], None] = lambda text: None) -> Script:
     """The script of the plan's model."""
-    return SCRIPTS[plan.dialect.model](plan, say)
+    return script_class(plan.dialect.model)(plan, say)
 
 
 def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:
@@ -82,5 +75,5 @@ def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:
         if requirement.needs == "session":
             names.add("replay")
         if requirement.needs == "motion":
-            names.add(SCRIPTS[requirement.model].motion)
+            names.add(script_class(requirement.model).motion)
     return frozenset(names)

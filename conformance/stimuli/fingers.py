@@ -1,4 +1,4 @@
-"""The stimulus for hands of several joints, the Dex3-1 and the Dex5-1.
+"""The stimulus for hands of several joints.
 
 Both hands do the same at once, except where their independence is the subject. Poses are told by
 how far the flexing joints are closed, in percent, as the object is. The phases of the mode byte's
@@ -19,7 +19,7 @@ foreign
 burst          hundreds of commands at once, of which the last one counts
 stiff, soft    the same step with the client's gains and with a tenth of its stiffness
 limp           zero gains, with a q far towards closed
-lock           the same with the client's gains and status 0 (Dex3-1), or mode 0 (Dex5-1)
+lock           the same with the client's gains and status 0 or mode 0
 replay         a recorded session, as recorded
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
@@ -48,10 +48,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from dexkit.conformance.parts import PARTS, Parts
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Script, Steps
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
+from dexkit.models import JointRoles
 
 __all__ = ["FingerScript"]
 
@@ -118,8 +118,9 @@ class FingerScript(Script):
             yield from self._squeeze_and_silence()
 
     @property
-    def _parts(self) -> Parts:
-        return PARTS[self._model.name]
+    def _roles(self) -> JointRoles:
+        assert self._model.roles is not None  # a profile of several joints has them
+        return self._model.roles
 
     # -- places -----------------------------------------------------------------------------
 
@@ -245,7 +246,7 @@ class FingerScript(Script):
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
         """Two motors with each other's id, the first of them told to go elsewhere."""
-        first, other = self._parts.crossed
+        first, other = self._roles.crossed
         target = self._other_place()[side][first]
         crossed = list(motors)
         crossed[first] = replace(motors[first], q=target, mode=self._wire.mode(other))
@@ -304,13 +305,13 @@ class FingerScript(Script):
                 for i, m in enumerate(self._motors(s, self._goal[s]))
             ]
             far = self._pose(s, CLOSED)
-            for i in self._parts.driven:
+            for i in self._roles.driven:
                 speed = math.copysign(_SPEED, self._joints[s][i].closing)
                 motors[i] = replace(motors[i], dq=speed, kp=0.0, kd=_DAMPING)
-            for i in self._parts.slow:
+            for i in self._roles.slow:
                 motors[i] = replace(motors[i], q=far[i], kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
             hands[s] = motors
-            targets[s] = {i: far[i] for i in self._parts.slow}
+            targets[s] = {i: far[i] for i in self._roles.slow}
         phase = self._begin(name, sides, targets=targets)
         yield from self._hold(0.3, hands)
         self._end(phase)

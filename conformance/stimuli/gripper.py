@@ -61,7 +61,7 @@ class GripperScript(Script):
         super().__init__(plan, say)
         self._stroke = plan.dialect.q_open
         # the interface specification: in unitree_hg the gains, dq and tau of a command are not used
-        self._gains_used = plan.dialect.name != "unitree_hg"
+        self._gains_used = plan.dialect.gains_are_used
 
     def _provoke(self) -> Steps:
         sides = self.plan.sides

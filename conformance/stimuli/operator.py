@@ -39,7 +39,7 @@ def _most(plan: Plan, side: Side) -> float:
     touch = plan.objects.get(side)
     if touch is None:
         return 1.0
-    if math.isnan(plan.dialect.q_open):  # percent of closing
+    if not plan.dialect.is_gripper:  # percent of closing
         return min(1.0, max(0.0, (touch / 100 - _CLEAR) / _DEEPEST))
     return min(1.0, max(0.0, 1.0 - touch / plan.dialect.q_open - _CLEAR))
 
@@ -55,7 +55,7 @@ def operate(script: Script) -> Steps:
     from dexkit.conformance.stimuli.script import Send  # which loads this module when it is used
 
     plan = script.plan
-    if plan.dialect.name == "unitree_hg":
+    if not plan.dialect.has_client:
         return  # no client of Unitree's speaks it, and none of the requirements applies
     script._say("an operator at Unitree's client: full strokes, steps, slow motion")
     phase = script._begin(OPERATOR, plan.sides, profile=PROFILE)

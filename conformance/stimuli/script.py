@@ -17,10 +17,9 @@ from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.view import joints_of
 from dexkit.conformance.wire import Motor, Motors, Wire
 from dexkit.hand import JointSpec, Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, model
+from dexkit.models import Dialect, HandModel, model
 
 __all__ = [
-    "DEFAULT_OBJECTS",
     "NOT_FINITE",
     "Action",
     "Join",
@@ -40,14 +39,6 @@ __all__ = [
     "object_places",
 ]
 
-DEFAULT_OBJECTS = {
-    DEX1_1.name: {Side.RIGHT: 37.0},
-    DEX3_1.name: {Side.RIGHT: 60.0},
-    DEX5_1.name: {Side.RIGHT: 60.0},
-}
-"""Where the hands of a pair that the kit starts feel an object. Percent of opening for a gripper:
-2.0 rad, where the shipped session closes on one. Percent of closing for others: nearly as far as
-the shipped session closes."""
 SETTLED = 0.02
 """Part of a joint's range within which it counts as being where it should."""
 PATIENCE = 6.0
@@ -165,14 +156,14 @@ class Plan:
 
 def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Side, float]:
     """Percents as the script takes them: of opening in radians, of closing as they are."""
-    if math.isnan(dialect.q_open):
+    if not dialect.is_gripper:
         return dict(percents)
     return {s: pct / 100 * dialect.q_open for s, pct in percents.items()}
 
 
 def default_objects(dialect: Dialect, sides: Sequence[Side]) -> dict[Side, float]:
     """The default objects of a pair of hands, as the script takes them."""
-    percents = DEFAULT_OBJECTS[dialect.model]
+    percents = model(dialect.model).objects
     return object_places(dialect, {s: p for s, p in percents.items() if s in sides})
 
 

@@ -12,16 +12,11 @@ from dexkit.conformance.view import Commands, Recording
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.errors import ConformanceError, TraceError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, model
+from dexkit.models import DEX1_1, Dialect, model
 from dexkit.traces import open_trace, sample_path
 
-__all__ = ["DEFAULT_SECONDS", "DEFAULT_SESSIONS", "Session"]
+__all__ = ["DEFAULT_SECONDS", "Session"]
 
-DEFAULT_SESSIONS = {
-    DEX1_1.name: "dex1_pick_place",
-    DEX3_1.name: "dex3_pinch",
-    DEX5_1.name: "dex5_synthetic",
-}
 DEFAULT_SECONDS = 10.0
 
 
@@ -67,8 +62,18 @@ class Session:
 
     @classmethod
     def default(cls, hand_model: str = DEX1_1.name) -> Session:
-        """The session that ships with dexkit for that model."""
-        return cls.load(sample_path(DEFAULT_SESSIONS[hand_model]), seconds=DEFAULT_SECONDS)
+        """The session of that model's profile.
+
+        :raises ConformanceError: it has none.
+        """
+        session = model(hand_model).session
+        if not session:
+            raise ConformanceError(
+                f"there is no session of a {model(hand_model).title} to replay",
+                hint="give one: --trace FILE.mcap",
+            )
+        path = session if isinstance(session, Path) else sample_path(session)
+        return cls.load(path, seconds=DEFAULT_SECONDS)
 
     def for_hand(self, target: Dialect) -> Session:
         """The session itself, if a hand of that dialect can be asked to repeat it.

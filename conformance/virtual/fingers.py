@@ -1,4 +1,4 @@
-"""Hands of several joints that do everything right: a Dex3-1 and a Dex5-1."""
+"""Reference services of hands of several joints, and that of the Dex3-1."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dexkit.conformance.virtual import Sample, Service
 from dexkit.conformance.wire import Motor
 from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import message_type
-from dexkit.models import DEX3_1, DEX5_1, Dialect, HandModel
+from dexkit.models import DEX3_1, Dialect, HandModel
 
-__all__ = ["Dex3Service", "Dex5Service", "FingerHand", "FingerService"]
+__all__ = ["Dex3Service", "FingerHand", "FingerService"]
 
 Flags: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]
@@ -235,31 +235,6 @@ class Dex3Hand(FingerHand):
         return felt
 
 
-class Dex5Hand(FingerHand):
-    """Twenty joints; mode 1 drives them (docs/sources/unitree-dex.md#b5)."""
-
-    model = DEX5_1
-    # light enough for the fingers' gains
-    inertia = 3e-4
-    viscous = 0.012
-    coulomb = 0.0005
-    brake = 0.05
-    stiffness = 20.0
-
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        """Only 1 drives; nothing is protected in another way than all are."""
-        return np.where(mode == JointMode.FOC, mode, 0), np.zeros_like(self.tripped)
-
-    def told(self) -> Ints:
-        """1 where a joint is driven."""
-        return np.asarray(self.driven, dtype=np.intp)
-
-    def expire(self) -> None:
-        """All joints brake."""
-        super().expire()
-        self.status = np.zeros_like(self.status)
-
-
 def _untouched() -> Floats:
     felt = np.full((len(DEX3_1.sensors), 12), NO_VALUE)
     for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
@@ -400,9 +375,3 @@ class Dex3Service(FingerService):
         message.power_v, message.power_a = 24.0, 0.3
         message.system_v, message.device_v = 12.0, 12.0
         return message
-
-
-class Dex5Service(FingerService):
-    """Dex5-1 hands on their topics."""
-
-    hand = Dex5Hand

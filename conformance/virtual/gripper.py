@@ -126,7 +126,7 @@ class ReferenceService(Service):
 
     def command(self, side: Side, motor: Motor) -> None:
         """A gripper's motor is commanded."""
-        if self.dialect.name == "unitree_hg" and math.isfinite(motor.q):
+        if self.dialect.interface_specification and math.isfinite(motor.q):
             # the interface specification: gains and feed-forward of a command are not used, the
             # ends snap
             q = 0.0 if motor.q <= 0.1 else self.dialect.q_open if motor.q >= 6.0 else motor.q
@@ -151,7 +151,7 @@ class ReferenceService(Service):
         """What a side's motor says of itself."""
         found: dict[str, Any] = {**self.hands[side].fields(), "temperature": 35}
         # the interface specification: mode 0, 25 degrees, 12 V, no sign
-        if self.dialect.name == "unitree_hg":
+        if self.dialect.interface_specification:
             grip = abs(found["tau_est"])
             found |= {"mode": 0, "tau_est": grip, "temperature": (25, 25), "vol": 12.0}
         return found

@@ -194,7 +194,7 @@ class ReferenceRobot(Service):
         state.imu_state.quaternion, state.imu_state.rpy = self.attitude()
         state.imu_state.accelerometer = self.gravity()
         state.wireless_remote = tuple(self.remote())
-        if self.robot.family == "unitree_go":
+        if self.robot.has_battery:
             state.head, state.level_flag = (0xFE, 0xEF), 0xFF
             state.bms_state.soc = 80
             state.bms_state.cell_vol = (4000,) * _CELLS
@@ -205,7 +205,7 @@ class ReferenceRobot(Service):
 
     def warmth(self) -> Any:
         """A motor's temperature."""
-        return 35 if self.robot.family == "unitree_go" else (35, 36)
+        return 35 if self.robot.motor_temperatures == 1 else (35, 36)
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Quaternion (w first) and rpy: it hangs a little askew."""

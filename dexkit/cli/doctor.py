@@ -26,7 +26,7 @@ __all__ = ["command"]
 
 _REFRESH = 1.0  # seconds between looks
 _FILES = 16  # descriptors beside one a domain and interface
-_MODEL_NAMES = {name.partition("-")[0]: name for name in MODELS}
+_MODEL_NAMES = {hand.short_name: name for name, hand in MODELS.items()}
 
 
 def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int]:

@@ -44,6 +44,7 @@ def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     console = Console(width=width)
     if not (names or every):
         _overview(console, models)
+        _unusable(console)
         return
     for i, data in enumerate(models):
         if i:
@@ -85,6 +86,20 @@ def _overview(console: Console, models: Sequence[dict[str, Any]]) -> None:
         "\nCommand rates are xr_teleoperate's. All of a model: dexkit models NAME; "
         "drawings: docs/models.md."
     )
+
+
+def _unusable(console: Console) -> None:
+    """The models of other packages that cannot be used, and why."""
+    from dexkit.models import model_plugins
+
+    for plugin in model_plugins():
+        if plugin.error is not None:
+            console.print(
+                f"{plugin.name} of {plugin.origin} cannot be used: {plugin.error}",
+                style="red",
+                markup=False,
+                soft_wrap=True,
+            )
 
 
 def _command_rate(rates: dict[str, Any]) -> float:

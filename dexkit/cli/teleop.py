@@ -23,7 +23,7 @@ from dexkit.cli.options import (
 )
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
+from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 from dexkit.stop_signals import stop_on_signals
@@ -60,7 +60,9 @@ _MS = 1e3
     type=DIALECT,
     default="unitree_go",
     show_default=True,
-    help="Topics, types and units of the hands; dex3 for a Dex3-1, dex5 for a Dex5-1.",
+    help="Dialect of the hands: "
+    + "; ".join(f"{', '.join(d.name for d in m.dialects)} for a {m.name}" for m in MODELS.values())
+    + ".",
 )
 @dds_options()
 @side_option("Hands to drive. The genuine client drives both, and waits for both.", default="both")
@@ -318,7 +320,7 @@ def _report(session: Session, operator: Operator, nominal: float, *, as_json: bo
             click.echo("  no occasion to measure anything")
         for name, values in measured["joints"].items():
             text = sentence(values) or "no occasion to measure anything"
-            click.echo(f"  {text}" if model.name == DEX1_1.name else f"  {name}: {text}")
+            click.echo(f"  {text}" if len(model.joints[Side.LEFT]) == 1 else f"  {name}: {text}")
 
 
 def _finite(value: Any) -> Any:

@@ -31,11 +31,6 @@ _FROZEN_COMMANDS = 0.1  # rad that commands move while an honest state could not
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
 _DRIVER_BAUD = 1_000_000
 _DURABILITY = ("volatile", "transient_local", "transient", "persistent")
-# xr_teleoperate v1.1 and every client of a Dex3-1 wait for a q that is not 0
-# (docs/sources/unitree-dex.md#b1)
-_ZERO_IS_NO_STATE = frozenset({"unitree_actuator", "dex3", "dex5"})
-# whose client is two processes, of which one sends: readers that come late hear nothing of it
-_FORKING = frozenset({"dex3-1", "dex5-1"})
 
 
 @dataclass(frozen=True)
@@ -219,7 +214,7 @@ def _missing(view: DomainView, dialect: Dialect) -> str:
         flowing = [s for p in parts if (s := view.stream(p.endpoint)) and s.samples > s.undecodable]
         if not flowing:
             return f"no state of {who} comes"
-        if dialect.name in _ZERO_IS_NO_STATE and not any(s.nonzero for s in flowing):
+        if dialect.zero_is_no_state and not any(s.nonzero for s in flowing):
             return f"all positions of {who} are exactly 0"
     return ""
 
@@ -401,7 +396,7 @@ def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
                 domain=view.number,
                 topic=topic,
             )
-        elif part.role.dialect.model in _FORKING and not (stream and stream.samples):
+        elif MODELS[part.role.dialect.model].client_forks and not (stream and stream.samples):
             late = _late(view, part.endpoint, readers)
             if late:
                 yield _finding(
@@ -476,7 +471,7 @@ def _streams(view: DomainView, wish: Wish) -> Iterator[Finding]:
                 topic=topic,
             )
             continue
-        if not stream.nonzero and dialect.name in _ZERO_IS_NO_STATE:
+        if not stream.nonzero and dialect.zero_is_no_state:
             yield _finding(
                 "DDS-ALL-ZERO", f"{what}: every q is 0.0", domain=view.number, topic=topic
             )

@@ -11,11 +11,11 @@ unitree_hg         the interface specification: q runs to 2 pi; a command at or 
                    closes, at or above 6.0 opens; dq, tau, kp and kd of a command are unused
                    (clients send 0), the gains are those of xr_teleoperate; tau_est of the
                    state is grip strength, not signed.
-dex3               seven motors in the order of the IDL, all values as they are; the mode byte is
-                   RIS_Mode (the Dex3-1 manual): id, status (0 lock, 1 FOC) and the time-out bit.
-dex5               20 joints in the order of the IDL; mode 1 is position control, 0 brakes
-                   (docs/sources/unitree-dex.md#b5); the fingers' tau and tau_est are in mN·m,
-                   as a comment in the only client says.
+RIS_Mode           hands of several joints: all values as they are, in the order of the IDL; the
+                   mode byte has the id, the status (0 lock, 1 FOC) and the time-out bit (the
+                   Dex3-1 manual).
+status             the same; mode 1 is position control, 0 brakes
+                   (docs/sources/unitree-dex.md#b5); tau and tau_est in the dialect's units.
 =================  ================================================================================
 
 **What a state holds.** ``Fill.VENDOR`` fills what the reference fills and leaves the rest 0:
@@ -38,7 +38,7 @@ the last good one
 q is predicted          reserve[1] = 1               reserve[0] = 1
 ======================  ===========================  ==============================================
 
-The states of dex3 and dex5 are described in docs/dex3.md and docs/dex5.md;
+The state of a hand of several joints is described on the page of the hand;
 :mod:`dexkit.service.finger_state` encodes them.
 
 ``temperature`` of unitree_go stops at 127 because Unitree's Python SDK cannot pack more
@@ -69,10 +69,23 @@ from dexkit.hand import (
     SupplyState,
 )
 from dexkit.messages import message_type, unitree_go, unitree_hg
-from dexkit.models import Dialect
+from dexkit.models import Dialect, ModeByte, model
 from dexkit.service.finger_state import FingerStateEncoder
 
-__all__ = ["HG_CLOSED", "HG_OPEN", "DialectMap", "Fill", "Remark", "StateView", "dialect_map"]
+__all__ = [
+    "HG_CLOSED",
+    "HG_OPEN",
+    "DialectMap",
+    "Fill",
+    "FingerMap",
+    "InterfaceSpecificationMap",
+    "MotorCmdsMap",
+    "Remark",
+    "RisModeMap",
+    "StateView",
+    "StatusModeMap",
+    "dialect_map",
+]
 
 # what xr_teleoperate sends to a Dex1 (docs/sources/unitree-dex.md#b1)
 _KP, _KD = 5.0, 0.05
@@ -202,12 +215,15 @@ class DialectMap(ABC):
         return np.array(values)
 
 
-class _GoMap(DialectMap):
+class MotorCmdsMap(DialectMap):
+    """Grippers in ``MotorCmds_`` and ``MotorStates_``: all values as they are."""
+
     def _motor_commands(self, message: Any) -> list[Any]:
         motors: list[Any] = message.cmds
         return motors
 
     def state(self, views: Mapping[Side, StateView]) -> unitree_go.MotorStates_:
+        """The state message."""
         motors = [unitree_go.MotorState_() for _ in range(self._length)]
         for side, view in views.items():
             s = view.state
@@ -226,8 +242,11 @@ class _GoMap(DialectMap):
         return unitree_go.MotorStates_(motors)
 
 
-class _HgMap(DialectMap):
+class InterfaceSpecificationMap(DialectMap):
+    """Grippers as the DDS interface specification defines them: 2 pi rad of opening, no gains."""
+
     def state(self, views: Mapping[Side, StateView]) -> unitree_hg.HandState_:
+        """The state message."""
         (side,) = self._specs
         view = views[side]
         s, spec = view.state, self._specs[side]
@@ -295,10 +314,8 @@ class _HgMap(DialectMap):
         return _zero_where_finite(values) + default
 
 
-class _FingerMap(DialectMap):
+class FingerMap(DialectMap):
     """Hands of several joints: all values as they are, but for the mode byte."""
-
-    _ids = True
 
     def __init__(
         self, dialect: Dialect, specs: Mapping[Side, HandSpec], fill: Fill = Fill.KNOWN
@@ -308,13 +325,18 @@ class _FingerMap(DialectMap):
         units = dialect.torque_units
         self._torque_units = np.array(units or (1.0,) * spec.n_joints)
         self._encoder = FingerStateEncoder(
-            spec, known=fill is Fill.KNOWN, ids=self._ids, torque_units=units
+            spec,
+            known=fill is Fill.KNOWN,
+            ids=dialect.mode_byte is ModeByte.RIS,
+            torque_units=units,
         )
 
     def state(self, views: Mapping[Side, StateView]) -> Any:
+        """The state message."""
         return self._state_type.decode(self.encode(views))
 
     def encode(self, views: Mapping[Side, StateView]) -> bytes:
+        """The state message as a DDS sample."""
         (view,) = views.values()
         return self._encoder.encode(view.state, view.fault, view.missed, view.tripped)
 
@@ -330,12 +352,13 @@ class _FingerMap(DialectMap):
         return np.asarray(self._torque_units * values)
 
 
-class _Dex3Map(_FingerMap):
-    """Mode bytes are RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7 (the Dex3-1
-    manual).
+class RisModeMap(FingerMap):
+    """Hands of several joints whose mode byte is RIS_Mode: id in bits 0 to 3, status in 4 to 6,
+    time-out in 7 (the Dex3-1 manual).
     """
 
     def command(self, message: Any, side: Side) -> HandCommand | None:
+        """The command for a side, with its mode bytes."""
         command = super().command(message, side)
         if command is None:
             return None
@@ -349,6 +372,7 @@ class _Dex3Map(_FingerMap):
         )
 
     def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
+        """Mode bytes that mean something else than their sender may think."""
         found: dict[str, Remark] = {}
         for i, mode in enumerate(self._modes(message, side)):
             if mode & 0x6F == i:  # its own id, and status 0 or 1
@@ -366,14 +390,13 @@ class _Dex3Map(_FingerMap):
         return tuple(found.values())
 
 
-class _Dex5Map(_FingerMap):
-    """Mode bytes are plain numbers: 1 is position control (docs/sources/unitree-dex.md#b5,
-    docs/sources/unitree-dex.md#d26).
+class StatusModeMap(FingerMap):
+    """Hands of several joints whose mode byte is a status: 1 is position control, 0 brakes
+    (docs/sources/unitree-dex.md#b5, docs/sources/unitree-dex.md#d26).
     """
 
-    _ids = False
-
     def command(self, message: Any, side: Side) -> HandCommand | None:
+        """The command for a side, with its mode bytes."""
         command = super().command(message, side)
         if command is None:
             return None
@@ -384,22 +407,15 @@ class _Dex5Map(_FingerMap):
         )
 
     def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
+        """Mode bytes that mean something else than their sender may think."""
         for i, mode in enumerate(self._modes(message, side)):
             if mode not in (JointMode.BRAKE, JointMode.FOC):
                 text = f"mode byte {mode:#04x} of joint {i} is unknown, so it is locked"
                 if mode & 0x70:
-                    text += "; a Dex5-1 has no RIS_Mode with ids, as a Dex3-1 has"
+                    product = model(self.dialect.model).title.partition(" ")[0]
+                    text += f"; a {product} has no RIS_Mode with ids, as a Dex3-1 has"
                 return (Remark("unknown_status", f"{text}; send 1 to drive it, 0 to lock it"),)
         return ()
-
-
-_MAPS: dict[str, type[DialectMap]] = {
-    "unitree_go": _GoMap,
-    "unitree_actuator": _GoMap,
-    "unitree_hg": _HgMap,
-    "dex3": _Dex3Map,
-    "dex5": _Dex5Map,
-}
 
 
 def dialect_map(
@@ -407,9 +423,12 @@ def dialect_map(
 ) -> DialectMap:
     """The mapping of ``dialect`` for the hands of one topic pair.
 
-    :raises UsageError: a hand is of another model.
+    :raises UsageError: a hand is of another model, or the dialect has no codec.
+    :raises ModelBroken: the codec of another package's dialect cannot be loaded.
     """
-    return _MAPS[dialect.name](dialect, specs, fill)
+    if dialect.codec is None:
+        raise UsageError(f"the dialect {dialect.name} has no codec in its profile")
+    return dialect.codec.load()(dialect, specs, fill)
 
 
 def _known(value: float) -> float:

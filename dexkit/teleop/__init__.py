@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from dexkit.teleop.client import (
     Dex1Client,
-    Dex3Client,
-    Dex5Client,
     FingerClient,
     Inputs,
     JointCommand,
@@ -23,13 +21,10 @@ from dexkit.teleop.client import (
     client_for,
 )
 from dexkit.teleop.feel import Feel, feel
-from dexkit.teleop.profiles import PROFILES, Operator, Profile, profile, profiles_for, recorded
+from dexkit.teleop.profiles import Operator, Profile, profile, profiles_for, recorded
 
 __all__ = [
-    "PROFILES",
     "Dex1Client",
-    "Dex3Client",
-    "Dex5Client",
     "Feel",
     "FingerClient",
     "Inputs",

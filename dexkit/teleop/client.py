@@ -29,7 +29,7 @@ from typing import NamedTuple, TypeAlias
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointMode, Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, dialect, model
+from dexkit.models import DEX1_1, Dialect, ModeByte, dialect, model
 
 __all__ = [
     "LEAD",
@@ -37,8 +37,6 @@ __all__ = [
     "PINCH_MIN",
     "POLL_PAUSE",
     "Dex1Client",
-    "Dex3Client",
-    "Dex5Client",
     "FingerClient",
     "Inputs",
     "JointCommand",
@@ -284,7 +282,9 @@ class TeleopClient(ABC):
 
     def _mode(self, index: int, status: JointMode) -> int:
         """The mode byte of a motor."""
-        return 0
+        if self.dialect.mode_byte is ModeByte.RIS:
+            return index | status << 4
+        return int(status) if self.dialect.mode_byte is ModeByte.STATUS else 0
 
     @abstractmethod
     def _control(
@@ -313,7 +313,7 @@ class Dex1Client(TeleopClient):
         simulated: bool = False,
     ) -> None:
         spoken = spoken or DEX1_1.dialects[0]
-        if spoken.model != DEX1_1.name:
+        if not spoken.is_gripper:
             raise UsageError(f"the dialect {spoken.name} is not of a {DEX1_1.title}")
         super().__init__(spoken, sides)
         shared = spoken.length > 1
@@ -386,13 +386,9 @@ class FingerClient(TeleopClient):
     (docs/sources/unitree-dex.md#b7).
     """
 
-    model: HandModel
-
-    def __init__(self, spoken: Dialect | None = None, sides: Sequence[Side] = tuple(Side)) -> None:
-        spoken = spoken or self.model.dialects[0]
-        if spoken.model != self.model.name:
-            raise UsageError(f"the dialect {spoken.name} is not of a {self.model.title}")
+    def __init__(self, spoken: Dialect, sides: Sequence[Side] = tuple(Side)) -> None:
         super().__init__(spoken, sides)
+        self._gains = model(spoken.model).gains
         self._targets: dict[Side, Pose] = dict.fromkeys(self.sides, (0.0,) * spoken.length)
 
     def _control(
@@ -404,32 +400,10 @@ class FingerClient(TeleopClient):
         return {
             s: tuple(
                 JointCommand(self._mode(i, JointMode.FOC), q, 0.0, 0.0, kp, kd)
-                for i, (q, (kp, kd)) in enumerate(
-                    zip(self._targets[s], self.model.gains, strict=True)
-                )
+                for i, (q, (kp, kd)) in enumerate(zip(self._targets[s], self._gains, strict=True))
             )
             for s in self.sides
         }
-
-
-class Dex3Client(FingerClient):
-    """xr_teleoperate's ``Dex3_1_Controller``: id and status in the mode byte."""
-
-    model = DEX3_1
-
-    def _mode(self, index: int, status: JointMode) -> int:
-        return index | status << 4
-
-
-class Dex5Client(FingerClient):
-    """xr_teleoperate's ``Dex5_1_Controller``: mode 1, other gains for the thumb
-    (docs/sources/unitree-dex.md#b1, docs/sources/unitree-dex.md#b5).
-    """
-
-    model = DEX5_1
-
-    def _mode(self, index: int, status: JointMode) -> int:
-        return int(status)
 
 
 def client_for(
@@ -444,9 +418,10 @@ def client_for(
     :raises UsageError: no such dialect, or a release or simulation of a client that has none.
     """
     chosen = dialect(spoken) if isinstance(spoken, str) else spoken
-    if chosen.model == DEX1_1.name:
-        return Dex1Client(chosen, sides, release=release, simulated=simulated)
+    profile = model(chosen.model)
+    client = profile.client.load()
+    if issubclass(client, Dex1Client):
+        return client(chosen, sides, release=release, simulated=simulated)
     if release is not None or simulated:
-        title = model(chosen.model).title
-        raise UsageError(f"the client of a {title} is the same in all releases")
-    return (Dex3Client if chosen.model == DEX3_1.name else Dex5Client)(chosen, sides)
+        raise UsageError(f"the client of a {profile.title} is the same in all releases")
+    return client(chosen, sides)

@@ -26,7 +26,7 @@ from dexkit.command_age import PAUSE, SETTLE, PauseWatch
 from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
-from dexkit.models import DEX1_1, Dialect, model
+from dexkit.models import Dialect, model
 from dexkit.single_publisher import Place, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.client_codec import ClientWire
@@ -79,7 +79,7 @@ class Session:
         spoken = operator.dialect
         found = {}
         for i, joint in enumerate(model(spoken.model).joints[side]):
-            stroke = spoken.q_open if spoken.model == DEX1_1.name else joint.stroke
+            stroke = spoken.q_open if spoken.is_gripper else joint.stroke
             figures = feel(t, q[:, i], lambda at, i=i: _of(operator.intent(at, side), i), stroke)  # type: ignore[misc]
             if figures.figures():
                 found[i] = figures
@@ -225,7 +225,7 @@ class LiveClient:
 
         The genuine one just stops sending. A Dex1-1's service then brakes within a second; a
         Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
-        to stay where it is, a Dex3-1 or Dex5-1 with its motors locked (status 0 of the mode byte).
+        to stay where it is, with its motors locked where the dialect has a mode byte (status 0).
         """
         if self._watch.away() > PAUSE:  # ended in a pause: the hands may be elsewhere by now
             time.sleep(SETTLE)

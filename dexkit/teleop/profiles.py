@@ -15,14 +15,15 @@ from types import MappingProxyType
 
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, model
+from dexkit.models import MODELS, Dialect, HandModel, model
 from dexkit.teleop.client import PINCH_MAX, PINCH_MIN, Pose
 
 __all__ = [
     "INPUT_RATE",
-    "PROFILES",
     "Operator",
     "Profile",
+    "finger_profiles",
+    "gripper_profiles",
     "profile",
     "profiles_for",
     "recorded",
@@ -106,7 +107,7 @@ class Operator:
     def _pose(self, side: Side, closing: Pose) -> Pose:
         joints = self._joints[side]
         parts = closing * len(joints) if len(closing) == 1 else closing
-        if self.dialect.model == DEX1_1.name:
+        if self.dialect.is_gripper:
             return (self.dialect.q_open * (1.0 - parts[0]),)
         return tuple(
             # the thumb's base swings both ways; closing a hand does not move it
@@ -124,7 +125,7 @@ class Operator:
         return {s: self._input(self.intent(at, s)) for s in sides}
 
     def _input(self, pose: Pose | None) -> Pose | None:
-        if pose is None or self.dialect.model != DEX1_1.name:
+        if pose is None or not self.dialect.is_gripper:
             return pose
         return (PINCH_MIN + (PINCH_MAX - PINCH_MIN) * pose[0] / self.dialect.q_open,)
 
@@ -159,19 +160,12 @@ def _sine(low: float, high: float, period: float) -> Closing:
     return lambda t: (middle + swing * math.sin(2 * math.pi * t / period),)
 
 
-# whose joints they are, by index; ring and little finger do what the middle one does
-_FINGERS = {
-    DEX3_1.name: 3 * ("thumb",) + 2 * ("middle",) + 2 * ("index",),
-    DEX5_1.name: 4 * ("index",) + 12 * ("middle",) + 4 * ("thumb",),
-}
-
-
-def _fingers(hand: str, closing: Closing, **parts: float) -> Closing:
+def _fingers(hand: HandModel, closing: Closing, **parts: float) -> Closing:
     """The same motion to different depths for the fingers of a hand.
 
     :param parts: of ``thumb``, ``middle`` and ``index``.
     """
-    each = tuple(parts[finger] for finger in _FINGERS[hand])
+    each = tuple(parts[finger] for finger in hand.fingers)
 
     def all_joints(t: float) -> Pose | None:
         found = closing(t)
@@ -180,7 +174,7 @@ def _fingers(hand: str, closing: Closing, **parts: float) -> Closing:
     return all_joints
 
 
-def _clear(hand: str, closing: Closing) -> Closing:
+def _clear(hand: HandModel, closing: Closing) -> Closing:
     """A hand's fingers, and the thumb less far, clear of them."""
     return _fingers(hand, closing, thumb=0.4, middle=1.0, index=1.0)
 
@@ -199,12 +193,12 @@ _FEEL = _joined(
 )
 
 
-def _of_fingers(hand: str) -> tuple[Profile, ...]:
-    """The profiles of a hand of several joints."""
+def finger_profiles(hand: HandModel) -> tuple[Profile, ...]:
+    """The operator profiles of a hand of several joints."""
     return (
         Profile(
             "full-stroke",
-            hand,
+            hand.name,
             "closed and open at once, two seconds each: how long a stroke takes",
             0.5,
             8.0,
@@ -212,29 +206,39 @@ def _of_fingers(hand: str) -> tuple[Profile, ...]:
         ),
         Profile(
             "pinch",
-            hand,
+            hand.name,
             "thumb against index finger and open again, twice",
             1.0,
             6.5,
             _fingers(hand, _GRASP, thumb=0.6, middle=0.1, index=0.6),
         ),
         Profile(
-            "fist", hand, "the whole hand closes and opens, twice", 1.0, 6.5, _clear(hand, _GRASP)
+            "fist",
+            hand.name,
+            "the whole hand closes and opens, twice",
+            1.0,
+            6.5,
+            _clear(hand, _GRASP),
         ),
         Profile(
             "steps",
-            hand,
+            hand.name,
             "all joints, a fifth of the stroke at a time",
             0.5,
             6.0,
             _clear(hand, _STEPS),
         ),
         Profile(
-            "sine", hand, "all joints to and fro, 4 s", 0.5, 8.0, _clear(hand, _sine(0.1, 0.9, 4.0))
+            "sine",
+            hand.name,
+            "all joints to and fro, 4 s",
+            0.5,
+            8.0,
+            _clear(hand, _sine(0.1, 0.9, 4.0)),
         ),
         Profile(
             "startle",
-            hand,
+            hand.name,
             "nothing for 3 s, then quick full strokes down to 0.25 s",
             3.0,
             4.0,
@@ -242,7 +246,7 @@ def _of_fingers(hand: str) -> tuple[Profile, ...]:
         ),
         Profile(
             "feel",
-            hand,
+            hand.name,
             "what the conformance suite does: all joints half closed, steps, sine",
             0.6,
             10.2,
@@ -251,46 +255,52 @@ def _of_fingers(hand: str) -> tuple[Profile, ...]:
     )
 
 
-PROFILES: tuple[Profile, ...] = (
-    Profile(
-        "full-stroke",
-        DEX1_1.name,
-        "closed and open at once, two seconds each: how long a stroke takes",
-        0.5,
-        8.0,
-        _STROKES,
-    ),
-    Profile("steps", DEX1_1.name, "a fifth of the stroke at a time", 0.5, 6.0, _STEPS),
-    Profile(
-        "sine", DEX1_1.name, "slowly to and fro, 4 s: how far it lags", 0.5, 8.0, _sine(0.1, 0.9, 4)
-    ),
-    Profile(
-        "pick-place", DEX1_1.name, "close, carry, open, twice, as a hand moves", 1.0, 6.5, _GRASP
-    ),
-    Profile(
-        "startle",
-        DEX1_1.name,
-        "nothing for 3 s, then quick full strokes down to 0.25 s",
-        3.0,
-        4.0,
-        _QUICK,
-    ),
-    Profile(
-        "feel",
-        DEX1_1.name,
-        "what the conformance suite does: strokes, steps, sine",
-        0.6,
-        10.2,
-        _FEEL,
-    ),
-    *(profile for hand in _FINGERS for profile in _of_fingers(hand)),
-)
-"""The profiles that ship, by model."""
+def gripper_profiles(hand: HandModel) -> tuple[Profile, ...]:
+    """The operator profiles of a gripper."""
+    return (
+        Profile(
+            "full-stroke",
+            hand.name,
+            "closed and open at once, two seconds each: how long a stroke takes",
+            0.5,
+            8.0,
+            _STROKES,
+        ),
+        Profile("steps", hand.name, "a fifth of the stroke at a time", 0.5, 6.0, _STEPS),
+        Profile(
+            "sine",
+            hand.name,
+            "slowly to and fro, 4 s: how far it lags",
+            0.5,
+            8.0,
+            _sine(0.1, 0.9, 4),
+        ),
+        Profile(
+            "pick-place", hand.name, "close, carry, open, twice, as a hand moves", 1.0, 6.5, _GRASP
+        ),
+        Profile(
+            "startle",
+            hand.name,
+            "nothing for 3 s, then quick full strokes down to 0.25 s",
+            3.0,
+            4.0,
+            _QUICK,
+        ),
+        Profile(
+            "feel",
+            hand.name,
+            "what the conformance suite does: strokes, steps, sine",
+            0.6,
+            10.2,
+            _FEEL,
+        ),
+    )
 
 
 def profiles_for(hand_model: str) -> tuple[Profile, ...]:
     """The profiles of a model."""
-    return tuple(p for p in PROFILES if p.model == hand_model)
+    hand = model(hand_model)
+    return hand.operator_profiles.load()(hand)
 
 
 def profile(name: str, hand_model: str) -> Profile:
@@ -300,7 +310,9 @@ def profile(name: str, hand_model: str) -> Profile:
     """
     found = [p for p in profiles_for(hand_model) if p.name == name]
     if not found:
-        owner = next((model(p.model) for p in PROFILES if p.name == name), None)
+        owner = next(
+            (m for m in MODELS.values() if name in {p.name for p in profiles_for(m.name)}), None
+        )
         its = f"--dialect {owner.dialects[0].name} has it; " if owner else ""
         raise UsageError(
             f"a {model(hand_model).title} has no profile {name!r}",

@@ -15,9 +15,6 @@ Array = NDArray[np.float64]
 
 PERIOD = 0.1
 """Seconds between two looks."""
-_CELLS = {"unitree_go": 15, "unitree_hg": 13}
-# of the battery: as many as H1's state has room for (docs/sources/unitree-dex.md#a2); the G1's
-# datasheet
 _CELL_FULL, _CELL_EMPTY = 4.15, 3.3  # V
 _COPPER_LOSS = 60.0  # W that a motor turns into heat at full torque
 
@@ -32,7 +29,7 @@ class Supply:
     """
 
     def __init__(self, model: RobotModel, joints: Joints, settings: Settings) -> None:
-        self.cells = _CELLS[model.family]
+        self.cells = model.battery_cells
         self._joints = joints
         self._settings = settings
         self.temperature: Array = np.full(len(joints.q), settings.ambient)

@@ -1,6 +1,6 @@
 """The drawings: joints by index and name, how they close, where a hand feels.
 
-Places come from :mod:`tools.generate.drawing_layout`, everything else from the models.
+Places come from the layout of a profile, everything else from the models.
 """
 
 from __future__ import annotations
@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, Side
-from dexkit.models import HandModel
+from dexkit.models import Finger, HandLayout, HandModel
+from dexkit.robot_layout import RobotLayout
 from dexkit.robots import RobotModel
-from tools.generate.drawing_layout import HANDS, ROBOTS, Finger, HandLayout, RobotLayout
 from tools.generate.svg_sheet import Point, Sheet
 
 __all__ = ["WIDTH", "draw_hand", "draw_robot"]
@@ -27,11 +28,13 @@ _SIGNS = {1: "+", -1: "−", 0: ""}
 def draw_hand(model: HandModel) -> Sheet:
     """Both hands of a model, side by side.
 
-    :raises KeyError: a hand of several joints that has no layout.
+    :raises UsageError: a hand of several joints that has no layout.
     """
     if len(model.joints[Side.LEFT]) == 1:
         return _draw_gripper(model)
-    return _draw_fingers(model, HANDS[model.name])
+    if model.layout is None:
+        raise UsageError(f"the profile of the {model.title} has no layout, so it cannot be drawn")
+    return _draw_fingers(model, model.layout)
 
 
 def _sheet(height: float, title: str, what: str, view: str) -> Sheet:
@@ -232,7 +235,7 @@ def draw_robot(model: RobotModel) -> Sheet:
 
     :raises KeyError: a robot that has no layout.
     """
-    layout = ROBOTS[model.name]
+    layout = model.layout.load()
     top = 138.0
     height = top + layout.bottom + 74
     sheet = _sheet(height, model.title, "joints by motor slot", "from behind: its left is left")

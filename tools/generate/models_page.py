@@ -20,7 +20,7 @@ _INTRO = """\
 # The models
 
 Every hand and robot that dexkit knows, as it is on DDS. This page and its drawings are made from
-`dexkit/models.py` and `dexkit/robots.py`, which name the source of each figure and say what is
+`dexkit/models/` and `dexkit/robots.py`, which name the source of each figure and say what is
 inferred or uncertain; `dexkit models NAME` prints the same in a terminal, `dexkit models --json`
 for programs. The drawings are schematic: they show order, names and directions, not dimensions.
 Nothing here was measured on a real hand or robot.

@@ -24,18 +24,13 @@ from dexkit.cli.options import (
 )
 from dexkit.cli.status_line import STATUS_LINES, StatusLine
 from dexkit.errors import DexkitError, EmulatorError
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1
+from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import StopRequest, stop_on_signals
 
 __all__ = ["emulate_all"]
 
-_HANDS = {
-    "dex3": ("sim-dex3", DEX3_1),
-    "dex1": ("sim-dex1", DEX1_1),
-    "dex5": ("sim-dex5", DEX5_1),
-}
-_ARMS = {"g1": "G1_29", "h1": "H1"}  # names of the robots in xr_teleoperate
+_HANDS = {hand.short_name: hand for hand in MODELS.values() if hand.simulator}
 _POLL = 0.05  # seconds between looks whether all parts live
 
 
@@ -89,13 +84,13 @@ def emulate_all(
     if hands != "none":
         own = [option for text in settings for option in ("--set", text)]
         own += ["--dialect", dialect] if dialect else []
-        parts["hands"] = ("serve", _HANDS[hands][0], "--side", "both", *own, *common)
+        parts["hands"] = ("serve", _HANDS[hands].simulator, "--side", "both", *own, *common)
     with stop_on_signals() as stop, _Processes(parts, quiet) as processes:
         processes.wait_ready(stop)
         if not stop:
             title = ROBOTS[robot].title
             if hands != "none":
-                title += f" and two {_HANDS[hands][1].title}s"
+                title += f" and two {_HANDS[hands].title}s"
             click.echo(f"ready: {title}, domain {domain}, {interface}")
             click.echo("\n".join(_next(robot, hands, domain, interface)))
             sys.stdout.flush()
@@ -110,10 +105,10 @@ def _next(robot: str, hands: str, domain: int, interface: str) -> list[str]:
         sim = " --sim" if domain == 1 else ""
         lines += [
             "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
-            f"  python teleop_hand_and_arm.py --arm={_ARMS[robot]}{end}{sim}",
+            f"  python teleop_hand_and_arm.py --arm={ROBOTS[robot].teleop_name}{end}{sim}",
         ]
-        if hands == "dex5":
-            lines.append("  (--ee=dex5 is not in a release: pull request 321)")
+        if hands in _HANDS and _HANDS[hands].client_note:
+            lines.append(f"  ({_HANDS[hands].client_note})")
     else:
         lines.append("xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md")
     where = "" if interface == "lo" else f" --interface {interface}"

@@ -1,0 +1,301 @@
+"""The profile of a hand model: all that dexkit knows of it, or where that is.
+
+Facts are values: joints, topics, types, rates, poses. Code that works for one model only (codec,
+client, stimulus script, reference service, wrong hands) is named by a
+:class:`~dexkit.lazy.Lazy` reference, so that a profile loads none of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from dexkit.hand import HandSpec, JointSpec, Side
+from dexkit.lazy import Lazy
+
+if TYPE_CHECKING:
+    from dexkit.conformance.stimuli.script import Script
+    from dexkit.conformance.virtual import Service
+    from dexkit.service.dialects import DialectMap
+    from dexkit.teleop.client import TeleopClient
+    from dexkit.teleop.profiles import Profile
+
+    WrongHand: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
+
+__all__ = [
+    "Dialect",
+    "Finger",
+    "HandLayout",
+    "HandModel",
+    "JointRoles",
+    "ModeByte",
+    "PressureSensor",
+]
+
+
+class ModeByte(Enum):
+    """What the mode byte of a motor's command and state holds."""
+
+    UNUSED = "nothing"
+    STATUS = "1 driven, 0 not"
+    RIS = "RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7"
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a hand model appears on DDS.
+
+    :param model: name of the hand model.
+    :param cmd_topic: command topic; ``{side}`` is replaced by ``left`` or ``right``.
+    :param cmd_type: DDS type name of the command.
+    :param index: position of a side's first motor in the sequence (0 unless both share a topic).
+    :param length: motors in the sequence.
+    :param q_open: q of a fully open gripper, rad, where 0 is closed; NaN for hands whose joints
+        have no such scale.
+    :param codec: translates its messages in ``dexkit serve``; None for a robot, which has none.
+    :param mode_byte: what the mode byte of a motor holds.
+    :param interface_specification: it is defined by the gripper's DDS interface specification:
+        gains, dq and tau of a command are not used, targets near an end go to the end, and a
+        state has no sign of force and no mode.
+    :param has_client: a client of Unitree's uses it.
+    :param zero_is_no_state: clients take a state of which every q is exactly 0 for no state
+        (docs/sources/unitree-dex.md#b1).
+    :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
+    :param torque_units: N·m in one unit of a motor's tau and tau_est; empty where all are in N·m.
+    """
+
+    name: str
+    model: str
+    cmd_topic: str
+    state_topic: str
+    cmd_type: str
+    state_type: str
+    index: dict[Side, int]
+    length: int
+    q_open: float
+    summary: str
+    codec: Lazy[type[DialectMap]] | None = None
+    mode_byte: ModeByte = ModeByte.UNUSED
+    interface_specification: bool = False
+    has_client: bool = True
+    zero_is_no_state: bool = False
+    low_rate_topic: str = ""
+    torque_units: tuple[float, ...] = ()
+
+    def topics(self, side: Side) -> tuple[str, str]:
+        """(command topic, state topic) of a side."""
+        return self.cmd_topic.format(side=side), self.state_topic.format(side=side)
+
+    @property
+    def is_gripper(self) -> bool:
+        """Whether its hand has one joint, whose q runs from 0, closed, to :attr:`q_open`."""
+        return not math.isnan(self.q_open)
+
+    @property
+    def gains_are_used(self) -> bool:
+        """Whether kp and kd of a command have an effect."""
+        return not self.interface_specification
+
+
+@dataclass(frozen=True)
+class PressureSensor:
+    """One sensor packet of a hand.
+
+    :param place: where it is.
+    :param slots: which of the packet's 12 values are sensor elements; the others hold "no value".
+    """
+
+    place: str
+    slots: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class JointRoles:
+    """Joints that the conformance stimulus uses, by index, for a hand of several joints.
+
+    :param driven: driven by a velocity when the commands stop.
+    :param slow: slowly on their way to a position when the commands stop.
+    :param crossed: two joints that get each other's id in the mode byte; the first is commanded to
+        move. Their limits are equal, so that a hand that goes by the id can move the other one.
+    """
+
+    driven: tuple[int, ...]
+    slow: tuple[int, ...]
+    crossed: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Finger:
+    """Joints of a drawn finger, one behind the other; lengths in px, y downward.
+
+    :param name: of the finger; sensor packets are found by it (``"thumb pad"``).
+    :param joints: their indices, from the palm outward.
+    :param start: place of the first joint, relative to the palm's centre.
+    :param step: from one joint to the next.
+    :param tip: from the last joint to the end, in steps.
+    :param root: from its beginning, which the palm may hide, to the first joint, in steps.
+    """
+
+    name: str
+    joints: range
+    start: tuple[float, float]
+    step: tuple[float, float]
+    tip: float
+    root: float = 0.4
+
+    def along(self, steps: float) -> tuple[float, float]:
+        """The place so many steps behind the first joint."""
+        (x, y), (dx, dy) = self.start, self.step
+        return x + steps * dx, y + steps * dy
+
+    @property
+    def end(self) -> tuple[float, float]:
+        """Where it ends."""
+        return self.along(len(self.joints) - 1 + self.tip)
+
+
+@dataclass(frozen=True)
+class HandLayout:
+    """How a hand of several joints is drawn; schematic, not to scale, lengths in px.
+
+    :param centres: x of the left and of the right hand.
+    :param top: y of the palm's centre on the sheet.
+    :param palm: its size.
+    :param width: of a finger.
+    :param fingers: of a left hand, the palm toward the reader.
+    :param palm_sensors: where the palm's sensor packets are.
+    """
+
+    centres: tuple[float, float]
+    top: float
+    palm: tuple[float, float]
+    width: float
+    fingers: tuple[Finger, ...]
+    palm_sensors: tuple[tuple[float, float], ...] = ()
+
+
+_FINGER_CLIENT: Lazy[type[TeleopClient]] = Lazy("dexkit.teleop.client:FingerClient")
+_FINGER_PROFILES: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = Lazy(
+    "dexkit.teleop.profiles:finger_profiles"
+)
+
+
+@dataclass(frozen=True)
+class HandModel:
+    """One hand model.
+
+    **On DDS.**
+
+    :param state_rate: Hz at which the vendor's service publishes state.
+    :param min_state_rate: Hz below which clients suffer.
+    :param command_rate: Hz at which xr_teleoperate sends commands.
+    :param command_timeout: seconds without a command after which the vendor's service brakes.
+    :param vendor_ids: id on the vendor's bus, for a hand of one motor.
+    :param client_gains: kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends, to every
+        joint that ``joint_gains`` does not name.
+    :param joint_gains: those that it sends to some joints, by index.
+    :param rest_q: where a simulated hand rests at first, per side, rad; never all zero, because
+        clients wait for a position that is not.
+    :param sensors: pressure sensor packets of a state, in order.
+    :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
+    :param shared_motors: joints that one motor moves, by index; the others have one each.
+    :param simulator: name of the backend that simulates it, with the setting ``object``; or empty.
+
+    **Teleoperation.**
+
+    :param client: model of the client that drives it.
+    :param operator_profiles: makes its operator profiles.
+    :param fingers: per joint, the finger whose motion it follows in an operator profile:
+        ``thumb``, ``middle`` or ``index``. Empty for a gripper.
+    :param client_forks: its client sends from a forked process, which a reader that starts later
+        does not receive.
+    :param client_note: what a user of its client has to know, or empty.
+
+    **Conformance kit.**
+
+    :param requirements: its requirement files; a relative path is one of dexkit's own.
+    :param script: its stimulus script.
+    :param roles: joints that the script uses; None for a gripper.
+    :param objects: where the hands of a pair that the kit starts have an object; percent of
+        opening for a gripper, of closing for others.
+    :param quick_seconds: seconds of stimulus of a quick run.
+    :param session: the recorded session to replay: name of a sample of dexkit, or path of a
+        recording; empty where there is none.
+    :param reference: service on a virtual clock that does everything right.
+    :param wrong_hands: of a model of another package, the wrong hands that prove its requirements:
+        (service, requirement that must fail, others that fail with it).
+
+    :param layout: how it is drawn; None for a gripper, and where no drawing is needed.
+    """
+
+    name: str
+    title: str
+    joints: dict[Side, tuple[JointSpec, ...]]
+    dialects: tuple[Dialect, ...]
+    state_rate: float
+    min_state_rate: float
+    command_rate: float
+    command_timeout: float
+    client_gains: tuple[float, float]
+    rest_q: dict[Side, tuple[float, ...]]
+    requirements: tuple[str | Path, ...]
+    script: Lazy[type[Script]]
+    reference: Lazy[type[Service]]
+    quick_seconds: float
+    vendor_ids: dict[Side, int] = field(default_factory=dict)
+    sensors: tuple[PressureSensor, ...] = ()
+    low_rate: float = 0.0
+    joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
+    shared_motors: tuple[tuple[int, ...], ...] = ()
+    simulator: str = ""
+    client: Lazy[type[TeleopClient]] = _FINGER_CLIENT
+    operator_profiles: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = _FINGER_PROFILES
+    fingers: tuple[str, ...] = ()
+    client_forks: bool = False
+    client_note: str = ""
+    roles: JointRoles | None = None
+    objects: Mapping[Side, float] = field(default_factory=dict)
+    session: str | Path = ""
+    wrong_hands: Lazy[Sequence[WrongHand]] | None = None
+    layout: HandLayout | None = None
+
+    @property
+    def short_name(self) -> str:
+        """The name without the vendor's revision: ``dex3`` of ``dex3-1``."""
+        return self.name.partition("-")[0]
+
+    @property
+    def gains(self) -> tuple[tuple[float, float], ...]:
+        """(kp, kd) that xr_teleoperate sends to each joint."""
+        count = len(self.joints[Side.LEFT])
+        return tuple(self.joint_gains.get(i, self.client_gains) for i in range(count))
+
+    @property
+    def motors(self) -> tuple[tuple[int, ...], ...]:
+        """The joints of each motor, by index, in the order of the joints."""
+        shared = {i: group for group in self.shared_motors for i in group}
+        count = len(self.joints[Side.LEFT])
+        return tuple(dict.fromkeys(shared.get(i, (i,)) for i in range(count)))
+
+    def spec(
+        self,
+        side: Side,
+        *,
+        io_rate: float,
+        exchange_timeout: float = 0.1,
+        simulated: bool = False,
+    ) -> HandSpec:
+        """The specification of a hand of this model."""
+        return HandSpec(
+            model=self.name,
+            side=side,
+            joints=self.joints[side],
+            io_rate=io_rate,
+            exchange_timeout=exchange_timeout,
+            n_sensors=len(self.sensors),
+            simulated=simulated,
+        )

@@ -1,0 +1,66 @@
+"""Entry points of installed packages: who registered what, and loading it with clear errors."""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from importlib import metadata
+
+from dexkit.errors import DexkitError
+
+__all__ = ["entry_points", "import_object", "is_own", "origin", "where"]
+
+_OWN_DISTRIBUTION = "dexkit"
+
+
+def entry_points(group: str) -> list[metadata.EntryPoint]:
+    """Every entry point of a group."""
+    return list(metadata.entry_points(group=group))
+
+
+def origin(entry: metadata.EntryPoint) -> str:
+    """Name and version of the distribution that registered it."""
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "unknown"
+
+
+def is_own(entry: metadata.EntryPoint) -> bool:
+    """Whether dexkit itself registered it."""
+    return entry.dist is not None and entry.dist.name.lower() == _OWN_DISTRIBUTION
+
+
+def where(error: BaseException) -> str:
+    """File and line that raised an error."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"at {frame.filename}:{frame.lineno}"
+
+
+def import_object(target: str, error_class: type[DexkitError], *, hint: str) -> object:
+    """The object at ``package.module:attribute``.
+
+    :param error_class: raised, naming the cause, when it cannot be imported.
+    :param hint: what the target should be, for an attribute that is not there.
+    """
+    module_name, _, attribute = target.partition(":")
+    try:
+        value: object = importlib.import_module(module_name)
+    except Exception as error:  # a plug-in may raise anything while it is imported
+        raise error_class(
+            f"cannot load {target}: {type(error).__name__}: {error}",
+            hint=_import_hint(error, module_name),
+        ) from error
+    for part in attribute.split("."):
+        if not hasattr(value, part):
+            raise error_class(
+                f"cannot load {target}: there is no {part!r} in {module_name}", hint=hint
+            )
+        value = getattr(value, part)
+    return value
+
+
+def _import_hint(error: Exception, module_name: str) -> str:
+    if isinstance(error, ModuleNotFoundError):
+        missing = error.name or ""
+        if module_name == missing or module_name.startswith(f"{missing}."):
+            return "is it installed in this environment, or in the working directory?"
+        return f"{module_name} needs it: is it installed in this environment?"
+    return where(error)

@@ -1,0 +1,1 @@
+"""An invented two-finger hand, as its vendor would add it to dexkit."""

@@ -1,0 +1,37 @@
+"""Wrong hands of this vendor's own: each has one fault, which one requirement must find.
+
+dexkit tries its own as well: a fault that breaks a requirement which one of ours is ``like`` is put
+into our reference service.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dexkit.conformance.virtual.fingers import FingerHand
+from twofinger_hand.reference import TwoFingerService
+
+__all__ = ["WRONG_HANDS"]
+
+
+class SwapsFingers(TwoFingerService):
+    """Publishes the index finger's joints before the thumb's."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["values"] = motors["values"][[3, 4, 5, 0, 1, 2]]
+
+
+class Degrees(TwoFingerService):
+    """Publishes q in degrees."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["q"] *= 57.3
+
+
+WRONG_HANDS = (
+    (SwapsFingers, "TWOFINGER-JOINT-01", ()),
+    (Degrees, "TWOFINGER-FIELD-03", ()),
+)
+"""(Wrong hand, requirement that must fail, requirements that cannot but fail with it)."""
