@@ -90,7 +90,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
             self.set()
 
     monkeypatch.setattr("dexkit.dds.DdsNode", NoNode)
-    monkeypatch.setattr("dexkit.doctor.dds.look", lambda *a, **k: ())
+    monkeypatch.setattr("dexkit.doctor.dds.observe_domains", lambda *a, **k: ())
     monkeypatch.setattr("dexkit.doctor.environment._import_problem", lambda module: "")
     monkeypatch.setattr("dexkit.stop_signals.StopRequest", Ended)
 

@@ -143,16 +143,13 @@ def force_option() -> Callable[[F], F]:
 def side_option(
     help: str, *, default: str | None = None, required: bool = False
 ) -> Callable[[F], F]:
-    """``--side``, as a tuple ``sides`` of :class:`~dexkit.hand.Side`."""
-    return click.option(
-        "--side",
-        "sides",
-        type=_Sides(),
-        default=default,
-        required=required,
-        show_default=default is not None,
-        help=help,
-    )
+    """``--side``, as a tuple ``sides`` of :class:`~dexkit.hand.Side`.
+
+    :param default: None for none, and for no default in ``--help``.
+    """
+    # an explicit default of None would count as a value for required (click 8.3)
+    given: dict[str, Any] = {} if default is None else {"default": default, "show_default": True}
+    return click.option("--side", "sides", type=_Sides(), required=required, help=help, **given)
 
 
 def set_option(help: str) -> Callable[[F], F]:
