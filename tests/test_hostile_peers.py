@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dexkit.child_processes import process_id
 from dexkit.dds import DdsNode, Participant
-from dexkit.doctor.dds import _participant, look
+from dexkit.doctor.dds import _participant, observe_domains
 from dexkit.doctor.rtps import ParticipantData
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
@@ -200,7 +200,7 @@ def test_doctor_reads_every_hostile_announcement() -> None:
             )
             assert _participant(data, "lo").pid == 0
         node.writer(STATE, STATE_TYPE)
-        (view,) = look([domain], seconds=0.1)
+        (view,) = observe_domains([domain], seconds=0.1)
     assert any(e.topic == STATE for e in view.endpoints)
 
 
