@@ -15,10 +15,10 @@ import numpy as np
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.verdicts import Judgement, excuse
-from dexkit.conformance.view import Recording
 from dexkit.hand import Side
 
 __all__ = ["judge", "judge_layer"]

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from dexkit.conformance.judge import judge, judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.evidence import evidence
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.plots import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
@@ -23,7 +24,6 @@ from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import mutants as usb_mutants
 from dexkit.conformance.usb.virtual import run_virtual as run_usb
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path

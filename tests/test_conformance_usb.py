@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dexkit.conformance.backend_processes import Tool
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.processes import Tool
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.requirements.page import BEGIN, END
 from dexkit.conformance.results import Verdict
@@ -35,9 +35,9 @@ from dexkit.conformance.usb.record import (
     UsbRecord,
     topic,
 )
+from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
 from dexkit.conformance.usb.script import BUSES, DAMAGES
-from dexkit.conformance.usb.view import UsbRecording
 from dexkit.conformance.usb.virtual import ReferenceDevice, run_virtual
 from dexkit.errors import ConformanceError, TraceUnsupported
 from dexkit.hand import Side
@@ -219,7 +219,7 @@ def test_what_failed_is_said_with_its_place() -> None:
 
 
 def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
-    from dexkit.conformance.phases import Beats
+    from dexkit.conformance.stimulus_record import Beats
 
     recording = run_virtual(BY_NAME["Slow"].device(Side.LEFT))
     hand = recording.sides[Side.LEFT]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
-from dexkit.conformance.view import joints_of
+from dexkit.conformance.recording import joints_of
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]

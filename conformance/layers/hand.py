@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.layers import Layer, claimed, not_blocked
+from dexkit.conformance.recording import Recording, SideView
 from dexkit.conformance.results import Result
 from dexkit.conformance.verdicts import Judgement
-from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
 __all__ = ["LAYER", "applies_to_dialect", "recorded", "subjects", "whole", "with_silence"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dexkit.conformance.checks.robot import RobotContext
 from dexkit.conformance.layers import Layer, claimed, hand, not_blocked
+from dexkit.conformance.recording import SideView
 from dexkit.conformance.robot import RobotRecording
-from dexkit.conformance.view import SideView
 
 __all__ = ["LAYER"]
 

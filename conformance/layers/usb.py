@@ -5,7 +5,7 @@ from __future__ import annotations
 from dexkit.conformance.layers import Layer, claimed, not_blocked
 from dexkit.conformance.results import Result
 from dexkit.conformance.usb.checks import UsbContext
-from dexkit.conformance.usb.view import UsbRecording, UsbSide
+from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.conformance.verdicts import Judgement
 
 __all__ = ["LAYER"]
