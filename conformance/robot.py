@@ -1,4 +1,4 @@
-"""A robot as the kit sees it: its dialect, its messages, and a recording of it.
+"""Robots in the conformance kit: their dialect, messages with a CRC, and decoded recordings.
 
 A robot has no sides: where a hand has a side, it has
 :data:`~dexkit.conformance.stimulus_record.ROBOT`. Its joints are those of the used motor slots, in
@@ -45,7 +45,7 @@ Flags = NDArray[np.bool_]
 
 @cache
 def robot_dialect(name: str) -> Dialect:
-    """How a robot speaks, in the form that hands have.
+    """A robot's topics and types as a dialect.
 
     :raises UsageError: there is no such robot.
     """
@@ -79,16 +79,11 @@ class RobotWire(Wire):
     """
 
     def __init__(self, dialect: Dialect) -> None:
-        self.dialect = dialect
         self.robot: RobotModel = robot(dialect.model)
-        self.joints = len(self.robot.used)
-        self.command = message_type(dialect.cmd_type)
-        self.state = message_type(dialect.state_type)
         other = next(b for b in ROBOTS.values() if b.family != self.robot.family)
-        self.foreign = message_type(other.cmd_type)
-        self.command_topics = {ROBOT: dialect.cmd_topic}
-        self.state_topics = {ROBOT: dialect.state_topic}
-        self.shared = False
+        super().__init__(
+            dialect, joints=len(self.robot.used), foreign=other.cmd_type, subjects=(ROBOT,)
+        )
         self.machine = 0
 
     def read_state(
@@ -153,8 +148,8 @@ class RobotRecording(Recording):
     layer = "robot"
 
     @property
-    def model(self) -> Any:
-        """The robot: it has a model's name, title and rates."""
+    def model(self) -> RobotModel:
+        """The robot's model."""
         return self.robot
 
     @cached_property
