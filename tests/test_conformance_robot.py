@@ -317,6 +317,13 @@ def test_hands_come_first_and_the_robot_is_mentioned(tmp_path: Path) -> None:
         recording_of(open_trace(path), "g1", (Side.LEFT,))
 
 
+def test_a_stimulus_record_of_an_earlier_version_is_read() -> None:
+    record = listened("h1").metadata["dexkit.stimulus"]
+    earlier = {name: text.replace('"robot"', '"body"') for name, text in record.items()}
+    assert earlier != record
+    assert Stimulus.from_metadata(earlier).to_metadata() == record
+
+
 def test_the_requirements_are_listed_without_a_recording() -> None:
     result = CliRunner().invoke(command, ["--list", "--dialect", "h1", "--level", "must"])
     assert result.exit_code == 0
