@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 
-from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.hand import Side
 from dexkit.models import model
 from dexkit.robots import ROBOTS

@@ -6,8 +6,8 @@ import warnings
 
 import pytest
 
+from dexkit.conformance.backend_processes import SIMULATED
 from dexkit.conformance.plugin import OPTIONS_KEY, REPORTED_KEY
-from dexkit.conformance.processes import SIMULATED
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.hand import Side

@@ -13,9 +13,12 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.check import command
-from dexkit.conformance.checks.robot import robot_checks
+from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.live import LiveOptions, record_run
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.robot import (
     MUTANTS,
     CdrCrc,
@@ -24,23 +27,20 @@ from dexkit.conformance.mutants.robot import (
     WaitsForCommands,
     run_robot_mutant,
 )
-from dexkit.conformance.phases import ROBOT, Stimulus
-from dexkit.conformance.processes import RigOptions
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.robot import (
     SPOILS,
     RobotWire,
-    recording_of,
     robot_dialect,
     robot_in,
     robot_recording,
 )
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
+from dexkit.conformance.stimulus_record import ROBOT, Stimulus
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
-from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import decode
@@ -119,11 +119,11 @@ def test_a_good_robot_passes_everything(name: str) -> None:
 
 def _one_of_each() -> list[RobotMutant]:
     """A wrong robot for each check of a MUST, and what only a G1 has."""
-    checks, level = robot_checks(), {r.id: r.level for r in catalogue(None, "robot")}
+    by_id = {r.id: r for r in catalogue(None, "robot")}
     found: dict[object, RobotMutant] = {}
     for mutant in MUTANTS:
-        if level[mutant.kills] is Level.MUST and mutant.model == "h1":
-            found.setdefault(checks[mutant.kills], mutant)
+        if by_id[mutant.kills].level is Level.MUST and mutant.model == "h1":
+            found.setdefault(check_of(by_id[mutant.kills]), mutant)
     only_g1 = [m for m in MUTANTS if m.kills in ("G1-MACH-01", "G1-SAFE-05", "G1-SAFE-03")]
     return [*found.values(), *only_g1]
 
@@ -137,7 +137,7 @@ def test_a_wrong_robot_is_caught(mutant: RobotMutant) -> None:
 def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> None:
     every = catalogue(name, "robot")
     assert {m.kills for m in MUTANTS if m.model == name} == {r.id for r in every}
-    assert {r.id for r in every} <= set(robot_checks())
+    assert all(check_of(r) for r in every)
     negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
     negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
     found = [r for r in every if r.id.partition("-")[2].startswith(negative)]
@@ -305,6 +305,13 @@ def test_hands_come_first_and_the_robot_is_mentioned(tmp_path: Path) -> None:
     assert "DEX1" not in robot.output
     with pytest.raises(UsageError, match="no sides"):
         recording_of(open_trace(path), "g1", (Side.LEFT,))
+
+
+def test_a_stimulus_record_of_an_earlier_version_is_read() -> None:
+    record = listened("h1").metadata["dexkit.stimulus"]
+    earlier = {name: text.replace('"robot"', '"body"') for name, text in record.items()}
+    assert earlier != record
+    assert Stimulus.from_metadata(earlier).to_metadata() == record
 
 
 def test_the_requirements_are_listed_without_a_recording() -> None:

@@ -154,13 +154,13 @@ class Packages:
 def forget() -> None:
     """What was found out about installed packages."""
     from dexkit import lazy
-    from dexkit.conformance import checks, requirements, selection
+    from dexkit.conformance import requirements, selection
 
     importlib.invalidate_caches()
     dexkit.models._plugins = None
     for cached in (
         *(requirements.catalogue, requirements._files, requirements._requirements),
-        *(requirements._document, selection.length, mutants, checks.all_checks, lazy._load),
+        *(requirements._document, selection.length, mutants, lazy._load),
     ):
         cached.cache_clear()
 

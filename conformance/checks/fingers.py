@@ -14,9 +14,9 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
-from dexkit.conformance.wire import Wire
+from dexkit.conformance.motor_messages import Wire
 from dexkit.hand import Floats, JointMode
-from dexkit.models import JointRoles, model
+from dexkit.models import HandModel, JointRoles, model
 
 _SLOTS = 12  # of a PressSensorState_
 
@@ -191,9 +191,11 @@ def attitude(ctx: Context) -> Outcome:
 
 def _roles(ctx: Context) -> JointRoles:
     """The joints that the stimulus uses."""
-    roles = ctx.recording.model.roles
-    assert roles is not None  # a profile of several joints has them
-    return roles
+    hand = ctx.recording.model
+    # a profile of several joints has them
+    assert isinstance(hand, HandModel)
+    assert hand.roles is not None
+    return hand.roles
 
 
 def _modes(ctx: Context, rows: slice = slice(None)) -> NDArray[np.intp]:

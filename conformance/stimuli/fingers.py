@@ -48,8 +48,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Script, Steps
-from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
 from dexkit.models import JointRoles
 

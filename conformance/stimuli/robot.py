@@ -34,7 +34,7 @@ from dataclasses import replace
 from functools import partial
 
 from dexkit.command_age import PAUSE
-from dexkit.conformance.phases import ROBOT, Phase
+from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.robot import SPOILS, RobotWire
 from dexkit.conformance.stimuli.script import (
     Join,
@@ -48,7 +48,7 @@ from dexkit.conformance.stimuli.script import (
     Send,
     Steps,
 )
-from dexkit.conformance.wire import Motor, Motors
+from dexkit.conformance.stimulus_record import ROBOT, Phase
 from dexkit.hand import Side
 from dexkit.robots import robot
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from dexkit.command_age import PAUSE
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.motor_messages import Motor, Motors, Wire
+from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli.operator import OPERATOR, operate
 from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.view import joints_of
-from dexkit.conformance.wire import Motor, Motors, Wire
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side
 from dexkit.models import Dialect, HandModel, model
 

@@ -36,6 +36,8 @@ RECORD = "dexkit.stimulus"
 VERSION = 1
 ROBOT = cast(Side, "robot")
 """What a whole robot has where a hand has its side."""
+_EARLIER_ROBOT = "body"
+"""The same in recordings of earlier versions."""
 IDLE = 1e-3
 """Seconds by which timers are late on a machine that has nothing else to do."""
 
@@ -213,7 +215,7 @@ class Stimulus:
 
 
 def _side(name: str) -> Side:
-    return ROBOT if name == ROBOT else Side(name)
+    return ROBOT if name in (ROBOT, _EARLIER_ROBOT) else Side(name)
 
 
 def _joints(value: Any) -> dict[int, float]:

@@ -1,0 +1,114 @@
+"""The layers at which a device is judged: a hand's DDS topics, a robot's DDS topics, a hand's USB.
+
+A :class:`Layer` is the data by which the one engine (:mod:`dexkit.conformance.judge`) goes from a
+recording to verdicts. Each layer is in a module of its own, imported when it is asked for:
+
+* :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
+* :mod:`~dexkit.conformance.layers.robot`: ``robot``, the low-level DDS topics of robots;
+* :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from dexkit.conformance.checks import BaseContext, Outcome
+from dexkit.conformance.recording import Recording, TraceLike
+from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.results import Result
+from dexkit.conformance.robot import robot_in
+from dexkit.conformance.verdicts import Judgement
+from dexkit.robots import ROBOTS
+from dexkit.topics import HAND_TOPICS
+
+if TYPE_CHECKING:
+    from dexkit.hand import Side
+
+__all__ = ["Layer", "Precondition", "claimed", "layer", "not_blocked", "recording_of"]
+
+
+RecordingT = TypeVar("RecordingT")
+ViewT = TypeVar("ViewT")
+ContextT = TypeVar("ContextT", bound=BaseContext[Any, Any])
+
+Precondition = Callable[[Judgement, ContextT], "Result | None"]
+"""The result, where a requirement is not to be checked at all."""
+
+
+@dataclass(frozen=True)
+class Layer(Generic[RecordingT, ViewT, ContextT]):
+    """How one layer is judged.
+
+    :param name: one of :data:`~dexkit.conformance.requirements.LAYERS`; it selects the catalogue
+        and, in :data:`~dexkit.conformance.checks.CHECK_MODULES`, the checks.
+    :param decode: a recording's part that is about the layer; None where there is none. It takes
+        the recording, the dialect's name (None for the one that the topics show) and the
+        subjects to be judged (none for all that are there).
+    :param subjects: the part of a recording that is about each subject to be judged.
+    :param context: what a check of the layer gets.
+    :param preconditions: what is asked before the check, in this order; the first that has a
+        result decides.
+    :param refine: adds to an outcome what the recording says beside the check.
+    :param whole: begin and end of the recording, seconds, as the place of failures that have
+        none; None where such a failure cannot be excused by a busy machine.
+    :param script: the stimulus script of a model, by the model's name.
+    :param reference: the simulated device of a model that meets every requirement, likewise.
+    """
+
+    name: str
+    decode: Callable[[TraceLike, str | None, Sequence[Side]], RecordingT | None]
+    subjects: Callable[[RecordingT], Mapping[Side, ViewT]]
+    context: Callable[[RecordingT, ViewT, Requirement], ContextT]
+    preconditions: Sequence[Precondition[ContextT]]
+    refine: Callable[[ContextT, Outcome], Outcome]
+    whole: Callable[[RecordingT], tuple[float, float] | None]
+    script: Callable[[str], type]
+    reference: Callable[[str], type]
+
+    def requirements(self, model: str | None = None) -> tuple[Requirement, ...]:
+        """The layer's requirements, in their order.
+
+        :param model: only those of that model; None for all.
+        """
+        return catalogue(model, self.name)
+
+
+_MODULES = {"dds": "hand", "robot": "robot", "usb": "usb"}
+
+
+def layer(name: str) -> Layer[Any, Any, Any]:
+    """The layer of that name, one of :data:`~dexkit.conformance.requirements.LAYERS`."""
+    module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+    found: Layer[Any, Any, Any] = module.LAYER
+    return found
+
+
+def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
+    """Decode a recording of hands or of a robot.
+
+    :param dialect_name: None to take what the topics show: hands, if there are any.
+    :raises ConformanceError: it has none of their topics.
+    :raises UsageError: sides of a robot.
+    :raises TraceUnsupported: its stimulus record cannot be read.
+    """
+    name = dialect_name
+    if name is None:
+        topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
+        found = None if topics & HAND_TOPICS else robot_in(trace)
+        name = found.name if found else None
+    recording = layer("robot" if name in ROBOTS else "dds").decode(trace, name, sides)
+    assert isinstance(recording, Recording), "only USB may be missing from a recording"
+    return recording
+
+
+def claimed(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
+    """A precondition: the vendor does not disclaim the unit that the requirement is about."""
+    return judgement.not_claimed()
+
+
+def not_blocked(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
+    """A precondition: nothing has failed that the requirement depends on."""
+    return judgement.blocked()
