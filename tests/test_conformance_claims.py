@@ -12,7 +12,7 @@ import dexkit.conformance
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.report.wording import hand_name
+from dexkit.conformance.report.labels import hand_name
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.verdicts import Excuse, Judgement

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
-from dexkit.conformance.report.evidence import evidence
+from dexkit.conformance.report.charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.html import render
-from dexkit.conformance.report.plots import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
-from dexkit.conformance.report.wording import VERDICTS
+from dexkit.conformance.report.labels import VERDICTS
+from dexkit.conformance.report.result_plots import evidence
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import mutants as usb_mutants

@@ -12,9 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from dexkit.conformance.report.evidence import evidence
-from dexkit.conformance.report.overview import overview
-from dexkit.conformance.report.wording import (
+from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,
@@ -29,6 +27,8 @@ from dexkit.conformance.report.wording import (
     subject,
     whose,
 )
+from dexkit.conformance.report.result_plots import evidence
+from dexkit.conformance.report.run_plots import overview
 from dexkit.conformance.requirements import CAPABILITIES, Requirement
 from dexkit.conformance.results import (
     Evidence,

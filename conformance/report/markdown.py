@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from dexkit.conformance.report.wording import (
+from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,

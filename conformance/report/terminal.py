@@ -9,7 +9,7 @@ import rich.markup
 from rich.table import Table
 from rich.text import Text
 
-from dexkit.conformance.report.wording import about_harness, causes
+from dexkit.conformance.report.labels import about_harness, causes
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape

@@ -97,7 +97,7 @@ def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
 
     :raises UsageError: the one that was named is not the one that was judged.
     """
-    from dexkit.conformance.report.wording import moment
+    from dexkit.conformance.report.labels import moment
     from dexkit.conformance.view import Recording
     from dexkit.hand import Side
     from dexkit.traces import open_trace

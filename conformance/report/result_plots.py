@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.conformance.phases import Phase
-from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, histogram
-from dexkit.conformance.report.wording import whose
+from dexkit.conformance.report.charts import Band, Level, Line, Range, chart, histogram
+from dexkit.conformance.report.labels import whose
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence, Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
