@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from dexkit.conformance.judge import judge
 from dexkit.conformance.phases import RECORD, Phase, Stimulus
 from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Overall, RunResult, Verdict, read_json, worst
+from dexkit.conformance.result_file import read_json
+from dexkit.conformance.results import Overall, RunResult, Verdict, worst
 from dexkit.conformance.view import Recording, detect_dialect, sides_of
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError

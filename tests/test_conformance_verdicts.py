@@ -34,7 +34,7 @@ MOVE = BY_ID["DEX1-MOVE-02"]  # not of real time
 
 def blame(outcome: Outcome) -> Excuse:
     """The machine has nothing to do with it."""
-    return Excuse(False)
+    return Excuse()
 
 
 IDLE = Lost(0.0, 0.0, 0.0)

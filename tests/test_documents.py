@@ -18,7 +18,7 @@ from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.phases import RECORD, Stimulus
-from dexkit.conformance.results import read_json
+from dexkit.conformance.result_file import read_json
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.drivers.ezgripper.config import Store
 from dexkit.errors import DexkitError, OutputError, UsageError

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 from dexkit.conformance.phases import Phase
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.view import Commands, Recording, SideView, States
@@ -69,6 +70,10 @@ class Outcome:
         tell; else as late as the failure's place is long.
     :param absent: the hand does not do this at all: a failure of who claims the unit, whatever
         ``met`` is for others.
+    :param joints: indices of the joints that it is about, the most important first; empty if it is
+        about none in particular.
+    :param plots: what shows it, where that is not what the requirement names.
+    :param retry: another run may come to another finding.
     """
 
     met: bool | None
@@ -80,6 +85,18 @@ class Outcome:
     cause: str = ""
     late: Late | None = None
     absent: bool = False
+    joints: tuple[int, ...] = ()
+    plots: tuple[Plot, ...] = ()
+    retry: bool = False
+
+    def about(self, *joints: int) -> Outcome:
+        """The same, about these joints (indices)."""
+        return replace(self, joints=tuple(int(joint) for joint in joints))
+
+    def shown_by(self, *plots: PlotKind | Plot) -> Outcome:
+        """The same, with plots of its own instead of the requirement's."""
+        chosen = tuple(Plot(p) if isinstance(p, PlotKind) else p for p in plots)
+        return replace(self, plots=chosen)
 
     def because(self, cause: str) -> Outcome:
         """The same, with a cause that the check could tell from what it saw."""

@@ -12,12 +12,11 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
+from dexkit.conformance.report.card import Blocked, Card, Fact, blocked_groups, cards
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,
-    by_gravity,
-    causes,
     hand_name,
     model_title,
     moment,
@@ -27,8 +26,8 @@ from dexkit.conformance.report.labels import (
     subject,
     whose,
 )
-from dexkit.conformance.report.result_plots import evidence
-from dexkit.conformance.report.run_plots import overview
+from dexkit.conformance.report.result_plots import plots_of
+from dexkit.conformance.report.run_plots import run_plots
 from dexkit.conformance.requirements import CAPABILITIES, Requirement
 from dexkit.conformance.results import (
     Evidence,
@@ -100,7 +99,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _areas(result),
         _troubles(result, view, link),
         _operator(result),
-        overview(result, view) if view is not None else "",
+        run_plots(result, view) if view is not None else "",
         _requirements(result, link),
         _what(result),
         _glossary(result),
@@ -246,26 +245,19 @@ def _anchor(text: str) -> str:
 
 def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
     """A card for each requirement that is not met, then what that kept from being judged."""
-    groups = [
-        (need, [r for r in group if r.verdict in _TROUBLE])
-        for need, group in result.by_requirement()
-    ]
-    full = [(n, [r for r in g if not r.blocked_by]) for n, g in groups]
-    full = by_gravity(result, ((need, group) for need, group in full if group), _TROUBLE)
-    blocked = [r for _, group in groups for r in group if r.blocked_by]
-    if not full and not blocked:
+    found = cards(result, _TROUBLE)
+    blocked = [group for group in blocked_groups(result.results) if group.before]
+    if not found and not blocked:
         return ""
     plots = _Plots(view)
-    cards = [_card(need, group, plots, link) for need, group in full]
-    worst_of_all = worst(r.verdict for _, group in full for r in group) if full else None
+    worst_of_all = worst(card.verdict for card in found) if found else Verdict.BLOCKED
     head = {
         Verdict.WARN: "What could be better, and what to try",
         Verdict.BLOCKED: "What could not be judged",
-    }.get(worst_of_all or Verdict.BLOCKED, "What is wrong, and what to try")
-    parts = [f"<h2>{head}</h2>{''.join(cards)}"]
-    if blocked:
-        parts.append(_blocked(blocked))
-    if view is None and full:
+    }.get(worst_of_all, "What is wrong, and what to try")
+    parts = [f"<h2>{head}</h2>", *(_card(card, plots, link) for card in found)]
+    parts += [_blocked(group) for group in blocked]
+    if view is None and found:
         parts.append(
             '<p class="dim">Plots of the evidence need the recording: '
             "<code>dexkit report RESULT.json --recording RUN.mcap --report REPORT.html</code></p>"
@@ -285,42 +277,32 @@ class _Plots:
             return ""
         if self._left <= 0:
             return '<p class="dim">No plot: this page has as many as it can hold.</p>'
-        figures = "".join(evidence(result, self._view))
+        figures = "".join(plots_of(result, self._view))
         self._left -= len(figures)
         return figures
 
 
-def _card(need: Requirement, group: list[Result], plots: _Plots, link: str) -> str:
-    word = VERDICTS[worst(r.verdict for r in group)]
-    sides = " and ".join(r.side for r in group)
-    rows = [("required", f"{escape(need.sentence)} <span class='dim'>{need.level}</span>")]
-    if group[0].expected != need.sentence:
-        rows.append(("expected", escape(group[0].expected)))
-    for entry in group:
-        seen = escape(entry.observed or entry.reason)
-        if entry.observed and entry.reason:
-            seen += f"<br><span class='dim'>{escape(entry.reason)}</span>"
-        name = "observed" if len(group) == 1 else f"observed, {escape(entry.side)}"
-        rows.append((name, seen))
-        if entry.evidence:
-            name = "where" if len(group) == 1 else f"where, {escape(entry.side)}"
-            rows.append((name, "".join(_place(e, link) for e in entry.evidence)))
-    found = causes(group)
-    for who, cause in found:
-        name = "likely cause" if len(found) == 1 else f"likely cause, {escape(who)}"
-        rows.append((name, escape(cause)))
-    rows.append(("what to try", escape(need.advice)))
-    rows.append(("source", _source(need)))
-    facts = "".join(f"<dt>{k}</dt><dd>{v}</dd>" for k, v in rows)
-    figures = "".join(plots.of(entry) for entry in group)
-    if figures and all(r.verdict is Verdict.BLOCKED for r in group):
+def _card(card: Card, plots: _Plots, link: str) -> str:
+    need, word = card.requirement, VERDICTS[card.verdict]
+    facts = "".join(
+        f"<dt>{_label(fact)}</dt><dd>"
+        + (_place(fact.place, link) if fact.place is not None else escape(fact.text, quote=False))
+        + "</dd>"
+        for fact in card.facts()
+    )
+    figures = "".join(plots.of(result) for result in card.results)
+    if figures and card.verdict is Verdict.BLOCKED:
         figures = f"<details><summary>What was seen</summary>{figures}</details>"
     return (
         f'<article class="card {word.css}" id="card-{escape(need.id)}">'
         f'<h3><b class="{word.css}">{word.text}</b> {escape(need.title)} '
-        f'<code>{escape(need.id)}</code> <span class="dim">{escape(sides)}</span></h3>'
+        f'<code>{escape(need.id)}</code> <span class="dim">{escape(card.sides)}</span></h3>'
         f'<dl class="facts">{facts}</dl>{figures}</article>'
     )
+
+
+def _label(fact: Fact) -> str:
+    return f"{fact.item.label}, {escape(fact.sides)}" if fact.sides else fact.item.label
 
 
 def _place(place: Evidence, link: str) -> str:
@@ -335,28 +317,20 @@ def _place(place: Evidence, link: str) -> str:
     )
 
 
-def _blocked(blocked: list[Result]) -> str:
-    groups: dict[str, list[Result]] = {}
-    for entry in blocked:
-        groups.setdefault(entry.blocked_by, []).append(entry)
-    parts = []
-    for before, group in groups.items():
-        names: dict[str, list[Result]] = {}
-        for entry in group:
-            names.setdefault(entry.requirement.id, []).append(entry)
-        rows = "".join(
-            f"<li><a href='#{escape(name)}'><code>{escape(name)}</code></a> "
-            f"{escape(entries[0].requirement.title)} "
-            f'<span class="dim">{escape(", ".join(e.side for e in entries))}</span></li>'
-            for name, entries in names.items()
-        )
-        parts.append(
-            f'<article class="card open"><h3><b class="open">blocked</b> by '
-            f"<a href='#{escape(before)}'><code>{escape(before)}</code></a></h3>"
-            "<p>Not judged, because that has to be right first:</p>"
-            f"<ul>{rows}</ul></article>"
-        )
-    return "".join(parts)
+def _blocked(blocked: Blocked) -> str:
+    before = escape(blocked.before)
+    rows = "".join(
+        f"<li><a href='#{escape(card.requirement.id)}'><code>{escape(card.requirement.id)}</code>"
+        f"</a> {escape(card.requirement.title)} "
+        f'<span class="dim">{escape(", ".join(r.side for r in card.results))}</span></li>'
+        for card in blocked.cards
+    )
+    return (
+        f'<article class="card open"><h3><b class="open">blocked</b> by '
+        f"<a href='#{before}'><code>{before}</code></a></h3>"
+        "<p>Not judged, because that has to be right first:</p>"
+        f"<ul>{rows}</ul></article>"
+    )
 
 
 def _operator(result: RunResult) -> str:
@@ -421,14 +395,9 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         f"{cells}</summary>"
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
         f"<p>{escape(need.rationale)}</p>"
-        f'<p class="dim">Source: {_source(need)}</p>'
+        f'<p class="dim">Source: {escape(Card.of(group).source, quote=False)}</p>'
         "</div></details>"
     )
-
-
-def _source(need: Requirement) -> str:
-    """Who says so, and how sure that is."""
-    return f"{escape(need.source, quote=False)} (confidence: {escape(need.confidence)})"
 
 
 def _cell(result: Result) -> str:

@@ -1,23 +1,18 @@
-"""The evidence of a result as plots: chosen by what its requirement is about.
-
-No list of ids decides: the requirement's layer, the stimulus it needs and the names of its
-tolerances say what a person wants to see. Every figure is drawn from the recording that was
-judged; :func:`evidence` returns none where it shows nothing of it.
-"""
+"""The plots that a result names (:mod:`dexkit.conformance.plots`), drawn from its recording."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dexkit.conformance.phases import Phase
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.report.charts import Band, Level, Line, Range, chart, histogram
 from dexkit.conformance.report.labels import whose
 from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Evidence, Result
+from dexkit.conformance.results import Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.conformance.usb.frames import NO_VALUE
 from dexkit.conformance.usb.record import Transfer
@@ -27,7 +22,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import Floats, JointSpec, Side
 from dexkit.untrusted import html as escape
 
-__all__ = ["PHASES", "command_and_state", "evidence", "operated", "phase_bands"]
+__all__ = ["PHASES", "command_and_state", "operated", "phase_bands", "plots_of"]
 
 PHASES = {
     "listen": "listen",
@@ -61,23 +56,22 @@ _LONGEST = 8.0
 """Seconds of a plot about a place in the recording."""
 _MOST_ROWS = 24
 _FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m"}
-_PATH = re.compile(r"[A-Za-z_]\w*(?:\[\d+\])?(?:\.\w+(?:\[\d+\])?)+|\w+_[av]\b")
-"""The path of a message's member in a sentence, as checks write it."""
 
 
-def evidence(result: Result, view: Recording) -> list[str]:
-    """Figures for one result, as HTML."""
-    need = result.requirement
-    if need.layer == "usb":
-        return _usb(result, view.usb) if view.usb is not None else []
+def plots_of(result: Result, view: Recording) -> list[str]:
+    """The plots that the result names, as HTML; those that show nothing of it are left out.
+
+    A hand without any state has nothing to plot: what discovery saw is shown instead.
+    """
+    if result.requirement.layer == "usb":
+        return _usb_plots(result, view.usb) if view.usb is not None else []
     side = next((s for s in view.sides if str(s) == result.side), None)
     if side is None:
         return []
     scene = _Scene(result, view, view.sides[side])
-    bare = need.needs in ("nothing", "endpoints") or need.area == "Discovery"
-    if bare or not len(scene.hand.states):
+    if not len(scene.hand.states):
         return [_endpoints(scene)]
-    return [figure for figure in _by_kind(scene) if figure]
+    return [figure for plot in result.plots if (figure := _drawn(scene, plot))]
 
 
 @dataclass(frozen=True)
@@ -120,24 +114,12 @@ class _Scene:
         return begin, max(end, begin + 0.1)
 
     def joints(self, span: tuple[float, float], most: int = 2) -> list[int]:
-        """The joints that the finding names, or those that move most in ``span``."""
+        """The joints that the finding is about, or those that move most in ``span``."""
         joints = self.hand.joints
         if len(joints) == 1:
             return [0]
-        text = f"{self.result.observed} {self.result.reason}"
-        named = [i for i, j in enumerate(joints) if re.search(rf"\b{re.escape(j.name)}\b", text)]
-        worst = {
-            name.removeprefix("rms_rad_"): value
-            for name, value in self.result.values.items()
-            if name.startswith("rms_rad_")
-        }
-        if worst:
-            names = [j.name for j in joints]
-            named = sorted(
-                (names.index(n) for n in worst if n in names), key=lambda i: -worst[names[i]]
-            )
-        if named:
-            return named[:most]
+        if self.result.joints:
+            return [j for j in self.result.joints if j < len(joints)][:most]
         q = self.hand.states.q[self.hand.states.between(*span)]
         if not len(q):
             return [0]
@@ -146,34 +128,9 @@ class _Scene:
         return [int(i) for i in np.argsort(-moved, kind="stable")[:most]]
 
 
-def _by_kind(scene: _Scene) -> list[str]:
-    need, values = scene.need, scene.result.values
-    limits = need.tolerances
-    if need.needs.startswith("other-"):
-        return _both_sides(scene)
-    if "max_gap_s" in values or (need.area == "Rate" and "max_gap_s" in limits):
-        return [_intervals(scene, scene.window(pad=1.0)), _follow(scene)]
-    if {"min_rate_hz", "max_rate_hz", "max_p99_s"} & set(limits):
-        return [_rates(scene), _interval_histogram(scene), _intervals(scene, None)]
-    if {"max_hold_s", "max_frozen_s"} & set(limits):
-        return _samples(scene)
-    if need.area == "Rate":
-        return [_intervals(scene, None)]
-    if need.needs == "session":
-        return _session(scene)
-    if need.phase == OPERATOR:
-        return [_operated(scene)]
-    if need.capability == "pressure" or scene.result.observed.startswith("pressure"):
-        return [_pressure(scene), _follow(scene)]
-    if need.area in ("Fields", "Sensors"):
-        return [_field(scene), _follow(scene)]
-    if any("tau" in name for name in (*limits, *values)):
-        return [_follow(scene), _torque(scene), _torque_by_position(scene)]
-    if any(p.targets.get(scene.hand.side) for p in scene.phases):
-        return [_steps(scene), _follow(scene)]
-    if need.area == "Mode byte":
-        return [_field(scene), _follow(scene)]
-    return [_follow(scene)]
+def _drawn(scene: _Scene, plot: Plot) -> str:
+    """One plot; empty if the recording holds nothing to draw."""
+    return _member(scene, plot.member) if plot.kind is PlotKind.MEMBER else _DRAWN[plot.kind](scene)
 
 
 # ------------------------------------------------------------------------------- curves
@@ -295,13 +252,13 @@ def _room(hand: SideView, joint: int, span: tuple[float, float]) -> list[float]:
     return [middle - 0.05 * hand.joints[joint].stroke, middle + 0.05 * hand.joints[joint].stroke]
 
 
-def _both_sides(scene: _Scene) -> list[str]:
+def _both_sides(scene: _Scene) -> str:
     """Both hands, while only the other one is to move."""
     hand = scene.hand
     phases = [p for p in scene.view.phases(scene.need.phase or "") if hand.side not in p.sides]
     spans = scene.places[:1] or [scene.span_of(p) for p in phases[:1]]
     if not spans:
-        return [_follow(scene)]
+        return _follow(scene)
     span = (max(0.0, spans[0][0] - 0.6), spans[0][1] + 0.6)
     lines = []
     joint = scene.joints(span)[0]
@@ -315,16 +272,14 @@ def _both_sides(scene: _Scene) -> list[str]:
             lines.insert(
                 0, Line(f"command to the {whose(view.side)}", "cmd", view.commands.t, goal)
             )
-    return [
-        chart(
-            f"both hands, {_called(hand, joint)}, while only the other one is to move",
-            lines,
-            y_unit="rad",
-            span=span,
-            bands=scene.alarms,
-            include=_room(hand, joint, span),
-        )
-    ]
+    return chart(
+        f"both hands, {_called(hand, joint)}, while only the other one is to move",
+        lines,
+        y_unit="rad",
+        span=span,
+        bands=scene.alarms,
+        include=_room(hand, joint, span),
+    )
 
 
 def _steps(scene: _Scene) -> str:
@@ -378,8 +333,8 @@ def _steps(scene: _Scene) -> str:
     )
 
 
-def _session(scene: _Scene) -> list[str]:
-    """The whole replayed session, and the worst moment closer."""
+def _session(scene: _Scene) -> str:
+    """The whole replayed session, and the first place closer."""
     spans = [scene.span_of(p) for p in scene.view.phases("replay", scene.hand.side)]
     t = scene.hand.commands.t
     span = spans[0] if spans else (float(t[0]), float(t[-1])) if len(t) else scene.window()
@@ -387,7 +342,7 @@ def _session(scene: _Scene) -> list[str]:
     for a, b in scene.places[:1]:
         if b - a < 0.5 * (span[1] - span[0]):
             figures.append(_follow(scene, (max(span[0], a - 1.5), min(span[1], b + 1.5))))
-    return figures
+    return "".join(figures)
 
 
 # ---------------------------------------------------------------------------- timing
@@ -470,21 +425,19 @@ def _rates(scene: _Scene) -> str:
     )
 
 
-def _samples(scene: _Scene) -> list[str]:
+def _samples(scene: _Scene) -> str:
     """The single samples: a value that is sent again stands beside the one before."""
     hand = scene.hand
     middle = scene.places[0] if scene.places else (_fastest(hand),) * 2
     span = (max(0.0, middle[0] - 0.05), middle[1] + 0.25)
-    return [
-        chart(
-            f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
-            [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
-            y_unit="rad",
-            span=span,
-            bands=scene.alarms,
-        )
-        for joint in scene.joints(span, 1)
-    ]
+    joint = scene.joints(span, 1)[0]
+    return chart(
+        f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
+        [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
+        y_unit="rad",
+        span=span,
+        bands=scene.alarms,
+    )
 
 
 def _fastest(hand: SideView) -> float:
@@ -547,17 +500,23 @@ def _torque_by_position(scene: _Scene) -> str:
     )
 
 
-def _field(scene: _Scene) -> str:
-    """The member that the finding is about, about the place."""
-    hand, span = scene.hand, scene.window(pad=0.3)
-    found = _member(scene)
-    if found is None:
+def _member(scene: _Scene, member: str) -> str:
+    """A member of the state about the place."""
+    states, span = scene.hand.states, scene.window(pad=0.3)
+    by_joint = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
+    values: Floats | None
+    if member == "length":
+        values, member = np.asarray(states.length, dtype=np.float64), "motors in the sequence"
+    elif member in by_joint:
+        values = by_joint[member][:, scene.joints(scene.window(), 1)[0]]
+    else:
+        values = _column(scene, member)
+    if values is None:
         return ""
-    name, column = found
     return chart(
-        f"{whose(hand.side)}: {name}",
-        [Line(name, "force", hand.states.t, column)],
-        y_unit=_FIELDS.get(name, ""),
+        f"{whose(scene.hand.side)}: {member}",
+        [Line(member, "force", states.t, values)],
+        y_unit=_FIELDS.get(member, ""),
         span=span,
         bands=_busy(scene.view, span) + scene.alarms,
         include=(0.0,),
@@ -589,31 +548,11 @@ def _pressure(scene: _Scene) -> str:
     )
 
 
-def _member(scene: _Scene) -> tuple[str, Floats] | None:
-    """(name, a value for each state): the member that the finding names, or its requirement."""
-    states, need, told = scene.hand.states, scene.need, scene.result.observed
-    for path in _PATH.findall(told) if states.columns is not None else ():
-        if (column := _column(scene, path)) is not None:
-            return path, column
-    text = f"{told} {need.title} {need.sentence}"
-    if re.search(r"\b(decodes?|length|packets)\b", text) and need.area == "Fields":
-        return "motors in the sequence", np.asarray(states.length, dtype=np.float64)
-    columns = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
-    if "quaternion" in told and (column := _column(scene, "imu_state.quaternion")) is not None:
-        return "first of imu_state.quaternion", column
-    # what it speaks of first is what it is about
-    named = re.search(rf"\b({'|'.join(columns)})\b", told) or re.search(
-        rf"\b({'|'.join(columns)})\b", text
-    )
-    if named is None:
-        return None
-    return named[1], columns[named[1]][:, scene.joints(scene.window(), 1)[0]]
-
-
 def _column(scene: _Scene, path: str) -> Floats | None:
     """A member by its path, whose last index may be a place in an array; None if none is."""
     columns = scene.hand.states.columns
-    assert columns is not None
+    if columns is None:
+        return None
     head, _, index = path.rpartition("[")
     for name, place in ((path, 0), (head, int(index[:-1]) if index[:-1].isdecimal() else 0)):
         try:
@@ -670,27 +609,36 @@ def _table(caption: str, heads: Sequence[str], rows: Sequence[str]) -> str:
     )
 
 
+_DRAWN: Mapping[PlotKind, Callable[[_Scene], str]] = {
+    PlotKind.ENDPOINTS: _endpoints,
+    PlotKind.POSITION: _follow,
+    PlotKind.BOTH_SIDES: _both_sides,
+    PlotKind.STEPS: _steps,
+    PlotKind.SESSION: _session,
+    PlotKind.OPERATOR: _operated,
+    PlotKind.SAMPLES: _samples,
+    PlotKind.RATE: _rates,
+    PlotKind.INTERVAL_HISTOGRAM: _interval_histogram,
+    PlotKind.INTERVALS: lambda scene: _intervals(scene, None),
+    PlotKind.GAP: lambda scene: _intervals(scene, scene.window(pad=1.0)),
+    PlotKind.TORQUE: _torque,
+    PlotKind.TORQUE_BY_POSITION: _torque_by_position,
+    PlotKind.PRESSURE: _pressure,
+}
+
+
 # ------------------------------------------------------------------------------------ USB
 
 
-def _usb(result: Result, usb: UsbRecording) -> list[str]:
-    """Transfers about the place: when, what bytes, and how the joints moved."""
+def _usb_plots(result: Result, usb: UsbRecording) -> list[str]:
     hand = next((h for s, h in usb.sides.items() if str(s) == result.side), None)
     if hand is None:
         return []
-    if not result.evidence:
-        return [_descriptors(hand)] if result.requirement.needs == "nothing" else []
-    place = result.evidence[0]
-    span = (max(0.0, place.time_s - 0.3), (place.end_s or place.time_s) + 0.3)
-    figures = [_bytes_at(hand, place)]
-    if {"min_rate_hz", "max_s"} & set(result.requirement.tolerances):
-        figures = [_latency(result, hand) or figures[0]]
-    elif place.end_s is not None:
-        figures = [_joints(result, hand, span)]
-    return [figure for figure in figures if figure]
+    drawn = (_USB_DRAWN[p.kind](result, hand) for p in result.plots if p.kind in _USB_DRAWN)
+    return [figure for figure in drawn if figure]
 
 
-def _descriptors(hand: UsbSide) -> str:
+def _descriptors(_: Result, hand: UsbSide) -> str:
     told = hand.device
     rows = {
         "idVendor:idProduct": f"{told.vendor:04X}:{told.product:04X}",
@@ -709,8 +657,11 @@ def _descriptors(hand: UsbSide) -> str:
     )
 
 
-def _bytes_at(hand: UsbSide, place: Evidence) -> str:
-    """The beginning of the transfer that the place is about."""
+def _bytes_at(result: Result, hand: UsbSide) -> str:
+    """The beginning of the transfer at the first place, if that has no end."""
+    if not result.evidence or result.evidence[0].end_s is not None:
+        return ""
+    place = result.evidence[0]
     inward = place.topic.endswith("/in")
 
     def distance(transfer: Transfer) -> int:
@@ -739,17 +690,20 @@ def _hex(data: bytes, at: int) -> str:
     return f"{at:04x}  {data[at : at + 8].hex(' ')}"
 
 
-def _joints(result: Result, hand: UsbSide, span: tuple[float, float]) -> str:
-    """Positions in the answers about the place; those that move most, or are named."""
+def _answers(result: Result, hand: UsbSide) -> str:
+    """Joint positions in the answers about the first place, if that has an end."""
+    if not result.evidence or result.evidence[0].end_s is None:
+        return ""
+    place = result.evidence[0]
+    span = (max(0.0, place.time_s - 0.3), (place.end_s or place.time_s) + 0.3)
     answers = [a for a in hand.answers if span[0] <= a.t <= span[1]]
     if len(answers) < 2:
         return ""
     t = np.array([a.t for a in answers])
     q = np.array([hand.q(a) for a in answers])
     names = [j.name for j in hand.joints]
-    wanted = [i for i, n in enumerate(names) if re.search(rf"\b{n}\b", result.observed)]
     moved = np.ptp(np.where(np.isfinite(q), q, 0.0), axis=0)
-    shown = wanted or np.argsort(-moved, kind="stable")[:2].tolist()
+    shown = result.joints or np.argsort(-moved, kind="stable")[:2].tolist()
     bands = [Band(p.name, *hand.span(p)) for p in hand.record.phases if hand.span(p)[1] > span[0]]
     marks = [Band("here", e.time_s, e.end_s or e.time_s, "alarm") for e in result.evidence]
     return chart(
@@ -787,3 +741,11 @@ def _latency(result: Result, hand: UsbSide) -> str:
         unit="ms",
         levels=levels,
     )
+
+
+_USB_DRAWN: Mapping[PlotKind, Callable[[Result, UsbSide], str]] = {
+    PlotKind.DESCRIPTORS: _descriptors,
+    PlotKind.BYTES: _bytes_at,
+    PlotKind.ANSWERS: _answers,
+    PlotKind.LATENCY: _latency,
+}

@@ -1,4 +1,4 @@
-"""What the hands did in a run: position, force and timing of each, over all of it."""
+"""Plots over a whole run, for each hand: position, torque and intervals between states."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import JointSpec
 from dexkit.untrusted import html as escape
 
-__all__ = ["overview"]
+__all__ = ["run_plots"]
 
 
-def overview(result: RunResult, view: Recording) -> str:
+def run_plots(result: RunResult, view: Recording) -> str:
     """Plots of every judged hand, as HTML."""
     parts = [
         f"<h2>What the {subject(result, many=True)} did</h2>",

@@ -27,7 +27,7 @@ def command(result: Path, output: Path) -> None:
     could not be judged.
     """
     from dexkit.conformance.report.badge import badge_text, render_badge
-    from dexkit.conformance.results import read_json
+    from dexkit.conformance.result_file import read_json
 
     found = read_json(result)
     write_text(output, render_badge(found))
