@@ -8,10 +8,11 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from dexkit.conformance.checks import Check, Context, Outcome, all_checks
+from dexkit.conformance.checks import Context, Outcome, check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
+from dexkit.conformance.robot import RobotRecording
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
@@ -38,17 +39,12 @@ def judge(
     claims = claims or Claims()
     every = claims.apply(catalogue(recording.model.name, recording.layer))
     wanted = None if requirements is None else {r.id for r in requirements}
-    checks = all_checks()
-    if recording.layer == "robot":
-        from dexkit.conformance.checks.robot import robot_checks
-
-        checks = robot_checks()
     results: list[Result] = []
     for side in recording.judged:
         found: dict[str, Result] = {}
         for requirement in every:
             judgement = Judgement(requirement, side, claims, found)
-            found[requirement.id] = _judge_one(recording, judgement, recording.sides[side], checks)
+            found[requirement.id] = _judge_one(recording, judgement, recording.sides[side])
         results += found.values()
     order = {r.id: i for i, r in enumerate(every)}
     results.sort(key=lambda r: order[r.requirement.id])
@@ -77,9 +73,7 @@ def judge(
     )
 
 
-def _judge_one(
-    recording: Recording, judgement: Judgement, hand: SideView, checks: Mapping[str, Check]
-) -> Result:
+def _judge_one(recording: Recording, judgement: Judgement, hand: SideView) -> Result:
     requirement = judgement.requirement
     dialect = recording.dialect.name
     if dialect not in requirement.dialects:
@@ -87,12 +81,17 @@ def _judge_one(
     unclaimed = judgement.not_claimed()
     if unclaimed:
         return unclaimed
-    context = Context(recording, hand, requirement)
+    if isinstance(recording, RobotRecording):
+        from dexkit.conformance.checks.robot import RobotContext
+
+        context: Context = RobotContext(recording, hand, requirement)
+    else:
+        context = Context(recording, hand, requirement)
     missing = _missing(context)
     if missing:
         return judgement.not_applicable(missing)
     return judgement.blocked() or judgement.of(
-        lambda: _in_silence(context, checks[requirement.id](context)),
+        lambda: _in_silence(context, check_of(requirement)(context)),
         lambda outcome: excuse(recording, requirement, outcome, (0.0, recording.duration)),
     )
 

@@ -39,6 +39,8 @@ class PlotKind(str, Enum):
     """Each interval between states over the whole run."""
     GAP = "gap"
     """Each interval between states about the place."""
+    COMMAND_INTERVALS = "command-intervals"
+    """Each interval between commands over the whole run."""
     TORQUE = "torque"
     """``tau_est`` of the joints about the place."""
     TORQUE_BY_POSITION = "torque-by-position"

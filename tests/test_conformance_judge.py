@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dexkit.conformance.checks import REGISTRY
 from dexkit.conformance.judge import judge
 from dexkit.conformance.phases import RECORD, Phase, Stimulus
 from dexkit.conformance.requirements import catalogue, select
@@ -204,8 +205,7 @@ def test_a_check_that_breaks_is_the_kits_error(monkeypatch: pytest.MonkeyPatch) 
     def broken(context: object) -> None:
         raise ZeroDivisionError("1/0")
 
-    checks = {**judge.__globals__["all_checks"](), "DEX1-RATE-01": broken}
-    monkeypatch.setitem(judge.__globals__, "all_checks", lambda: checks)
+    monkeypatch.setitem(REGISTRY, "DEX1-RATE-01", broken)
     result = judged(short_run())
     assert of(result, "DEX1-RATE-01").verdict is Verdict.ERROR
     assert "ZeroDivisionError: 1/0" in of(result, "DEX1-RATE-01").reason

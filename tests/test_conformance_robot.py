@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.check import command
-from dexkit.conformance.checks.robot import robot_checks
+from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, free_domain, record_run
 from dexkit.conformance.mutants.robot import (
@@ -120,11 +120,11 @@ def test_a_good_robot_passes_everything(name: str) -> None:
 
 def _one_of_each() -> list[RobotMutant]:
     """A wrong robot for each check of a MUST, and what only a G1 has."""
-    checks, level = robot_checks(), {r.id: r.level for r in catalogue(None, "robot")}
+    by_id = {r.id: r for r in catalogue(None, "robot")}
     found: dict[object, RobotMutant] = {}
     for mutant in MUTANTS:
-        if level[mutant.kills] is Level.MUST and mutant.model == "h1":
-            found.setdefault(checks[mutant.kills], mutant)
+        if by_id[mutant.kills].level is Level.MUST and mutant.model == "h1":
+            found.setdefault(check_of(by_id[mutant.kills]), mutant)
     only_g1 = [m for m in MUTANTS if m.kills in ("G1-MACH-01", "G1-SAFE-05", "G1-SAFE-03")]
     return [*found.values(), *only_g1]
 
@@ -138,7 +138,7 @@ def test_a_wrong_robot_is_caught(mutant: RobotMutant) -> None:
 def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> None:
     every = catalogue(name, "robot")
     assert {m.kills for m in MUTANTS if m.model == name} == {r.id for r in every}
-    assert {r.id for r in every} <= set(robot_checks())
+    assert all(check_of(r) for r in every)
     negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
     negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
     found = [r for r in every if r.id.partition("-")[2].startswith(negative)]

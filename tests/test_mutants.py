@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.mutants import command
-from dexkit.conformance.checks import all_checks
+from dexkit.conformance.checks import check_of
 from dexkit.conformance.mutants import REFERENCES, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import Outcome, Score, Trial, chosen, essential, try_one
 from dexkit.conformance.mutants.matrix import trials as all_trials
@@ -56,7 +56,8 @@ def name_of(given: Trial) -> str:
 
 
 # one of each check: what the models share is shown with the first
-OF_EACH_CHECK = {all_checks()[t.kills]: t for t in reversed(ESSENTIAL) if t.layer == "dds"}
+HAND = {r.id: r for r in catalogue()}
+OF_EACH_CHECK = {check_of(HAND[t.kills]): t for t in reversed(ESSENTIAL) if t.layer == "dds"}
 
 
 @pytest.mark.parametrize("given", OF_EACH_CHECK.values(), ids=name_of)

@@ -386,6 +386,24 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
     )
 
 
+def _command_intervals(scene: _Scene) -> str:
+    """Time from each command to the next, over the whole run."""
+    t = scene.hand.commands.t
+    if len(t) < 2:
+        return ""
+    span = (0.0, max(scene.view.duration, 0.1))
+    return chart(
+        f"{whose(scene.hand.side)}: time from each command to the next",
+        [Line("each command", "cmd", t[1:], np.diff(t) * 1e3, "dots")],
+        y_unit="ms",
+        span=span,
+        bands=_busy(scene.view, span) + scene.alarms,
+        levels=_interval_levels(scene.need),
+        include=(0.0,),
+        height=150,
+    )
+
+
 def _interval_histogram(scene: _Scene) -> str:
     _, steps = _milliseconds(scene)
     steps = steps[steps > 0]
@@ -621,6 +639,7 @@ _DRAWN: Mapping[PlotKind, Callable[[_Scene], str]] = {
     PlotKind.INTERVAL_HISTOGRAM: _interval_histogram,
     PlotKind.INTERVALS: lambda scene: _intervals(scene, None),
     PlotKind.GAP: lambda scene: _intervals(scene, scene.window(pad=1.0)),
+    PlotKind.COMMAND_INTERVALS: _command_intervals,
     PlotKind.TORQUE: _torque,
     PlotKind.TORQUE_BY_POSITION: _torque_by_position,
     PlotKind.PRESSURE: _pressure,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from dexkit.conformance.checks import check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result
-from dexkit.conformance.usb.checks import CHECKS, UsbContext
+from dexkit.conformance.usb.checks import UsbContext
 from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.verdicts import Judgement, excuse
 
@@ -44,6 +45,6 @@ def _judge_one(recording: UsbRecording, hand: UsbSide, judgement: Judgement) -> 
         trouble = hand.record.trouble
         return judgement.not_applicable(f"{reason}: {trouble}" if trouble else reason)
     return judgement.of(
-        lambda: CHECKS[requirement.id](UsbContext(recording, hand, requirement)),
+        lambda: check_of(requirement)(UsbContext(recording, hand, requirement)),
         lambda outcome: excuse(recording, requirement, outcome),
     )
