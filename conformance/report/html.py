@@ -286,7 +286,7 @@ def _card(card: Card, plots: _Plots, link: str) -> str:
     need, word = card.requirement, VERDICTS[card.verdict]
     facts = "".join(
         f"<dt>{_label(fact)}</dt><dd>"
-        + (_place(fact.place, link) if fact.place is not None else escape(fact.text, quote=False))
+        + (_place(fact.place, link) if fact.place is not None else escape(fact.text))
         + "</dd>"
         for fact in card.facts()
     )
@@ -395,7 +395,7 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         f"{cells}</summary>"
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
         f"<p>{escape(need.rationale)}</p>"
-        f'<p class="dim">Source: {escape(Card.of(group).source, quote=False)}</p>'
+        f'<p class="dim">Source: {escape(Card.of(group).source)}</p>'
         "</div></details>"
     )
 
