@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.conformance.judge import judge
+from dexkit.conformance.judge import judge, judge_layer
+from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.labels import VERDICTS
@@ -21,9 +23,7 @@ from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import mutants as usb_mutants
-from dexkit.conformance.usb.judge import judge_usb
 from dexkit.conformance.usb.virtual import run_virtual as run_usb
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
@@ -252,7 +252,7 @@ def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
     for device, title in kinds.items():
         kills = next(m.kills for m in usb_mutants.MUTANTS if m.device is device)
         usb = run_usb(device(Side.LEFT))
-        found = next(r for r in judge_usb(usb, every) if r.requirement.id == kills)
+        found = next(r for r in judge_layer(USB, usb, every) if r.requirement.id == kills)
         (figure,) = plots_of(found, replace(view, usb=usb))
         parsed(figure)
         assert title in figure

@@ -13,9 +13,11 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.check import command
+from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, free_domain, record_run
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.robot import (
     MUTANTS,
     CdrCrc,
@@ -24,8 +26,6 @@ from dexkit.conformance.mutants.robot import (
     WaitsForCommands,
     run_robot_mutant,
 )
-from dexkit.conformance.phases import ROBOT, Stimulus
-from dexkit.conformance.processes import RigOptions
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
@@ -39,9 +39,9 @@ from dexkit.conformance.robot import (
 )
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimulus_record import ROBOT, Stimulus
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
-from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import decode

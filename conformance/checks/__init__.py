@@ -15,11 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-from dexkit.conformance.phases import Phase
 from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
-from dexkit.conformance.view import Commands, Recording, SideView, States
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side
 
 __all__ = [

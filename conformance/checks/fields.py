@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
-from dexkit.conformance.view import joints_of
+from dexkit.conformance.recording import joints_of
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]

@@ -6,7 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
-from dexkit.conformance.wire import Wire
+from dexkit.conformance.motor_messages import Wire
 from dexkit.hand import JointMode
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
-from dexkit.conformance.phases import Phase
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.robot import RobotRecording
 from dexkit.conformance.stimuli.robot import STEP
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 from dexkit.messages import Columns
 

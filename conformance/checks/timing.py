@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.figures import median
+from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
 # stimuli whose own requirements judge the state's flow

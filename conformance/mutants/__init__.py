@@ -13,12 +13,12 @@ from functools import cache
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import fingers, gripper, operator, shared
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli import SCRIPTS, Plan, Session, phases_for
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import Service, run_virtual
 from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service
 from dexkit.conformance.virtual.gripper import ReferenceService

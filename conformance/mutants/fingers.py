@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants import shared
 from dexkit.conformance.mutants.shared import of
 from dexkit.conformance.requirements import catalogue
@@ -27,7 +28,6 @@ from dexkit.conformance.virtual.fingers import (
     Flags,
     Ints,
 )
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX3_1, DEX5_1
 

@@ -8,10 +8,10 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants import shared
 from dexkit.conformance.mutants.shared import of
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.messages import message_type
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants import shared
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service, FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.robot import robot_dialect, robot_recording
 from dexkit.conformance.stimuli import Plan, phases_for
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.hand import Floats, Side

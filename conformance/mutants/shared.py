@@ -8,8 +8,8 @@ import math
 from dataclasses import replace
 from typing import TypeVar
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.virtual import Sample, Service
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.messages import message_type
 

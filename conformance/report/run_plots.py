@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dexkit.conformance.recording import Recording, SideView
 from dexkit.conformance.report.charts import Band, Level, Line, chart, histogram
 from dexkit.conformance.report.labels import subject, whose
 from dexkit.conformance.report.result_plots import command_and_state, operated, phase_bands
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
-from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import JointSpec
 from dexkit.untrusted import html as escape
 

@@ -48,9 +48,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.parts import PARTS, Parts
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Script, Steps
-from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
 
 __all__ = ["FingerScript"]

@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from dexkit.conformance.phases import Phase
-from dexkit.conformance.wire import Motor
+from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, client_for, profile

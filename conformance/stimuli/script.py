@@ -10,11 +10,11 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.motor_messages import Motor, Motors, Wire
+from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli.operator import OPERATOR, operate
 from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.view import joints_of
-from dexkit.conformance.wire import Motor, Motors, Wire
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.freshness import PAUSE
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, HandModel, model

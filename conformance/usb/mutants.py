@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from dexkit.conformance.judge import judge_layer
+from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.usb.frames import Motor, Scale
-from dexkit.conformance.usb.judge import judge_usb
 from dexkit.conformance.usb.virtual import FOC, ReferenceDevice, run_virtual
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID
@@ -581,6 +582,6 @@ def try_mutant(
     device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
 ) -> tuple[list[Result], set[str]]:
     """Judge one device; the results, and the requirements that found fault with it."""
-    results = judge_usb(run_virtual(device(side)), requirements)
+    results = judge_layer(USB, run_virtual(device(side)), requirements)
     bad = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
     return results, {r.requirement.id for r in results if r.verdict in bad}

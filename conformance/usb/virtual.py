@@ -25,9 +25,9 @@ from dexkit.conformance.usb.frames import (
     crc,
 )
 from dexkit.conformance.usb.record import TIMED_OUT, Descriptors, SideRecord, Transfer
+from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.conformance.usb.script import BUSES as MAP
 from dexkit.conformance.usb.script import Alone, In, Observation, Out, Plan, Reopen, UsbScript, Wait
-from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dexkit.conformance.phases import RECORD, Stimulus
+from dexkit.conformance.motor_messages import Motor, Wire
 from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli import (
     Join,
@@ -28,7 +28,7 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.wire import Motor, Wire
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.errors import WireError
 from dexkit.hand import Side
 from dexkit.models import Dialect
