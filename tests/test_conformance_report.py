@@ -220,7 +220,7 @@ WRONG = {m.name: m.service for m in MUTANTS if m.model == "dex1-1"}
         ("OldTopic", {"step"}, "TOPIC-01", ["On the network"]),
     ],
 )
-def test_evidence_suits_what_is_required(
+def test_a_failure_shows_the_plots_of_its_requirement(
     name: str, phases: set[str], need: str, titles: list[str]
 ) -> None:
     view = Recording.of(

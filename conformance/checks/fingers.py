@@ -288,7 +288,8 @@ def wrong_id(ctx: Context) -> Outcome:
     first, other = _parts(ctx).crossed
     names = [ctx.joints[i].name for i in (first, other)]
     quiet = [j for j in range(len(ctx.joints)) if j != first]
-    return stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
+    outcome = stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
+    return outcome.about(*outcome.joints, first)
 
 
 # ------------------------------------------------------------------------------------- joints

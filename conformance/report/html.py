@@ -20,11 +20,11 @@ from dexkit.conformance.report.labels import (
     about_harness,
     hand_name,
     model_title,
-    moment,
     nature,
     part,
     quantity,
     subject,
+    utc_date,
     whose,
 )
 from dexkit.conformance.report.result_plots import plots_of
@@ -47,7 +47,7 @@ __all__ = ["document", "render", "write_html"]
 
 _STYLE = Path(__file__).with_name("report.css")
 _PLOT_BUDGET = 1_000_000
-"""Bytes of plots on a page; beyond, failures are told in words only."""
+"""Bytes of plots on a page; the failures after that have none."""
 _BUSY = 0.2
 """Part of a run with programs waiting for a processor from which on the page says so."""
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
@@ -136,7 +136,7 @@ def _verdict(result: RunResult) -> str:
     if result.starved > _BUSY:
         caution = (
             f"<p><b>The testing machine was busy</b>: {escape(about_harness(result))}. What "
-            "this can have caused is blocked, not failed; on an idle machine more can be told.</p>"
+            "this can have caused is blocked, not failed; run again on an idle machine.</p>"
         )
     if of := part(result):
         caution = f"<p><b>{of}</b>: this does not prove a drop-in.</p>{caution}"
@@ -308,7 +308,7 @@ def _label(fact: Fact) -> str:
 def _place(place: Evidence, link: str) -> str:
     """Where in the recording, in a form that can be copied."""
     until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
-    when = moment(place.log_time_ns).isoformat(timespec="milliseconds")
+    when = utc_date(place.log_time_ns).isoformat(timespec="milliseconds")
     file = f' in <a href="{escape(quote(link))}">{escape(Path(link).name)}</a>' if link else ""
     return (
         f'<div class="place"><code>{escape(place.topic)}</code> at {place.time_s:.3f} s{until}'
@@ -334,7 +334,7 @@ def _blocked(blocked: Blocked) -> str:
 
 
 def _operator(result: RunResult) -> str:
-    """What an operator would feel, where one was modelled."""
+    """What an operator would notice, where one was modelled."""
     rows = [
         (need.title, " · ".join(f"{r.side} {r.figure or VERDICTS[r.verdict].text}" for r in group))
         for need, group in result.by_requirement()
@@ -343,7 +343,7 @@ def _operator(result: RunResult) -> str:
     if not rows:
         return ""
     return (
-        "<h2>What an operator would feel</h2><p>A model of Unitree's teleoperation client drove "
+        "<h2>What an operator would notice</h2><p>A model of Unitree's teleoperation client drove "
         "the hand: it sends no command further than 0.18 rad from the last state, so that a hand "
         f"which reports late is slow.</p>{_definitions(rows)}"
     )
@@ -465,10 +465,13 @@ def _what(result: RunResult) -> str:
 
 def _glossary(result: RunResult) -> str:
     terms = [
-        ("topic", "a named channel on the network (DDS); who uses another name is not heard."),
+        (
+            "topic",
+            "a named channel on the network (DDS); nobody receives what is sent on another.",
+        ),
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
-        ("tau_est, N m", "torque that the motor feels: what the hand knows of touch."),
-        ("not applicable", "this recording or hand gave no occasion for it; the row says why."),
+        ("tau_est, N m", "torque that the motor reports; the only sign of touch without sensors."),
+        ("not applicable", "the recording does not show it; the row says why."),
         ("docs/sources", "pages of dexkit with the facts, documents and measurements, by section."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]

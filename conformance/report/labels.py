@@ -18,12 +18,12 @@ __all__ = [
     "about_harness",
     "hand_name",
     "model_title",
-    "moment",
     "nature",
     "part",
     "quantity",
     "subject",
     "tally",
+    "utc_date",
     "whose",
 ]
 
@@ -167,7 +167,7 @@ def about_harness(result: RunResult) -> str:
     return "; ".join(told)
 
 
-def moment(time_ns: int) -> datetime:
+def utc_date(time_ns: int) -> datetime:
     """A log time as a date."""
     return datetime.fromtimestamp(time_ns / 1e9, tz=timezone.utc)
 

@@ -111,7 +111,11 @@ def _troubles(result: RunResult) -> list[str]:
 def _card(card: Card) -> list[str]:
     need, word = card.requirement, VERDICTS[card.verdict]
     lines = [f"### {word.mark} {code(need.id)} {plain(need.title)} ({plain(card.sides)})", ""]
+    placed: set[str] = set()
     for fact in card.facts():
+        if fact.place is not None and fact.sides in placed:
+            continue  # of several places, the first one of each side
+        placed |= {fact.sides} if fact.place is not None else set()
         side = f", {plain(fact.sides)}" if fact.sides else ""
         lines.append(f"- {fact.item.label}{side}: {_text(fact)}")
     return [*lines, ""]

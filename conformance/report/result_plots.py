@@ -55,6 +55,7 @@ PHASES = {
 _LONGEST = 8.0
 """Seconds of a plot about a place in the recording."""
 _MOST_ROWS = 24
+_MOST_ELEMENTS = 12  # of an array, in one plot
 _FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m"}
 
 
@@ -88,7 +89,7 @@ class _Scene:
 
     @property
     def places(self) -> list[tuple[float, float]]:
-        """Where the check points."""
+        """The places that the check names, as (begin, end) in seconds."""
         return [(e.time_s, e.end_s or e.time_s) for e in self.result.evidence]
 
     @property
@@ -137,7 +138,7 @@ def _drawn(scene: _Scene, plot: Plot) -> str:
 
 
 def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band]:
-    """What the kit did when, neighbours of one name joined."""
+    """The phases of the stimulus, neighbours of one name joined."""
     if view.stimulus is None:
         return []
     merged: list[Band] = []
@@ -154,7 +155,7 @@ def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band
 
 
 def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
-    """When the kit's own machine was short of processor time: what is late then proves little.
+    """When the kit's own machine was short of processor time; lateness then proves little.
 
     Stretches that a plot of ``span`` could not show apart are taken together.
     """
@@ -204,13 +205,15 @@ def _operated(scene: _Scene) -> str:
 
 
 def _clipped(values: Floats, joint: JointSpec) -> Floats:
-    """Wild commands would squash the rest of a plot."""
+    """``values`` limited to the joint's range and a tenth of it: commands far outside would flatten
+    the rest of the plot.
+    """
     margin = 0.1 * joint.stroke
     return np.asarray(np.clip(values, joint.q_min - margin, joint.q_max + margin))
 
 
 def command_and_state(hand: SideView, joint: int) -> list[Line]:
-    """Two curves: where it is told to go, and where it says that it is."""
+    """Two curves of a joint: commanded and reported position."""
     commands, states = hand.commands, hand.states
     return [
         Line("command", "cmd", commands.t, _clipped(commands.q[:, joint], hand.joints[joint])),
@@ -245,7 +248,7 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
 
 
 def _room(hand: SideView, joint: int, span: tuple[float, float]) -> list[float]:
-    """Values that make a plot at least a tenth of the stroke high: noise is not to fill it."""
+    """Values that make a plot a tenth of the stroke high or more: noise is not to fill it."""
     q = hand.states.q[hand.states.between(*span), joint]
     q = q[np.isfinite(q)]
     middle = float(np.median(q)) if len(q) else 0.0
@@ -476,7 +479,7 @@ def _torque(scene: _Scene) -> str:
         for sign in (1, -1)
     ]
     return chart(
-        f"{whose(hand.side)}: torque that it reports",
+        f"{whose(hand.side)}: torque (tau_est)",
         [
             Line("tau_est", "force", hand.states.t, hand.states.tau[:, j])
             for j in scene.joints(span)
@@ -531,9 +534,10 @@ def _member(scene: _Scene, member: str) -> str:
         values = _column(scene, member)
     if values is None:
         return ""
+    table = values.reshape(len(values), -1)[:, :_MOST_ELEMENTS]
     return chart(
         f"{whose(scene.hand.side)}: {member}",
-        [Line(member, "force", states.t, values)],
+        [Line(member, "force", states.t, column) for column in table.T],
         y_unit=_FIELDS.get(member, ""),
         span=span,
         bands=_busy(scene.view, span) + scene.alarms,
@@ -567,27 +571,30 @@ def _pressure(scene: _Scene) -> str:
 
 
 def _column(scene: _Scene, path: str) -> Floats | None:
-    """A member by its path, whose last index may be a place in an array; None if none is."""
+    """A member of every state, or one element of it; None if the states have no such member."""
     columns = scene.hand.states.columns
     if columns is None:
         return None
-    head, _, index = path.rpartition("[")
-    for name, place in ((path, 0), (head, int(index[:-1]) if index[:-1].isdecimal() else 0)):
-        try:
-            values = columns[name] if name else None
-        except UsageError:
-            continue
-        if values is not None:
-            table = values.reshape(len(values), -1)
-            return table[:, place] if place < table.shape[1] else None
-    return None
+    try:
+        return columns[path]
+    except UsageError:
+        pass
+    head, _, index = path.removesuffix("]").rpartition("[")
+    try:
+        values = columns[head] if head and index.isdecimal() else None
+    except UsageError:
+        return None
+    if values is None:
+        return None
+    table = values.reshape(len(values), -1)
+    return table[:, int(index)] if int(index) < table.shape[1] else None
 
 
 # -------------------------------------------------------------------------------- network
 
 
 def _endpoints(scene: _Scene) -> str:
-    """Who was there: a table is the picture of what discovery saw."""
+    """Table of the endpoints that a client needs, and of those that discovery saw."""
     dialect, side = scene.view.dialect, scene.hand.side
     wanted = [
         (dialect.topics(side)[1], dialect.state_type, "writer"),
@@ -611,9 +618,9 @@ def _endpoints(scene: _Scene) -> str:
         for kind, topic, name, qos in sorted(seen)[:_MOST_ROWS]
     ]
     if not seen:
-        rows.append('<tr><td>seen</td><td colspan="4">discovery saw nobody</td></tr>')
+        rows.append('<tr><td>seen</td><td colspan="4">discovery saw no endpoint</td></tr>')
     return _table(
-        "On the network: what a client needs, and who was there (the kit's own among them)",
+        "On the network: what a client needs, and what discovery saw (the kit's own among it)",
         ("", "kind", "topic", "type", "QoS"),
         rows,
     )
@@ -670,7 +677,7 @@ def _descriptors(_: Result, hand: UsbSide) -> str:
         or "none",
     }
     return _table(
-        f"{whose(hand.side)}: what the device says of itself",
+        f"{whose(hand.side)}: descriptors of the device",
         ("", ""),
         [f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows.items()],
     )

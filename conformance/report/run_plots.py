@@ -20,9 +20,9 @@ def run_plots(result: RunResult, view: Recording) -> str:
     """Plots of every judged hand, as HTML."""
     parts = [
         f"<h2>What the {subject(result, many=True)} did</h2>",
-        '<p class="key"><span><i class="cmd"></i>command: where it is told to go</span>'
-        '<span><i class="state"></i>state: where it says it is</span>'
-        '<span><i class="force"></i>the force that it feels</span></p>',
+        '<p class="key"><span><i class="cmd"></i>command: the commanded position</span>'
+        '<span><i class="state"></i>state: the reported position</span>'
+        '<span><i class="force"></i>tau_est: the reported torque</span></p>',
     ]
     for side in view.judged:
         parts.append(_hand(result, view, view.sides[side]))
