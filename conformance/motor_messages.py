@@ -1,6 +1,7 @@
-"""The kit's own reading of the dialects: which member of which message is which motor.
+"""Encode motor commands and decode motor states of each dialect, independently of the service.
 
-Kept apart from the service on purpose: a mistake there must not be repeated here.
+Which member of which message is which motor is written down here a second time on purpose: the
+kit judges dexkit's own service as well, and with shared code it could not see a mistake in it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ _SEQUENCE = {
     "unitree_go::msg::dds_::MotorStates_": ("states", "unitree_go::msg::dds_::MotorState_"),
     "unitree_hg::msg::dds_::HandCmd_": ("motor_cmd", "unitree_hg::msg::dds_::MotorCmd_"),
     "unitree_hg::msg::dds_::HandState_": ("motor_state", "unitree_hg::msg::dds_::MotorState_"),
+    "unitree_go::msg::dds_::LowCmd_": ("motor_cmd", "unitree_go::msg::dds_::MotorCmd_"),
+    "unitree_go::msg::dds_::LowState_": ("motor_state", "unitree_go::msg::dds_::MotorState_"),
+    "unitree_hg::msg::dds_::LowCmd_": ("motor_cmd", "unitree_hg::msg::dds_::MotorCmd_"),
+    "unitree_hg::msg::dds_::LowState_": ("motor_state", "unitree_hg::msg::dds_::MotorState_"),
 }
 
 
@@ -55,26 +60,41 @@ def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) ->
 
 
 class Wire:
-    """Encodes commands and reads states of one dialect."""
+    """Encodes commands and reads states of one dialect.
+
+    :param joints: of one subject; by default those of a hand of the dialect's model.
+    :param foreign: another command type, which the device must ignore; by default the other one
+        of hands.
+    :param subjects: what has a topic or a place in the messages.
+    """
 
     machine = 0
     """``mode_machine`` of the last state, where there is one."""
 
-    def __init__(self, dialect: Dialect) -> None:
+    def __init__(
+        self,
+        dialect: Dialect,
+        *,
+        joints: int | None = None,
+        foreign: str | None = None,
+        subjects: Sequence[Side] = tuple(Side),
+    ) -> None:
         self.dialect = dialect
-        self.joints = len(model(dialect.model).joints[Side.LEFT])
+        self.joints = joints or len(model(dialect.model).joints[Side.LEFT])
         self.command: MessageType = message_type(dialect.cmd_type)
         self.state: MessageType = message_type(dialect.state_type)
         self.command_sequence, self._command_motor = _SEQUENCE[dialect.cmd_type]
         self.state_sequence, self._state_motor = _SEQUENCE[dialect.state_type]
-        others = (DEX1_1.dialects[0].cmd_type, DEX3_1.dialects[0].cmd_type)
-        self.foreign: MessageType = message_type(next(t for t in others if t != dialect.cmd_type))
+        if foreign is None:
+            others = (DEX1_1.dialects[0].cmd_type, DEX3_1.dialects[0].cmd_type)
+            foreign = next(t for t in others if t != dialect.cmd_type)
+        self.foreign: MessageType = message_type(foreign)
         self._states: dict[int, Any] = {}
         self._ids = dialect.name == "dex3"
         self._modes = dialect.name in ("dex3", "dex5")
-        self.command_topics = {s: dialect.topics(s)[0] for s in Side}
-        self.state_topics = {s: dialect.topics(s)[1] for s in Side}
-        self.shared = len(set(self.command_topics.values())) == 1
+        self.command_topics = {s: dialect.topics(s)[0] for s in subjects}
+        self.state_topics = {s: dialect.topics(s)[1] for s in subjects}
+        self.shared = len(set(self.command_topics.values())) < len(subjects)
 
     def mode(self, index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
         """The mode byte of a motor: RIS_Mode for a Dex3-1; for a Dex5-1 just 1, position control

@@ -24,6 +24,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side
 from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
+from dexkit.robots import RobotModel
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 
 if TYPE_CHECKING:
@@ -246,8 +247,8 @@ class Recording:
         )
 
     @property
-    def model(self) -> HandModel:
-        """The hand model that the dialect belongs to."""
+    def model(self) -> HandModel | RobotModel:
+        """The model that the dialect belongs to."""
         return model(self.dialect.model)
 
     def seconds(self, time_ns: int) -> float:

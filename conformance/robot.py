@@ -1,4 +1,4 @@
-"""A robot as the kit sees it: its dialect, its messages, and a recording of it.
+"""Robots in the conformance kit: their dialect, messages with a CRC, and decoded recordings.
 
 A robot has no sides: where a hand has a side, it has
 :data:`~dexkit.conformance.stimulus_record.ROBOT`. Its joints are those of the used motor slots, in
@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from dexkit.conformance.motor_messages import Motor, Motors, Wire
 from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
 from dexkit.conformance.stimulus_record import RECORD, ROBOT, Stimulus
-from dexkit.errors import ConformanceError, UsageError, WireError
+from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import Dialect
 from dexkit.robots import H1, ROBOTS, RobotModel, robot
-from dexkit.topics import HAND_TOPICS
 from dexkit.traces import SampleArray
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import encode_with_crc, verify_payload
@@ -33,7 +32,6 @@ __all__ = [
     "SPOILS",
     "RobotRecording",
     "RobotWire",
-    "recording_of",
     "robot_dialect",
     "robot_in",
     "robot_recording",
@@ -45,7 +43,7 @@ Flags = NDArray[np.bool_]
 
 @cache
 def robot_dialect(name: str) -> Dialect:
-    """How a robot speaks, in the form that hands have.
+    """A robot's topics and types as a dialect.
 
     :raises UsageError: there is no such robot.
     """
@@ -79,16 +77,11 @@ class RobotWire(Wire):
     """
 
     def __init__(self, dialect: Dialect) -> None:
-        self.dialect = dialect
         self.robot: RobotModel = robot(dialect.model)
-        self.joints = len(self.robot.used)
-        self.command = message_type(dialect.cmd_type)
-        self.state = message_type(dialect.state_type)
         other = next(b for b in ROBOTS.values() if b.family != self.robot.family)
-        self.foreign = message_type(other.cmd_type)
-        self.command_topics = {ROBOT: dialect.cmd_topic}
-        self.state_topics = {ROBOT: dialect.state_topic}
-        self.shared = False
+        super().__init__(
+            dialect, joints=len(self.robot.used), foreign=other.cmd_type, subjects=(ROBOT,)
+        )
         self.machine = 0
 
     def read_state(
@@ -153,8 +146,8 @@ class RobotRecording(Recording):
     layer = "robot"
 
     @property
-    def model(self) -> Any:
-        """The robot: it has a model's name, title and rates."""
+    def model(self) -> RobotModel:
+        """The robot's model."""
         return self.robot
 
     @cached_property
@@ -238,26 +231,6 @@ def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
         payloads=states.payloads if states is not None else (),
         command_payloads=commands.payloads if commands is not None else (),
     )
-
-
-def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
-    """Decode a recording of hands or of a robot.
-
-    :param dialect_name: None to take what the topics show: hands, if there are any.
-    :raises ConformanceError: it has none of their topics.
-    :raises UsageError: sides of a robot.
-    :raises TraceUnsupported: its stimulus record cannot be read.
-    """
-    name = dialect_name
-    if name is None:
-        topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
-        found = None if topics & HAND_TOPICS else robot_in(trace)
-        name = found.name if found else None
-    if name in ROBOTS:
-        if sides not in ((), (ROBOT,)):
-            raise UsageError("a robot has no sides", hint="leave --side out")
-        return robot_recording(trace, name)
-    return Recording.of(trace, dialect_name=name, sides=sides)
 
 
 def _right(samples: SampleArray | None, type_name: str) -> SampleArray | None:

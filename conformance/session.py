@@ -20,10 +20,11 @@ from dexkit.conformance.backend_processes import (
 )
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
-from dexkit.conformance.robot import recording_of, robot_dialect
+from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS

@@ -16,6 +16,7 @@ from dexkit.cli.check import command
 from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.live import LiveOptions, free_domain, record_run
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.robot import (
@@ -32,7 +33,6 @@ from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.robot import (
     SPOILS,
     RobotWire,
-    recording_of,
     robot_dialect,
     robot_in,
     robot_recording,

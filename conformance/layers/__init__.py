@@ -16,14 +16,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from dexkit.conformance.checks import BaseContext, Outcome
+from dexkit.conformance.recording import Recording, TraceLike
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result
+from dexkit.conformance.robot import robot_in
 from dexkit.conformance.verdicts import Judgement
+from dexkit.robots import ROBOTS
+from dexkit.topics import HAND_TOPICS
 
 if TYPE_CHECKING:
     from dexkit.hand import Side
 
-__all__ = ["Layer", "Precondition", "claimed", "layer", "not_blocked"]
+__all__ = ["Layer", "Precondition", "claimed", "layer", "not_blocked", "recording_of"]
 
 
 RecordingT = TypeVar("RecordingT")
@@ -40,6 +44,9 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
 
     :param name: one of :data:`~dexkit.conformance.requirements.LAYERS`; it selects the catalogue
         and, in :data:`~dexkit.conformance.checks.CHECK_MODULES`, the checks.
+    :param decode: a recording's part that is about the layer; None where there is none. It takes
+        the recording, the dialect's name (None for the one that the topics show) and the
+        subjects to be judged (none for all that are there).
     :param subjects: the part of a recording that is about each subject to be judged.
     :param context: what a check of the layer gets.
     :param preconditions: what is asked before the check, in this order; the first that has a
@@ -52,6 +59,7 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     """
 
     name: str
+    decode: Callable[[TraceLike, str | None, Sequence[Side]], RecordingT | None]
     subjects: Callable[[RecordingT], Mapping[Side, ViewT]]
     context: Callable[[RecordingT, ViewT, Requirement], ContextT]
     preconditions: Sequence[Precondition[ContextT]]
@@ -76,6 +84,24 @@ def layer(name: str) -> Layer[Any, Any, Any]:
     module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
     found: Layer[Any, Any, Any] = module.LAYER
     return found
+
+
+def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
+    """Decode a recording of hands or of a robot.
+
+    :param dialect_name: None to take what the topics show: hands, if there are any.
+    :raises ConformanceError: it has none of their topics.
+    :raises UsageError: sides of a robot.
+    :raises TraceUnsupported: its stimulus record cannot be read.
+    """
+    name = dialect_name
+    if name is None:
+        topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
+        found = None if topics & HAND_TOPICS else robot_in(trace)
+        name = found.name if found else None
+    recording = layer("robot" if name in ROBOTS else "dds").decode(trace, name, sides)
+    assert isinstance(recording, Recording), "only USB may be missing from a recording"
+    return recording
 
 
 def claimed(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.layers import Layer, claimed, not_blocked
-from dexkit.conformance.recording import Recording, SideView
+from dexkit.conformance.recording import Recording, SideView, TraceLike
 from dexkit.conformance.results import Result
 from dexkit.conformance.verdicts import Judgement
 from dexkit.hand import Side
@@ -25,6 +25,10 @@ _REMEDY = {
     "service-restart": _NOT_OURS,
 }
 """What to do, or why not, where a stimulus was not applied."""
+
+
+def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
+    return Recording.of(trace, dialect_name=dialect_name, sides=sides)
 
 
 def subjects(recording: Recording) -> Mapping[Side, SideView]:
@@ -103,6 +107,7 @@ def _reference(model: str) -> type:
 
 LAYER: Layer[Recording, SideView, Context] = Layer(
     name="dds",
+    decode=_decode,
     subjects=subjects,
     context=Context,
     preconditions=(applies_to_dialect, claimed, recorded, not_blocked),

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from dexkit.conformance.checks.robot import RobotContext
 from dexkit.conformance.layers import Layer, claimed, hand, not_blocked
-from dexkit.conformance.recording import SideView
-from dexkit.conformance.robot import RobotRecording
+from dexkit.conformance.recording import SideView, TraceLike
+from dexkit.conformance.robot import RobotRecording, robot_in, robot_recording
+from dexkit.conformance.stimulus_record import ROBOT
+from dexkit.errors import UsageError
+from dexkit.hand import Side
+from dexkit.robots import H1
 
 __all__ = ["LAYER"]
+
+
+def _decode(trace: TraceLike, name: str | None, sides: Sequence[Side]) -> RobotRecording:
+    if sides not in ((), (ROBOT,)):
+        raise UsageError("a robot has no sides", hint="leave --side out")
+    found = name or (robot_in(trace) or H1).name
+    return robot_recording(trace, found)
 
 
 def _script(model: str) -> type:
@@ -24,6 +37,7 @@ def _reference(model: str) -> type:
 
 LAYER: Layer[RobotRecording, SideView, RobotContext] = Layer(
     name="robot",
+    decode=_decode,
     subjects=hand.subjects,
     context=RobotContext,
     preconditions=(hand.applies_to_dialect, claimed, hand.recorded, not_blocked),

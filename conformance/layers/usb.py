@@ -35,6 +35,7 @@ def _reference(model: str) -> type:
 
 LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     name="usb",
+    decode=lambda trace, dialect_name, sides: UsbRecording.of(trace),
     subjects=lambda recording: recording.sides,
     context=UsbContext,
     # the script ends where a device no longer answers: what failed first explains a missing

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants.matrix import Outcome, Trial
-from dexkit.conformance.robot import recording_of
 from dexkit.traces import open_trace
 from dexkit.traces.samples import SAMPLES, sample_path
 
