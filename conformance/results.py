@@ -1,5 +1,7 @@
 """What a run found: one object, written as JSON, from which every report is rendered.
 
+:mod:`dexkit.conformance.result_file` reads the JSON back.
+
 Verdicts (h2spec and Autobahn grade theirs likewise; a plain pass or fail hides too much):
 
 ============== ============================================================================
@@ -21,20 +23,20 @@ import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from dexkit import __version__, documents
+from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Level, Requirement
-from dexkit.errors import UsageError
-from dexkit.escaping import REMARK, one_line
 
 __all__ = [
-    "BUSY",
     "FORMAT",
-    "TOO_BUSY",
+    "UNDISTURBED",
+    "VERSION",
+    "Disturbance",
     "Evidence",
+    "Load",
     "Overall",
     "Result",
     "RunResult",
@@ -42,16 +44,11 @@ __all__ = [
     "Verdict",
     "environment",
     "overall_of",
-    "read_json",
     "worst",
 ]
 
-TOO_BUSY = "the machine was too busy"
-"""How the reason of a result begins that a busy machine may have caused."""
-BUSY = "the machine was busy"
-"""How the reason of a failure begins that was seen on a busy machine, but is larger than that."""
 FORMAT = "dexkit-conformance-result"
-VERSION = 2
+VERSION = 3
 
 
 class Verdict(str, Enum):
@@ -136,6 +133,39 @@ class Evidence:
     end_s: float | None = None
 
 
+class Load(str, Enum):
+    """Whether the load of the machine that made the recording can have caused a failure."""
+
+    NONE = "none"
+    BUSY = "busy"
+    """The machine was busy, but the failure is larger than its load explains."""
+    TOO_BUSY = "too busy"
+    """The load may have caused the failure."""
+
+    def __str__(self) -> str:
+        return self.value
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What the machine that made the recording has to do with a failure.
+
+    :param late_s: by how much the kit's own timer was late at the failure's place, seconds; None
+        if it was not measured.
+    :param explained_s: by how much a good hand may then have been late, seconds.
+    :param failure_s: by how much a good hand would have had to be late to look like this, seconds;
+        None if no delay does.
+    """
+
+    load: Load
+    late_s: float | None = None
+    explained_s: float | None = None
+    failure_s: float | None = None
+
+
+UNDISTURBED = Disturbance(Load.NONE)
+
+
 @dataclass(frozen=True)
 class Result:
     """What was found for one requirement on one side.
@@ -146,6 +176,11 @@ class Result:
     :param values: measured figures by name.
     :param cause: the likely cause of a failure.
     :param blocked_by: id of the requirement that failed first, or empty.
+    :param joints: indices of the joints that the finding is about; empty if it is about none in
+        particular.
+    :param disturbance: what the load of the machine has to do with a failure.
+    :param plots: what shows the finding.
+    :param retry: whether another run may come to another finding.
     """
 
     requirement: Requirement
@@ -158,6 +193,10 @@ class Result:
     values: Mapping[str, float] = field(default_factory=dict)
     cause: str = ""
     blocked_by: str = ""
+    joints: tuple[int, ...] = ()
+    disturbance: Disturbance = UNDISTURBED
+    plots: tuple[Plot, ...] = ()
+    retry: bool = False
 
     @property
     def expected(self) -> str:
@@ -165,28 +204,10 @@ class Result:
         return self.requirement.expected or self.requirement.sentence
 
     def explain(self) -> str:
-        """Everything a person needs to act on it, in lines."""
+        """The result as the lines of a card; see :mod:`dexkit.conformance.report.card`."""
+        from dexkit.conformance.report.card import Card
 
-        def say(name: str, text: str) -> None:
-            lines.append(f"  {name + ':':<9} {one_line(text, REMARK)}")
-
-        lines = [f"{self.requirement.id} ({self.requirement.level}) {self.side}: {self.verdict}"]
-        say("required", self.requirement.sentence)
-        if self.expected != self.requirement.sentence:
-            say("expected", self.expected)
-        if self.observed:
-            say("observed", self.observed)
-        if self.reason:
-            say("reason", self.reason)
-        for place in self.evidence:
-            until = f" .. {place.end_s:.3f} s" if place.end_s is not None else ""
-            say("where", f"{one_line(place.topic)} at {place.time_s:.3f} s{until}")
-        if self.verdict in (Verdict.FAIL, Verdict.WARN):
-            if self.cause:
-                say("cause", self.cause)
-            say("try", self.requirement.advice)
-            say("source", self.requirement.source)
-        return "\n".join(lines)
+        return Card.of([self]).as_text()
 
 
 def environment() -> dict[str, str]:
@@ -272,9 +293,9 @@ class RunResult:
         """
         failed = [r for r in self.results if r.verdict is Verdict.FAIL]
         if failed:
-            return all(r.reason.startswith(BUSY) for r in failed)
+            return all(r.retry for r in failed)
         return self.overall is Overall.INCONCLUSIVE and any(
-            r.verdict is Verdict.BLOCKED and r.reason.startswith(TOO_BUSY) for r in self.results
+            r.verdict is Verdict.BLOCKED and r.retry for r in self.results
         )
 
     @property
@@ -325,6 +346,7 @@ class RunResult:
 def _result_dict(result: Result) -> dict[str, Any]:
     requirement = asdict(result.requirement)
     requirement["level"] = str(result.requirement.level)
+    requirement["plots"] = [str(plot) for plot in result.requirement.plots]
     return {
         "id": result.requirement.id,
         "side": result.side,
@@ -337,128 +359,9 @@ def _result_dict(result: Result) -> dict[str, Any]:
         "blocked_by": result.blocked_by,
         "evidence": [asdict(e) for e in result.evidence],
         "values": {name: v for name, v in result.values.items() if math.isfinite(v)},
+        "joints": list(result.joints),
+        "disturbance": {**asdict(result.disturbance), "load": str(result.disturbance.load)},
+        "plots": [str(plot) for plot in result.plots],
+        "retry": result.retry,
         "requirement": requirement,
     }
-
-
-def read_json(path: Path) -> RunResult:
-    """Read a result file back.
-
-    :raises UsageError: it is not one, of a version that this dexkit does not know, or something
-        in it is not as ``result.schema.json`` says: the error names the place.
-    """
-    data = documents.read_json(path)
-    about = data if isinstance(data, dict) else {}
-    if about.get("format") != FORMAT:
-        raise UsageError(
-            f"{path} is not a result file of dexkit",
-            hint="'dexkit check --json FILE' and the suite's '--json FILE' write them",
-        )
-    if about.get("version") != VERSION:
-        raise UsageError(f"{path} is version {one_line(about.get('version'), 40)} of {FORMAT}")
-    _validate(data, path)
-    return RunResult(
-        subject=data["subject"],
-        stage={side: Stage(stage) for side, stage in data["stage"].items()},
-        duration_s=data["duration_s"],
-        notes=data["notes"],
-        environment=data["environment"],
-        harness=data["harness"],
-        claims=data["claims"],
-        catalogue=data["catalogue"],
-        recorded_at=data["recorded_at"],
-        results=[_result_of(entry) for entry in data["results"]],
-    )
-
-
-@cache
-def _validator() -> Any:
-    import jsonschema
-
-    text = Path(__file__).with_name("report").joinpath("result.schema.json").read_text("utf-8")
-    return jsonschema.Draft202012Validator(json.loads(text))
-
-
-def _validate(data: Any, path: Path) -> None:
-    """Hold a document to the schema that is published with dexkit.
-
-    :raises UsageError: naming the first place that is not as it says.
-    """
-    from jsonschema.exceptions import relevance
-
-    error = min(_validator().iter_errors(data), key=relevance, default=None)
-    if error is None:
-        return
-    while error.context:  # of several alternatives: what is wrong with the nearest
-        error = min(error.context, key=relevance)
-    where = one_line(error.json_path.removeprefix("$").removeprefix(".") or "the document")
-    raise UsageError(
-        f"{path}: {where} {_expected(error.validator, error.validator_value, error.instance)}",
-        hint="the file is damaged, or was written by another program; docs/reports.md says what is "
-        "in a result file",
-    )
-
-
-_KINDS = {
-    dict: "an object",
-    list: "a list",
-    str: "a text",
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    type(None): "null",
-}
-_NAMES = {
-    "object": "an object",
-    "array": "a list",
-    "string": "a text",
-    "boolean": "true or false",
-    "integer": "a whole number",
-    "number": "a number",
-    "null": "null",
-}
-
-
-def _expected(rule: str, value: Any, found: Any) -> str:
-    """What a rule of the schema wants, and what is there instead."""
-    is_there = _KINDS[type(found)]
-    if isinstance(found, str | int | float | bool):
-        is_there = one_line(json.dumps(found), 60)
-    if rule == "type":
-        kinds = [value] if isinstance(value, str) else value
-        return f"must be {' or '.join(_NAMES[kind] for kind in kinds)}, not {is_there}"
-    if rule == "required":
-        missing = [name for name in value if name not in found]
-        return f"has no {', '.join(missing)}"
-    if rule == "enum":
-        return f"must be one of {', '.join(json.dumps(v) for v in value)}, not {is_there}"
-    if rule == "const":
-        return f"must be {json.dumps(value)}, not {is_there}"
-    if rule in ("minimum", "maximum"):
-        return f"must be {'at least' if rule == 'minimum' else 'at most'} {value:g}, not {is_there}"
-    if rule == "additionalProperties":
-        return "holds something that is not known"
-    if rule in ("maxLength", "maxItems", "maxProperties", "minLength"):
-        return f"is too {'short' if rule == 'minLength' else 'long'} ({rule} {value})"
-    if rule == "pattern":
-        return f"is not of the form {value}: {is_there}"
-    return f"is not as it should be ({rule})"
-
-
-def _result_of(entry: dict[str, Any]) -> Result:
-    data = dict(entry["requirement"])
-    data["level"] = Level(data["level"])
-    data["after"] = tuple(data["after"])
-    data["dialects"] = tuple(data["dialects"])
-    return Result(
-        requirement=Requirement(**data),
-        side=entry["side"],
-        verdict=Verdict(entry["verdict"]),
-        figure=entry["figure"],
-        observed=entry["observed"],
-        reason=entry["reason"],
-        cause=entry["cause"],
-        blocked_by=entry["blocked_by"],
-        evidence=tuple(Evidence(**e) for e in entry["evidence"]),
-        values=entry["values"],
-    )

@@ -37,7 +37,7 @@ from typing import Protocol
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Level, Requirement
-from dexkit.conformance.results import BUSY, TOO_BUSY, Result, Verdict
+from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
 from dexkit.conformance.stimulus_record import IDLE, Lost
 from dexkit.hand import Side
 
@@ -56,6 +56,9 @@ NOTABLE = 0.1
 """Part of a failure that the machine must explain to be mentioned."""
 SHORT = 1.0
 """Seconds before a failure that has no end, in which the machine may have caused it."""
+
+_TOO_BUSY = "the machine was too busy"
+_BUSY = "the machine was busy"
 
 MOST_PLACES = 5
 """Places that a result names; all of them are looked at before a failure is excused."""
@@ -79,14 +82,19 @@ class Machine(Protocol):
 class Excuse:
     """What the machine has to do with a failure.
 
-    :param excused: it can have caused all of it.
+    :param disturbance: its load, and what was measured of it.
     :param text: what it was like, where it was not idle; else empty.
     :param final: no load, however heavy, makes a good hand look like this.
     """
 
-    excused: bool
+    disturbance: Disturbance = UNDISTURBED
     text: str = ""
     final: bool = False
+
+    @property
+    def excused(self) -> bool:
+        """Whether the machine can have caused all of it."""
+        return self.disturbance.load is Load.TOO_BUSY
 
 
 def excuse(
@@ -101,8 +109,7 @@ def excuse(
     """
     overloaded = _overloaded(machine, whole)
     if not requirement.realtime:
-        moving = requirement.needs not in _STILL
-        return Excuse(bool(overloaded) and moving, overloaded if moving else "")
+        return overloaded if overloaded and requirement.needs not in _STILL else Excuse()
     spans = [
         (e.time_s, e.end_s) if e.end_s is not None else (e.time_s - SHORT, e.time_s)
         for e in outcome.evidence
@@ -114,22 +121,23 @@ def excuse(
     best = outcome.late.best if outcome.late else 0.0
     found = [_at(machine, size, best, how, *s) for size, s in zip(sizes, spans, strict=True)]
     if not found:
-        return Excuse(False)
+        return Excuse()
     # the place that is hardest to explain decides
     least = min(found, key=lambda e: e.excused)
     if overloaded and not least.final:
-        return Excuse(True, overloaded)
+        return overloaded
     return least
 
 
-def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> str:
-    """That the machine was overloaded, or nothing."""
+def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse | None:
+    """That the machine was overloaded, or None."""
     lost = machine.lost(*whole) if whole is not None else None
     if lost is None or lost.mean < OVERLOADED:
-        return ""
-    return (
-        f"{TOO_BUSY} to tell: the kit's own timer was late by {_ms(lost.mean)} each time, over the "
-        "whole run; run again"
+        return None
+    return Excuse(
+        Disturbance(Load.TOO_BUSY, lost.mean),
+        f"{_TOO_BUSY} to tell: the kit's own timer was late by {_ms(lost.mean)} each time, over "
+        "the whole run; run again",
     )
 
 
@@ -148,29 +156,29 @@ def _at(machine: Machine, size: float, best: float, how: str, begin: float, end:
     lost = machine.lost(begin, end)
     share = min(machine.starved(begin, end), 1.0)
     if lost is None:
-        return Excuse(False)
+        return Excuse()
     measured = {"total": lost.total, "mean": lost.mean, "p99": lost.p99}[how]
     harder = HARDEST * (1.0 + share)
     explained = harder * measured
-    busy = share >= BUSY_SHARE or explained >= NOTABLE * size
+    failure_s = size if math.isfinite(size) else None
     was = f"the kit's own timer was late by {_ms(measured)} {_HOW[how]} there"
-    if best > IDLE + harder * lost.best:
-        why = f"{BUSY}, but by fits, and the hand is {_ms(best)} late in its best quarter, too"
-        return Excuse(False, why if busy else "", final=True)
-    if measured > 0 and explained >= size:
+    by_fits = best > IDLE + harder * lost.best
+    if not by_fits and measured > 0 and explained >= size:
         return Excuse(
-            True,
-            f"{TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(size)} late; run again",
+            Disturbance(Load.TOO_BUSY, measured, explained, failure_s),
+            f"{_TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(size)} late; run again",
         )
-    if not math.isfinite(size):
-        why = f"{BUSY}, but no delay makes a good hand look like this" if busy else ""
-        return Excuse(False, why, final=True)
-    if not busy:
-        return Excuse(False)
-    return Excuse(
-        False,
-        f"{BUSY}, but {was}, which explains at most {_ms(explained)} of {_ms(size)}",
-    )
+    final = by_fits or failure_s is None
+    if not (share >= BUSY_SHARE or explained >= NOTABLE * size):
+        return Excuse(final=final)
+    if by_fits:
+        why = f"by fits, and the hand is {_ms(best)} late in its best quarter, too"
+    elif failure_s is None:
+        why = "no delay makes a good hand look like this"
+    else:
+        why = f"{was}, which explains at most {_ms(explained)} of {_ms(size)}"
+    disturbance = Disturbance(Load.BUSY, measured, explained, failure_s)
+    return Excuse(disturbance, f"{_BUSY}, but {why}", final)
 
 
 def _ms(seconds: float) -> str:
@@ -192,7 +200,13 @@ class Judgement:
         self._claimed = claims.claimed(requirement)
         self._found = found
 
-    def result(self, verdict: Verdict, outcome: Outcome, blocked_by: str = "") -> Result:
+    def result(
+        self,
+        verdict: Verdict,
+        outcome: Outcome,
+        blocked_by: str = "",
+        disturbance: Disturbance = UNDISTURBED,
+    ) -> Result:
         """The result of that verdict."""
         cause = outcome.cause or self.requirement.cause
         return Result(
@@ -206,6 +220,10 @@ class Judgement:
             values=outcome.values,
             cause=cause if verdict in (Verdict.FAIL, Verdict.WARN) else "",
             blocked_by=blocked_by,
+            joints=outcome.joints,
+            disturbance=disturbance,
+            plots=outcome.plots or self.requirement.plots,
+            retry=outcome.retry or disturbance.load is not Load.NONE,
         )
 
     def not_applicable(self, reason: str) -> Result:
@@ -252,7 +270,7 @@ class Judgement:
         busy = excuse(outcome)
         if busy.text:
             outcome = replace(outcome, reason=busy.text)
-        if busy.excused:
-            return self.result(Verdict.BLOCKED, outcome)
         must = self.requirement.level is Level.MUST
-        return self.result(Verdict.FAIL if must else Verdict.WARN, outcome)
+        failed = Verdict.FAIL if must else Verdict.WARN
+        verdict = Verdict.BLOCKED if busy.excused else failed
+        return self.result(verdict, outcome, disturbance=busy.disturbance)

@@ -201,7 +201,7 @@ def render_all(path: Path, folder: Path, view: Any = None) -> None:
     from dexkit.conformance.report.junit import write_junit
     from dexkit.conformance.report.markdown import render_markdown
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.results import read_json
+    from dexkit.conformance.result_file import read_json
     from dexkit.console import Console
 
     found = read_json(path)

@@ -13,7 +13,7 @@ from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.report.wording import hand_name
+from dexkit.conformance.report.labels import hand_name
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.verdicts import Excuse, Judgement
@@ -94,7 +94,7 @@ def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
     claims = Claims.parse(text) if text else Claims()
     (applied,) = claims.apply([requirement])
-    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: Excuse(False))
+    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: Excuse())
 
 
 @pytest.mark.parametrize("met", [None, True])

@@ -13,7 +13,7 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import gripper, plan_for
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import BUSY, Overall, RunResult, Verdict
+from dexkit.conformance.results import Load, Overall, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
@@ -173,7 +173,7 @@ def test_a_busy_machine_explains_as_much_as_it_was_late_by(
         assert result.disturbed
     elif verdict is Verdict.FAIL:
         assert result.overall is Overall.FAIL
-        assert found.reason.startswith(BUSY) is pressed
+        assert found.disturbance.load is (Load.BUSY if pressed else Load.NONE)
 
 
 @pytest.mark.parametrize(("usual_ms", "verdict"), [(2.0, Verdict.FAIL), (6.0, Verdict.BLOCKED)])

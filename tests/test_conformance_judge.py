@@ -14,7 +14,8 @@ from dexkit.conformance.checks import REGISTRY
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording, detect_dialect, sides_of
 from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Overall, RunResult, Verdict, read_json, worst
+from dexkit.conformance.result_file import read_json
+from dexkit.conformance.results import Overall, RunResult, Verdict, worst
 from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError

@@ -16,10 +16,10 @@ from dexkit.conformance.judge import judge, judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.report.evidence import evidence
+from dexkit.conformance.report.charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.html import render
-from dexkit.conformance.report.plots import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
-from dexkit.conformance.report.wording import VERDICTS
+from dexkit.conformance.report.labels import VERDICTS
+from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import mutants as usb_mutants
@@ -220,7 +220,7 @@ WRONG = {m.name: m.service for m in MUTANTS if m.model == "dex1-1"}
         ("OldTopic", {"step"}, "TOPIC-01", ["On the network"]),
     ],
 )
-def test_evidence_suits_what_is_required(
+def test_a_failure_shows_the_plots_of_its_requirement(
     name: str, phases: set[str], need: str, titles: list[str]
 ) -> None:
     view = Recording.of(
@@ -230,7 +230,7 @@ def test_evidence_suits_what_is_required(
     )
     found = of(judge(view), f"DEX1-{need}")
     assert found.verdict in (Verdict.FAIL, Verdict.WARN)
-    figures = evidence(found, view)
+    figures = plots_of(found, view)
     assert len(figures) == len(titles)
     for figure, title in zip(figures, titles, strict=True):
         parsed(figure)
@@ -253,7 +253,7 @@ def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
         kills = next(m.kills for m in usb_mutants.MUTANTS if m.device is device)
         usb = run_usb(device(Side.LEFT))
         found = next(r for r in judge_layer(USB, usb, every) if r.requirement.id == kills)
-        (figure,) = evidence(found, replace(view, usb=usb))
+        (figure,) = plots_of(found, replace(view, usb=usb))
         parsed(figure)
         assert title in figure
 

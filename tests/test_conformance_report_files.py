@@ -23,10 +23,11 @@ from dexkit.conformance.report.compare import (
 )
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
+from dexkit.conformance.report.labels import VERDICTS
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
-from dexkit.conformance.report.wording import VERDICTS
-from dexkit.conformance.results import RunResult, Verdict, read_json
+from dexkit.conformance.result_file import read_json
+from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
 from dexkit.errors import UsageError
 from dexkit.hand import Side

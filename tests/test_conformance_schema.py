@@ -11,9 +11,10 @@ import pytest
 
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
+from dexkit.conformance.plots import PlotKind
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
-from dexkit.conformance.results import VERSION, Overall, Stage, Verdict
+from dexkit.conformance.results import VERSION, Load, Overall, Stage, Verdict
 from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
@@ -51,7 +52,7 @@ def test_a_result_with_claims_and_stimulus_validates() -> None:
     assert data["harness"] == {"starved": 0.0}
     assert {r["verdict"] for r in data["results"]} >= {"pass", "fail", "blocked", "not claimed"}
     with pytest.raises(jsonschema.ValidationError):
-        validate({**data, "version": 1})
+        validate({**data, "version": 2})
     with pytest.raises(jsonschema.ValidationError):
         validate({**data, "surprise": 1})
 
@@ -66,5 +67,9 @@ def test_the_schema_knows_every_value() -> None:
     assert properties["stage"]["additionalProperties"]["enum"] == [str(s) for s in Stage]
     assert defs["side"]["enum"] == [*map(str, Side), ROBOT]
     assert defs["level"]["enum"] == [str(level) for level in Level]
+    loads = defs["disturbance"]["properties"]["load"]["enum"]
+    assert loads == [str(load) for load in Load]
+    kinds = defs["plots"]["items"]["pattern"].removeprefix("^(").removesuffix(")$").split("|")
+    assert kinds == [str(k) if k is not PlotKind.MEMBER else "member:.+" for k in PlotKind]
     assert defs["requirement"]["properties"]["confidence"]["enum"] == list(CONFIDENCE)
     assert defs["requirement"]["properties"]["layer"]["enum"] == list(LAYERS)

@@ -18,7 +18,7 @@ from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.operator import LateState
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import BUSY, TOO_BUSY, Evidence, Result, Verdict
+from dexkit.conformance.results import Evidence, Load, Result, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimulus_record import Beats, Lost
 from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
@@ -34,7 +34,7 @@ MOVE = BY_ID["DEX1-MOVE-02"]  # not of real time
 
 def blame(outcome: Outcome) -> Excuse:
     """The machine has nothing to do with it."""
-    return Excuse(False)
+    return Excuse()
 
 
 IDLE = Lost(0.0, 0.0, 0.0)
@@ -113,7 +113,8 @@ def test_a_machine_excuses_what_it_can_have_caused(
 ) -> None:
     found = excuse(machine, requirement, outcome)
     assert found.excused is excused
-    assert found.text.startswith(TOO_BUSY) is excused
+    assert found.text.startswith("the machine was too busy") is excused
+    assert (found.disturbance.load is Load.TOO_BUSY) is excused
 
 
 def test_a_failure_on_a_busy_machine_says_what_the_machine_does_not_explain() -> None:
@@ -122,6 +123,9 @@ def test_a_failure_on_a_busy_machine_says_what_the_machine_does_not_explain() ->
         "the machine was busy, but the kit's own timer was late by 1 ms each time there, which "
         "explains at most 4 ms of 15 ms"
     )
+    told = found.disturbance
+    assert (told.load, told.late_s, told.explained_s) == (Load.BUSY, 0.001, 0.004)
+    assert told.failure_s == pytest.approx(0.015)
     assert not excuse(Machine(IDLE), RATE, rate(50.0)).text
 
 
@@ -177,12 +181,14 @@ def test_a_gap_no_longer_than_the_kits_own_lateness_is_not_blamed_on_the_hand() 
     found = of(result, GAP.id)
     assert found.verdict is Verdict.BLOCKED
     assert "late by 149 ms in all" in found.reason
+    assert (found.disturbance.load, found.retry) == (Load.TOO_BUSY, True)
+    assert found.disturbance.late_s == pytest.approx(0.149, abs=0.001)
     assert result.disturbed
     assert result.harness["jitter_p50_ms"] == pytest.approx(0.1)
     result = judge(with_beats(trace, [begin], stall_s=0.02))
     found = of(result, GAP.id)
     assert found.verdict is Verdict.FAIL
-    assert found.reason.startswith(BUSY)
+    assert (found.disturbance.load, found.retry) == (Load.BUSY, True)
     assert result.disturbed  # one more run, to be sure
     assert not judge(with_beats(trace)).disturbed
 
@@ -230,7 +236,7 @@ def test_a_failure_is_explained_in_full() -> None:
     assert result.verdict is Verdict.FAIL
     lines = dict(line.strip().split(": ", 1) for line in result.explain().splitlines()[1:])
     assert {k.strip() for k in lines} >= {"required", "observed", "cause", "try", "source"}
-    assert "rt/x at 1.500 s .. 2.000 s" in result.explain()
+    assert "rt/x at 1.500 s to 2.000 s" in result.explain()
     assert GAP.cause in result.explain()
     told = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome.because("the moon"), blame)
     assert told.cause == "the moon"

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
@@ -77,6 +78,10 @@ class Outcome:
         tell; else as late as the failure's place is long.
     :param absent: the hand does not do this at all: a failure of who claims the unit, whatever
         ``met`` is for others.
+    :param joints: indices of the joints that it is about, the most important first; empty if it is
+        about none in particular.
+    :param plots: what shows it, where that is not what the requirement names.
+    :param retry: another run may come to another finding.
     """
 
     met: bool | None
@@ -88,6 +93,18 @@ class Outcome:
     cause: str = ""
     late: Late | None = None
     absent: bool = False
+    joints: tuple[int, ...] = ()
+    plots: tuple[Plot, ...] = ()
+    retry: bool = False
+
+    def about(self, *joints: int) -> Outcome:
+        """The same, about these joints (indices)."""
+        return replace(self, joints=tuple(int(joint) for joint in joints))
+
+    def shown_by(self, *plots: PlotKind | Plot) -> Outcome:
+        """The same, with plots of its own instead of the requirement's."""
+        chosen = tuple(Plot(p) if isinstance(p, PlotKind) else p for p in plots)
+        return replace(self, plots=chosen)
 
     def because(self, cause: str) -> Outcome:
         """The same, with a cause that the check could tell from what it saw."""

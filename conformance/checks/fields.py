@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import joints_of
 from dexkit.hand import Floats
 
@@ -47,13 +48,15 @@ def finite(ctx: Context) -> Outcome:
         return ctx.passed("all finite", f"{int(there.sum())} samples")
     name, rows = next(iter(bad.items()))
     joint = int(np.argmin(np.isfinite(columns[name][rows[0]])))
-    return ctx.failed(
+    outcome = ctx.failed(
         f"{name} = {columns[name][rows[0], joint]}",
         "; ".join(
             ctx.named(f"{n} is not finite in {len(r)} samples", joint) for n, r in bad.items()
         ),
         *(ctx.at(states.topic, float(states.t[k])) for k in rows[:5]),
-    )
+    ).about(joint)
+    shown = (Plot.of_member(name),) if name != "q" else ()
+    return outcome.shown_by(*shown, PlotKind.POSITION)
 
 
 @check("DEX1-FIELD-03", "DEX3-FIELD-03")
@@ -81,17 +84,21 @@ def in_stroke(ctx: Context) -> Outcome:
         outside = ((column < spec.q_min - margin) | (column > spec.q_max + margin)) & ~excused
         if outside.any():
             i = int(np.argmax(outside))
-            return ctx.failed(
-                f"{column[i]:.2f} rad",
-                f"{text}; outside in {int(outside.sum())} samples",
-                ctx.at(states.topic, float(states.t[i])),
-                q_min=low,
-                q_max=high,
-            ).because(
-                causes.of_positions(
-                    states.q[~excused],
-                    ctx.joints,
-                    joints_of(ctx.recording.dialect, ctx.other),
+            return (
+                ctx.failed(
+                    f"{column[i]:.2f} rad",
+                    f"{text}; outside in {int(outside.sum())} samples",
+                    ctx.at(states.topic, float(states.t[i])),
+                    q_min=low,
+                    q_max=high,
+                )
+                .about(joint)
+                .because(
+                    causes.of_positions(
+                        states.q[~excused],
+                        ctx.joints,
+                        joints_of(ctx.recording.dialect, ctx.other),
+                    )
                 )
             )
         beyond = max(spec.q_min - low, high - spec.q_max)
@@ -121,16 +128,17 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
                 if len(stand) < 5 or t[-1] < t[i] + _STAND_S:
                     break
                 if float(np.ptp(stand)) <= 0.1 * spec.stroke:
-                    return ctx.failed(
+                    text = (
+                        f"commanded far out of range it came to a stand at q = {q[i]:.1f} rad; "
+                        f"the stroke is {spec.q_min:g} to {spec.q_max:.3f} rad"
+                    )
+                    outcome = ctx.failed(
                         f"{q[i]:.1f} rad",
-                        ctx.named(
-                            f"commanded far out of range it came to a stand at q = {q[i]:.1f} rad; "
-                            f"the stroke is {spec.q_min:g} to {spec.q_max:.3f} rad",
-                            joint,
-                        ),
+                        ctx.named(text, joint),
                         ctx.at(ctx.states.topic, float(t[i]), float(t[i]) + _STAND_S),
                         q_stand=float(q[i]),
-                    ).because(causes.of_range(float(q[i])))
+                    )
+                    return outcome.about(joint).because(causes.of_range(float(q[i])))
     return None
 
 
@@ -165,7 +173,7 @@ def plausible_speed(ctx: Context) -> Outcome:
         f"{text}: {part:.1f} times what the joint is good for",
         ctx.at(ctx.states.topic, at, at + window),
         speed_rad_s=speed_rad_s,
-    )
+    ).about(joint)
 
 
 @check("DEX1-FIELD-04", "DEX3-FIELD-04")
@@ -217,9 +225,13 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
         return ctx.passed(f"{error:.0%} off", text, relative_rms=error)
     worst = starts[np.argmax(np.abs(mean - slope))]
     turned = float(np.mean(mean[moving] * slope[moving])) < 0
-    return ctx.failed(
-        f"{error:.0%} off",
-        text + ("; its sign is turned" if turned else ""),
-        ctx.at(states.topic, float(t[worst]), float(t[worst]) + window),
-        relative_rms=error,
-    ).if_late((error - ctx.tolerance("max_relative_rms")) * window, how="mean")
+    return (
+        ctx.failed(
+            f"{error:.0%} off",
+            text + ("; its sign is turned" if turned else ""),
+            ctx.at(states.topic, float(t[worst]), float(t[worst]) + window),
+            relative_rms=error,
+        )
+        .about(joint)
+        .if_late((error - ctx.tolerance("max_relative_rms")) * window, how="mean")
+    )

@@ -221,11 +221,15 @@ def ids(ctx: Context) -> Outcome:
         cause = "mode holds the status without the id."
     elif sorted(row) == list(range(len(ctx.joints))):
         cause = "The motors are in another order than the message has."
-    return ctx.failed(
-        f"id {row[joint]}",
-        ctx.named(f"motor {joint} says id {row[joint]}, in {int(wrong.sum())} states", joint),
-        ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(wrong))])),
-    ).because(cause)
+    return (
+        ctx.failed(
+            f"id {row[joint]}",
+            ctx.named(f"motor {joint} says id {row[joint]}, in {int(wrong.sum())} states", joint),
+            ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(wrong))])),
+        )
+        .about(joint)
+        .because(cause)
+    )
 
 
 @check("DEX3-MODE-02")
@@ -247,7 +251,7 @@ def status(ctx: Context) -> Outcome:
                     f"status {found[joint]:g}",
                     ctx.named(f"status {found[joint]:g} while {when}", joint),
                     ctx.at(ctx.states.topic, a, b),
-                )
+                ).about(joint)
     return ctx.passed("1, then 0", "1 while driven, 0 while locked")
 
 
@@ -287,7 +291,8 @@ def wrong_id(ctx: Context) -> Outcome:
     first, other = _roles(ctx).crossed
     names = [ctx.joints[i].name for i in (first, other)]
     quiet = [j for j in range(len(ctx.joints)) if j != first]
-    return stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
+    outcome = stays(ctx, f"a command to {names[0]} with the id of {names[1]} ({other})", quiet)
+    return outcome.about(*outcome.joints, first)
 
 
 # ------------------------------------------------------------------------------------- joints
@@ -314,12 +319,14 @@ def order(ctx: Context) -> Outcome:
             name = ctx.joints[step.joint].name
             if own < ctx.tolerance("min_progress") * abs(step.size) or wrong:
                 seen = ", ".join(f"{ctx.joints[j].name} moved {moved[j]:.2f} rad" for j in wrong)
-                return ctx.failed(
+                outcome = ctx.failed(
                     ctx.joints[wrong[0]].name if wrong else "no motion",
                     f"{name} was told to go {abs(step.size):.2f} rad and moved {own:.2f} rad; "
                     + (seen or "no joint moved"),
                     ctx.at(ctx.states.topic, begin, end),
-                ).because(_order_cause(ctx, step.joint, wrong, own < 0.1 * abs(step.size)))
+                ).about(step.joint, *wrong)
+                cause = _order_cause(ctx, step.joint, wrong, own < 0.1 * abs(step.size))
+                return outcome.because(cause)
             found += 1
     if not found:
         return ctx.failed("no step", "there is no state while the joints were moved")
@@ -363,7 +370,7 @@ def stiffness(ctx: Context) -> Outcome:
     text = ctx.named(f"a soft step takes {ratio:.1f} times as long to half-way", joint)
     if ratio >= ctx.tolerance("min_ratio"):
         return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio)
-    return ctx.failed(f"x {ratio:.1f}", text, ratio=ratio)
+    return ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
 
 
 def _half_way(step: Step) -> float | None:
@@ -475,7 +482,7 @@ def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
             ),
             ctx.at(ctx.states.topic, late, end),
             motion_rad=rad,
-        )
+        ).about(joint)
     if before.min() < ctx.requirement.tolerance("min_travel_stroke"):
         return ctx.skipped(
             "not every joint that was set in motion still moved when the commands stopped: "
@@ -516,7 +523,7 @@ def tells(ctx: Context) -> Outcome:
             "not set",
             ctx.named("bit 7 is not set after the time-out", joint),
             ctx.at(ctx.states.topic, late, end),
-        )
+        ).about(joint)
     return ctx.passed("set", "bit 7 is set in every motor after the time-out, and not before")
 
 
@@ -568,7 +575,7 @@ def holds(ctx: Context) -> Outcome:
                 "stops",
                 ctx.named("stopped on its way after the time-out", joint),
                 ctx.at(ctx.states.topic, late, end),
-            )
+            ).about(joint)
     return ctx.passed("goes on", "went on to its position after the time-out")
 
 

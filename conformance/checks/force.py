@@ -144,7 +144,9 @@ def unit(ctx: Context) -> Outcome:
     text = ctx.named(f"|tau_est| of at most {tau_nm:.2f} N m", joint)
     if part <= ctx.tolerance("max_part"):
         return ctx.passed(f"{tau_nm:.2f} N m", text, tau_nm=tau_nm)
-    return ctx.failed(f"{tau_nm:.3g} N m", text, ctx.at(ctx.states.topic, float(at)), tau_nm=tau_nm)
+    return ctx.failed(
+        f"{tau_nm:.3g} N m", text, ctx.at(ctx.states.topic, float(at)), tau_nm=tau_nm
+    ).about(joint)
 
 
 @check("DEX1-FORCE-05")

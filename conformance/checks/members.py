@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.hand import Floats
 
 __all__: list[str] = []
@@ -78,7 +79,7 @@ def _outside(
             f"{value:g}",
             f"{name} = {value:g} in {int((~good).any(axis=1).sum())} states",
             ctx.at(ctx.states.topic, _at(ctx, row)),
-        )
+        ).shown_by(Plot.of_member(name), PlotKind.POSITION)
     return None
 
 
@@ -175,7 +176,7 @@ def acceleration(ctx: Context) -> Outcome:
         return ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
     # stamps that are so late bend a straight line as much as the least acceleration that counts
     size = 0.1 * window
-    outcome = ctx.failed(f"x {ratio:.2f}", text, ratio=ratio).if_late(size, how="p99")
+    outcome = ctx.failed(f"x {ratio:.2f}", text, ratio=ratio).about(joint).if_late(size, how="p99")
     return outcome.because("its sign is turned") if ratio < 0 else outcome
 
 
@@ -222,7 +223,8 @@ def reserved(ctx: Context) -> Outcome:
     text = f"{path} takes {count} different {'value' if count == 1 else 'values'}"
     if count <= ctx.tolerance("max_values"):
         return ctx.passed(f"{count}", text)
-    return ctx.failed(f"{count} values", text)
+    outcome = ctx.failed(f"{count} values", text)
+    return outcome.shown_by(Plot.of_member(path), PlotKind.POSITION)
 
 
 @check("DEX1-FIELD-11", "DEX3-FIELD-07")
@@ -259,7 +261,7 @@ def no_fault(ctx: Context) -> Outcome:
                 f"{path} = {int(values[row, 0]):#x} in {int(values.any(axis=1).sum())} states of "
                 "a hand that moves as it is told",
                 ctx.at(ctx.states.topic, float(t[free][row])),
-            )
+            ).shown_by(Plot.of_member(path), PlotKind.POSITION)
     return ctx.passed("0", f"no fault in {int(free.sum())} states")
 
 

@@ -110,12 +110,16 @@ def direction(ctx: Context) -> Outcome:
     verdict = "it did not move" if moved < 0.02 * step.stroke else "that is the wrong way"
     if progress[worst] > -0.05 and moved >= 0.02 * step.stroke:
         verdict = "it did not get there"
-    return ctx.failed(
-        f"{progress[worst]:+.0%}",
-        f"{step}: {verdict}",
-        ctx.at(ctx.states.topic, step.begin, step.end),
-        progress=progress[worst],
-    ).because(_cause(found))
+    return (
+        ctx.failed(
+            f"{progress[worst]:+.0%}",
+            f"{step}: {verdict}",
+            ctx.at(ctx.states.topic, step.begin, step.end),
+            progress=progress[worst],
+        )
+        .about(step.joint)
+        .because(_cause(found))
+    )
 
 
 @check("DEX1-MOVE-02", "DEX3-MOVE-02")
@@ -131,12 +135,16 @@ def arrives(ctx: Context) -> Outcome:
             f"{len(found)} steps, ending at most {worst.error:.3f} rad off",
             error_rad=worst.error,
         )
-    return ctx.failed(
-        f"{worst.error:.2f} rad",
-        f"{worst}",
-        ctx.at(ctx.states.topic, worst.begin, worst.end),
-        error_rad=worst.error,
-    ).because(_cause(found))
+    return (
+        ctx.failed(
+            f"{worst.error:.2f} rad",
+            f"{worst}",
+            ctx.at(ctx.states.topic, worst.begin, worst.end),
+            error_rad=worst.error,
+        )
+        .about(worst.joint)
+        .because(_cause(found))
+    )
 
 
 def _cause(found: Sequence[Step]) -> str:
@@ -176,7 +184,7 @@ def settles(ctx: Context) -> Outcome:
         "to peak",
         ctx.at(ctx.states.topic, step.end - window, step.end),
         ripple_rad=ripple,
-    )
+    ).about(step.joint)
 
 
 @check("DEX1-MOVE-04", "DEX3-MOVE-04")
@@ -199,12 +207,16 @@ def speed(ctx: Context) -> Outcome:
     way = 0.8 * abs(step.size)
     if slowest >= ctx.tolerance("min_speed_rad_s"):
         return ctx.passed(f"{slowest:.1f} rad/s", text, speed_rad_s=slowest)
-    return ctx.failed(
-        f"{slowest:.1f} rad/s",
-        text,
-        ctx.at(ctx.states.topic, step.begin, step.end),
-        speed_rad_s=slowest,
-    ).if_late(way / slowest - way / ctx.tolerance("min_speed_rad_s"))
+    return (
+        ctx.failed(
+            f"{slowest:.1f} rad/s",
+            text,
+            ctx.at(ctx.states.topic, step.begin, step.end),
+            speed_rad_s=slowest,
+        )
+        .about(step.joint)
+        .if_late(way / slowest - way / ctx.tolerance("min_speed_rad_s"))
+    )
 
 
 @check("DEX1-MOVE-05", "DEX3-MOVE-05")
@@ -223,12 +235,16 @@ def overshoot(ctx: Context) -> Outcome:
         return ctx.passed(
             f"{beyond:.3f} rad", f"at most {beyond:.3f} rad beyond the target", overshoot_rad=beyond
         )
-    return ctx.failed(
-        f"{beyond:.2f} rad",
-        f"{step.name}{beyond:.2f} rad beyond the target {step.target:.2f} rad",
-        ctx.at(ctx.states.topic, step.begin, step.end),
-        overshoot_rad=beyond,
-    ).if_late(STROKE_S * beyond / step.stroke)
+    return (
+        ctx.failed(
+            f"{beyond:.2f} rad",
+            f"{step.name}{beyond:.2f} rad beyond the target {step.target:.2f} rad",
+            ctx.at(ctx.states.topic, step.begin, step.end),
+            overshoot_rad=beyond,
+        )
+        .about(step.joint)
+        .if_late(STROKE_S * beyond / step.stroke)
+    )
 
 
 @check("DEX1-MOVE-06", "DEX3-MOVE-06")
@@ -250,13 +266,17 @@ def monotonous(ctx: Context) -> Outcome:
     text = f"{step.name}turned back by at most {back_by:.3f} rad in {len(found)} steps"
     if back_by <= ctx.tolerance("max_back_stroke", step.joint):
         return ctx.passed(f"{back_by:.3f} rad", text, back_rad=back_by)
-    return ctx.failed(
-        f"{back_by:.2f} rad",
-        f"{step.name}on its way from {step.start:.2f} to {step.target:.2f} rad q went back by "
-        f"{back_by:.2f} rad",
-        ctx.at(ctx.states.topic, at, step.end),
-        back_rad=back_by,
-    ).if_late(STROKE_S * back_by / step.stroke)
+    return (
+        ctx.failed(
+            f"{back_by:.2f} rad",
+            f"{step.name}on its way from {step.start:.2f} to {step.target:.2f} rad q went back by "
+            f"{back_by:.2f} rad",
+            ctx.at(ctx.states.topic, at, step.end),
+            back_rad=back_by,
+        )
+        .about(step.joint)
+        .if_late(STROKE_S * back_by / step.stroke)
+    )
 
 
 @check("DEX1-MOVE-07", "DEX3-MOVE-07")
@@ -276,12 +296,16 @@ def settling(ctx: Context) -> Outcome:
     text = f"{step.name}{longest:.2f} s in the slowest of {len(found)} steps"
     if longest <= ctx.tolerance("max_settle_s"):
         return ctx.passed(f"{longest:.2f} s", text, settle_s=longest)
-    return ctx.failed(
-        f"{longest:.2f} s",
-        f"{step}: after {longest:.2f} s it was still away from its target",
-        ctx.at(ctx.states.topic, step.begin, step.begin + longest),
-        settle_s=longest,
-    ).if_late(longest - ctx.tolerance("max_settle_s"))
+    return (
+        ctx.failed(
+            f"{longest:.2f} s",
+            f"{step}: after {longest:.2f} s it was still away from its target",
+            ctx.at(ctx.states.topic, step.begin, step.begin + longest),
+            settle_s=longest,
+        )
+        .about(step.joint)
+        .if_late(longest - ctx.tolerance("max_settle_s"))
+    )
 
 
 @check("DEX1-MOVE-08")
@@ -348,7 +372,7 @@ def independent(ctx: Context) -> Outcome:
         ),
         ctx.at(ctx.states.topic, begin, end),
         motion_rad=most,
-    )
+    ).about(joint)
 
 
 @check("DEX1-GAIN-01", "DEX3-GAIN-01")
@@ -382,4 +406,4 @@ def not_pulled(ctx: Context, how: str) -> Outcome:
         f"{step.name}moved {towards:.2f} rad towards q = {step.target:.2f} {how}",
         ctx.at(ctx.states.topic, step.begin, step.end),
         motion_rad=towards,
-    )
+    ).about(step.joint)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
@@ -90,10 +90,11 @@ def _judge(
         return ctx.passed(text(worst), observed, **values)
     wanted = 1.0 / client_for(ctx.recording.dialect, (ctx.side,)).period
     if found.client_hz < _PART * wanted:
-        return ctx.skipped(
+        skipped = ctx.skipped(
             f"the kit's own client managed {found.client_hz:.0f} of {wanted:.0f} commands a "
             f"second: '{text(worst)}' may be its machine's fault; run again"
         )
+        return replace(skipped, retry=True)
     places = [ctx.at(ctx.states.topic, found.begin, found.end)]
     if of_step is not None:
         steps = [s for s in found.joints[joint].steps if not of_step(s) < worst]
@@ -101,7 +102,7 @@ def _judge(
     size, how = (worst - ctx.tolerance(limit, joint)), "total" if of_step else "mean"
     if limit.endswith("_stroke"):
         size *= STROKE_S / ctx.joints[joint].stroke
-    return ctx.failed(text(worst), observed, *places, **values).if_late(size, how=how)
+    return ctx.failed(text(worst), observed, *places, **values).about(joint).if_late(size, how=how)
 
 
 @check("DEX1-OPER-01", "DEX3-OPER-01")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
+from dexkit.conformance.plots import Plot
 from dexkit.conformance.robot import RobotRecording
 from dexkit.conformance.stimuli.robot import STEP
 from dexkit.conformance.stimulus_record import Phase
@@ -42,12 +43,14 @@ def _at(ctx: RobotContext, row: int) -> float:
     return float(ctx.states.t[row])
 
 
-def _wrong_rows(ctx: RobotContext, bad: ArrayLike, figure: str, what: str) -> Outcome:
-    """A failure in the samples where ``bad`` is true."""
+def _wrong_rows(
+    ctx: RobotContext, bad: ArrayLike, figure: str, what: str, joints: tuple[int, ...] = ()
+) -> Outcome:
+    """A failure in the samples where ``bad`` is true, about these joints."""
     rows = np.flatnonzero(bad)
     places = [ctx.at(ctx.states.topic, _at(ctx, int(i))) for i in rows[:5]]
     text = f"{what}, in {len(rows)} of {len(ctx.states)} states"
-    return ctx.failed(figure, text, *places, wrong=len(rows))
+    return ctx.failed(figure, text, *places, wrong=len(rows)).about(*joints)
 
 
 # ------------------------------------------------------------------------------------ discovery
@@ -170,13 +173,14 @@ def within_limits(ctx: RobotContext) -> Outcome:
         (beyond > 0).any(axis=1),
         f"{q:.2f} rad",
         f"{spec.name}: q = {q:.3f} rad; its limits are {spec.q_min:g} and {spec.q_max:g}",
+        (int(joint),),
     )
 
 
 @check("H1-FIELD-04")
 def speed_of_q(ctx: RobotContext) -> Outcome:
     """Speeds against the change of q, of each joint while it is moved."""
-    window, worst, name = ctx.tolerance("window_s"), 0.0, ""
+    window, worst, which = ctx.tolerance("window_s"), 0.0, -1
     for phase in ctx.phases():
         joint = _index(ctx, phase)
         rows = ctx.states.between(*ctx.span(phase))
@@ -191,11 +195,12 @@ def speed_of_q(ctx: RobotContext) -> Outcome:
         told = (sums[later] - sums[first]) / (later - first)
         off = float(np.abs(change - told).mean())
         if not off <= worst:
-            worst, name = off, ctx.joints[joint].name
+            worst, which = off, joint
+    name = ctx.joints[which].name if which >= 0 else ""
     text = f"{name}: dq is off the change of q by {worst:.2f} rad/s in the mean"
     if worst <= ctx.tolerance("tolerance_rad_s"):
         return ctx.passed(f"{worst:.2f} rad/s", text)
-    return ctx.failed(f"{worst:.2f} rad/s", text)
+    return ctx.failed(f"{worst:.2f} rad/s", text).about(which)
 
 
 @check("H1-FIELD-05")
@@ -208,8 +213,10 @@ def unused_still(ctx: RobotContext) -> Outcome:
         bad = (np.nan_to_num(values) != 0).any(axis=1)
         if bad.any():
             slot = unused[int(np.argmax(np.abs(values[np.argmax(bad)])))]
-            what = f"motor_state[{slot}].{member} is {values[np.argmax(bad)].max():.3g}"
-            return _wrong_rows(ctx, bad, f"slot {slot}", what)
+            path = f"motor_state[{slot}].{member}"
+            what = f"{path} is {values[np.argmax(bad)].max():.3g}"
+            outcome = _wrong_rows(ctx, bad, f"slot {slot}", what)
+            return outcome.shown_by(Plot.of_member(path))
     return ctx.passed("0", f"slots {', '.join(map(str, unused))}")
 
 
@@ -227,7 +234,9 @@ def byte_temperatures(ctx: RobotContext) -> Outcome:
         values = np.nan_to_num(low[member]).reshape(len(low), -1).max(axis=1)
         bad = values > ctx.tolerance("max_c")
         if bad.any():
-            return _wrong_rows(ctx, bad, f"{values.max():.0f}", f"{member} is {values.max():.0f}")
+            figure = f"{values.max():.0f}"
+            outcome = _wrong_rows(ctx, bad, figure, f"{member} is {figure}")
+            return outcome.shown_by(Plot.of_member(member))
         top = max(top, float(values.max(initial=0.0)))
     return ctx.passed(f"{top:.0f}", f"at most {top:.0f} degrees")
 
@@ -244,7 +253,9 @@ def motor_temperatures(ctx: RobotContext) -> Outcome:
     row = int(np.argmax(bad.any(axis=1)))
     joint = int(np.argmax(bad[row]))
     what = f"{ctx.joints[joint].name}: {values[row, joint]:.0f} degrees"
-    return _wrong_rows(ctx, bad.any(axis=1), f"{values[row, joint]:.0f}", what)
+    figure = f"{values[row, joint]:.0f}"
+    outcome = _wrong_rows(ctx, bad.any(axis=1), figure, what, (joint,))
+    return outcome.shown_by(Plot.of_member(f"motor_state[{robot.used[joint]}].{path}"))
 
 
 @check("H1-IMU-01")
@@ -381,7 +392,7 @@ def mode_told(ctx: RobotContext) -> Outcome:
                 f"{name}: mode {told:.0f} in the state, {wanted[joint]} in the command"
                 + (f"; {len(wrong)} motors are so" if len(wrong) > 1 else ""),
                 ctx.at(ctx.states.topic, begin, end),
-            )
+            ).about(joint)
     return ctx.passed("told")
 
 
@@ -410,7 +421,7 @@ def _q(ctx: RobotContext, begin: float, end: float) -> Floats:
 @check("H1-MOVE-01", "H1-SAFE-04", "H1-LIFE-02")
 def follows(ctx: RobotContext) -> Outcome:
     """Where each step of a joint ends."""
-    worst, where, name = -1.0, None, ""
+    worst, where, which = -1.0, None, 0
     for phase in ctx.phases():
         if not phase.targets:
             continue
@@ -422,20 +433,21 @@ def follows(ctx: RobotContext) -> Outcome:
         error = abs(float(q[:, joint].mean()) - goal)
         error = error if math.isfinite(error) else math.inf
         if error > worst:
-            worst, where, name = error, (begin, end), ctx.joints[joint].name
+            worst, where, which = error, (begin, end), joint
     if where is None:
         return ctx.skipped("no step was made")
-    text = f"{name} ends {worst:.3f} rad from where it was told to go"
+    text = f"{ctx.joints[which].name} ends {worst:.3f} rad from where it was told to go"
     if worst <= ctx.tolerance("max_error_rad"):
         return ctx.passed(f"{worst:.3f} rad", text, error_rad=worst)
     outcome = ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
-    return outcome.if_late(STROKE_S * worst / STEP)
+    return outcome.about(which).if_late(STROKE_S * worst / STEP)
 
 
 @check("H1-MOVE-02")
 def independent(ctx: RobotContext) -> Outcome:
     """How far other joints move along."""
     worst, text, where = -1.0, "", (0.0, 0.0)
+    about: tuple[int, ...] = ()
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         q = _q(ctx, begin, end)
@@ -446,18 +458,18 @@ def independent(ctx: RobotContext) -> Outcome:
         moved[mine] = 0.0
         joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
         if moved[joint] > worst:
-            worst, where = float(moved[joint]), (begin, end)
+            worst, where, about = float(moved[joint]), (begin, end), (joint, mine)
             text = f"{ctx.joints[joint].name} moves by {worst:.3f} rad with {ctx.joints[mine].name}"
     if worst <= ctx.tolerance("max_motion_rad"):
         return ctx.passed(f"{worst:.3f} rad", text)
-    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
+    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where)).about(*about)
 
 
 @check("H1-CRC-02", "H1-MODE-02", "H1-GAIN-04")
 @check("H1-SAFE-01", "H1-SAFE-02", "H1-SAFE-03", "G1-SAFE-05")
 def stays(ctx: RobotContext) -> Outcome:
     """How far joints move during commands that are to have no effect."""
-    worst, text, where = -1.0, "", (0.0, 0.0)
+    worst, text, where, which = -1.0, "", (0.0, 0.0), 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         before, q = _q(ctx, begin - _LATE, begin)[-_SOME:], _q(ctx, begin, end + _END)
@@ -467,13 +479,13 @@ def stays(ctx: RobotContext) -> Outcome:
         joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
         kind = f" ({phase.params['kind']})" if "kind" in phase.params else ""
         if not moved[joint] <= worst:
-            worst, where = float(moved[joint]), (begin, end)
+            worst, where, which = float(moved[joint]), (begin, end), joint
             text = f"{ctx.joints[joint].name} moves by {worst:.3f} rad{kind}"
         if math.isnan(worst):
             break
     if worst <= ctx.tolerance("max_motion_rad"):
         return ctx.passed(f"{worst:.3f} rad", text)
-    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
+    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where)).about(which)
 
 
 @check("H1-GAIN-01")
@@ -492,7 +504,8 @@ def stiffness(ctx: RobotContext) -> Outcome:
     text = f"it gives way by {way:.3f} rad; tau / kp is {wanted:.3f} rad"
     if abs(way / wanted - 1.0) <= ctx.tolerance("tolerance_part"):
         return ctx.passed(f"{way:.3f} rad", text)
-    return ctx.failed(f"{way:.3f} rad", text, ctx.at(ctx.states.topic, begin, end))
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{way:.3f} rad", text, place).about(_index(ctx, phase))
 
 
 def _speed(ctx: RobotContext, phase: Phase, begin: float, end: float) -> float | None:
@@ -514,7 +527,8 @@ def velocity(ctx: RobotContext) -> Outcome:
     text = f"{speed:.2f} rad/s, commanded {wanted:.2f} rad/s"
     if ctx.tolerance("low_part") <= speed / wanted <= ctx.tolerance("high_part"):
         return ctx.passed(f"{speed:.2f} rad/s", text)
-    return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, begin, end))
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{speed:.2f} rad/s", text, place).about(_index(ctx, phase))
 
 
 @check("H1-GAIN-03")
@@ -531,7 +545,8 @@ def torque(ctx: RobotContext) -> Outcome:
     text = f"{wanted:.2f} N m turn it by {far * math.copysign(1.0, wanted):.3f} rad"
     if far >= ctx.tolerance("min_motion_rad"):
         return ctx.passed(f"{far:.2f} rad", text)
-    return ctx.failed(f"{far:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{far:.2f} rad", text, place).about(_index(ctx, phase))
 
 
 @check("H1-FORCE-01")
@@ -547,7 +562,8 @@ def torque_told(ctx: RobotContext) -> Outcome:
     text = f"tau_est is {told:.2f} N m, tau was {wanted:.2f} N m"
     if ctx.tolerance("low_part") <= told / wanted <= ctx.tolerance("high_part"):
         return ctx.passed(f"{told:.2f} N m", text)
-    return ctx.failed(f"{told:.2f} N m", text, ctx.at(ctx.states.topic, begin, end))
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{told:.2f} N m", text, place).about(_index(ctx, phase))
 
 
 # ------------------------------------------------------------------------------------- watchdog
@@ -565,7 +581,8 @@ def damps(ctx: RobotContext) -> Outcome:
     text = f"{after - begin:.1f} s after the last command it turns at {speed:.2f} rad/s"
     if abs(speed) <= ctx.tolerance("max_speed_rad_s"):
         return ctx.passed(f"{abs(speed):.3f} rad/s", text)
-    return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, after, end))
+    place = ctx.at(ctx.states.topic, after, end)
+    return ctx.failed(f"{speed:.2f} rad/s", text, place).about(_index(ctx, phase))
 
 
 @check("H1-WDOG-02")
@@ -597,7 +614,8 @@ def resumes(ctx: RobotContext) -> Outcome:
     joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
     if not moved[joint] <= ctx.tolerance("max_jump_rad"):
         text = f"{ctx.joints[joint].name} moves by {moved[joint]:.3f} rad when commands come again"
-        return ctx.failed(f"{moved[joint]:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
+        place = ctx.at(ctx.states.topic, begin, end)
+        return ctx.failed(f"{moved[joint]:.2f} rad", text, place).about(joint)
     return follows(ctx)
 
 
@@ -613,4 +631,5 @@ def bridges(ctx: RobotContext) -> Outcome:
     text = f"{speed:.2f} rad/s in a pause of {end - begin:.2f} s, commanded {wanted:.2f} rad/s"
     if speed / wanted >= ctx.tolerance("low_part"):
         return ctx.passed(f"{speed:.2f} rad/s", text)
-    return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, begin, end))
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{speed:.2f} rad/s", text, place).about(_index(ctx, phase))

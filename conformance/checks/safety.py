@@ -42,12 +42,16 @@ def unharmed(ctx: Context, what: str) -> Outcome:
                 "no state", f"no state after {what}, when a good command came", ctx.at(topic, end)
             )
         if step.error > ctx.tolerance("max_error_stroke", step.joint):
-            return ctx.failed(
-                "disobeys",
-                f"after {what}: {step}",
-                ctx.at(topic, step.begin, step.end),
-                error_rad=step.error,
-            ).if_late(STROKE_S * step.error / step.stroke)
+            return (
+                ctx.failed(
+                    "disobeys",
+                    f"after {what}: {step}",
+                    ctx.at(topic, step.begin, step.end),
+                    error_rad=step.error,
+                )
+                .about(step.joint)
+                .if_late(STROKE_S * step.error / step.stroke)
+            )
     return Outcome(None)
 
 
@@ -74,16 +78,20 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
                     "q not finite",
                     ctx.named(f"q became {q[i, joint]} during {what}", joint),
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                )
+                ).about(joint)
             i = int(np.argmax(column))
             most = float(column[i])
             if most > ctx.tolerance("max_motion_stroke", joint):
-                return ctx.failed(
-                    f"{most:.2f} rad",
-                    ctx.named(f"moved by {most:.2f} rad during {what}", joint),
-                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                    motion_rad=most,
-                ).if_late(STROKE_S * most / ctx.joints[joint].stroke)
+                return (
+                    ctx.failed(
+                        f"{most:.2f} rad",
+                        ctx.named(f"moved by {most:.2f} rad during {what}", joint),
+                        ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                        motion_rad=most,
+                    )
+                    .about(joint)
+                    .if_late(STROKE_S * most / ctx.joints[joint].stroke)
+                )
             far = max(far, (most / ctx.joints[joint].stroke, most, joint))
     _, most, joint = far
     return ctx.passed(
@@ -126,15 +134,19 @@ def out_of_range(ctx: Context) -> Outcome:
             bad = ~((q >= spec.q_min - margin) & (q <= spec.q_max + margin))
             if bad.any():
                 i = int(np.argmax(bad))
-                return ctx.failed(
-                    f"{q[i]:.2f} rad",
-                    ctx.named(
-                        f"q became {q[i]:.2f} rad; the stroke is {spec.q_min:g} to "
-                        f"{spec.q_max:.2f} rad",
-                        joint,
-                    ),
-                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                ).because(causes.of_range(float(np.nanmax(q))))
+                return (
+                    ctx.failed(
+                        f"{q[i]:.2f} rad",
+                        ctx.named(
+                            f"q became {q[i]:.2f} rad; the stroke is {spec.q_min:g} to "
+                            f"{spec.q_max:.2f} rad",
+                            joint,
+                        ),
+                        ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
+                    )
+                    .about(joint)
+                    .because(causes.of_range(float(np.nanmax(q))))
+                )
             reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} rad")
             values = {"q_min": float(q.min()), "q_max": float(q.max())}
     outcome = unharmed(ctx, "commands far out of range")
@@ -289,12 +301,16 @@ def resumes(ctx: Context) -> Outcome:
                 slowest = after, step
     if slowest is not None and slowest[0] > limit:
         after, step = slowest
-        return ctx.failed(
-            f"after {after:.2f} s",
-            f"after a silence: {step}, but was not under way before {after:.2f} s",
-            ctx.at(ctx.states.topic, step.begin, step.begin + after),
-            reaction_s=after,
-        ).if_late(after - limit)
+        return (
+            ctx.failed(
+                f"after {after:.2f} s",
+                f"after a silence: {step}, but was not under way before {after:.2f} s",
+                ctx.at(ctx.states.topic, step.begin, step.begin + after),
+                reaction_s=after,
+            )
+            .about(step.joint)
+            .if_late(after - limit)
+        )
     return arrival(ctx, "after a silence")
 
 
@@ -306,12 +322,16 @@ def arrival(ctx: Context, when: str) -> Outcome:
     worst = max(found, key=lambda s: s.error / s.stroke)
     if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
         return ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
-    return ctx.failed(
-        "disobeys",
-        f"{when}: {worst}",
-        ctx.at(ctx.states.topic, worst.begin, worst.end),
-        error_rad=worst.error,
-    ).if_late(STROKE_S * worst.error / worst.stroke)
+    return (
+        ctx.failed(
+            "disobeys",
+            f"{when}: {worst}",
+            ctx.at(ctx.states.topic, worst.begin, worst.end),
+            error_rad=worst.error,
+        )
+        .about(worst.joint)
+        .if_late(STROKE_S * worst.error / worst.stroke)
+    )
 
 
 # ------------------------------------------------------------------------------ crowded topics
@@ -357,16 +377,20 @@ def burst(ctx: Context) -> Outcome:
         for joint, spec in enumerate(ctx.joints):
             far = max(far, (float(away[joint]) / spec.stroke, float(away[joint]), joint))
             if away[joint] > ctx.tolerance("max_motion_stroke", joint):
-                return ctx.failed(
-                    f"{away[joint]:.2f} rad",
-                    ctx.named(
-                        f"{wait:g} s after the last command of the burst it was still up to "
-                        f"{away[joint]:.2f} rad away",
-                        joint,
-                    ),
-                    ctx.at(topic, sent + wait, end),
-                    motion_rad=float(away[joint]),
-                ).if_late(STROKE_S * float(away[joint]) / spec.stroke)
+                return (
+                    ctx.failed(
+                        f"{away[joint]:.2f} rad",
+                        ctx.named(
+                            f"{wait:g} s after the last command of the burst it was still up to "
+                            f"{away[joint]:.2f} rad away",
+                            joint,
+                        ),
+                        ctx.at(topic, sent + wait, end),
+                        motion_rad=float(away[joint]),
+                    )
+                    .about(joint)
+                    .if_late(STROKE_S * float(away[joint]) / spec.stroke)
+                )
     return ctx.passed(
         f"{far[1]:.3f} rad",
         ctx.named(f"within {far[1]:.3f} rad {wait:g} s after the burst", far[2]),
@@ -399,7 +423,7 @@ def two_writers(ctx: Context) -> Outcome:
                         joint,
                     ),
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                )
+                ).about(joint)
     outcome = unharmed(ctx, "two clients at once")
     if outcome.met is False:
         return outcome

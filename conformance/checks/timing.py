@@ -206,16 +206,20 @@ def not_frozen(ctx: Context) -> Outcome:
         worst = max(worst, float(held[i]))
         if held[i] > limit:
             at, count = float(begin[i]), int(((t >= begin[i]) & (t <= end[i])).sum())
-            return ctx.failed(
-                f"{held[i]:.2f} s",
-                ctx.named(
-                    f"{count} states in a row with q = {q[changes[i]]:.3f} rad over "
-                    f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} rad",
-                    joint,
-                ),
-                ctx.at(ctx.states.topic, at, at + float(held[i])),
-                frozen_s=float(held[i]),
-            ).if_late(float(held[i]) - limit)
+            return (
+                ctx.failed(
+                    f"{held[i]:.2f} s",
+                    ctx.named(
+                        f"{count} states in a row with q = {q[changes[i]]:.3f} rad over "
+                        f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} rad",
+                        joint,
+                    ),
+                    ctx.at(ctx.states.topic, at, at + float(held[i])),
+                    frozen_s=float(held[i]),
+                )
+                .about(joint)
+                .if_late(float(held[i]) - limit)
+            )
     if not any(len(np.unique(c)) > 3 for c in ctx.states.q.T):
         return ctx.skipped("the hand does not move in this recording")
     return ctx.passed(
@@ -290,13 +294,17 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     if hold <= ctx.tolerance("max_hold_s"):
         return ctx.passed(f"{hold * 1e3:.1f} ms", ctx.named(text, joint), hold_s=hold)
     starts = t[changes][:-1][moving]
-    return ctx.failed(
-        f"{hold * 1e3:.0f} ms",
-        ctx.named(text, joint),
-        *(ctx.at(ctx.states.topic, float(s), float(s) + hold) for s in starts[:3]),
-        hold_s=hold,
-    ).if_late(
-        hold - ctx.tolerance("max_hold_s"),
-        how="mean",
-        best=float(np.percentile(holds, 25)) - ctx.tolerance("max_hold_s"),
+    return (
+        ctx.failed(
+            f"{hold * 1e3:.0f} ms",
+            ctx.named(text, joint),
+            *(ctx.at(ctx.states.topic, float(s), float(s) + hold) for s in starts[:3]),
+            hold_s=hold,
+        )
+        .about(joint)
+        .if_late(
+            hold - ctx.tolerance("max_hold_s"),
+            how="mean",
+            best=float(np.percentile(holds, 25)) - ctx.tolerance("max_hold_s"),
+        )
     )

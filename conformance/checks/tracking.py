@@ -168,13 +168,16 @@ def follows(ctx: Context) -> Outcome:
         values |= {f"rms_rad_{ctx.joints[f.joint].name}": f.rms for f in figures}
     if found.rms <= ctx.tolerance("max_rms_stroke", found.joint):
         return ctx.passed(f"rms {found.rms:.3f} rad", text, **values)
-    return ctx.failed(
+    worst_first = sorted(figures, key=lambda f: -f.rms)
+    size = STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin)
+    outcome = ctx.failed(
         f"rms {found.rms:.2f} rad",
         text,
         ctx.at(ctx.states.topic, found.peak_at),
         ctx.at(ctx.states.topic, found.begin, found.end),
         **values,
-    ).if_late(STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin))
+    )
+    return outcome.about(*(f.joint for f in worst_first)).if_late(size)
 
 
 @check("DEX1-TRACK-02", "DEX3-TRACK-02")

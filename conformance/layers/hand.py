@@ -66,13 +66,12 @@ def _missing(context: Context) -> str:
         why = f": {why.format(side=context.side)}" if why else ""
         if not recording.phases(requirement.phase):
             return f"the stimulus '{requirement.phase}' was not applied in this run{why}"
-        other = requirement.needs.startswith("other-")
-        if not other and not context.phases():
+        if not requirement.moves_other_side and not context.phases():
             to = f"the {context.side} hand"
             return f"the stimulus '{requirement.phase}' was not applied to {to}{why}"
-    if requirement.needs == "endpoints" and not recording.endpoints:
+    if requirement.needs_discovery and not recording.endpoints:
         return "the recording does not say who published and subscribed (record dds_endpoints)"
-    if requirement.needs in ("commands", "session") and not len(context.commands):
+    if requirement.needs_commands and not len(context.commands):
         return "no commands to this hand in the recording"
     return ""
 

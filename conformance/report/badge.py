@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dexkit.conformance.report.wording import model_title, nature, tally
+from dexkit.conformance.report.labels import model_title, nature, tally
 from dexkit.conformance.results import Overall, RunResult
 from dexkit.escaping import html as escape
 

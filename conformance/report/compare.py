@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from dexkit.conformance.report.html import document
-from dexkit.conformance.report.markdown import code, plain, table
-from dexkit.conformance.report.wording import (
+from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     hand_name,
@@ -16,6 +15,7 @@ from dexkit.conformance.report.wording import (
     nature,
     tally,
 )
+from dexkit.conformance.report.markdown import code, plain, table
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.errors import UsageError

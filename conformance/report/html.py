@@ -13,23 +13,22 @@ from pathlib import Path
 from urllib.parse import quote
 
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.report.evidence import evidence
-from dexkit.conformance.report.overview import overview
-from dexkit.conformance.report.wording import (
+from dexkit.conformance.report.card import Blocked, Card, Fact, blocked_groups, cards
+from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,
-    by_gravity,
-    causes,
     hand_name,
     model_title,
-    moment,
     nature,
     part,
     quantity,
     subject,
+    utc_date,
     whose,
 )
+from dexkit.conformance.report.result_plots import plots_of
+from dexkit.conformance.report.run_plots import run_plots
 from dexkit.conformance.requirements import CAPABILITIES, Requirement
 from dexkit.conformance.results import (
     Evidence,
@@ -48,7 +47,7 @@ __all__ = ["document", "render", "write_html"]
 
 _STYLE = Path(__file__).with_name("report.css")
 _PLOT_BUDGET = 1_000_000
-"""Bytes of plots on a page; beyond, failures are told in words only."""
+"""Bytes of plots on a page; the failures after that have none."""
 _BUSY = 0.2
 """Part of a run with programs waiting for a processor from which on the page says so."""
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
@@ -100,7 +99,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _areas(result),
         _troubles(result, view, link),
         _operator(result),
-        overview(result, view) if view is not None else "",
+        run_plots(result, view) if view is not None else "",
         _requirements(result, link),
         _what(result),
         _glossary(result),
@@ -137,7 +136,7 @@ def _verdict(result: RunResult) -> str:
     if result.starved > _BUSY:
         caution = (
             f"<p><b>The testing machine was busy</b>: {escape(about_harness(result))}. What "
-            "this can have caused is blocked, not failed; on an idle machine more can be told.</p>"
+            "this can have caused is blocked, not failed; run again on an idle machine.</p>"
         )
     if of := part(result):
         caution = f"<p><b>{of}</b>: this does not prove a drop-in.</p>{caution}"
@@ -246,26 +245,19 @@ def _anchor(text: str) -> str:
 
 def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
     """A card for each requirement that is not met, then what that kept from being judged."""
-    groups = [
-        (need, [r for r in group if r.verdict in _TROUBLE])
-        for need, group in result.by_requirement()
-    ]
-    full = [(n, [r for r in g if not r.blocked_by]) for n, g in groups]
-    full = by_gravity(result, ((need, group) for need, group in full if group), _TROUBLE)
-    blocked = [r for _, group in groups for r in group if r.blocked_by]
-    if not full and not blocked:
+    found = cards(result, _TROUBLE)
+    blocked = [group for group in blocked_groups(result.results) if group.before]
+    if not found and not blocked:
         return ""
     plots = _Plots(view)
-    cards = [_card(need, group, plots, link) for need, group in full]
-    worst_of_all = worst(r.verdict for _, group in full for r in group) if full else None
+    worst_of_all = worst(card.verdict for card in found) if found else Verdict.BLOCKED
     head = {
         Verdict.WARN: "What could be better, and what to try",
         Verdict.BLOCKED: "What could not be judged",
-    }.get(worst_of_all or Verdict.BLOCKED, "What is wrong, and what to try")
-    parts = [f"<h2>{head}</h2>{''.join(cards)}"]
-    if blocked:
-        parts.append(_blocked(blocked))
-    if view is None and full:
+    }.get(worst_of_all, "What is wrong, and what to try")
+    parts = [f"<h2>{head}</h2>", *(_card(card, plots, link) for card in found)]
+    parts += [_blocked(group) for group in blocked]
+    if view is None and found:
         parts.append(
             '<p class="dim">Plots of the evidence need the recording: '
             "<code>dexkit report RESULT.json --recording RUN.mcap --report REPORT.html</code></p>"
@@ -285,48 +277,38 @@ class _Plots:
             return ""
         if self._left <= 0:
             return '<p class="dim">No plot: this page has as many as it can hold.</p>'
-        figures = "".join(evidence(result, self._view))
+        figures = "".join(plots_of(result, self._view))
         self._left -= len(figures)
         return figures
 
 
-def _card(need: Requirement, group: list[Result], plots: _Plots, link: str) -> str:
-    word = VERDICTS[worst(r.verdict for r in group)]
-    sides = " and ".join(r.side for r in group)
-    rows = [("required", f"{escape(need.sentence)} <span class='dim'>{need.level}</span>")]
-    if group[0].expected != need.sentence:
-        rows.append(("expected", escape(group[0].expected)))
-    for entry in group:
-        seen = escape(entry.observed or entry.reason)
-        if entry.observed and entry.reason:
-            seen += f"<br><span class='dim'>{escape(entry.reason)}</span>"
-        name = "observed" if len(group) == 1 else f"observed, {escape(entry.side)}"
-        rows.append((name, seen))
-        if entry.evidence:
-            name = "where" if len(group) == 1 else f"where, {escape(entry.side)}"
-            rows.append((name, "".join(_place(e, link) for e in entry.evidence)))
-    found = causes(group)
-    for who, cause in found:
-        name = "likely cause" if len(found) == 1 else f"likely cause, {escape(who)}"
-        rows.append((name, escape(cause)))
-    rows.append(("what to try", escape(need.advice)))
-    rows.append(("source", _source(need)))
-    facts = "".join(f"<dt>{k}</dt><dd>{v}</dd>" for k, v in rows)
-    figures = "".join(plots.of(entry) for entry in group)
-    if figures and all(r.verdict is Verdict.BLOCKED for r in group):
+def _card(card: Card, plots: _Plots, link: str) -> str:
+    need, word = card.requirement, VERDICTS[card.verdict]
+    facts = "".join(
+        f"<dt>{_label(fact)}</dt><dd>"
+        + (_place(fact.place, link) if fact.place is not None else escape(fact.text))
+        + "</dd>"
+        for fact in card.facts()
+    )
+    figures = "".join(plots.of(result) for result in card.results)
+    if figures and card.verdict is Verdict.BLOCKED:
         figures = f"<details><summary>What was seen</summary>{figures}</details>"
     return (
         f'<article class="card {word.css}" id="card-{escape(need.id)}">'
         f'<h3><b class="{word.css}">{word.text}</b> {escape(need.title)} '
-        f'<code>{escape(need.id)}</code> <span class="dim">{escape(sides)}</span></h3>'
+        f'<code>{escape(need.id)}</code> <span class="dim">{escape(card.sides)}</span></h3>'
         f'<dl class="facts">{facts}</dl>{figures}</article>'
     )
+
+
+def _label(fact: Fact) -> str:
+    return f"{fact.item.label}, {escape(fact.sides)}" if fact.sides else fact.item.label
 
 
 def _place(place: Evidence, link: str) -> str:
     """Where in the recording, in a form that can be copied."""
     until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
-    when = moment(place.log_time_ns).isoformat(timespec="milliseconds")
+    when = utc_date(place.log_time_ns).isoformat(timespec="milliseconds")
     file = f' in <a href="{escape(quote(link))}">{escape(Path(link).name)}</a>' if link else ""
     return (
         f'<div class="place"><code>{escape(place.topic)}</code> at {place.time_s:.3f} s{until}'
@@ -335,32 +317,24 @@ def _place(place: Evidence, link: str) -> str:
     )
 
 
-def _blocked(blocked: list[Result]) -> str:
-    groups: dict[str, list[Result]] = {}
-    for entry in blocked:
-        groups.setdefault(entry.blocked_by, []).append(entry)
-    parts = []
-    for before, group in groups.items():
-        names: dict[str, list[Result]] = {}
-        for entry in group:
-            names.setdefault(entry.requirement.id, []).append(entry)
-        rows = "".join(
-            f"<li><a href='#{escape(name)}'><code>{escape(name)}</code></a> "
-            f"{escape(entries[0].requirement.title)} "
-            f'<span class="dim">{escape(", ".join(e.side for e in entries))}</span></li>'
-            for name, entries in names.items()
-        )
-        parts.append(
-            f'<article class="card open"><h3><b class="open">blocked</b> by '
-            f"<a href='#{escape(before)}'><code>{escape(before)}</code></a></h3>"
-            "<p>Not judged, because that has to be right first:</p>"
-            f"<ul>{rows}</ul></article>"
-        )
-    return "".join(parts)
+def _blocked(blocked: Blocked) -> str:
+    before = escape(blocked.before)
+    rows = "".join(
+        f"<li><a href='#{escape(card.requirement.id)}'><code>{escape(card.requirement.id)}</code>"
+        f"</a> {escape(card.requirement.title)} "
+        f'<span class="dim">{escape(", ".join(r.side for r in card.results))}</span></li>'
+        for card in blocked.cards
+    )
+    return (
+        f'<article class="card open"><h3><b class="open">blocked</b> by '
+        f"<a href='#{before}'><code>{before}</code></a></h3>"
+        "<p>Not judged, because that has to be right first:</p>"
+        f"<ul>{rows}</ul></article>"
+    )
 
 
 def _operator(result: RunResult) -> str:
-    """What an operator would feel, where one was modelled."""
+    """What an operator would notice, where one was modelled."""
     rows = [
         (need.title, " · ".join(f"{r.side} {r.figure or VERDICTS[r.verdict].text}" for r in group))
         for need, group in result.by_requirement()
@@ -369,7 +343,7 @@ def _operator(result: RunResult) -> str:
     if not rows:
         return ""
     return (
-        "<h2>What an operator would feel</h2><p>A model of Unitree's teleoperation client drove "
+        "<h2>What an operator would notice</h2><p>A model of Unitree's teleoperation client drove "
         "the hand: it sends no command further than 0.18 rad from the last state, so that a hand "
         f"which reports late is slow.</p>{_definitions(rows)}"
     )
@@ -421,14 +395,9 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         f"{cells}</summary>"
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
         f"<p>{escape(need.rationale)}</p>"
-        f'<p class="dim">Source: {_source(need)}</p>'
+        f'<p class="dim">Source: {escape(Card.of(group).source)}</p>'
         "</div></details>"
     )
-
-
-def _source(need: Requirement) -> str:
-    """Who says so, and how sure that is."""
-    return f"{escape(need.source, quote=False)} (confidence: {escape(need.confidence)})"
 
 
 def _cell(result: Result) -> str:
@@ -496,10 +465,13 @@ def _what(result: RunResult) -> str:
 
 def _glossary(result: RunResult) -> str:
     terms = [
-        ("topic", "a named channel on the network (DDS); who uses another name is not heard."),
+        (
+            "topic",
+            "a named channel on the network (DDS); nobody receives what is sent on another.",
+        ),
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
-        ("tau_est, N m", "torque that the motor feels: what the hand knows of touch."),
-        ("not applicable", "this recording or hand gave no occasion for it; the row says why."),
+        ("tau_est, N m", "torque that the motor reports; the only sign of touch without sensors."),
+        ("not applicable", "the recording does not show it; the row says why."),
         ("docs/sources", "pages of dexkit with the facts, documents and measurements, by section."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]

@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from xml.etree import ElementTree
 
-from dexkit.conformance.report.wording import hand_name
+from dexkit.conformance.report.labels import hand_name
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.documents import write_file
 from dexkit.escaping import visible

@@ -9,26 +9,24 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from dexkit.conformance.report.wording import (
+from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards
+from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,
-    by_gravity,
-    causes,
     hand_name,
     model_title,
     nature,
     part,
     whose,
 )
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Result, RunResult, Verdict, worst
+from dexkit.conformance.results import RunResult, Verdict, worst
 from dexkit.escaping import REMARK, one_line
 
 __all__ = ["code", "plain", "render_markdown", "table"]
 
 MOST_CARDS = 25
-"""Failures told at length: a comment on GitHub holds 65536 characters."""
+"""Cards at most: a comment on GitHub holds 65536 characters."""
 _SPECIAL = re.compile(r"([\\`*_\[\]|~#])")
 _NOTHING = "&#8203;"
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN)
@@ -97,53 +95,39 @@ def _areas(result: RunResult) -> list[str]:
 
 
 def _troubles(result: RunResult) -> list[str]:
-    groups = [
-        (need, [r for r in group if r.verdict in _TROUBLE])
-        for need, group in result.by_requirement()
-    ]
-    groups = by_gravity(result, ((need, group) for need, group in groups if group), _TROUBLE)
+    found = cards(result, _TROUBLE)
     lines: list[str] = []
-    for need, group in groups[:MOST_CARDS]:
-        lines += _card(need, group)
-    if len(groups) > MOST_CARDS:
-        lines += [f"... and {len(groups) - MOST_CARDS} more.", ""]
-    blocked: dict[str, dict[str, None]] = {}
-    for entry in result.results:
-        if entry.verdict is Verdict.BLOCKED:
-            blocked.setdefault(entry.reason, {})[entry.requirement.id] = None
-    for reason, names in blocked.items():
-        told = ", ".join(code(name) for name in names)
-        lines += [f"{VERDICTS[Verdict.BLOCKED].mark} {plain(reason)}: {told}", ""]
+    for card in found[:MOST_CARDS]:
+        lines += _card(card)
+    if len(found) > MOST_CARDS:
+        lines += [f"... and {len(found) - MOST_CARDS} more.", ""]
+    mark = VERDICTS[Verdict.BLOCKED].mark
+    for blocked in blocked_groups(result.results):
+        names = ", ".join(code(card.requirement.id) for card in blocked.cards)
+        lines += [f"{mark} {plain(blocked.reason)}: {names}", ""]
     return lines
 
 
-def _card(need: Requirement, group: Sequence[Result]) -> list[str]:
-    word = VERDICTS[worst(r.verdict for r in group)]
-    sides = " and ".join(r.side for r in group)
-    lines = [
-        f"### {word.mark} {code(need.id)} {plain(need.title)} ({plain(sides)})",
-        "",
-        f"- required: {plain(need.sentence)} ({need.level})",
-    ]
-    if group[0].expected != need.sentence:
-        lines.append(f"- expected: {plain(group[0].expected)}")
-    for entry in group:
-        lines.append(f"- observed, {plain(entry.side)}: {plain(entry.observed or entry.reason)}")
-        if entry.observed and entry.reason:
-            lines.append(f"- reason, {plain(entry.side)}: {plain(entry.reason)}")
-        for place in entry.evidence[:1]:
-            until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
-            lines.append(
-                f"- where: {code(place.topic)} at {place.time_s:.3f} s{until}, log time "
-                f"`{place.log_time_ns}`"
-            )
-    lines += [f"- likely cause: {plain(cause)}" for _, cause in causes(list(group))]
-    lines += [
-        f"- try: {plain(need.advice)}",
-        f"- source: {plain(need.source)} ({plain(need.confidence)})",
-        "",
-    ]
-    return lines
+def _card(card: Card) -> list[str]:
+    need, word = card.requirement, VERDICTS[card.verdict]
+    lines = [f"### {word.mark} {code(need.id)} {plain(need.title)} ({plain(card.sides)})", ""]
+    placed: set[str] = set()
+    for fact in card.facts():
+        if fact.place is not None and fact.sides in placed:
+            continue  # of several places, the first one of each side
+        placed |= {fact.sides} if fact.place is not None else set()
+        side = f", {plain(fact.sides)}" if fact.sides else ""
+        lines.append(f"- {fact.item.label}{side}: {_text(fact)}")
+    return [*lines, ""]
+
+
+def _text(fact: Fact) -> str:
+    place = fact.place
+    if place is None:
+        return plain(fact.text)
+    until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
+    when = f"at {place.time_s:.3f} s{until}, log time `{place.log_time_ns}`"
+    return f"{code(place.topic)} {when}"
 
 
 def _every(result: RunResult) -> list[str]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence
 
 import rich.markup
 from rich.table import Table
 from rich.text import Text
 
-from dexkit.conformance.report.wording import about_harness, causes
+from dexkit.conformance.report.card import Card, blocked_groups, cards
+from dexkit.conformance.report.labels import about_harness
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape
@@ -26,6 +26,7 @@ MARKS = {
     Verdict.BLOCKED: ("blocked", "magenta"),
     Verdict.ERROR: ("ERROR", "bold magenta"),
 }
+_TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN)
 _UNJUDGED = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
 _STYLE = {Overall.PASS: "green", Overall.FAIL: "red", Overall.INCONCLUSIVE: "magenta"}
 
@@ -69,12 +70,9 @@ def print_result(
             f"here, or {'is' if hidden == 1 else 'are'} not claimed, and "
             f"{'is' if hidden == 1 else 'are'} not shown{f' ({more})' if more else ''}.[/dim]"
         )
-    for wanted in ((Verdict.FAIL, Verdict.ERROR), (Verdict.WARN,)):
-        for _, group in result.by_requirement():
-            troubles = [r for r in group if r.verdict in wanted]
-            if troubles:
-                console.print()
-                _print_trouble(troubles, console)
+    for card in cards(result, _TROUBLE):
+        console.print()
+        _print_card(card, console)
     _print_blocked(result, console)
     if verbose:
         reasons: dict[tuple[str, str], list[str]] = {}
@@ -102,41 +100,16 @@ def print_result(
     )
 
 
-def _print_trouble(group: Sequence[Result], console: Console) -> None:
-    """What is wrong in one requirement; what holds for both sides is said once."""
-    need = group[0].requirement
-    sides = " and ".join(r.side for r in group)
+def _print_card(card: Card, console: Console) -> None:
+    need = card.requirement
     console.print(
-        f"[bold]{escape(need.id)}[/] ({need.level}) {escape(sides)}: "
-        f"{worst(r.verdict for r in group)}",
+        f"[bold]{escape(need.id)}[/] ({need.level}) {escape(card.sides)}: {card.verdict}",
         highlight=False,
     )
-    for name, text in _lines(group):
-        label = f"{name}:" if name else ""
-        console.print(_hung(console, f"  {label:<9} ", text), soft_wrap=True)
-
-
-def _lines(group: Sequence[Result]) -> Iterator[tuple[str, str]]:
-    """(what it is, text) of a requirement that failed alike on these sides."""
-    need = group[0].requirement
-    yield "required", need.sentence
-    if group[0].expected != need.sentence:
-        yield "expected", group[0].expected
-    for entry in group:
-        side = f"{entry.side}: " if len(group) > 1 else ""
-        if entry.observed:
-            yield "observed", side + entry.observed
-        if entry.reason:
-            yield "reason", side + entry.reason
-        for place in entry.evidence:
-            until = f" .. {place.end_s:.3f} s" if place.end_s is not None else ""
-            yield "where", f"{place.topic} at {place.time_s:.3f} s{until}"
-    found = causes(list(group))
-    for sides, cause in found:
-        yield "cause", f"{sides}: {cause}" if len(found) > 1 else cause
-    if group[0].verdict is not Verdict.ERROR:
-        yield "try", need.advice
-        yield "source", f"{need.source} ({need.confidence})"
+    for fact in card.facts():
+        side = f"{fact.sides}: " if fact.sides else ""
+        label = f"{fact.item}:"
+        console.print(_hung(console, f"  {label:<9} ", side + fact.text), soft_wrap=True)
 
 
 def _hung(console: Console, head: str, text: str) -> str:
@@ -153,15 +126,13 @@ def _hung(console: Console, head: str, text: str) -> str:
 
 
 def _print_blocked(result: RunResult, console: Console) -> None:
-    """What was not judged because something else failed first, by what that was."""
-    groups: dict[str, dict[str, None]] = {}
-    for entry in result.results:
-        if entry.verdict is Verdict.BLOCKED:
-            groups.setdefault(entry.reason, {})[entry.requirement.id] = None
+    """What was not judged: something else failed first, or the machine was too busy."""
+    groups = blocked_groups(result.results)
     if groups:
         console.print()
-    for reason, names in groups.items():
-        text = _hung(console, "", f"{reason}: {', '.join(names)}")
+    for blocked in groups:
+        names = ", ".join(card.requirement.id for card in blocked.cards)
+        text = _hung(console, "", f"{blocked.reason}: {names}")
         console.print(f"[magenta]{text}[/]", highlight=False, soft_wrap=True)
 
 

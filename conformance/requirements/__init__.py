@@ -21,6 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.documents import parse_toml, read_toml
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import BUILT_IN, DIALECTS, HandModel, model, model_plugins
@@ -61,6 +62,12 @@ _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
 LAYERS = ("dds", "usb", "robot")
 """Where a requirement is judged: on a hand's topics, on its USB device, or on a robot's topics."""
+_PLOTS: Mapping[str, tuple[Plot, ...]] = {
+    "dds": (Plot(PlotKind.POSITION),),
+    "robot": (Plot(PlotKind.POSITION),),
+    "usb": (Plot(PlotKind.ANSWERS), Plot(PlotKind.BYTES)),
+}
+"""By layer: what a failure shows where neither the catalogue nor the check names a plot."""
 _KEYS = {
     "id",
     "area",
@@ -80,6 +87,7 @@ _KEYS = {
     "cause",
     "expected",
     "repeat",
+    "plots",
     "like",
 }
 _OPTIONAL = {
@@ -92,12 +100,14 @@ _OPTIONAL = {
     "cause",
     "expected",
     "repeat",
+    "plots",
 }
 
 
 _TYPES: Mapping[str, type] = {
     "after": list,
     "dialects": list,
+    "plots": list,
     "tolerances": dict,
     "realtime": bool,
     "repeat": int,
@@ -147,6 +157,7 @@ class Requirement:
         where nothing shorter says it.
     :param capability: one of :data:`CAPABILITIES`, where it is about a unit that a hand may lack.
     :param repeat: how often its stimulus is applied.
+    :param plots: what shows a failure, unless its check names other plots.
     :param like: the requirement of another model that it is taken from, and whose check judges
         it; empty if it stands for itself.
     """
@@ -172,11 +183,27 @@ class Requirement:
     capability: str = ""
     repeat: int = 1
     like: str = ""
+    plots: tuple[Plot, ...] = ()
 
     @property
     def phase(self) -> str | None:
         """The stimulus phase that it needs, if any."""
         return self.needs.partition(":")[2] or None
+
+    @property
+    def moves_other_side(self) -> bool:
+        """Whether it is judged while only the other side is commanded."""
+        return self.needs.startswith("other-")
+
+    @property
+    def needs_discovery(self) -> bool:
+        """Whether it needs what discovery saw of readers and writers."""
+        return self.needs == "endpoints"
+
+    @property
+    def needs_commands(self) -> bool:
+        """Whether it needs commands to the hand in the recording."""
+        return self.needs in ("commands", "session")
 
     def tolerance(self, name: str) -> float:
         """The figure called ``name``.
@@ -271,6 +298,13 @@ def _filled(text: str, tolerances: Mapping[str, float], where: str) -> str:
         raise UsageError(f"{where}: {text!r} cannot be filled in: {error}") from error
 
 
+def _plots(names: Iterable[str], where: str) -> tuple[Plot, ...]:
+    try:
+        return tuple(Plot.parse(name) for name in names)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error.message}", hint=error.hint) from error
+
+
 def parse(
     text: str, origin: str = "requirements", others: Mapping[str, Any] | None = None
 ) -> tuple[Requirement, ...]:
@@ -353,6 +387,7 @@ def _parse(
             capability=entry.get("capability", ""),
             repeat=entry.get("repeat", 1),
             like=entry.get("like", ""),
+            plots=_plots(entry["plots"], where) if "plots" in entry else _PLOTS[layer],
         )
     return tuple(found.values())
 

@@ -251,7 +251,7 @@ def _both_sizes(c: UsbContext) -> Outcome:
     if part >= c.tolerance("min_part"):
         return c.passed("both", told)
     observed = f"a frame of {size} bytes got {phase.params['answers']} answers; {told}"
-    return c.failed(f"not {size}", observed, c.over(phase))
+    return c.failed(f"not {size}", observed, c.over(phase)).about(joint)
 
 
 @check("DEX3USB-HEAD-01")
@@ -395,9 +395,12 @@ def _quiet_motors(
         travel = _travel(c.hand, phase)
         most = max(most, float(travel.max()))
         if travel.max() > limit:
-            joint = c.hand.joints[int(travel.argmax())].name
-            observed = f"{joint} moved by {travel.max():.2f} rad {name(phase)}"
-            return c.failed(f"{travel.max():.2f} rad", observed, c.over(phase), moved=travel.max())
+            joint = int(travel.argmax())
+            observed = f"{_named(c, [joint])} moved by {travel.max():.2f} rad {name(phase)}"
+            outcome = c.failed(
+                f"{travel.max():.2f} rad", observed, c.over(phase), moved=travel.max()
+            )
+            return outcome.about(joint)
     return c.passed(f"{most:.3f} rad", moved=most)
 
 
@@ -431,19 +434,19 @@ def _moves(c: UsbContext) -> Iterator[tuple[UsbPhase, int, float, float]]:
 
 @check("DEX3USB-MOVE-01")
 def _follows(c: UsbContext) -> Outcome:
-    parts: dict[str, float] = {}
+    parts: dict[int, float] = {}
     wrong = []
     for phase, joint, begin, target in _moves(c):
-        name = c.hand.joints[joint].name
-        parts[name] = _part(c.hand, phase, joint, begin, target)
+        parts[joint] = _part(c.hand, phase, joint, begin, target)
         # to overshoot by as much again is no following either
-        if not c.tolerance("min_part") <= parts[name] <= 2 - c.tolerance("min_part"):
-            wrong.append((name, phase))
+        if not c.tolerance("min_part") <= parts[joint] <= 2 - c.tolerance("min_part"):
+            wrong.append((joint, phase))
     told = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
     if not wrong:
         return c.passed(told, f"of the way in 0.2 s: {told}")
-    text = ", ".join(f"{name} {parts[name]:.0%}" for name, _ in wrong)
-    return c.failed(told, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
+    text = ", ".join(f"{_named(c, [joint])} {parts[joint]:.0%}" for joint, _ in wrong)
+    outcome = c.failed(told, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
+    return outcome.about(*(joint for joint, _ in wrong))
 
 
 @check("DEX3USB-MOVE-02")
@@ -457,9 +460,11 @@ def _others(c: UsbContext) -> Outcome:
         earlier.add(joint)
         most = max(most, float(travel.max()))
         if travel.max() > c.tolerance("max_q"):
-            moved, told = (c.hand.joints[i].name for i in (int(travel.argmax()), joint))
+            other = int(travel.argmax())
+            moved, told = (_named(c, [i]) for i in (other, joint))
             observed = f"{moved} moved by {travel.max():.2f} rad when {told} was told to"
-            return c.failed(f"{travel.max():.2f} rad", observed, c.over(phase))
+            outcome = c.failed(f"{travel.max():.2f} rad", observed, c.over(phase))
+            return outcome.about(other, joint)
     return c.passed(f"{most:.3f} rad", moved=most)
 
 
@@ -468,20 +473,20 @@ def _limits(c: UsbContext) -> Outcome:
     margin = c.tolerance("margin")
     beyond = 0.0
     for answer in c.hand.answers:
-        for joint, q in zip(c.hand.joints, c.hand.q(answer), strict=True):
+        for i, (joint, q) in enumerate(zip(c.hand.joints, c.hand.q(answer), strict=True)):
             over = max(joint.q_min - q, q - joint.q_max)
             beyond = max(beyond, over)  # NaN is never beyond
             if over > margin:
                 span = f"{joint.q_min:.2f} .. {joint.q_max:.2f}"
                 return c.failed(
                     f"{q:.2f} rad", f"{joint.name} at {q:.2f} rad of {span}", c.at(answer.t)
-                )
+                ).about(i)
     return c.passed(f"{beyond:.3f} rad beyond")
 
 
 @check("DEX3USB-UNIT-01")
 def _speed_unit(c: UsbContext) -> Outcome:
-    ratios: dict[str, float] = {}
+    ratios: dict[int, float] = {}
     for phase, joint, _, _ in _moves(c):
         points = [
             (a.t, m) for a in c.hand.answers_in(phase) if (m := c.hand.motor(a, joint)) is not None
@@ -494,13 +499,13 @@ def _speed_unit(c: UsbContext) -> Outcome:
         close = len(points) > 2 and np.diff(t).max() <= _COARSEST
         if close and abs(q[-1] - q[0]) > 0.05:
             way = float(np.sum((dq[1:] + dq[:-1]) / 2 * np.diff(t)))
-            ratios[c.hand.joints[joint].name] = way / float(q[-1] - q[0])
+            ratios[joint] = way / float(q[-1] - q[0])
     return _ratio(c, ratios, "the integrated speed is {:.2f} of the way of {}")
 
 
 @check("DEX3USB-UNIT-02")
 def _torque_unit(c: UsbContext) -> Outcome:
-    ratios: dict[str, float] = {}
+    ratios: dict[int, float] = {}
     for phase, joint, _, _ in _moves(c):
         scale = Scale(c.hand.joints[joint].gear_ratio)
         law, told = [], []
@@ -523,17 +528,18 @@ def _torque_unit(c: UsbContext) -> Outcome:
             told.append(motor.torque / scale.tau)
         both = np.array([law, told])
         if both.size and np.abs(both[0]).max() > c.tolerance("min_tau"):
-            ratios[c.hand.joints[joint].name] = float(both[0] @ both[1] / (both[0] @ both[0]))
+            ratios[joint] = float(both[0] @ both[1] / (both[0] @ both[0]))
     return _ratio(c, ratios, "the reported torque is {:.2f} of what the gains demand of {}")
 
 
-def _ratio(c: UsbContext, ratios: Mapping[str, float], text: str) -> Outcome:
+def _ratio(c: UsbContext, ratios: Mapping[int, float], text: str) -> Outcome:
     if not ratios:
         return c.skipped("no motion to judge by")
     told = f"{min(ratios.values()):.2f} .. {max(ratios.values()):.2f}"
-    for name, ratio in ratios.items():
+    for joint, ratio in ratios.items():
         if not c.tolerance("min_ratio") <= ratio <= c.tolerance("max_ratio"):
-            return c.failed(told, text.format(ratio, name), *map(c.over, c.phases()))
+            observed = text.format(ratio, _named(c, [joint]))
+            return c.failed(told, observed, *map(c.over, c.phases())).about(joint)
     return c.passed(told)
 
 
@@ -561,7 +567,7 @@ def _trips(c: UsbContext) -> Outcome:
     if not silent:
         return c.passed(f"{sum(flags.values())} tripped")
     observed = f"after 1.5 s without a command {_named(c, silent)} show no time-out"
-    return c.failed(f"{len(silent)} not", observed, c.at(answers[0].t))
+    return c.failed(f"{len(silent)} not", observed, c.at(answers[0].t)).about(*silent)
 
 
 def _driven(c: UsbContext, joint: int) -> float | None:
@@ -596,7 +602,7 @@ def _stops(c: UsbContext) -> Outcome:
     if driven <= c.tolerance("max_s"):
         return c.passed(told, driven_s=driven)
     observed = f"in the silence it went as far as in {told} of driving"
-    return c.failed(told, observed, c.over(silence), driven_s=driven)
+    return c.failed(told, observed, c.over(silence), driven_s=driven).about(DRIVEN)
 
 
 @check("DEX3USB-PROT-03")
@@ -609,12 +615,13 @@ def _stays(c: UsbContext) -> Outcome:
         cleared = [i for i, tripped in _flags(c, answer).items() if not tripped and i != FREE]
         if cleared:
             observed = f"{_named(c, cleared)} cleared the flag while bit 7 was set"
-            return c.failed("cleared", observed, c.at(answer.t))
+            return c.failed("cleared", observed, c.at(answer.t)).about(*cleared)
     moved = abs(float(c.hand.q(answers[-1])[DRIVEN]) - phase.params["begin"][DRIVEN])
     if moved <= c.tolerance("max_q"):
         return c.passed(f"{moved:.3f} rad", moved=moved)
     observed = f"it followed a position command by {moved:.2f} rad while tripped"
-    return c.failed(f"{moved:.2f} rad", observed, c.over(phase), moved=moved)
+    outcome = c.failed(f"{moved:.2f} rad", observed, c.over(phase), moved=moved)
+    return outcome.about(DRIVEN)
 
 
 @check("DEX3USB-PROT-04")
@@ -626,12 +633,12 @@ def _cleared(c: UsbContext) -> Outcome:
     tripped = [i for i, flag in _flags(c, answers[-1]).items() if flag]
     if tripped:
         observed = f"{_named(c, tripped)} still tripped after 0.25 s of commands with bit 7 = 0"
-        return c.failed(f"{len(tripped)} tripped", observed, c.over(phase))
+        return c.failed(f"{len(tripped)} tripped", observed, c.over(phase)).about(*tripped)
     part = _part(c.hand, phase, DRIVEN, phase.params["begin"], phase.params["target"])
     told = f"{part:.0%} of the way"
     if part >= c.tolerance("min_part"):
         return c.passed(told)
-    return c.failed(told, f"after clearing it went {told}", c.over(phase))
+    return c.failed(told, f"after clearing it went {told}", c.over(phase)).about(DRIVEN)
 
 
 @check("DEX3USB-PROT-05")
@@ -642,19 +649,19 @@ def _disabled(c: UsbContext) -> Outcome:
         return c.skipped("no answer after the silence")
     if any(_flags(c, a).get(FREE) for a in answers):
         observed = f"{_named(c, [FREE])} reports a time-out although its protection was off"
-        return c.failed("tripped", observed, c.over(phase))
+        return c.failed("tripped", observed, c.over(phase)).about(FREE)
     driven = _driven(c, FREE)
     if driven is None:
         return c.skipped(_NO_SPEED)
     if driven < c.tolerance("min_s"):
         observed = f"{_named(c, [FREE])} stopped {driven:.2f} s into the silence"
-        return c.failed(f"{driven:.2f} s", observed, c.over(phase), driven_s=driven)
+        return c.failed(f"{driven:.2f} s", observed, c.over(phase), driven_s=driven).about(FREE)
     begin, target = (phase.params[name][FREE] for name in ("begin", "targets"))
     part = _part(c.hand, phase, FREE, begin, target)
     told = f"{part:.0%} of the way"
     if part >= c.tolerance("min_part"):
         return c.passed(told)
-    return c.failed(told, f"after the silence it went {told}", c.over(phase))
+    return c.failed(told, f"after the silence it went {told}", c.over(phase)).about(FREE)
 
 
 @check("DEX3USB-PROT-06")
@@ -667,7 +674,7 @@ def _early(c: UsbContext) -> Outcome:
     if not tripped:
         return c.passed("none")
     observed = f"{_named(c, tripped)} tripped within {phase.params['seconds']:g} s"
-    return c.failed(f"{len(tripped)} tripped", observed, c.over(phase))
+    return c.failed(f"{len(tripped)} tripped", observed, c.over(phase)).about(*tripped)
 
 
 # ----------------------------------------------------------------------------------- damaged
@@ -710,14 +717,14 @@ def _broadcast(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     begin, target = phase.params["begin"], phase.params["target"]
     parts = {
-        c.hand.joints[i].name: _part(c.hand, phase, i, begin[i], target)
+        i: _part(c.hand, phase, i, begin[i], target)
         for i, (bus, _) in enumerate(c.hand.record.buses)
         if bus == phase.params["bus"] and abs(target - begin[i]) >= c.tolerance("min_way")
     }
-    told = ", ".join(f"{name} {part:.0%}" for name, part in parts.items())
+    told = ", ".join(f"{_named(c, [i])} {part:.0%}" for i, part in parts.items())
     if min(parts.values()) >= c.tolerance("min_part"):
         return c.passed("followed", told)
-    return c.failed("ignored", f"part of the way: {told}", c.over(phase))
+    return c.failed("ignored", f"part of the way: {told}", c.over(phase)).about(*parts)
 
 
 # -------------------------------------------------------------------------------- connection

@@ -28,7 +28,7 @@ def command(result: Path, output: Path) -> None:
     could not be judged.
     """
     from dexkit.conformance.report.badge import badge_text, render_badge
-    from dexkit.conformance.results import read_json
+    from dexkit.conformance.result_file import read_json
 
     check_output_paths([output], [result])
     found = read_json(result)

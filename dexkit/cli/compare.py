@@ -34,7 +34,7 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
         render_comparison,
         render_comparison_markdown,
     )
-    from dexkit.conformance.results import read_json
+    from dexkit.conformance.result_file import read_json
 
     check_output_paths([html_path, markdown_path], results)
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])

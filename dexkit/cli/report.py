@@ -59,7 +59,7 @@ def command(
     from dexkit.conformance.report.junit import write_junit
     from dexkit.conformance.report.markdown import render_markdown
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.results import read_json
+    from dexkit.conformance.result_file import read_json
     from dexkit.console import Console
 
     found = read_json(result)
@@ -95,7 +95,7 @@ def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
     :raises UsageError: the one that was named is not the one that was judged.
     """
     from dexkit.conformance.recording import Recording
-    from dexkit.conformance.report.wording import moment
+    from dexkit.conformance.report.labels import utc_date
     from dexkit.hand import Side
     from dexkit.traces import open_trace
 
@@ -105,7 +105,7 @@ def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
     view = Recording.of(trace, dialect_name=about.get("dialect"), sides=sides)
     for text in trace.damage:
         click.echo(f"warning: {path}: {text}", err=True)
-    when = moment(view.origin_ns).isoformat(timespec="seconds")
+    when = utc_date(view.origin_ns).isoformat(timespec="seconds")
     if not result.recorded_at or when == result.recorded_at:
         return view
     text = f"{path} begins at {when}, the run of this result at {result.recorded_at}"

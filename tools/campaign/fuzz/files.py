@@ -30,7 +30,7 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import render_markdown
 from dexkit.conformance.report.terminal import print_result
-from dexkit.conformance.results import read_json
+from dexkit.conformance.result_file import read_json
 from dexkit.conformance.stimulus_record import Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.console import Console

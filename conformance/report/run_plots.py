@@ -1,28 +1,28 @@
-"""What the hands did in a run: position, force and timing of each, over all of it."""
+"""Plots over a whole run, for each hand: position, torque and intervals between states."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dexkit.conformance.recording import Recording, SideView
-from dexkit.conformance.report.evidence import command_and_state, operated, phase_bands
-from dexkit.conformance.report.plots import Band, Level, Line, chart, histogram
-from dexkit.conformance.report.wording import subject, whose
+from dexkit.conformance.report.charts import Band, Level, Line, chart, histogram
+from dexkit.conformance.report.labels import subject, whose
+from dexkit.conformance.report.result_plots import command_and_state, operated, phase_bands
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.escaping import html as escape
 from dexkit.hand import JointSpec
 
-__all__ = ["overview"]
+__all__ = ["run_plots"]
 
 
-def overview(result: RunResult, view: Recording) -> str:
+def run_plots(result: RunResult, view: Recording) -> str:
     """Plots of every judged hand, as HTML."""
     parts = [
         f"<h2>What the {subject(result, many=True)} did</h2>",
-        '<p class="key"><span><i class="cmd"></i>command: where it is told to go</span>'
-        '<span><i class="state"></i>state: where it says it is</span>'
-        '<span><i class="force"></i>the force that it feels</span></p>',
+        '<p class="key"><span><i class="cmd"></i>command: the commanded position</span>'
+        '<span><i class="state"></i>state: the reported position</span>'
+        '<span><i class="force"></i>tau_est: the reported torque</span></p>',
     ]
     for side in view.judged:
         parts.append(_hand(result, view, view.sides[side]))

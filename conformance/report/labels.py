@@ -1,14 +1,11 @@
-"""What all reports say in the same words: verdicts, the hand's name, how real it was."""
+"""Names that all reports share: of verdicts, hands, quantities, and how real a hand was."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
+from dexkit.conformance.results import Overall, RunResult, Verdict, worst
 from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
@@ -19,16 +16,14 @@ __all__ = [
     "Tally",
     "Word",
     "about_harness",
-    "by_gravity",
-    "causes",
     "hand_name",
     "model_title",
-    "moment",
     "nature",
     "part",
     "quantity",
     "subject",
     "tally",
+    "utc_date",
     "whose",
 ]
 
@@ -138,17 +133,6 @@ def hand_name(result: RunResult) -> str:
     return name
 
 
-def by_gravity(
-    result: RunResult, groups: Iterable[tuple[Requirement, list[Result]]], order: Sequence[Verdict]
-) -> list[tuple[Requirement, list[Result]]]:
-    """Requirements with their results, worst verdict first, then what blocks most of the others."""
-    blocks = Counter(r.blocked_by for r in result.results)
-    return sorted(
-        groups,
-        key=lambda item: (order.index(worst(r.verdict for r in item[1])), -blocks[item[0].id]),
-    )
-
-
 def part(result: RunResult) -> str:
     """What to say of a run for which only a part of the catalogue was selected, or nothing."""
     if not result.partial:
@@ -183,7 +167,7 @@ def about_harness(result: RunResult) -> str:
     return "; ".join(told)
 
 
-def moment(time_ns: int) -> datetime:
+def utc_date(time_ns: int) -> datetime:
     """A log time as a date."""
     return datetime.fromtimestamp(time_ns / 1e9, tz=timezone.utc)
 
@@ -194,12 +178,3 @@ def quantity(name: str, value: float) -> tuple[str, str]:
     if head and tail in _UNITS:
         return head.replace("_", " "), f"{value:.4g} {_UNITS[tail]}".strip()
     return name.replace("_", " "), f"{value:.4g}"
-
-
-def causes(group: list[Result]) -> list[tuple[str, str]]:
-    """(sides, likely cause) of a requirement's failures, one entry for each cause."""
-    found: dict[str, list[str]] = {}
-    for entry in group:
-        if entry.cause:
-            found.setdefault(entry.cause, []).append(entry.side)
-    return [(", ".join(sides), cause) for cause, sides in found.items()]

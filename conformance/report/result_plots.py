@@ -1,23 +1,18 @@
-"""The evidence of a result as plots: chosen by what its requirement is about.
-
-No list of ids decides: the requirement's layer, the stimulus it needs and the names of its
-tolerances say what a person wants to see. Every figure is drawn from the recording that was
-judged; :func:`evidence` returns none where it shows nothing of it.
-"""
+"""The plots that a result names (:mod:`dexkit.conformance.plots`), drawn from its recording."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Recording, SideView
-from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, histogram
-from dexkit.conformance.report.wording import whose
+from dexkit.conformance.report.charts import Band, Level, Line, Range, chart, histogram
+from dexkit.conformance.report.labels import whose
 from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Evidence, Result
+from dexkit.conformance.results import Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.usb.frames import NO_VALUE
@@ -27,7 +22,7 @@ from dexkit.errors import UsageError
 from dexkit.escaping import html as escape
 from dexkit.hand import Floats, JointSpec, Side
 
-__all__ = ["PHASES", "command_and_state", "evidence", "operated", "phase_bands"]
+__all__ = ["PHASES", "command_and_state", "operated", "phase_bands", "plots_of"]
 
 PHASES = {
     "listen": "listen",
@@ -60,24 +55,24 @@ PHASES = {
 _LONGEST = 8.0
 """Seconds of a plot about a place in the recording."""
 _MOST_ROWS = 24
+_MOST_ELEMENTS = 12  # of an array, in one plot
 _FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m"}
-_PATH = re.compile(r"[A-Za-z_]\w*(?:\[\d+\])?(?:\.\w+(?:\[\d+\])?)+|\w+_[av]\b")
-"""The path of a message's member in a sentence, as checks write it."""
 
 
-def evidence(result: Result, view: Recording) -> list[str]:
-    """Figures for one result, as HTML."""
-    need = result.requirement
-    if need.layer == "usb":
-        return _usb(result, view.usb) if view.usb is not None else []
+def plots_of(result: Result, view: Recording) -> list[str]:
+    """The plots that the result names, as HTML; those that show nothing of it are left out.
+
+    A hand without any state has nothing to plot: what discovery saw is shown instead.
+    """
+    if result.requirement.layer == "usb":
+        return _usb_plots(result, view.usb) if view.usb is not None else []
     side = next((s for s in view.sides if str(s) == result.side), None)
     if side is None:
         return []
     scene = _Scene(result, view, view.sides[side])
-    bare = need.needs in ("nothing", "endpoints") or need.area == "Discovery"
-    if bare or not len(scene.hand.states):
+    if not len(scene.hand.states):
         return [_endpoints(scene)]
-    return [figure for figure in _by_kind(scene) if figure]
+    return [figure for plot in result.plots if (figure := _drawn(scene, plot))]
 
 
 @dataclass(frozen=True)
@@ -94,7 +89,7 @@ class _Scene:
 
     @property
     def places(self) -> list[tuple[float, float]]:
-        """Where the check points."""
+        """The places that the check names, as (begin, end) in seconds."""
         return [(e.time_s, e.end_s or e.time_s) for e in self.result.evidence]
 
     @property
@@ -120,24 +115,12 @@ class _Scene:
         return begin, max(end, begin + 0.1)
 
     def joints(self, span: tuple[float, float], most: int = 2) -> list[int]:
-        """The joints that the finding names, or those that move most in ``span``."""
+        """The joints that the finding is about, or those that move most in ``span``."""
         joints = self.hand.joints
         if len(joints) == 1:
             return [0]
-        text = f"{self.result.observed} {self.result.reason}"
-        named = [i for i, j in enumerate(joints) if re.search(rf"\b{re.escape(j.name)}\b", text)]
-        worst = {
-            name.removeprefix("rms_rad_"): value
-            for name, value in self.result.values.items()
-            if name.startswith("rms_rad_")
-        }
-        if worst:
-            names = [j.name for j in joints]
-            named = sorted(
-                (names.index(n) for n in worst if n in names), key=lambda i: -worst[names[i]]
-            )
-        if named:
-            return named[:most]
+        if self.result.joints:
+            return [j for j in self.result.joints if j < len(joints)][:most]
         q = self.hand.states.q[self.hand.states.between(*span)]
         if not len(q):
             return [0]
@@ -146,41 +129,16 @@ class _Scene:
         return [int(i) for i in np.argsort(-moved, kind="stable")[:most]]
 
 
-def _by_kind(scene: _Scene) -> list[str]:
-    need, values = scene.need, scene.result.values
-    limits = need.tolerances
-    if need.needs.startswith("other-"):
-        return _both_sides(scene)
-    if "max_gap_s" in values or (need.area == "Rate" and "max_gap_s" in limits):
-        return [_intervals(scene, scene.window(pad=1.0)), _follow(scene)]
-    if {"min_rate_hz", "max_rate_hz", "max_p99_s"} & set(limits):
-        return [_rates(scene), _interval_histogram(scene), _intervals(scene, None)]
-    if {"max_hold_s", "max_frozen_s"} & set(limits):
-        return _samples(scene)
-    if need.area == "Rate":
-        return [_intervals(scene, None)]
-    if need.needs == "session":
-        return _session(scene)
-    if need.phase == OPERATOR:
-        return [_operated(scene)]
-    if need.capability == "pressure" or scene.result.observed.startswith("pressure"):
-        return [_pressure(scene), _follow(scene)]
-    if need.area in ("Fields", "Sensors"):
-        return [_field(scene), _follow(scene)]
-    if any("tau" in name for name in (*limits, *values)):
-        return [_follow(scene), _torque(scene), _torque_by_position(scene)]
-    if any(p.targets.get(scene.hand.side) for p in scene.phases):
-        return [_steps(scene), _follow(scene)]
-    if need.area == "Mode byte":
-        return [_field(scene), _follow(scene)]
-    return [_follow(scene)]
+def _drawn(scene: _Scene, plot: Plot) -> str:
+    """One plot; empty if the recording holds nothing to draw."""
+    return _member(scene, plot.member) if plot.kind is PlotKind.MEMBER else _DRAWN[plot.kind](scene)
 
 
 # ------------------------------------------------------------------------------- curves
 
 
 def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band]:
-    """What the kit did when, neighbours of one name joined."""
+    """The phases of the stimulus, neighbours of one name joined."""
     if view.stimulus is None:
         return []
     merged: list[Band] = []
@@ -197,7 +155,7 @@ def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band
 
 
 def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
-    """When the kit's own machine was short of processor time: what is late then proves little.
+    """When the kit's own machine was short of processor time; lateness then proves little.
 
     Stretches that a plot of ``span`` could not show apart are taken together.
     """
@@ -247,13 +205,15 @@ def _operated(scene: _Scene) -> str:
 
 
 def _clipped(values: Floats, joint: JointSpec) -> Floats:
-    """Wild commands would squash the rest of a plot."""
+    """``values`` limited to the joint's range and a tenth of it: commands far outside would flatten
+    the rest of the plot.
+    """
     margin = 0.1 * joint.stroke
     return np.asarray(np.clip(values, joint.q_min - margin, joint.q_max + margin))
 
 
 def command_and_state(hand: SideView, joint: int) -> list[Line]:
-    """Two curves: where it is told to go, and where it says that it is."""
+    """Two curves of a joint: commanded and reported position."""
     commands, states = hand.commands, hand.states
     return [
         Line("command", "cmd", commands.t, _clipped(commands.q[:, joint], hand.joints[joint])),
@@ -288,20 +248,20 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
 
 
 def _room(hand: SideView, joint: int, span: tuple[float, float]) -> list[float]:
-    """Values that make a plot at least a tenth of the stroke high: noise is not to fill it."""
+    """Values that make a plot a tenth of the stroke high or more: noise is not to fill it."""
     q = hand.states.q[hand.states.between(*span), joint]
     q = q[np.isfinite(q)]
     middle = float(np.median(q)) if len(q) else 0.0
     return [middle - 0.05 * hand.joints[joint].stroke, middle + 0.05 * hand.joints[joint].stroke]
 
 
-def _both_sides(scene: _Scene) -> list[str]:
+def _both_sides(scene: _Scene) -> str:
     """Both hands, while only the other one is to move."""
     hand = scene.hand
     phases = [p for p in scene.view.phases(scene.need.phase or "") if hand.side not in p.sides]
     spans = scene.places[:1] or [scene.span_of(p) for p in phases[:1]]
     if not spans:
-        return [_follow(scene)]
+        return _follow(scene)
     span = (max(0.0, spans[0][0] - 0.6), spans[0][1] + 0.6)
     lines = []
     joint = scene.joints(span)[0]
@@ -315,16 +275,14 @@ def _both_sides(scene: _Scene) -> list[str]:
             lines.insert(
                 0, Line(f"command to the {whose(view.side)}", "cmd", view.commands.t, goal)
             )
-    return [
-        chart(
-            f"both hands, {_called(hand, joint)}, while only the other one is to move",
-            lines,
-            y_unit="rad",
-            span=span,
-            bands=scene.alarms,
-            include=_room(hand, joint, span),
-        )
-    ]
+    return chart(
+        f"both hands, {_called(hand, joint)}, while only the other one is to move",
+        lines,
+        y_unit="rad",
+        span=span,
+        bands=scene.alarms,
+        include=_room(hand, joint, span),
+    )
 
 
 def _steps(scene: _Scene) -> str:
@@ -378,8 +336,8 @@ def _steps(scene: _Scene) -> str:
     )
 
 
-def _session(scene: _Scene) -> list[str]:
-    """The whole replayed session, and the worst moment closer."""
+def _session(scene: _Scene) -> str:
+    """The whole replayed session, and the first place closer."""
     spans = [scene.span_of(p) for p in scene.view.phases("replay", scene.hand.side)]
     t = scene.hand.commands.t
     span = spans[0] if spans else (float(t[0]), float(t[-1])) if len(t) else scene.window()
@@ -387,7 +345,7 @@ def _session(scene: _Scene) -> list[str]:
     for a, b in scene.places[:1]:
         if b - a < 0.5 * (span[1] - span[0]):
             figures.append(_follow(scene, (max(span[0], a - 1.5), min(span[1], b + 1.5))))
-    return figures
+    return "".join(figures)
 
 
 # ---------------------------------------------------------------------------- timing
@@ -425,6 +383,24 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
         y_unit="ms",
         span=shown,
         bands=_busy(scene.view, shown) + scene.alarms,
+        levels=_interval_levels(scene.need),
+        include=(0.0,),
+        height=150,
+    )
+
+
+def _command_intervals(scene: _Scene) -> str:
+    """Time from each command to the next, over the whole run."""
+    t = scene.hand.commands.t
+    if len(t) < 2:
+        return ""
+    span = (0.0, max(scene.view.duration, 0.1))
+    return chart(
+        f"{whose(scene.hand.side)}: time from each command to the next",
+        [Line("each command", "cmd", t[1:], np.diff(t) * 1e3, "dots")],
+        y_unit="ms",
+        span=span,
+        bands=_busy(scene.view, span) + scene.alarms,
         levels=_interval_levels(scene.need),
         include=(0.0,),
         height=150,
@@ -470,21 +446,19 @@ def _rates(scene: _Scene) -> str:
     )
 
 
-def _samples(scene: _Scene) -> list[str]:
+def _samples(scene: _Scene) -> str:
     """The single samples: a value that is sent again stands beside the one before."""
     hand = scene.hand
     middle = scene.places[0] if scene.places else (_fastest(hand),) * 2
     span = (max(0.0, middle[0] - 0.05), middle[1] + 0.25)
-    return [
-        chart(
-            f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
-            [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
-            y_unit="rad",
-            span=span,
-            bands=scene.alarms,
-        )
-        for joint in scene.joints(span, 1)
-    ]
+    joint = scene.joints(span, 1)[0]
+    return chart(
+        f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
+        [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
+        y_unit="rad",
+        span=span,
+        bands=scene.alarms,
+    )
 
 
 def _fastest(hand: SideView) -> float:
@@ -505,7 +479,7 @@ def _torque(scene: _Scene) -> str:
         for sign in (1, -1)
     ]
     return chart(
-        f"{whose(hand.side)}: torque that it reports",
+        f"{whose(hand.side)}: torque (tau_est)",
         [
             Line("tau_est", "force", hand.states.t, hand.states.tau[:, j])
             for j in scene.joints(span)
@@ -547,17 +521,24 @@ def _torque_by_position(scene: _Scene) -> str:
     )
 
 
-def _field(scene: _Scene) -> str:
-    """The member that the finding is about, about the place."""
-    hand, span = scene.hand, scene.window(pad=0.3)
-    found = _member(scene)
-    if found is None:
+def _member(scene: _Scene, member: str) -> str:
+    """A member of the state about the place."""
+    states, span = scene.hand.states, scene.window(pad=0.3)
+    by_joint = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
+    values: Floats | None
+    if member == "length":
+        values, member = np.asarray(states.length, dtype=np.float64), "motors in the sequence"
+    elif member in by_joint:
+        values = by_joint[member][:, scene.joints(scene.window(), 1)[0]]
+    else:
+        values = _column(scene, member)
+    if values is None:
         return ""
-    name, column = found
+    table = values.reshape(len(values), -1)[:, :_MOST_ELEMENTS]
     return chart(
-        f"{whose(hand.side)}: {name}",
-        [Line(name, "force", hand.states.t, column)],
-        y_unit=_FIELDS.get(name, ""),
+        f"{whose(scene.hand.side)}: {member}",
+        [Line(member, "force", states.t, column) for column in table.T],
+        y_unit=_FIELDS.get(member, ""),
         span=span,
         bands=_busy(scene.view, span) + scene.alarms,
         include=(0.0,),
@@ -589,48 +570,31 @@ def _pressure(scene: _Scene) -> str:
     )
 
 
-def _member(scene: _Scene) -> tuple[str, Floats] | None:
-    """(name, a value for each state): the member that the finding names, or its requirement."""
-    states, need, told = scene.hand.states, scene.need, scene.result.observed
-    for path in _PATH.findall(told) if states.columns is not None else ():
-        if (column := _column(scene, path)) is not None:
-            return path, column
-    text = f"{told} {need.title} {need.sentence}"
-    if re.search(r"\b(decodes?|length|packets)\b", text) and need.area == "Fields":
-        return "motors in the sequence", np.asarray(states.length, dtype=np.float64)
-    columns = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
-    if "quaternion" in told and (column := _column(scene, "imu_state.quaternion")) is not None:
-        return "first of imu_state.quaternion", column
-    # what it speaks of first is what it is about
-    named = re.search(rf"\b({'|'.join(columns)})\b", told) or re.search(
-        rf"\b({'|'.join(columns)})\b", text
-    )
-    if named is None:
-        return None
-    return named[1], columns[named[1]][:, scene.joints(scene.window(), 1)[0]]
-
-
 def _column(scene: _Scene, path: str) -> Floats | None:
-    """A member by its path, whose last index may be a place in an array; None if none is."""
+    """A member of every state, or one element of it; None if the states have no such member."""
     columns = scene.hand.states.columns
-    assert columns is not None
-    head, _, index = path.rpartition("[")
-    for name, place in ((path, 0), (head, int(index[:-1]) if index[:-1].isdecimal() else 0)):
-        try:
-            values = columns[name] if name else None
-        except UsageError:
-            continue
-        if values is not None:
-            table = values.reshape(len(values), -1)
-            return table[:, place] if place < table.shape[1] else None
-    return None
+    if columns is None:
+        return None
+    try:
+        return columns[path]
+    except UsageError:
+        pass
+    head, _, index = path.removesuffix("]").rpartition("[")
+    try:
+        values = columns[head] if head and index.isdecimal() else None
+    except UsageError:
+        return None
+    if values is None:
+        return None
+    table = values.reshape(len(values), -1)
+    return table[:, int(index)] if int(index) < table.shape[1] else None
 
 
 # -------------------------------------------------------------------------------- network
 
 
 def _endpoints(scene: _Scene) -> str:
-    """Who was there: a table is the picture of what discovery saw."""
+    """Table of the endpoints that a client needs, and of those that discovery saw."""
     dialect, side = scene.view.dialect, scene.hand.side
     wanted = [
         (dialect.topics(side)[1], dialect.state_type, "writer"),
@@ -654,9 +618,9 @@ def _endpoints(scene: _Scene) -> str:
         for kind, topic, name, qos in sorted(seen)[:_MOST_ROWS]
     ]
     if not seen:
-        rows.append('<tr><td>seen</td><td colspan="4">discovery saw nobody</td></tr>')
+        rows.append('<tr><td>seen</td><td colspan="4">discovery saw no endpoint</td></tr>')
     return _table(
-        "On the network: what a client needs, and who was there (the kit's own among them)",
+        "On the network: what a client needs, and what discovery saw (the kit's own among it)",
         ("", "kind", "topic", "type", "QoS"),
         rows,
     )
@@ -670,27 +634,37 @@ def _table(caption: str, heads: Sequence[str], rows: Sequence[str]) -> str:
     )
 
 
+_DRAWN: Mapping[PlotKind, Callable[[_Scene], str]] = {
+    PlotKind.ENDPOINTS: _endpoints,
+    PlotKind.POSITION: _follow,
+    PlotKind.BOTH_SIDES: _both_sides,
+    PlotKind.STEPS: _steps,
+    PlotKind.SESSION: _session,
+    PlotKind.OPERATOR: _operated,
+    PlotKind.SAMPLES: _samples,
+    PlotKind.RATE: _rates,
+    PlotKind.INTERVAL_HISTOGRAM: _interval_histogram,
+    PlotKind.INTERVALS: lambda scene: _intervals(scene, None),
+    PlotKind.GAP: lambda scene: _intervals(scene, scene.window(pad=1.0)),
+    PlotKind.COMMAND_INTERVALS: _command_intervals,
+    PlotKind.TORQUE: _torque,
+    PlotKind.TORQUE_BY_POSITION: _torque_by_position,
+    PlotKind.PRESSURE: _pressure,
+}
+
+
 # ------------------------------------------------------------------------------------ USB
 
 
-def _usb(result: Result, usb: UsbRecording) -> list[str]:
-    """Transfers about the place: when, what bytes, and how the joints moved."""
+def _usb_plots(result: Result, usb: UsbRecording) -> list[str]:
     hand = next((h for s, h in usb.sides.items() if str(s) == result.side), None)
     if hand is None:
         return []
-    if not result.evidence:
-        return [_descriptors(hand)] if result.requirement.needs == "nothing" else []
-    place = result.evidence[0]
-    span = (max(0.0, place.time_s - 0.3), (place.end_s or place.time_s) + 0.3)
-    figures = [_bytes_at(hand, place)]
-    if {"min_rate_hz", "max_s"} & set(result.requirement.tolerances):
-        figures = [_latency(result, hand) or figures[0]]
-    elif place.end_s is not None:
-        figures = [_joints(result, hand, span)]
-    return [figure for figure in figures if figure]
+    drawn = (_USB_DRAWN[p.kind](result, hand) for p in result.plots if p.kind in _USB_DRAWN)
+    return [figure for figure in drawn if figure]
 
 
-def _descriptors(hand: UsbSide) -> str:
+def _descriptors(_: Result, hand: UsbSide) -> str:
     told = hand.device
     rows = {
         "idVendor:idProduct": f"{told.vendor:04X}:{told.product:04X}",
@@ -703,14 +677,17 @@ def _descriptors(hand: UsbSide) -> str:
         or "none",
     }
     return _table(
-        f"{whose(hand.side)}: what the device says of itself",
+        f"{whose(hand.side)}: descriptors of the device",
         ("", ""),
         [f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows.items()],
     )
 
 
-def _bytes_at(hand: UsbSide, place: Evidence) -> str:
-    """The beginning of the transfer that the place is about."""
+def _bytes_at(result: Result, hand: UsbSide) -> str:
+    """The beginning of the transfer at the first place, if that has no end."""
+    if not result.evidence or result.evidence[0].end_s is not None:
+        return ""
+    place = result.evidence[0]
     inward = place.topic.endswith("/in")
 
     def distance(transfer: Transfer) -> int:
@@ -739,17 +716,20 @@ def _hex(data: bytes, at: int) -> str:
     return f"{at:04x}  {data[at : at + 8].hex(' ')}"
 
 
-def _joints(result: Result, hand: UsbSide, span: tuple[float, float]) -> str:
-    """Positions in the answers about the place; those that move most, or are named."""
+def _answers(result: Result, hand: UsbSide) -> str:
+    """Joint positions in the answers about the first place, if that has an end."""
+    if not result.evidence or result.evidence[0].end_s is None:
+        return ""
+    place = result.evidence[0]
+    span = (max(0.0, place.time_s - 0.3), (place.end_s or place.time_s) + 0.3)
     answers = [a for a in hand.answers if span[0] <= a.t <= span[1]]
     if len(answers) < 2:
         return ""
     t = np.array([a.t for a in answers])
     q = np.array([hand.q(a) for a in answers])
     names = [j.name for j in hand.joints]
-    wanted = [i for i, n in enumerate(names) if re.search(rf"\b{n}\b", result.observed)]
     moved = np.ptp(np.where(np.isfinite(q), q, 0.0), axis=0)
-    shown = wanted or np.argsort(-moved, kind="stable")[:2].tolist()
+    shown = result.joints or np.argsort(-moved, kind="stable")[:2].tolist()
     bands = [Band(p.name, *hand.span(p)) for p in hand.record.phases if hand.span(p)[1] > span[0]]
     marks = [Band("here", e.time_s, e.end_s or e.time_s, "alarm") for e in result.evidence]
     return chart(
@@ -787,3 +767,11 @@ def _latency(result: Result, hand: UsbSide) -> str:
         unit="ms",
         levels=levels,
     )
+
+
+_USB_DRAWN: Mapping[PlotKind, Callable[[Result, UsbSide], str]] = {
+    PlotKind.DESCRIPTORS: _descriptors,
+    PlotKind.BYTES: _bytes_at,
+    PlotKind.ANSWERS: _answers,
+    PlotKind.LATENCY: _latency,
+}

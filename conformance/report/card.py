@@ -1,0 +1,185 @@
+"""The card of a requirement: everything a person needs to act on what was found.
+
+Built once from the results of one requirement, and drawn as HTML, for a terminal, as Markdown and
+as plain text (JUnit, pytest).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.results import Evidence, Result, RunResult, Verdict, worst
+from dexkit.escaping import REMARK, one_line
+
+__all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards"]
+
+
+class Item(str, Enum):
+    """What a line of a card is about; the value is its label on a terminal."""
+
+    REQUIRED = "required"
+    EXPECTED = "expected"
+    OBSERVED = "observed"
+    REASON = "reason"
+    WHERE = "where"
+    CAUSE = "cause"
+    TRY = "try"
+    SOURCE = "source"
+
+    def __str__(self) -> str:
+        return self.value
+
+    @property
+    def label(self) -> str:
+        """Its label on a page, where there is room for two words."""
+        return {Item.CAUSE: "likely cause", Item.TRY: "what to try"}.get(self, self.value)
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One line of a card.
+
+    :param sides: the sides that it holds for, where that is not all of the card's; else empty.
+    :param place: of :attr:`Item.WHERE`, the place in the recording that ``text`` describes.
+    """
+
+    item: Item
+    text: str
+    sides: str = ""
+    place: Evidence | None = None
+
+
+@dataclass(frozen=True)
+class Card:
+    """What was found for one requirement.
+
+    :param results: of the sides that the card is about, one or more.
+    """
+
+    results: tuple[Result, ...]
+
+    @classmethod
+    def of(cls, results: Sequence[Result]) -> Card:
+        """The card of these results of one requirement."""
+        return cls(tuple(results))
+
+    @property
+    def requirement(self) -> Requirement:
+        """The requirement."""
+        return self.results[0].requirement
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict of all sides together."""
+        return worst(r.verdict for r in self.results)
+
+    @property
+    def sides(self) -> str:
+        """``left and right``."""
+        return " and ".join(r.side for r in self.results)
+
+    @property
+    def expected(self) -> str:
+        """What would have been right, where that is shorter than the sentence; else empty."""
+        text = self.results[0].expected
+        return "" if text == self.requirement.sentence else text
+
+    @property
+    def causes(self) -> list[tuple[str, str]]:
+        """(sides, likely cause), one entry for each cause."""
+        found: dict[str, list[str]] = {}
+        for result in self.results:
+            if result.cause:
+                found.setdefault(result.cause, []).append(result.side)
+        return [(", ".join(sides), cause) for cause, sides in found.items()]
+
+    @property
+    def source(self) -> str:
+        """The source of the requirement, and how sure it is."""
+        return f"{self.requirement.source} (confidence: {self.requirement.confidence})"
+
+    def facts(self) -> Iterator[Fact]:
+        """All that the card says, in its order; what holds for all sides is there once."""
+        yield Fact(Item.REQUIRED, f"{self.requirement.sentence} ({self.requirement.level})")
+        if self.expected:
+            yield Fact(Item.EXPECTED, self.expected)
+        for result in self.results:
+            side = result.side if len(self.results) > 1 else ""
+            if result.observed:
+                yield Fact(Item.OBSERVED, result.observed, side)
+            if result.reason:
+                yield Fact(Item.REASON, result.reason, side)
+            for place in result.evidence:
+                yield Fact(Item.WHERE, _described(place), side, place)
+        causes = self.causes
+        for sides, cause in causes:
+            yield Fact(Item.CAUSE, cause, sides if len(causes) > 1 else "")
+        if any(r.retry for r in self.results):
+            yield Fact(Item.TRY, "Run it again on a machine that does nothing else.")
+        blocked_by_load = any(
+            r.verdict is Verdict.BLOCKED and not r.blocked_by for r in self.results
+        )
+        if self.verdict in (Verdict.FAIL, Verdict.WARN) or blocked_by_load:
+            yield Fact(Item.TRY, self.requirement.advice)
+            yield Fact(Item.SOURCE, self.source)
+
+    def as_text(self) -> str:
+        """The card as lines of plain text."""
+        need = self.requirement
+        lines = [f"{need.id} ({need.level}) {self.sides}: {self.verdict}"]
+        for fact in self.facts():
+            side = f"{fact.sides}: " if fact.sides else ""
+            label = f"{fact.item}:"
+            lines.append(f"  {label:<9} {one_line(side + fact.text, REMARK)}")
+        return "\n".join(lines)
+
+
+def _described(place: Evidence) -> str:
+    until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
+    return f"{one_line(place.topic)} at {place.time_s:.3f} s{until}"
+
+
+def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
+    """A card for each requirement with one of ``verdicts`` that nothing else blocked.
+
+    In the order of ``verdicts``; among equals, what blocks most of the others comes first.
+    """
+    blocks = Counter(r.blocked_by for r in result.results)
+    found = [
+        Card.of(group)
+        for _, every in result.by_requirement()
+        if (group := [r for r in every if r.verdict in verdicts and not r.blocked_by])
+    ]
+    return sorted(
+        found, key=lambda card: (verdicts.index(card.verdict), -blocks[card.requirement.id])
+    )
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """Requirements that could not be judged for the same reason.
+
+    :param before: id of the requirement that failed first; empty where the load of the machine
+        is the reason.
+    """
+
+    reason: str
+    before: str
+    cards: tuple[Card, ...]
+
+
+def blocked_groups(results: Iterable[Result]) -> list[Blocked]:
+    """What was blocked, by the reason."""
+    found: dict[tuple[str, str], dict[str, list[Result]]] = {}
+    for result in results:
+        if result.verdict is Verdict.BLOCKED:
+            group = found.setdefault((result.reason, result.blocked_by), {})
+            group.setdefault(result.requirement.id, []).append(result)
+    return [
+        Blocked(reason, before, tuple(Card.of(group) for group in groups.values()))
+        for (reason, before), groups in found.items()
+    ]

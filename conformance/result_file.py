@@ -1,0 +1,166 @@
+"""Read a result file: hold it to its schema, and convert one of version 2."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from dexkit import documents
+from dexkit.conformance.plots import Plot
+from dexkit.conformance.requirements import Level, Requirement
+from dexkit.conformance.result_file_v2 import converted
+from dexkit.conformance.results import (
+    FORMAT,
+    VERSION,
+    Disturbance,
+    Evidence,
+    Load,
+    Result,
+    RunResult,
+    Stage,
+    Verdict,
+)
+from dexkit.errors import UsageError
+from dexkit.escaping import one_line
+
+__all__ = ["read_json"]
+
+
+def read_json(path: Path) -> RunResult:
+    """Read a result file back.
+
+    :raises UsageError: it is not one, of a version that this dexkit does not know, or something
+        in it is not as ``result.schema.json`` says: the error names the place.
+    """
+    data = documents.read_json(path)
+    about = data if isinstance(data, dict) else {}
+    if about.get("format") != FORMAT:
+        raise UsageError(
+            f"{path} is not a result file of dexkit",
+            hint="'dexkit check --json FILE' and the suite's '--json FILE' write them",
+        )
+    if about.get("version") == 2:
+        data = converted(about)
+    elif about.get("version") != VERSION:
+        raise UsageError(f"{path} is version {one_line(about.get('version'), 40)} of {FORMAT}")
+    _validate(data, path)
+    return RunResult(
+        subject=data["subject"],
+        stage={side: Stage(stage) for side, stage in data["stage"].items()},
+        duration_s=data["duration_s"],
+        notes=data["notes"],
+        environment=data["environment"],
+        harness=data["harness"],
+        claims=data["claims"],
+        catalogue=data["catalogue"],
+        recorded_at=data["recorded_at"],
+        results=[_result_of(entry) for entry in data["results"]],
+    )
+
+
+@cache
+def _validator() -> Any:
+    import jsonschema
+
+    text = Path(__file__).with_name("report").joinpath("result.schema.json").read_text("utf-8")
+    return jsonschema.Draft202012Validator(json.loads(text))
+
+
+def _validate(data: Any, path: Path) -> None:
+    """Hold a document to the schema that is published with dexkit.
+
+    :raises UsageError: naming the first place that is not as it says.
+    """
+    from jsonschema.exceptions import relevance
+
+    error = min(_validator().iter_errors(data), key=relevance, default=None)
+    if error is None:
+        return
+    while error.context:  # of several alternatives: what is wrong with the nearest
+        error = min(error.context, key=relevance)
+    where = one_line(error.json_path.removeprefix("$").removeprefix(".") or "the document")
+    raise UsageError(
+        f"{path}: {where} {_expected(error.validator, error.validator_value, error.instance)}",
+        hint="the file is damaged, or was written by another program; docs/reports.md says what is "
+        "in a result file",
+    )
+
+
+_KINDS = {
+    dict: "an object",
+    list: "a list",
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    type(None): "null",
+}
+_NAMES = {
+    "object": "an object",
+    "array": "a list",
+    "string": "a text",
+    "boolean": "true or false",
+    "integer": "a whole number",
+    "number": "a number",
+    "null": "null",
+}
+
+
+def _expected(rule: str, value: Any, found: Any) -> str:
+    """What a rule of the schema wants, and what is there instead."""
+    is_there = _KINDS[type(found)]
+    if isinstance(found, str | int | float | bool):
+        is_there = one_line(json.dumps(found), 60)
+    if rule == "type":
+        kinds = [value] if isinstance(value, str) else value
+        return f"must be {' or '.join(_NAMES[kind] for kind in kinds)}, not {is_there}"
+    if rule == "required":
+        missing = [name for name in value if name not in found]
+        return f"has no {', '.join(missing)}"
+    if rule == "enum":
+        return f"must be one of {', '.join(json.dumps(v) for v in value)}, not {is_there}"
+    if rule == "const":
+        return f"must be {json.dumps(value)}, not {is_there}"
+    if rule in ("minimum", "maximum"):
+        return f"must be {'at least' if rule == 'minimum' else 'at most'} {value:g}, not {is_there}"
+    if rule == "additionalProperties":
+        return "holds something that is not known"
+    if rule in ("maxLength", "maxItems", "maxProperties", "minLength"):
+        return f"is too {'short' if rule == 'minLength' else 'long'} ({rule} {value})"
+    if rule == "pattern":
+        return f"is not of the form {value}: {is_there}"
+    return f"is not as it should be ({rule})"
+
+
+def _result_of(entry: dict[str, Any]) -> Result:
+    data = dict(entry["requirement"])
+    data["level"] = Level(data["level"])
+    data["after"] = tuple(data["after"])
+    data["dialects"] = tuple(data["dialects"])
+    data["plots"] = _plots(data["plots"])
+    entry["disturbance"]
+    return Result(
+        requirement=Requirement(**data),
+        side=entry["side"],
+        verdict=Verdict(entry["verdict"]),
+        figure=entry["figure"],
+        observed=entry["observed"],
+        reason=entry["reason"],
+        cause=entry["cause"],
+        blocked_by=entry["blocked_by"],
+        evidence=tuple(Evidence(**e) for e in entry["evidence"]),
+        values=entry["values"],
+        joints=tuple(entry["joints"]),
+        disturbance=Disturbance(
+            **{**entry["disturbance"], "load": Load(entry["disturbance"]["load"])}
+        ),
+        plots=_plots(entry["plots"]),
+        retry=entry["retry"],
+    )
+
+
+def _plots(names: Iterable[str]) -> tuple[Plot, ...]:
+    return tuple(Plot.parse(name) for name in names)
