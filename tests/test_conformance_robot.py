@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,14 +17,9 @@ from dexkit.cli.check import command
 from dexkit.conformance.checks.robot import robot_checks
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, free_domain, record_run
-from dexkit.conformance.mutants.robot import (
-    MUTANTS,
-    CdrCrc,
-    NoCrc,
-    RobotMutant,
-    WaitsForCommands,
-    run_robot_mutant,
-)
+from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
+from dexkit.conformance.mutants.matrix import Outcome, try_one
+from dexkit.conformance.mutants.robot import CdrCrc, NoCrc, WaitsForCommands
 from dexkit.conformance.phases import ROBOT, Stimulus
 from dexkit.conformance.processes import RigOptions
 from dexkit.conformance.requirements import Level, catalogue, select
@@ -118,26 +114,32 @@ def test_a_good_robot_passes_everything(name: str) -> None:
     assert result.stage == {"robot": Stage.MOVING}
 
 
-def _one_of_each() -> list[RobotMutant]:
+def blamed(robot: type[ReferenceRobot], model: str, *phases: str) -> set[str]:
+    plan = replace(plan_for(model), phases=frozenset(phases))
+    bad = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
+    return {r.requirement.id for r in run_mutant(robot, plan).results if r.verdict in bad}
+
+
+def _one_of_each() -> list[Mutant]:
     """A wrong robot for each check of a MUST, and what only a G1 has."""
     checks, level = robot_checks(), {r.id: r.level for r in catalogue(None, "robot")}
-    found: dict[object, RobotMutant] = {}
-    for mutant in MUTANTS:
+    found: dict[object, Mutant] = {}
+    for mutant in mutants("robot"):
         if level[mutant.kills] is Level.MUST and mutant.model == "h1":
             found.setdefault(checks[mutant.kills], mutant)
-    only_g1 = [m for m in MUTANTS if m.kills in ("G1-MACH-01", "G1-SAFE-05", "G1-SAFE-03")]
+    only_g1 = [m for m in mutants() if m.kills in ("G1-MACH-01", "G1-SAFE-05", "G1-SAFE-03")]
     return [*found.values(), *only_g1]
 
 
 @pytest.mark.parametrize("mutant", _one_of_each(), ids=lambda m: f"{m.model}-{m.name}")
-def test_a_wrong_robot_is_caught(mutant: RobotMutant) -> None:
-    assert mutant.blamed(short=True) == {mutant.kills, *mutant.also}, mutant.summary
+def test_a_wrong_robot_is_caught(mutant: Mutant) -> None:
+    assert try_one(mutant, short=True) == Outcome(mutant), mutant.summary
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> None:
     every = catalogue(name, "robot")
-    assert {m.kills for m in MUTANTS if m.model == name} == {r.id for r in every}
+    assert {m.kills for m in mutants() if m.model == name} == {r.id for r in every}
     assert {r.id for r in every} <= set(robot_checks())
     negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
     negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
@@ -173,8 +175,7 @@ def test_a_crc_that_was_never_set_is_told_from_a_wrong_one() -> None:
 
 
 def test_a_robot_that_waits_is_woken() -> None:
-    blamed = run_robot_mutant(WaitsForCommands, "g1", frozenset())
-    assert blamed == {"G1-START-01"}
+    assert blamed(WaitsForCommands, "g1") == {"G1-START-01"}
 
 
 def test_a_robot_that_says_nothing_is_not_commanded_for_long() -> None:
@@ -242,8 +243,8 @@ class Hiccup(ReferenceRobot):
 
 
 def test_a_robot_that_dies_of_a_command_is_told_from_a_late_one() -> None:
-    assert "H1-SAFE-01" in run_robot_mutant(DiesOfNaN, "h1", frozenset({"nan"}))
-    assert run_robot_mutant(Hiccup, "h1", frozenset({"nan"})) == set()
+    assert "H1-SAFE-01" in blamed(DiesOfNaN, "h1", "nan")
+    assert blamed(Hiccup, "h1", "nan") == set()
 
 
 # --------------------------------------------------------------------------------- recordings

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 
 from dexkit.cli.mutants import command
 from dexkit.conformance.checks import all_checks
-from dexkit.conformance.mutants import REFERENCES, plan_for, run_mutant
-from dexkit.conformance.mutants.matrix import Outcome, Score, Trial, chosen, essential, try_one
-from dexkit.conformance.mutants.matrix import trials as all_trials
+from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
+from dexkit.conformance.mutants.matrix import Outcome, Score, chosen, essential, try_one
+from dexkit.conformance.mutants.trials import REFERENCES
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.hand import Side
@@ -33,7 +33,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
 )
 def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
     plan = plan_for(dialect, sides=sides)
-    result = run_mutant(REFERENCES[plan.dialect.model], plan)
+    result = run_mutant(REFERENCES["dds", plan.dialect.model], plan)
     bad = [r.explain() for r in result.results if r.verdict not in GOOD]
     assert not bad, "\n".join(bad)
     assert result.overall is Overall.PASS
@@ -48,10 +48,10 @@ def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
 GOOD = (Verdict.PASS, Verdict.NOT_APPLICABLE)
 
 # one wrong hand of each MUST, no longer than it takes to show it
-ESSENTIAL = essential(all_trials())
+ESSENTIAL = essential(mutants())
 
 
-def name_of(given: Trial) -> str:
+def name_of(given: Mutant) -> str:
     return f"{given.layer}-{given.model}-{given.name}"
 
 
@@ -60,13 +60,13 @@ OF_EACH_CHECK = {all_checks()[t.kills]: t for t in reversed(ESSENTIAL) if t.laye
 
 
 @pytest.mark.parametrize("given", OF_EACH_CHECK.values(), ids=name_of)
-def test_a_wrong_hand_is_caught(given: Trial) -> None:
+def test_a_wrong_hand_is_caught(given: Mutant) -> None:
     assert try_one(given, short=True) == Outcome(given), given.summary
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("given", all_trials(), ids=name_of)
-def test_a_wrong_hand_is_caught_for_the_right_reason(given: Trial) -> None:
+@pytest.mark.parametrize("given", mutants(), ids=name_of)
+def test_a_wrong_hand_is_caught_for_the_right_reason(given: Mutant) -> None:
     assert try_one(given) == Outcome(given), given.summary
 
 
@@ -76,7 +76,7 @@ def test_every_must_has_a_wrong_hand() -> None:
 
 
 def test_every_mutant_says_what_it_does_wrong() -> None:
-    every = all_trials()
+    every = mutants()
     assert all(t.summary for t in every)
     assert len({(t.layer, t.model, t.name) for t in every}) == len(every)
 
@@ -112,7 +112,7 @@ def test_a_requirement_without_a_wrong_hand_is_an_error() -> None:
 
 
 def test_a_survivor_and_a_stray_are_errors() -> None:
-    (nan,) = (t for t in all_trials() if t.kills == "DEX1-FIELD-02")
+    (nan,) = (t for t in mutants() if t.kills == "DEX1-FIELD-02")
     assert score_of(Outcome(nan)).perfect
     survivor = score_of(Outcome(nan, missed=("DEX1-FIELD-02",)))
     assert survivor.unproven

@@ -1,26 +1,22 @@
-"""Wrong hands that only an operator notices: with Unitree's client in the loop.
+"""Wrong hands whose fault shows only in a closed loop, with a model of Unitree's client.
 
-Each keeps every MUST; what is wrong shows where commands depend on states.
+Each meets every MUST; the fault shows where commands depend on states.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
-from dexkit.conformance.mutants import shared
+from dexkit.conformance.mutants.any_model import Delayed
+from dexkit.conformance.mutants.registry import wrong_hand
 from dexkit.conformance.virtual import Service
-from dexkit.conformance.virtual.fingers import Dex3Service, Dex5Service, FingerService
+from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
-
-__all__ = ["ZOO"]
-
-_Entry: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
+from dexkit.models import DEX1_1, model
 
 
 class _PerJoint(Service):
@@ -60,12 +56,15 @@ class _DeadBand(_PerJoint):
         return self.told.setdefault(joint, (here, self.now))[0]
 
 
+@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-04",))
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a target nearer than 0.14 rad: where the client sticks there, it never goes on."""
 
     band = 0.14 / 5.4
 
 
+@wrong_hand("DEX3-OPER-02")
+@wrong_hand("DEX5-OPER-02", also=("DEX5-LIFE-03",))
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a target nearer than a fifteenth of a joint's range."""
 
@@ -81,18 +80,22 @@ class _Coarse(_PerJoint):
         return round(q / grid) * grid
 
 
+@wrong_hand("DEX1-OPER-04")
 class CoarseTargets(_Coarse, ReferenceService):
     """Goes to the nearest of nineteen places."""
 
     grid = 1 / 18
 
 
+@wrong_hand("DEX3-OPER-04", also=("DEX3-MOVE-04",))
+@wrong_hand("DEX5-OPER-04")
 class CoarseFingers(_Coarse, FingerService):
     """Goes to the nearest of twenty-one places."""
 
     grid = 1 / 20
 
 
+@wrong_hand("DEX1-OPER-02", also=("DEX1-OPER-01", "DEX1-OPER-05"))
 class LateState(ReferenceService):
     """Says where it was 60 ms ago, in ever fresh messages."""
 
@@ -111,6 +114,7 @@ class LateState(ReferenceService):
         return {**found, **past[0][1]}
 
 
+@wrong_hand("DEX1-OPER-03")
 class RunsAhead(_PerJoint, ReferenceService):
     """Goes where moving targets will soon be, and so too far when they stop."""
 
@@ -156,6 +160,7 @@ class _SlowToWake(_PerJoint):
         return before
 
 
+@wrong_hand("DEX1-OPER-05")
 class SlowToWake(_SlowToWake, ReferenceService):
     """Sleeps when its target rests, and needs 0.2 s to wake."""
 
@@ -179,6 +184,8 @@ class _OpenEnd(_PerJoint):
         raise AssertionError  # overridden
 
 
+@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05",))
+@wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01"))
 class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range a second."""
 
@@ -193,6 +200,7 @@ class SlowToLeave(_OpenEnd, FingerService):
         return taken
 
 
+@wrong_hand("DEX3-OPER-03")
 class Springs(_OpenEnd, FingerService):
     """Goes a quarter too far for half a second when it comes from the open end of a joint."""
 
@@ -203,53 +211,7 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-class LateFingers(shared.Delayed, FingerService):
+@wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02",))
+@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02"))
+class LateFingers(Delayed, FingerService):
     """Carries out each command 0.15 s late."""
-
-
-_FINGERS: tuple[_Entry, ...] = (
-    (SlowToLeave, "OPER-01", ("OPER-05",)),
-    (FingerDeadBand, "OPER-02", ()),
-    (Springs, "OPER-03", ()),
-    (CoarseFingers, "OPER-04", ()),
-    (LateFingers, "OPER-05", ("TRACK-02",)),
-)
-
-
-def _zoo(
-    prefix: str, reference: type[FingerService], others: Mapping[type[Service], tuple[str, ...]]
-) -> tuple[_Entry, ...]:
-    """The wrong hands of a model; ``others`` says what else fails only with this one."""
-    return tuple(
-        (
-            shared.of(mixin, reference),
-            f"{prefix}-{kills}",
-            tuple(f"{prefix}-{a}" for a in (*also, *others.get(mixin, ()))),
-        )
-        for mixin, kills, also in _FINGERS
-    )
-
-
-ZOO: dict[str, tuple[_Entry, ...]] = {
-    DEX1_1.name: (
-        # where the client's filter sticks within the dead band, nothing moves any more
-        (DeadBand, "DEX1-OPER-01", ("DEX1-OPER-04",)),
-        (LateState, "DEX1-OPER-02", ("DEX1-OPER-01", "DEX1-OPER-05")),
-        (RunsAhead, "DEX1-OPER-03", ()),
-        (CoarseTargets, "DEX1-OPER-04", ()),
-        (SlowToWake, "DEX1-OPER-05", ()),
-    ),
-    DEX3_1.name: _zoo("DEX3", Dex3Service, {CoarseFingers: ("MOVE-04",)}),
-    # its session begins at the open end, and it rests nearer to where it is brought first
-    DEX5_1.name: _zoo(
-        "DEX5",
-        Dex5Service,
-        {
-            SlowToLeave: ("TRACK-01",),
-            FingerDeadBand: ("LIFE-03",),
-            # its delay is long beside what the light joints take
-            LateFingers: ("OPER-02",),
-        },
-    ),
-}
-"""By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""

@@ -7,19 +7,13 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import ROBOT
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Verdict
-from dexkit.conformance.robot import robot_dialect, robot_recording
-from dexkit.conformance.stimuli import Plan, phases_for
-from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
+from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.virtual import MemoryTrace, Sample
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.hand import Floats, Side
 from dexkit.messages import decode, message_type
@@ -27,8 +21,6 @@ from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
 from dexkit.traces import TraceEndpoint
 from dexkit.wire.crc32 import crc32_words
-
-__all__ = ["MUTANTS", "RobotMutant", "run_robot_mutant"]
 
 _EARLY = 0.8  # s: while the kit only listens
 
@@ -43,6 +35,7 @@ class _OtherFamily(ReferenceRobot):
         return other.cmd_type, other.state_type
 
 
+@wrong_hand("H1-TOPIC-01")
 class OtherState(_OtherFamily):
     """Publishes the other family's LowState_."""
 
@@ -57,6 +50,7 @@ class OtherState(_OtherFamily):
         return kind.encode(kind.cls())
 
 
+@wrong_hand("H1-TOPIC-02", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
 class OtherCommands(_OtherFamily):
     """Listens for the other family's LowCmd_."""
 
@@ -67,6 +61,7 @@ class OtherCommands(_OtherFamily):
         self.command_type = self.others[0]
 
 
+@wrong_hand("H1-TOPIC-03")
 class Twins(ReferenceRobot):
     """Two of them publish."""
 
@@ -75,18 +70,21 @@ class Twins(ReferenceRobot):
         return every + [e for e in every if e.kind == "writer"]
 
 
+@wrong_hand("H1-QOS-01", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
 class AsksForMore(ReferenceRobot):
     """Asks for the commands from before it came."""
 
     reader_durability = "TransientLocal"
 
 
+@wrong_hand("H1-QOS-02")
 class BestEffort(ReferenceRobot):
     """Offers its state without reliability."""
 
     writer_reliability = "best_effort"
 
 
+@wrong_hand("H1-START-01")
 class WaitsForCommands(ReferenceRobot):
     """Says nothing until it is commanded."""
 
@@ -97,6 +95,7 @@ class WaitsForCommands(ReferenceRobot):
 # ------------------------------------------------------------------------------------ integrity
 
 
+@wrong_hand("H1-FIELD-01")
 class CutShort(ReferenceRobot):
     """Its first states lack the last word."""
 
@@ -105,6 +104,7 @@ class CutShort(ReferenceRobot):
         return payload[:-4] if self.now < _EARLY else payload
 
 
+@wrong_hand("H1-FIELD-02")
 class NotANumber(ReferenceRobot):
     """Divides by a time of zero at first."""
 
@@ -114,6 +114,7 @@ class NotANumber(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-CRC-01")
 class CdrCrc(ReferenceRobot):
     """Computes the CRC over the CDR bytes."""
 
@@ -122,6 +123,7 @@ class CdrCrc(ReferenceRobot):
         return payload[:-4] + crc32_words(payload[4:-4]).to_bytes(4, "little")
 
 
+@wrong_hand("H1-CRC-01")
 class NoCrc(ReferenceRobot):
     """Leaves the CRC 0."""
 
@@ -132,18 +134,21 @@ class NoCrc(ReferenceRobot):
 # ----------------------------------------------------------------------------------------- rate
 
 
+@wrong_hand("H1-RATE-01")
 class Slow(ReferenceRobot):
     """Publishes 100 times a second."""
 
     period = 0.01
 
 
+@wrong_hand("H1-RATE-02")
 class Leisurely(ReferenceRobot):
     """Publishes 333 times a second."""
 
     period = 0.003
 
 
+@wrong_hand("H1-RATE-03")
 class Stumbles(ReferenceRobot):
     """Says nothing for a fifth of a second."""
 
@@ -151,6 +156,7 @@ class Stumbles(ReferenceRobot):
         return [] if 0.5 < self.now < 0.7 else super().publish()
 
 
+@wrong_hand("H1-ORDER-01")
 class Repeats(ReferenceRobot):
     """Sends some states twice."""
 
@@ -159,6 +165,7 @@ class Repeats(ReferenceRobot):
         return found * 2 if self.now < _EARLY and self.ticks() % 50 == 0 else found
 
 
+@wrong_hand("H1-TICK-01")
 class NoTick(ReferenceRobot):
     """Leaves tick 0."""
 
@@ -166,6 +173,7 @@ class NoTick(ReferenceRobot):
         return 0
 
 
+@wrong_hand("H1-TICK-02")
 class CountsStates(ReferenceRobot):
     """Counts states instead of milliseconds."""
 
@@ -176,6 +184,7 @@ class CountsStates(ReferenceRobot):
 # --------------------------------------------------------------------------------------- fields
 
 
+@wrong_hand("H1-FIELD-03")
 class TurnedOnce(ReferenceRobot):
     """One encoder counts from a turn further."""
 
@@ -188,6 +197,7 @@ class TurnedOnce(ReferenceRobot):
             values[slot] += 2 * math.pi
 
 
+@wrong_hand("H1-FIELD-04")
 class NoSpeed(ReferenceRobot):
     """Leaves dq 0."""
 
@@ -196,6 +206,7 @@ class NoSpeed(ReferenceRobot):
         return q, np.zeros_like(dq), tau
 
 
+@wrong_hand("H1-FIELD-05")
 class Ghost(ReferenceRobot):
     """Tells of a motor where none is."""
 
@@ -206,6 +217,7 @@ class Ghost(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-TEMP-01")
 class NoSensor(ReferenceRobot):
     """Takes 255 for "no temperature"."""
 
@@ -213,6 +225,7 @@ class NoSensor(ReferenceRobot):
         return 255
 
 
+@wrong_hand("H1-TEMP-02")
 class Frozen(ReferenceRobot):
     """Leaves the motors' temperatures 0."""
 
@@ -220,6 +233,7 @@ class Frozen(ReferenceRobot):
         return 0 if self.robot.family == "unitree_go" else (0, 0)
 
 
+@wrong_hand("H1-IMU-01")
 class NoAttitude(ReferenceRobot):
     """Leaves the quaternion 0."""
 
@@ -227,6 +241,7 @@ class NoAttitude(ReferenceRobot):
         return (0.0,) * 4, (0.0,) * 3
 
 
+@wrong_hand("H1-IMU-02")
 class WLast(ReferenceRobot):
     """Writes the quaternion with w last."""
 
@@ -235,6 +250,7 @@ class WLast(ReferenceRobot):
         return (x, y, z, w), rpy
 
 
+@wrong_hand("H1-IMU-03")
 class InG(ReferenceRobot):
     """Tells accelerations in g."""
 
@@ -242,6 +258,7 @@ class InG(ReferenceRobot):
         return (0.0, 0.0, 1.0)
 
 
+@wrong_hand("H1-HEAD-01")
 class NoHead(ReferenceRobot):
     """Leaves the head 0."""
 
@@ -251,6 +268,7 @@ class NoHead(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-BMS-01")
 class Empty(ReferenceRobot):
     """Has an empty battery."""
 
@@ -260,6 +278,7 @@ class Empty(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-FOOT-01")
 class Hangs(ReferenceRobot):
     """Its feet pull."""
 
@@ -269,6 +288,7 @@ class Hangs(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-REMOTE-01")
 class RemoteRubbish(ReferenceRobot):
     """Does not clear the remote's bytes."""
 
@@ -276,6 +296,7 @@ class RemoteRubbish(ReferenceRobot):
         return b"\xaa\x55" * 20
 
 
+@wrong_hand("H1-REMOTE-01")
 class ShiftedRemote(ReferenceRobot):
     """Writes the sticks without the two bytes before them."""
 
@@ -283,6 +304,7 @@ class ShiftedRemote(ReferenceRobot):
         return struct.pack("<H5f18x", 0, 0.5, 0.7, -0.3, 0.9, -0.25)
 
 
+@wrong_hand("G1-MACH-01")
 class NoMachine(ReferenceRobot):
     """Leaves mode_machine 0."""
 
@@ -292,6 +314,7 @@ class NoMachine(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-MODE-01")
 class NoMode(ReferenceRobot):
     """Leaves the mode bytes 0."""
 
@@ -302,6 +325,7 @@ class NoMode(ReferenceRobot):
 # --------------------------------------------------------------------------------------- motion
 
 
+@wrong_hand("H1-MOVE-01", also=("H1-WDOG-03",))
 class Halfway(ReferenceRobot):
     """Goes half of each way."""
 
@@ -312,6 +336,7 @@ class Halfway(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-MOVE-02")
 class Coupled(ReferenceRobot):
     """Its hip gives way while the elbow moves."""
 
@@ -323,6 +348,7 @@ class Coupled(ReferenceRobot):
             self.q[hip] += 3.0 * (self.q[elbow] - before)
 
 
+@wrong_hand("H1-GAIN-01")
 class OwnGains(ReferenceRobot):
     """Puts in its own stiffness."""
 
@@ -332,6 +358,7 @@ class OwnGains(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-GAIN-02")
 class NoVelocity(ReferenceRobot):
     """Ignores dq."""
 
@@ -340,6 +367,7 @@ class NoVelocity(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-GAIN-03", also=("H1-GAIN-01",))
 class NoTorque(ReferenceRobot):
     """Ignores tau."""
 
@@ -348,6 +376,7 @@ class NoTorque(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-GAIN-04")
 class DefaultGains(ReferenceRobot):
     """Takes kp 0 for "as usual"."""
 
@@ -358,6 +387,7 @@ class DefaultGains(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-FORCE-01")
 class NoForce(ReferenceRobot):
     """Leaves tau_est 0."""
 
@@ -369,6 +399,7 @@ class NoForce(ReferenceRobot):
 # --------------------------------------------------------------------------------------- safety
 
 
+@wrong_hand("H1-MODE-02", also=("H1-MODE-01",))
 class NoModes(ReferenceRobot):
     """Does not look at the mode byte."""
 
@@ -376,6 +407,7 @@ class NoModes(ReferenceRobot):
         return np.ones(self.robot.slots, dtype=np.bool_)
 
 
+@wrong_hand("H1-CRC-02")
 class TrustsAll(ReferenceRobot):
     """Does not check the CRC."""
 
@@ -383,6 +415,7 @@ class TrustsAll(ReferenceRobot):
         return True
 
 
+@wrong_hand("H1-SAFE-01")
 class Sanitises(ReferenceRobot):
     """Takes 0 for what is no number, and obeys the rest."""
 
@@ -393,6 +426,7 @@ class Sanitises(ReferenceRobot):
         return super().accepts(orders)
 
 
+@wrong_hand("H1-SAFE-02")
 class Packed(ReferenceRobot):
     """Has a joint in the slot without a motor."""
 
@@ -403,6 +437,7 @@ class Packed(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-SAFE-03")
 class Untyped(_OtherFamily):
     """Takes whatever is on its command topic."""
 
@@ -418,6 +453,7 @@ class Untyped(_OtherFamily):
         self.obey(orders)
 
 
+@wrong_hand("H1-SAFE-04")
 class Sulks(ReferenceRobot):
     """Follows nothing for a while after a NaN."""
 
@@ -429,6 +465,7 @@ class Sulks(ReferenceRobot):
         return super().accepts(orders) and self.now >= self.until
 
 
+@wrong_hand("G1-SAFE-05")
 class AnyMachine(ReferenceRobot):
     """Obeys commands for another machine."""
 
@@ -439,12 +476,14 @@ class AnyMachine(ReferenceRobot):
 # ------------------------------------------------------------------------------------- watchdog
 
 
+@wrong_hand("H1-WDOG-01")
 class GoesOn(ReferenceRobot):
     """Has no time-out."""
 
     timeout = math.inf
 
 
+@wrong_hand("H1-WDOG-02")
 class AnswersOnly(ReferenceRobot):
     """Says nothing while it is told nothing."""
 
@@ -453,6 +492,7 @@ class AnswersOnly(ReferenceRobot):
         return [] if 0.5 < waited < math.inf else super().publish()
 
 
+@wrong_hand("H1-WDOG-03", also=("H1-LIFE-02",))
 class Latches(ReferenceRobot):
     """Follows nothing any more after a time-out."""
 
@@ -461,6 +501,7 @@ class Latches(ReferenceRobot):
             super().obey(orders)
 
 
+@wrong_hand("H1-WDOG-04")
 class Nervous(ReferenceRobot):
     """Times out after a seventh of a second."""
 
@@ -470,12 +511,14 @@ class Nervous(ReferenceRobot):
 # ----------------------------------------------------------------------------------- life cycle
 
 
+@wrong_hand("H1-LIFE-01")
 class KnowsItsReaders(ReferenceRobot):
     """Serves only those who were there at first."""
 
     serves_late_readers = False
 
 
+@wrong_hand("H1-LIFE-02")
 class Loyal(ReferenceRobot):
     """Follows the first client only."""
 
@@ -484,6 +527,7 @@ class Loyal(ReferenceRobot):
             super().receive(topic, payload, client)
 
 
+@wrong_hand("H1-CLIENT-01")
 class ForgetfulClient(ReferenceRobot):
     """Its client does not set the CRC now and then."""
 
@@ -494,6 +538,7 @@ class ForgetfulClient(ReferenceRobot):
                 rows[::100] = [(a, b, data[:-4] + bytes(4)) for a, b, data in rows[::100]]
 
 
+@wrong_hand("H1-CLIENT-02")
 class SlowClient(ReferenceRobot):
     """Its client sends every fourth command only."""
 
@@ -502,125 +547,3 @@ class SlowClient(ReferenceRobot):
         for (topic, _), rows in trace.rows.items():
             if topic == "rt/lowcmd":
                 del rows[1::4], rows[1::3], rows[1::2]
-
-
-# ---------------------------------------------------------------------------------------- the zoo
-
-
-@dataclass(frozen=True)
-class RobotMutant:
-    """One wrong robot.
-
-    :param model: the robot that it is a bad copy of.
-    :param kills: the requirement that must catch it.
-    :param also: requirements that fail or warn with it.
-    """
-
-    model: str
-    service: type[ReferenceRobot]
-    kills: str
-    also: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Its class's name."""
-        return self.service.__name__
-
-    @property
-    def summary(self) -> str:
-        """What it does wrong, in a line."""
-        return (self.service.__doc__ or "").strip().splitlines()[0]
-
-    def blamed(self, *, short: bool = False) -> set[str]:
-        """The requirements that find fault with it.
-
-        :param short: go through no more phases than show it.
-        """
-        every = catalogue(self.model, "robot")
-        if not short:
-            return run_robot_mutant(self.service, self.model, phases_for(every))
-        needed = select(every, prefixes=[self.kills, *self.also])
-        phases = phases_for(needed)
-        if not any(r.phase == "joint" for r in needed):
-            phases -= {"joint"}  # by far the longest: all of them were moved for the others
-        return run_robot_mutant(self.service, self.model, phases)
-
-
-def run_robot_mutant(service: type[ReferenceRobot], model: str, phases: frozenset[str]) -> set[str]:
-    """The requirements that find fault with a robot on the virtual clock."""
-    trace = run_virtual(Plan(robot_dialect(model), (ROBOT,), phases=phases), service)
-    service.recorded(trace)
-    bad = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
-    results = judge(robot_recording(trace, model)).results
-    return {r.requirement.id for r in results if r.verdict in bad}
-
-
-_DEAF = ("MOVE-01", "MODE-01", "WDOG-03")
-_ZOO: tuple[tuple[type[ReferenceRobot], str, tuple[str, ...]], ...] = (
-    (OtherState, "TOPIC-01", ()),
-    (OtherCommands, "TOPIC-02", _DEAF),
-    (Twins, "TOPIC-03", ()),
-    (AsksForMore, "QOS-01", _DEAF),
-    (BestEffort, "QOS-02", ()),
-    (WaitsForCommands, "START-01", ()),
-    (CutShort, "FIELD-01", ()),
-    (NotANumber, "FIELD-02", ()),
-    (CdrCrc, "CRC-01", ()),
-    (NoCrc, "CRC-01", ()),
-    (Slow, "RATE-01", ()),
-    (Leisurely, "RATE-02", ()),
-    (Stumbles, "RATE-03", ()),
-    (Repeats, "ORDER-01", ()),
-    (NoTick, "TICK-01", ()),
-    (CountsStates, "TICK-02", ()),
-    (TurnedOnce, "FIELD-03", ()),
-    (NoSpeed, "FIELD-04", ()),
-    (Ghost, "FIELD-05", ()),
-    (NoSensor, "TEMP-01", ()),
-    (Frozen, "TEMP-02", ()),
-    (NoAttitude, "IMU-01", ()),
-    (WLast, "IMU-02", ()),
-    (InG, "IMU-03", ()),
-    (NoHead, "HEAD-01", ()),
-    (Empty, "BMS-01", ()),
-    (Hangs, "FOOT-01", ()),
-    (RemoteRubbish, "REMOTE-01", ()),
-    (ShiftedRemote, "REMOTE-01", ()),
-    (NoMachine, "MACH-01", ()),
-    (NoMode, "MODE-01", ()),
-    (Halfway, "MOVE-01", ("WDOG-03",)),
-    (Coupled, "MOVE-02", ()),
-    (OwnGains, "GAIN-01", ()),
-    (NoVelocity, "GAIN-02", ()),
-    (NoTorque, "GAIN-03", ("GAIN-01",)),
-    (DefaultGains, "GAIN-04", ()),
-    (NoForce, "FORCE-01", ()),
-    (NoModes, "MODE-02", ("MODE-01",)),
-    (TrustsAll, "CRC-02", ()),
-    (Sanitises, "SAFE-01", ()),
-    (Packed, "SAFE-02", ()),
-    (Untyped, "SAFE-03", ()),
-    (Sulks, "SAFE-04", ()),
-    (AnyMachine, "SAFE-05", ()),
-    (GoesOn, "WDOG-01", ()),
-    (AnswersOnly, "WDOG-02", ()),
-    (Latches, "WDOG-03", ("LIFE-02",)),
-    (Nervous, "WDOG-04", ()),
-    (KnowsItsReaders, "LIFE-01", ()),
-    (Loyal, "LIFE-02", ()),
-    (ForgetfulClient, "CLIENT-01", ()),
-    (SlowClient, "CLIENT-02", ()),
-)
-
-
-def _mutants() -> Iterator[RobotMutant]:
-    for model in ROBOTS:
-        known = {r.id for r in catalogue(model, "robot")}
-        prefix = model.upper()
-        for service, kills, also in _ZOO:
-            if f"{prefix}-{kills}" in known:
-                names = tuple(f"{prefix}-{name}" for name in also)
-                yield RobotMutant(model, service, f"{prefix}-{kills}", names)
-
-
-MUTANTS: tuple[RobotMutant, ...] = tuple(_mutants())

@@ -25,7 +25,7 @@ PAGES = {"dds": "conformance.md", "robot": "conformance-robots.md"}
 
 def catalogue_page(layer: str = "dds") -> str:
     """Markdown of a layer's requirements, by area."""
-    from dexkit.conformance.mutants import MUTANTS, robot
+    from dexkit.conformance.mutants import mutants
 
     lines: list[str] = []
     area = ""
@@ -36,8 +36,7 @@ def catalogue_page(layer: str = "dds") -> str:
         if f"{whose}{requirement.area}" != area:
             area = f"{whose}{requirement.area}"
             lines += ["", f"### {area}", ""]
-        zoo = robot.MUTANTS if layer == "robot" else MUTANTS
-        killers = [m.name for m in zoo if m.kills == requirement.id]
+        killers = [m.name for m in mutants() if m.kills == requirement.id]
         lines += entry(requirement, _needs(requirement), killers)
     return "\n".join(lines)
 

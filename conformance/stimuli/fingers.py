@@ -49,7 +49,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.parts import PARTS, Parts
-from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Script, Steps
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
 
@@ -78,7 +79,7 @@ _BAD = {
 }
 
 
-class FingerScript(Script):
+class FingerScript(HandScript):
     """The script of a hand of several joints."""
 
     motion = "joint"

@@ -37,7 +37,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Script, Steps
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import Side
 
@@ -54,7 +55,7 @@ _BAD = {
 }
 
 
-class GripperScript(Script):
+class GripperScript(HandScript):
     """The script of a gripper."""
 
     def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:

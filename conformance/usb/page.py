@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.requirements.page import BEGIN, END, entry
-from dexkit.conformance.usb.mutants import MUTANTS
 
 __all__ = ["catalogue_page"]
 
@@ -21,7 +21,7 @@ def catalogue_page() -> str:
         if requirement.area != area:
             area = requirement.area
             lines += ["", f"### {area.removeprefix('USB: ').capitalize()}", ""]
-        killers = [m.name for m in MUTANTS if m.kills == requirement.id]
+        killers = [m.name for m in mutants() if m.kills == requirement.id]
         where = f"phase `{requirement.phase}`" if requirement.phase else "the descriptors"
         lines += entry(requirement, where, killers)
     return "\n".join(lines)

@@ -1,29 +1,20 @@
-"""Wrong hands of any model: each is mixed into a model's reference service by :func:`of`."""
-
-# ruff: noqa: D102  (each class says what it does wrong; its methods only override)
+"""Wrong hands of every model: mixed into the reference service of each."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TypeVar
 
+from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.messages import message_type
 
-S = TypeVar("S", bound=Service)
-
-
-def of(mixin: type[Service], reference: type[S]) -> type[S]:
-    """The wrong hand that the reference becomes with ``mixin``."""
-    return type(mixin.__name__, (mixin, reference), {"__doc__": mixin.__doc__})
-
-
 # -------------------------------------------------------------------------------- discovery
 
 
+@wrong_hand(("DEX1-TOPIC-01", "DEX3-TOPIC-01"))
 class OldTopic(Service):
     """Publishes on the topic of an older stack."""
 
@@ -31,6 +22,7 @@ class OldTopic(Service):
         return replace(super().sample(topic, sides), topic="rt/unitree_actuator/state")
 
 
+@wrong_hand(("DEX1-TOPIC-01", "DEX3-TOPIC-01"))
 class OtherStateType(Service):
     """Publishes another type of the family on the right topic."""
 
@@ -40,6 +32,7 @@ class OtherStateType(Service):
         return Sample(topic, kind.name, kind.encode(kind.cls()), self.now)
 
 
+@wrong_hand(("DEX1-TOPIC-02", "DEX3-TOPIC-02"))
 class OtherCommandType(Service):
     """Subscribes to the right topic with the wrong type."""
 
@@ -49,12 +42,14 @@ class OtherCommandType(Service):
         self.command_type = hg if self.dialect.cmd_type == go else go
 
 
+@wrong_hand(("DEX1-QOS-01", "DEX3-QOS-01"))
 class DemandsHistory(Service):
     """Asks for TRANSIENT_LOCAL commands, which no official client offers."""
 
     reader_durability = "TransientLocal"
 
 
+@wrong_hand(("DEX1-QOS-02", "DEX3-QOS-02"))
 class BestEffortWriter(Service):
     """Publishes state best effort."""
 
@@ -64,6 +59,7 @@ class BestEffortWriter(Service):
 # --------------------------------------------------------------------------------- start-up
 
 
+@wrong_hand(("DEX1-START-01", "DEX3-START-01"))
 class SilentUntilCommanded(Service):
     """Publishes nothing before the first command."""
 
@@ -80,18 +76,21 @@ class SilentUntilCommanded(Service):
 # --------------------------------------------------------------------------- rate and order
 
 
+@wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
 class SlowPublisher(Service):
     """Publishes at 125 Hz."""
 
     period = 0.008
 
 
+@wrong_hand(("DEX1-RATE-02", "DEX3-RATE-02"))
 class HalfRate(Service):
     """Publishes at 222 Hz: enough, but not what the vendor does."""
 
     period = 0.0045
 
 
+@wrong_hand(("DEX1-RATE-03", "DEX3-RATE-03"))
 class Hiccup(Service):
     """Is silent for 0.3 s once, as when the device is waited for in the publishing thread."""
 
@@ -99,6 +98,7 @@ class Hiccup(Service):
         return [] if 2.0 < self.now < 2.3 else super().publish()
 
 
+@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
 class Bursts(Service):
     """Publishes ten states at once."""
 
@@ -125,6 +125,7 @@ class Bursts(Service):
         return super().end()
 
 
+@wrong_hand(("DEX1-ORDER-01", "DEX3-ORDER-01"))
 class RepeatsOldStates(Service):
     """Sends every hundredth state a second time, after the next one."""
 
@@ -141,6 +142,7 @@ class RepeatsOldStates(Service):
         return samples
 
 
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -155,6 +157,7 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), whole=True)
 class FreezesOnce(Service):
     """Publishes the same values for a third of a second when it first begins to move."""
 
@@ -172,6 +175,7 @@ class FreezesOnce(Service):
         return old if self.now < until else super().payload(sides, length)
 
 
+@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01"))
 class Frozen(Service):
     """Publishes the first measurement for ever, at full rate."""
 
@@ -188,6 +192,7 @@ class Frozen(Service):
 # ----------------------------------------------------------------------------------- fields
 
 
+@wrong_hand(("DEX1-FIELD-01", "DEX3-FIELD-01"))
 class OneTooMany(Service):
     """Publishes a sequence with one motor too many."""
 
@@ -195,6 +200,7 @@ class OneTooMany(Service):
         return super().payload(sides, self.dialect.length + 1)
 
 
+@wrong_hand(("DEX1-FIELD-01", "DEX3-FIELD-01"))
 class EmptyNowAndThen(Service):
     """Publishes an empty sequence when the device did not answer."""
 
@@ -208,6 +214,7 @@ class EmptyNowAndThen(Service):
 # ----------------------------------------------------------------------------------- motion
 
 
+@wrong_hand(("DEX1-SIDE-01", "DEX3-SIDE-01"), also=("DEX1-MOVE-01", "DEX3-JOINT-01"), sides=BOTH)
 class Swapped(Service):
     """Left commands move the right hand."""
 
@@ -215,6 +222,7 @@ class Swapped(Service):
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
 
 
+@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"))
 class KicksBack(Service):
     """Goes the wrong way for a moment when its target jumps."""
 
@@ -241,6 +249,7 @@ class KicksBack(Service):
 # ----------------------------------------------------------------------------------- safety
 
 
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"))
 class NanIsZero(Service):
     """Takes NaN and infinity for 0."""
 
@@ -257,6 +266,7 @@ class NanIsZero(Service):
         )
 
 
+@wrong_hand(("DEX1-SAFE-03", "DEX3-SAFE-03"))
 class EmptyIsZero(Service):
     """Takes an empty command for one of zeros, with its default gains."""
 
@@ -270,6 +280,7 @@ class EmptyIsZero(Service):
                 self.motors(side, tuple(motors))
 
 
+@wrong_hand(("DEX1-SAFE-03", "DEX3-SAFE-03"))
 class DiesOfEmpty(Service):
     """Crashes on a command without motors, and is restarted a second later."""
 
@@ -285,6 +296,7 @@ class DiesOfEmpty(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-04", "DEX3-SAFE-05"))
 class TakesTheLast(Service):
     """Takes the last motors of an over-long command."""
 
@@ -297,6 +309,7 @@ class TakesTheLast(Service):
         super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-SAFE-06", "DEX3-SAFE-07"))
 class TakesAnyType(Service):
     """Decodes whatever is published on its command topic."""
 
@@ -310,6 +323,7 @@ class TakesAnyType(Service):
                 self.motors(side, tuple(Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in mine))
 
 
+@wrong_hand(("DEX1-SAFE-06", "DEX3-SAFE-07"))
 class DiesOfAnyType(Service):
     """Crashes on a message of another type, and is restarted half a second later."""
 
@@ -322,6 +336,7 @@ class DiesOfAnyType(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
 class QueuesCommands(Service):
     """Works off every command it was ever sent, two in each cycle."""
 
@@ -339,6 +354,7 @@ class QueuesCommands(Service):
         super().live(dt)
 
 
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
 class StopsInABurst(Service):
     """Receives in the publishing thread: each waiting command delays the next state."""
 
@@ -354,6 +370,7 @@ class StopsInABurst(Service):
         return [] if self.busy_until > self.now + 0.02 else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-08", "DEX3-SAFE-09"))
 class GivesUpOnTwo(Service):
     """Ends when a second client commands it, and is restarted half a second later."""
 
@@ -371,6 +388,7 @@ class GivesUpOnTwo(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-08", "DEX3-SAFE-09"))
 class StaysWithTheNewest(Service):
     """Keeps to the client that it heard of last, even when that one has gone."""
 
@@ -388,6 +406,7 @@ class StaysWithTheNewest(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-ORDER-02", "DEX3-ORDER-02"))
 class DropsOldStamps(Service):
     """Ignores commands whose source timestamps are more than a second old."""
 
@@ -396,6 +415,7 @@ class DropsOldStamps(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), whole=True)
 class StuttersUnderLoad(Service):
     """Publishes one state in three while four commands come within 11 ms."""
 
@@ -419,6 +439,7 @@ class StuttersUnderLoad(Service):
         return [] if busy and self.cycle % 3 else super().publish()
 
 
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"))
 class WaitsForItsReaders(Service):
     """Keeps all samples for a slow reliable reader, and blocks when its history is full."""
 
@@ -426,6 +447,7 @@ class WaitsForItsReaders(Service):
         return [] if self.loaded and self.now % 0.5 < 0.2 else super().publish()
 
 
+@wrong_hand(("DEX1-WDOG-02", "DEX3-WDOG-02"))
 class QuietInSilence(Service):
     """Publishes only while it is commanded."""
 
@@ -442,12 +464,14 @@ class QuietInSilence(Service):
 # ------------------------------------------------------------------------------- life cycle
 
 
+@wrong_hand(("DEX1-LIFE-01", "DEX3-LIFE-01"))
 class ServesOnlyTheFirst(Service):
     """Serves only the subscribers that were there when it started."""
 
     serves_late_readers = False
 
 
+@wrong_hand(("DEX1-LIFE-02", "DEX3-LIFE-02"))
 class BoundToOneClient(Service):
     """Obeys only the first client that it ever heard."""
 
@@ -460,6 +484,7 @@ class BoundToOneClient(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
 class DeafAfterRestart(Service):
     """Finds only the clients that come after it."""
 
@@ -468,6 +493,7 @@ class DeafAfterRestart(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
 class SilentAfterRestart(Service):
     """Waits two seconds for its device when it is started a second time."""
 
@@ -481,18 +507,21 @@ class SilentAfterRestart(Service):
         return [] if self.restarted and self.now - self.began < 2.0 else super().publish()
 
 
+@wrong_hand(("DEX1-LIFE-04", "DEX3-LIFE-04"))
 class HangsAtTheEnd(Service):
     """Does not end when it is asked to."""
 
     exit_s = None
 
 
+@wrong_hand(("DEX1-LIFE-04", "DEX3-LIFE-04"))
 class LeavesItsName(Service):
     """Ends without a word, so that its publisher is announced for another ten seconds."""
 
     gone_s = 10.0
 
 
+@wrong_hand(("DEX1-LIFE-05", "DEX3-LIFE-05"))
 class LeavesItDriven(Service):
     """Ends without braking."""
 
@@ -503,6 +532,7 @@ class LeavesItDriven(Service):
 # --------------------------------------------------------------------------------- tracking
 
 
+@wrong_hand(("DEX1-TRACK-01", "DEX3-TRACK-01"))
 class WaitsForRest(Service):
     """Takes a new target only when it has stood still for a tenth of a second."""
 
@@ -529,6 +559,7 @@ class WaitsForRest(Service):
         )
 
 
+@wrong_hand(("DEX1-TRACK-02", "DEX3-TRACK-02"))
 class Delayed(Service):
     """Carries out each command 0.15 s late."""
 
@@ -544,12 +575,3 @@ class Delayed(Service):
             _, side, motors = self.queue.pop(0)
             super().motors(side, motors)
         super().live(dt)
-
-
-DILUTED = (
-    *("StuttersUnderLoad", "FreezesOnce", "StaleState", "Hunts"),
-    *("PercentBothWays", "DegreesBothWays"),
-)
-"""What weighs too much in the mean of a short run, shows elsewhere by chance of its phase, or
-shows only after more than its requirement asks for.
-"""
