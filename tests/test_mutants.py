@@ -132,7 +132,7 @@ def test_the_command_prints_the_score_and_writes_it(tmp_path: Path) -> None:
     run = CliRunner().invoke(command, arguments)
     assert run.exit_code == 0, run.output
     assert "6 of 6 requirements proven" in run.output
-    assert "OtherSide: A left hand that says it is a right one." in run.output
+    assert "OtherSide: A left hand with the product id of a right one." in run.output
     score = json.loads(path.read_text())
     assert score["perfect"] is True
     assert score["requirements"]["DEX3USB-DESC-01"]["killed_by"] == ["OtherSide"]

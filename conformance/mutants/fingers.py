@@ -1,7 +1,8 @@
 """Wrong hands of several joints.
 
 Each is mixed into the reference service of a model, and its ``hand_fault``, if it has one, into
-the mechanics of the reference's hands.
+the mechanics of the reference's hands. A Dex5-1 has declarations of its own where its softer gains
+make other requirements fail: it oscillates less, and comes to rest more slowly.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class NoLowRate(Dex3Service):
 
 @wrong_hand("DEX3-TOPIC-03", brief=True)
 class LowRateIsFull(Dex3Service):
-    """Publishes the low-rate copy as often as the state."""
+    """Publishes the low-rate copy at the rate of the state."""
 
     low_period = Dex3Service.period
 
@@ -61,7 +62,7 @@ class RestsAtZero(FingerService):
 
 @wrong_hand("DEX3-FIELD-02")
 class NanVelocity(FingerService):
-    """Divides by a time step of zero at rest, in one joint."""
+    """Publishes NaN as dq of one joint at rest."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
@@ -71,7 +72,7 @@ class NanVelocity(FingerService):
 
 @wrong_hand("DEX3-FIELD-03", sides=BOTH)
 class Unmirrored(FingerService):
-    """Has the left hand's signs on the right one, in both directions."""
+    """Has the left hand's signs on the right one, in commands and states."""
 
     def signs(self, side: Side) -> Floats:
         """-1 for the joints of the right hand that are mirrored."""
@@ -117,7 +118,7 @@ class TurnedAcceleration(FingerService):
 
 
 class _Filled(FingerService):
-    """Motors that say something else of themselves, or a hand that does."""
+    """Publishes a fixed wrong value in a member of motors, sensor packets or the message."""
 
     motor: tuple[str, Any] | None = None
     whole: tuple[str, Any] | None = None
@@ -175,14 +176,14 @@ class HotSensors(_Filled):
 
 @wrong_hand("DEX3-SENS-06", brief=True)
 class UnsetLost(_Filled):
-    """Publishes memory that was never set as the sensors' count of lost packets."""
+    """Publishes uninitialised memory as the sensors' count of lost packets."""
 
     packet = ("lost", 0xCCCCCCCC)
 
 
 @wrong_hand("DEX3-IMU-02", brief=True)
 class NanGyroscope(FingerService):
-    """Publishes NaN for an angular velocity that it does not know."""
+    """Publishes NaN as its angular velocity."""
 
     def message(self, count: int) -> Any:
         message = super().message(count)
@@ -237,7 +238,7 @@ class SevenPackets(FingerService):
 
 @wrong_hand("DEX3-SENS-04", sides=BOTH)
 class Numb(FingerService):
-    """Never feels a touch."""
+    """Publishes a pressure of 0 at every touch."""
 
     def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
@@ -246,7 +247,7 @@ class Numb(FingerService):
 
 @wrong_hand("DEX3-IMU-01", brief=True)
 class LongQuaternion(FingerService):
-    """Publishes the raw counts of its attitude."""
+    """Publishes raw counts as its quaternion."""
 
     def quaternion(self) -> list[float]:
         return [16384.0, 0.0, 0.0, 0.0]
@@ -264,7 +265,7 @@ def _reordered(order: tuple[int, ...]) -> Callable[[tuple[Motor, ...]], tuple[Mo
 
 @wrong_hand("DEX3-JOINT-01", sides=BOTH)
 class IndexFirst(Dex3Service):
-    """Takes the commands of the right hand index finger first, as xr_teleoperate's enum says."""
+    """Obeys the right hand's commands index finger first, as xr_teleoperate's enum lists them."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         if side is Side.RIGHT:
@@ -274,7 +275,7 @@ class IndexFirst(Dex3Service):
 
 @wrong_hand("DEX5-JOINT-01")
 class ThumbFirst(FingerService):
-    """Takes the commands thumb first, as the URDF numbers the fingers."""
+    """Obeys commands thumb first, as the URDF numbers the fingers."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         super().motors(side, _reordered((*range(4, 20), *range(4)))(motors))
@@ -282,7 +283,7 @@ class ThumbFirst(FingerService):
 
 @wrong_hand("DEX3-JOINT-01")
 class CoupledFinger(FingerService):
-    """Has the second joint of a finger follow the first a little."""
+    """The second joint of a finger follows the first a little."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         coupled = list(motors)
@@ -301,14 +302,14 @@ class _Backwards(FingerHand):
 
 @wrong_hand("DEX3-MOVE-01")
 class OneJointBackwards(FingerService):
-    """Turns the sign of one joint."""
+    """Moves one joint backwards."""
 
     hand_fault = _Backwards
 
 
 @wrong_hand("DEX3-MOVE-02")
 class OtherScale(FingerService):
-    """Goes only part of the way from its rest."""
+    """Moves only 75 % of the way from its rest pose."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         rest = self.hand.model.rest_q[side]
@@ -330,7 +331,7 @@ class _Hunts(FingerHand):
 @wrong_hand("DEX3-MOVE-03", also=("DEX3-SAFE-06",), whole=True)
 @wrong_hand("DEX5-MOVE-03", whole=True)
 class Hunts(FingerService):
-    """Shakes a joint about its target."""
+    """One joint oscillates about its goal."""
 
     hand_fault = _Hunts
 
@@ -344,7 +345,7 @@ class _Weak(FingerHand):
 @wrong_hand("DEX3-MOVE-04")
 @wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01",))
 class Slow(FingerService):
-    """Has stiff grease in its gears."""
+    """Has high friction: it moves slowly."""
 
     hand_fault = _Weak
 
@@ -363,7 +364,7 @@ class _Springy(FingerHand):
 @wrong_hand("DEX3-MOVE-05")
 @wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01"))
 class Undamped(FingerService):
-    """Applies little of kd where there is a kp."""
+    """Applies 15 % of kd where kp is not 0."""
 
     hand_fault = _Springy
 
@@ -371,7 +372,7 @@ class Undamped(FingerService):
 @wrong_hand("DEX3-SIDE-01", also=("DEX3-MOVE-07",), sides=BOTH)
 @wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)
 class Coupled(FingerService):
-    """The left hand's first finger leaks into the right one."""
+    """The goal of the left hand's first finger leaks into the right one's."""
 
     left = 0.0
 
@@ -412,7 +413,7 @@ class _Creeps(FingerHand):
 @wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04",))
 @wrong_hand("DEX5-MOVE-07")
 class Creeps(FingerService):
-    """Creeps the last part of the way with one finger."""
+    """One joint creeps the last part of the way to its goal."""
 
     hand_fault = _Creeps
 
@@ -428,7 +429,7 @@ class _IgnoresZeroGains(FingerHand):
 
 @wrong_hand("DEX3-GAIN-01")
 class DefaultsForZeroGains(FingerService):
-    """Takes zero gains for gains that were not set, and uses its own."""
+    """Uses its own gains where kp and kd are 0."""
 
     hand_fault = _IgnoresZeroGains
 
@@ -443,7 +444,7 @@ class _OwnStiffness(FingerHand):
 
 @wrong_hand("DEX3-GAIN-02")
 class OwnStiffness(FingerService):
-    """Uses its own stiffness whenever there is any."""
+    """Uses its own gains wherever kp is not 0."""
 
     hand_fault = _OwnStiffness
 
@@ -453,7 +454,7 @@ class OwnStiffness(FingerService):
 
 @wrong_hand("DEX3-MODE-02", also=("DEX3-LIFE-05",))
 class AlwaysDriven(FingerService):
-    """Says that its motors are driven whatever it does."""
+    """Publishes that its motors are driven, whatever their state."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
@@ -468,7 +469,7 @@ class _IgnoresStatus(FingerHand):
 
 @wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
 class IgnoresStatus(FingerService):
-    """Drives whatever the mode byte says."""
+    """Drives its motors whatever the mode byte of the command is."""
 
     hand_fault = _IgnoresStatus
 
@@ -480,7 +481,7 @@ class _Ris(FingerHand):
 
 @wrong_hand("DEX5-MODE-01")
 class DecodesRis(FingerService):
-    """Takes the mode byte for a Dex3-1's: 1 is id 1 with status 0, which locks."""
+    """Decodes the mode byte as a Dex3-1's: 1 is id 1 with status 0, which locks."""
 
     hand_fault = _Ris
 
@@ -510,7 +511,7 @@ class TurnedForce(FingerService):
 
 @wrong_hand("DEX5-FORCE-03", sides=BOTH)
 class FingersInNewtonMetres(FingerService):
-    """Publishes all torques in N m, the fingers' too."""
+    """Publishes the fingers' torques in N m, as the other joints'."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
@@ -537,7 +538,7 @@ class _NegativeGains(FingerHand):
 
 @wrong_hand("DEX3-SAFE-06")
 class NegativeGains(FingerService):
-    """Takes a negative stiffness as it comes."""
+    """Applies a negative kp."""
 
     hand_fault = _NegativeGains
 
@@ -559,7 +560,7 @@ class _NanPerJoint(FingerHand):
 
 @wrong_hand("DEX3-SAFE-01")
 class RejectsOnlyTheBadJoint(FingerService):
-    """Leaves out the joint with a NaN and moves the others."""
+    """Ignores only the joint whose command is NaN, and moves the others."""
 
     hand_fault = _NanPerJoint
 
@@ -573,7 +574,7 @@ class _NanInTheLast(FingerHand):
 
 @wrong_hand("DEX3-SAFE-01")
 class LooksAtTheLastJoint(FingerService):
-    """Tests the last joint alone for NaN, and lets any other that has one go limp."""
+    """Checks only the last joint for NaN; any other joint with a NaN goes limp."""
 
     hand_fault = _NanInTheLast
 
@@ -587,14 +588,14 @@ class _NoLimits(FingerHand):
 
 @wrong_hand("DEX3-SAFE-02")
 class NoLimits(FingerService):
-    """Goes half a radian beyond the limits."""
+    """Follows goals up to 0.5 rad beyond its limits."""
 
     hand_fault = _NoLimits
 
 
 @wrong_hand("DEX3-SAFE-04")
 class FillsUpWithZeros(FingerService):
-    """Fills up a short command with zeros."""
+    """Fills a command that is too short with zeros."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
@@ -614,7 +615,7 @@ class _KeepsSpeed(FingerHand):
 
 @wrong_hand("DEX3-WDOG-01")
 class KeepsDriving(FingerService):
-    """Keeps the last velocity for ever, unless protected."""
+    """Keeps driving by the last velocity after the time-out, unless protected."""
 
     hand_fault = _KeepsSpeed
 
@@ -641,7 +642,7 @@ class _AlwaysBrakes(FingerHand):
 
 @wrong_hand("DEX3-HOLD-01")
 class LetsGo(FingerService):
-    """Brakes in every silence, protected or not."""
+    """Brakes after the time-out even without protection."""
 
     hand_fault = _AlwaysBrakes
 
@@ -660,7 +661,7 @@ class _LatchesWithoutGuard(FingerHand):
 
 @wrong_hand("DEX3-WDOG-03")
 class StuckAfterSilence(FingerService):
-    """Takes no command any more after a silence without protection."""
+    """Obeys no command after a silence without protection."""
 
     hand_fault = _LatchesWithoutGuard
 
@@ -680,7 +681,7 @@ class _SleepsWithoutGuard(FingerHand):
 
 @wrong_hand("DEX3-WDOG-03")
 class SleepsWithoutGuard(FingerService):
-    """Takes a while after a silence without protection until it listens again."""
+    """Ignores commands for 2 s after a silence without protection."""
 
     hand_fault = _SleepsWithoutGuard
 
@@ -705,7 +706,7 @@ class _HoldsOnly(FingerHand):
 
 @wrong_hand("DEX3-GUARD-01")
 class HoldsWhenGuarded(FingerService):
-    """Takes the time-out bit for news about the next command: keeps going to the position."""
+    """Applies the time-out protection only when the next command comes: it moves on to its goal."""
 
     hand_fault = _HoldsOnly
 
@@ -718,7 +719,7 @@ class _Silent(FingerHand):
 
 @wrong_hand("DEX3-GUARD-02")
 class TripsInSecret(FingerService):
-    """Does not say that the protection has tripped."""
+    """Does not publish that the protection has tripped."""
 
     hand_fault = _Silent
 
@@ -731,7 +732,7 @@ class _Unlatched(FingerHand):
 
 @wrong_hand("DEX3-GUARD-03")
 class ClearsByItself(FingerService):
-    """Goes on with the next command, bit 7 or not."""
+    """Obeys the next command after a trip, whether or not bit 7 is set."""
 
     hand_fault = _Unlatched
 
@@ -757,7 +758,7 @@ class _ForEver(FingerHand):
 
 @wrong_hand("DEX3-GUARD-04")
 class SlowToClear(FingerService):
-    """Stays tripped for two seconds after it was cleared."""
+    """Stays tripped for 2 s after it was cleared."""
 
     hand_fault = _ForEver
 

@@ -1,4 +1,7 @@
-"""Wrong grippers."""
+"""Wrong grippers.
+
+Where a fault is in the left hand alone, the object would hold the right one away from 0.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ class NanVelocity(_Fields):
 
 
 class _InUnit(_Fields):
-    """Takes or publishes another unit than radians, ``full`` where it is open."""
+    """Obeys or publishes another unit than radians: ``full`` when open."""
 
     full = 100.0
     takes = publishes = True
@@ -67,7 +70,7 @@ class Percent(_InUnit):
 
 @wrong_hand("DEX1-MOVE-01")
 class PercentCommands(_InUnit):
-    """Takes percent of the stroke instead of radians."""
+    """Obeys q as percent of the stroke instead of radians."""
 
     publishes = False
 
@@ -81,7 +84,7 @@ class Degrees(_InUnit):
 
 
 class _OtherScale(ReferenceHand):
-    """Counts in another unit, and is as quick in it as a good hand is in radians."""
+    """Computes in another unit, and is as fast in it as a good hand is in radians."""
 
     full = 100.0
     tau_max = 120.0
@@ -97,14 +100,14 @@ class _OtherScale(ReferenceHand):
 
 @wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
 class PercentBothWays(ReferenceService):
-    """Takes and publishes percent; begins nearly closed, where percent look like radians."""
+    """Obeys and publishes percent; starts nearly closed, where percent look like radians."""
 
     hand = _OtherScale
 
 
 @wrong_hand("DEX1-FIELD-14", sides=LEFT)
 class PercentWithin(PercentBothWays):
-    """Takes and publishes percent, of commands that it has clamped to 5.4."""
+    """Obeys and publishes percent, after it has clamped q to 0 to 5.4."""
 
     def command(self, side: Side, motor: Motor) -> None:
         if math.isfinite(motor.q):
@@ -118,7 +121,7 @@ class _InDegrees(_OtherScale):
 
 @wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
 class DegreesBothWays(ReferenceService):
-    """Takes and publishes degrees; begins nearly closed, where degrees look like radians."""
+    """Obeys and publishes degrees; starts nearly closed, where degrees look like radians."""
 
     hand = _InDegrees
 
@@ -133,7 +136,7 @@ class Normalised(_InUnit):
 
 @wrong_hand("DEX1-MOVE-02", also=("DEX1-MOVE-01",))
 class NormalisedCommands(_InUnit):
-    """Takes 0 to 1 instead of radians."""
+    """Obeys q as 0 to 1 instead of radians."""
 
     full = 1.0
     publishes = False
@@ -141,14 +144,14 @@ class NormalisedCommands(_InUnit):
 
 @wrong_hand("DEX1-MOVE-01")
 class NormalisedBothWays(_InUnit):
-    """Takes and publishes 0 to 1 instead of radians."""
+    """Obeys and publishes 0 to 1 instead of radians."""
 
     full = 1.0
 
 
 @wrong_hand("DEX1-MOVE-01")
 class Metres(_InUnit):
-    """Takes and publishes the opening in metres instead of radians."""
+    """Obeys and publishes the opening in metres instead of radians."""
 
     full = 0.09
 
@@ -162,7 +165,7 @@ class TurnedVelocity(_Fields):
 
 
 class _Filled(_Fields):
-    """One member of the state holds what it should not."""
+    """One member of the state has a fixed wrong value."""
 
     member = ""
     value: object = 0
@@ -173,14 +176,14 @@ class _Filled(_Fields):
 
 @wrong_hand("DEX1-FIELD-05")
 class OtherRobotsMode(_Filled):
-    """Publishes the mode byte of an H1's motors."""
+    """Publishes the mode byte of an H1's motors, 0x0A."""
 
     member, value = "mode", 0x0A
 
 
 @wrong_hand("DEX1-FIELD-05", also=("DEX1-LIFE-05",))
 class AlwaysDriven(_Filled):
-    """Says all the time that the motor is driven."""
+    """Publishes mode 1, driven, all the time."""
 
     member, value = "mode", 1
 
@@ -210,21 +213,21 @@ class NanRaw(_Filled):
 
 @wrong_hand("DEX1-FIELD-08")
 class HotByte(_Filled):
-    """Publishes the raw register of its thermometer."""
+    """Publishes 200 degrees Celsius: a raw register as the temperature."""
 
     member, value = "temperature", 200
 
 
 @wrong_hand("DEX1-FIELD-09")
 class UnsetLost(_Filled):
-    """Publishes memory that was never set as a count of lost packets."""
+    """Publishes uninitialised memory as the count of lost packets."""
 
     member, value = "lost", 0xCCCCCCCC
 
 
 @wrong_hand("DEX1-FIELD-10")
 class CountsInReserve(_Fields):
-    """Counts its samples in a reserved word."""
+    """Counts its states in a reserved word."""
 
     count = 0
 
@@ -298,7 +301,7 @@ class _Hunts(ReferenceHand):
 
 @wrong_hand("DEX1-MOVE-03", whole=True)
 class Hunts(ReferenceService):
-    """Shakes about its target."""
+    """Oscillates about its goal."""
 
     hand = _Hunts
 
@@ -315,6 +318,7 @@ class _Slow(ReferenceHand):
         return super().motor_torque()
 
 
+# a session is faster than this hand can go
 @wrong_hand("DEX1-MOVE-04", also=("DEX1-TRACK-01",))
 class Slow(ReferenceService):
     """Moves at 2.6 rad/s at most."""
@@ -358,14 +362,14 @@ class _Creeps(ReferenceHand):
 
 @wrong_hand("DEX1-MOVE-07")
 class Creeps(ReferenceService):
-    """Creeps the last three millimetres."""
+    """Creeps the last 3 mm to its goal."""
 
     hand = _Creeps
 
 
 @wrong_hand("DEX1-MOVE-08")
 class ShortStroke(ReferenceService):
-    """Keeps a margin of 5 % from its stops."""
+    """Stays 5 % of the stroke away from its stops."""
 
     def command(self, side: Side, motor: Motor) -> None:
         low, high = 0.05 * self.dialect.q_open, 0.95 * self.dialect.q_open
@@ -375,7 +379,7 @@ class ShortStroke(ReferenceService):
 
 @wrong_hand("DEX1-SIDE-01")
 class Coupled(ReferenceService):
-    """The left hand's target leaks into the right hand."""
+    """The left hand's goal leaks into the right hand's."""
 
     left = 0.0
 
@@ -394,7 +398,7 @@ class _IgnoresGains(ReferenceHand):
 
 @wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05",))
 class IgnoresGains(ReferenceService):
-    """Goes to q whatever the gains are."""
+    """Moves to q whatever the gains are."""
 
     hand = _IgnoresGains
 
@@ -454,7 +458,7 @@ class _NegativeGains(ReferenceHand):
 
 @wrong_hand("DEX1-SAFE-05")
 class NegativeGains(ReferenceService):
-    """Takes negative gains as they come."""
+    """Applies negative gains."""
 
     hand = _NegativeGains
 
@@ -469,7 +473,7 @@ class _NoLimits(ReferenceHand):
 
 @wrong_hand("DEX1-SAFE-02")
 class NoLimits(ReferenceService):
-    """Follows a q far outside the stroke, through its stops."""
+    """Follows a q far outside the stroke."""
 
     hand = _NoLimits
 
@@ -478,6 +482,7 @@ class _NoWatchdog(ReferenceHand):
     timeout = math.inf
 
 
+# its mode byte is true, which a client cannot tell from a stuck byte
 @wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
 class NoWatchdog(ReferenceService):
     """Follows the last command for ever."""
@@ -496,7 +501,7 @@ class _SnapsOpen(ReferenceHand):
 
 @wrong_hand("DEX1-WDOG-01")
 class SnapsOpenAtTheTimeOut(ReferenceService):
-    """Opens when commands end, and then brakes: drops what it holds."""
+    """Opens after the time-out and then brakes: it drops its object."""
 
     hand = _SnapsOpen
 
@@ -513,7 +518,7 @@ class _Sleeps(ReferenceHand):
 
 @wrong_hand("DEX1-WDOG-03")
 class SleepsAfterSilence(ReferenceService):
-    """Takes a while after a silence until it listens again."""
+    """Ignores commands for a while after a silence."""
 
     hand = _Sleeps
 
@@ -525,7 +530,7 @@ class _InfiniteGains(ReferenceHand):
 
 @wrong_hand("DEX1-SAFE-01")
 class InfiniteGains(ReferenceService):
-    """Caps the stiffness before it looks whether it is finite."""
+    """Clamps kp before it checks that it is finite."""
 
     hand = _InfiniteGains
 
@@ -542,6 +547,6 @@ class _Latches(ReferenceHand):
 
 @wrong_hand("DEX1-WDOG-03")
 class LatchesTheBrake(ReferenceService):
-    """Brakes in silence, and never lets go again."""
+    """Brakes after a silence and never releases."""
 
     hand = _Latches

@@ -1,7 +1,4 @@
-"""Bodies that are wrong in one way each; see :mod:`dexkit.conformance.mutants`.
-
-Each is tried as an H1 and as a G1, where the requirement that it breaks is about both.
-"""
+"""Wrong robots: each is made as an H1 and as a G1, where both have the requirement."""
 
 from __future__ import annotations
 
@@ -52,7 +49,7 @@ class OtherState(_OtherFamily):
 
 @wrong_hand("H1-TOPIC-02", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
 class OtherCommands(_OtherFamily):
-    """Listens for the other family's LowCmd_."""
+    """Subscribes to the other family's LowCmd_."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -63,7 +60,7 @@ class OtherCommands(_OtherFamily):
 
 @wrong_hand("H1-TOPIC-03")
 class Twins(ReferenceRobot):
-    """Two of them publish."""
+    """Two publishers send its state."""
 
     def endpoints(self) -> list[TraceEndpoint]:
         every = super().endpoints()
@@ -72,21 +69,21 @@ class Twins(ReferenceRobot):
 
 @wrong_hand("H1-QOS-01", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
 class AsksForMore(ReferenceRobot):
-    """Asks for the commands from before it came."""
+    """Requests TRANSIENT_LOCAL commands, which no official client offers."""
 
     reader_durability = "TransientLocal"
 
 
 @wrong_hand("H1-QOS-02")
 class BestEffort(ReferenceRobot):
-    """Offers its state without reliability."""
+    """Publishes its state with best-effort reliability."""
 
     writer_reliability = "best_effort"
 
 
 @wrong_hand("H1-START-01")
 class WaitsForCommands(ReferenceRobot):
-    """Says nothing until it is commanded."""
+    """Publishes nothing before the first command."""
 
     def publish(self) -> list[Sample]:
         return super().publish() if self.orders is not None else []
@@ -97,7 +94,7 @@ class WaitsForCommands(ReferenceRobot):
 
 @wrong_hand("H1-FIELD-01")
 class CutShort(ReferenceRobot):
-    """Its first states lack the last word."""
+    """Its first states lack their last four bytes."""
 
     def sealed(self) -> bytes:
         payload = super().sealed()
@@ -106,7 +103,7 @@ class CutShort(ReferenceRobot):
 
 @wrong_hand("H1-FIELD-02")
 class NotANumber(ReferenceRobot):
-    """Divides by a time of zero at first."""
+    """Publishes NaN as ddq of one motor at first."""
 
     def message(self) -> Any:
         state = super().message()
@@ -125,7 +122,7 @@ class CdrCrc(ReferenceRobot):
 
 @wrong_hand("H1-CRC-01")
 class NoCrc(ReferenceRobot):
-    """Leaves the CRC 0."""
+    """Publishes a CRC of 0."""
 
     def sealed(self) -> bytes:
         return super().sealed()[:-4] + bytes(4)
@@ -136,21 +133,21 @@ class NoCrc(ReferenceRobot):
 
 @wrong_hand("H1-RATE-01")
 class Slow(ReferenceRobot):
-    """Publishes 100 times a second."""
+    """Publishes at 100 Hz."""
 
     period = 0.01
 
 
 @wrong_hand("H1-RATE-02")
 class Leisurely(ReferenceRobot):
-    """Publishes 333 times a second."""
+    """Publishes at 333 Hz."""
 
     period = 0.003
 
 
 @wrong_hand("H1-RATE-03")
 class Stumbles(ReferenceRobot):
-    """Says nothing for a fifth of a second."""
+    """Publishes nothing for 0.2 s once."""
 
     def publish(self) -> list[Sample]:
         return [] if 0.5 < self.now < 0.7 else super().publish()
@@ -158,7 +155,7 @@ class Stumbles(ReferenceRobot):
 
 @wrong_hand("H1-ORDER-01")
 class Repeats(ReferenceRobot):
-    """Sends some states twice."""
+    """Publishes some states twice."""
 
     def publish(self) -> list[Sample]:
         found = super().publish()
@@ -167,7 +164,7 @@ class Repeats(ReferenceRobot):
 
 @wrong_hand("H1-TICK-01")
 class NoTick(ReferenceRobot):
-    """Leaves tick 0."""
+    """Publishes a tick of 0."""
 
     def ticks(self) -> int:
         return 0
@@ -175,7 +172,7 @@ class NoTick(ReferenceRobot):
 
 @wrong_hand("H1-TICK-02")
 class CountsStates(ReferenceRobot):
-    """Counts states instead of milliseconds."""
+    """Counts states instead of milliseconds in tick."""
 
     def ticks(self) -> int:
         return super().ticks() // 2
@@ -186,7 +183,7 @@ class CountsStates(ReferenceRobot):
 
 @wrong_hand("H1-FIELD-03")
 class TurnedOnce(ReferenceRobot):
-    """One encoder counts from a turn further."""
+    """Publishes one joint a full turn off."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -199,7 +196,7 @@ class TurnedOnce(ReferenceRobot):
 
 @wrong_hand("H1-FIELD-04")
 class NoSpeed(ReferenceRobot):
-    """Leaves dq 0."""
+    """Publishes dq as 0."""
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
         q, dq, tau = super().shown()
@@ -208,7 +205,7 @@ class NoSpeed(ReferenceRobot):
 
 @wrong_hand("H1-FIELD-05")
 class Ghost(ReferenceRobot):
-    """Tells of a motor where none is."""
+    """Publishes a position in a slot without a motor."""
 
     def message(self) -> Any:
         state = super().message()
@@ -219,7 +216,7 @@ class Ghost(ReferenceRobot):
 
 @wrong_hand("H1-TEMP-01")
 class NoSensor(ReferenceRobot):
-    """Takes 255 for "no temperature"."""
+    """Publishes a temperature of 255 where it has none."""
 
     def warmth(self) -> Any:
         return 255
@@ -227,7 +224,7 @@ class NoSensor(ReferenceRobot):
 
 @wrong_hand("H1-TEMP-02")
 class Frozen(ReferenceRobot):
-    """Leaves the motors' temperatures 0."""
+    """Publishes motor temperatures of 0."""
 
     def warmth(self) -> Any:
         return 0 if self.robot.family == "unitree_go" else (0, 0)
@@ -235,7 +232,7 @@ class Frozen(ReferenceRobot):
 
 @wrong_hand("H1-IMU-01")
 class NoAttitude(ReferenceRobot):
-    """Leaves the quaternion 0."""
+    """Publishes a quaternion of zeros."""
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         return (0.0,) * 4, (0.0,) * 3
@@ -243,7 +240,7 @@ class NoAttitude(ReferenceRobot):
 
 @wrong_hand("H1-IMU-02")
 class WLast(ReferenceRobot):
-    """Writes the quaternion with w last."""
+    """Publishes the quaternion with w last."""
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         (w, x, y, z), rpy = super().attitude()
@@ -252,7 +249,7 @@ class WLast(ReferenceRobot):
 
 @wrong_hand("H1-IMU-03")
 class InG(ReferenceRobot):
-    """Tells accelerations in g."""
+    """Publishes accelerations in g."""
 
     def gravity(self) -> tuple[float, float, float]:
         return (0.0, 0.0, 1.0)
@@ -260,7 +257,7 @@ class InG(ReferenceRobot):
 
 @wrong_hand("H1-HEAD-01")
 class NoHead(ReferenceRobot):
-    """Leaves the head 0."""
+    """Publishes a head of 0."""
 
     def message(self) -> Any:
         state = super().message()
@@ -270,7 +267,7 @@ class NoHead(ReferenceRobot):
 
 @wrong_hand("H1-BMS-01")
 class Empty(ReferenceRobot):
-    """Has an empty battery."""
+    """Publishes a battery charge of 0 %."""
 
     def message(self) -> Any:
         state = super().message()
@@ -280,7 +277,7 @@ class Empty(ReferenceRobot):
 
 @wrong_hand("H1-FOOT-01")
 class Hangs(ReferenceRobot):
-    """Its feet pull."""
+    """Publishes a negative foot force."""
 
     def message(self) -> Any:
         state = super().message()
@@ -290,7 +287,7 @@ class Hangs(ReferenceRobot):
 
 @wrong_hand("H1-REMOTE-01")
 class RemoteRubbish(ReferenceRobot):
-    """Does not clear the remote's bytes."""
+    """Publishes uninitialised bytes of the remote control."""
 
     def remote(self) -> bytes:
         return b"\xaa\x55" * 20
@@ -298,7 +295,7 @@ class RemoteRubbish(ReferenceRobot):
 
 @wrong_hand("H1-REMOTE-01")
 class ShiftedRemote(ReferenceRobot):
-    """Writes the sticks without the two bytes before them."""
+    """Publishes the remote control's sticks two bytes too early."""
 
     def remote(self) -> bytes:
         return struct.pack("<H5f18x", 0, 0.5, 0.7, -0.3, 0.9, -0.25)
@@ -306,7 +303,7 @@ class ShiftedRemote(ReferenceRobot):
 
 @wrong_hand("G1-MACH-01")
 class NoMachine(ReferenceRobot):
-    """Leaves mode_machine 0."""
+    """Publishes a mode_machine of 0."""
 
     def message(self) -> Any:
         state = super().message()
@@ -316,7 +313,7 @@ class NoMachine(ReferenceRobot):
 
 @wrong_hand("H1-MODE-01")
 class NoMode(ReferenceRobot):
-    """Leaves the mode bytes 0."""
+    """Publishes mode bytes of 0."""
 
     def modes(self) -> list[int]:
         return [0] * self.robot.slots
@@ -327,7 +324,7 @@ class NoMode(ReferenceRobot):
 
 @wrong_hand("H1-MOVE-01", also=("H1-WDOG-03",))
 class Halfway(ReferenceRobot):
-    """Goes half of each way."""
+    """Moves only half of the way to its goals."""
 
     def obey(self, orders: Orders) -> None:
         if orders is not self.orders:
@@ -338,7 +335,7 @@ class Halfway(ReferenceRobot):
 
 @wrong_hand("H1-MOVE-02")
 class Coupled(ReferenceRobot):
-    """Its hip gives way while the elbow moves."""
+    """Its hip moves along with the elbow."""
 
     def live(self, dt: float) -> None:
         elbow, hip = self.robot.slot("right_elbow"), self.robot.slot("right_hip_pitch")
@@ -350,7 +347,7 @@ class Coupled(ReferenceRobot):
 
 @wrong_hand("H1-GAIN-01")
 class OwnGains(ReferenceRobot):
-    """Puts in its own stiffness."""
+    """Uses its own kp wherever kp is not 0."""
 
     def obey(self, orders: Orders) -> None:
         own = np.array(self.robot.client_gains)[:, 0]
@@ -378,7 +375,7 @@ class NoTorque(ReferenceRobot):
 
 @wrong_hand("H1-GAIN-04")
 class DefaultGains(ReferenceRobot):
-    """Takes kp 0 for "as usual"."""
+    """Uses its own kp where kp is 0."""
 
     def obey(self, orders: Orders) -> None:
         own = np.array(self.robot.client_gains)[:, 0]
@@ -389,7 +386,7 @@ class DefaultGains(ReferenceRobot):
 
 @wrong_hand("H1-FORCE-01")
 class NoForce(ReferenceRobot):
-    """Leaves tau_est 0."""
+    """Publishes tau_est as 0."""
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
         q, dq, tau = super().shown()
@@ -401,7 +398,7 @@ class NoForce(ReferenceRobot):
 
 @wrong_hand("H1-MODE-02", also=("H1-MODE-01",))
 class NoModes(ReferenceRobot):
-    """Does not look at the mode byte."""
+    """Ignores the mode byte of commands."""
 
     def follows(self, orders: Orders) -> Any:
         return np.ones(self.robot.slots, dtype=np.bool_)
@@ -409,7 +406,7 @@ class NoModes(ReferenceRobot):
 
 @wrong_hand("H1-CRC-02")
 class TrustsAll(ReferenceRobot):
-    """Does not check the CRC."""
+    """Does not check the CRC of commands."""
 
     def intact(self, payload: bytes) -> bool:
         return True
@@ -417,7 +414,7 @@ class TrustsAll(ReferenceRobot):
 
 @wrong_hand("H1-SAFE-01")
 class Sanitises(ReferenceRobot):
-    """Takes 0 for what is no number, and obeys the rest."""
+    """Replaces NaN and infinity by 0, and obeys the rest."""
 
     def accepts(self, orders: Orders) -> bool:
         for name in ("q", "dq", "tau", "kp", "kd"):
@@ -428,7 +425,7 @@ class Sanitises(ReferenceRobot):
 
 @wrong_hand("H1-SAFE-02")
 class Packed(ReferenceRobot):
-    """Has a joint in the slot without a motor."""
+    """Obeys the slot without a motor as a joint's."""
 
     def obey(self, orders: Orders) -> None:
         unused = [s for s in range(self.robot.slots) if s not in self.robot.used]
@@ -439,7 +436,7 @@ class Packed(ReferenceRobot):
 
 @wrong_hand("H1-SAFE-03")
 class Untyped(_OtherFamily):
-    """Takes whatever is on its command topic."""
+    """Decodes and obeys any type that is published on its command topic."""
 
     def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
         message = decode(type_name, payload)
@@ -455,7 +452,7 @@ class Untyped(_OtherFamily):
 
 @wrong_hand("H1-SAFE-04")
 class Sulks(ReferenceRobot):
-    """Follows nothing for a while after a NaN."""
+    """Ignores commands for about 2 s after a NaN."""
 
     until = -math.inf
 
@@ -485,7 +482,7 @@ class GoesOn(ReferenceRobot):
 
 @wrong_hand("H1-WDOG-02")
 class AnswersOnly(ReferenceRobot):
-    """Says nothing while it is told nothing."""
+    """Publishes nothing 0.5 s after the last command."""
 
     def publish(self) -> list[Sample]:
         waited = self.now - self.heard
@@ -494,7 +491,7 @@ class AnswersOnly(ReferenceRobot):
 
 @wrong_hand("H1-WDOG-03", also=("H1-LIFE-02",))
 class Latches(ReferenceRobot):
-    """Follows nothing any more after a time-out."""
+    """Obeys no command after a time-out."""
 
     def obey(self, orders: Orders) -> None:
         if self.now - self.heard <= self.timeout or self.orders is None:
@@ -503,7 +500,7 @@ class Latches(ReferenceRobot):
 
 @wrong_hand("H1-WDOG-04")
 class Nervous(ReferenceRobot):
-    """Times out after a seventh of a second."""
+    """Times out after 0.15 s."""
 
     timeout = 0.15
 
@@ -513,14 +510,14 @@ class Nervous(ReferenceRobot):
 
 @wrong_hand("H1-LIFE-01")
 class KnowsItsReaders(ReferenceRobot):
-    """Serves only those who were there at first."""
+    """Its states reach only subscribers that were there when it started."""
 
     serves_late_readers = False
 
 
 @wrong_hand("H1-LIFE-02")
 class Loyal(ReferenceRobot):
-    """Follows the first client only."""
+    """Obeys only the first client."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         if client == 0:
@@ -529,7 +526,7 @@ class Loyal(ReferenceRobot):
 
 @wrong_hand("H1-CLIENT-01")
 class ForgetfulClient(ReferenceRobot):
-    """Its client does not set the CRC now and then."""
+    """Its client sends some commands without a CRC."""
 
     @classmethod
     def recorded(cls, trace: MemoryTrace) -> None:
@@ -540,7 +537,7 @@ class ForgetfulClient(ReferenceRobot):
 
 @wrong_hand("H1-CLIENT-02")
 class SlowClient(ReferenceRobot):
-    """Its client sends every fourth command only."""
+    """Its client sends only every fourth command."""
 
     @classmethod
     def recorded(cls, trace: MemoryTrace) -> None:

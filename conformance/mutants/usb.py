@@ -21,7 +21,7 @@ def _sizes(frame: bytes) -> list[int]:
 
 @wrong_hand("DEX3USB-DESC-01")
 class OtherSide(ReferenceDevice):
-    """A left hand that says it is a right one."""
+    """A left hand with the product id of a right one."""
 
     @property
     def product(self) -> int:
@@ -30,7 +30,7 @@ class OtherSide(ReferenceDevice):
 
 @wrong_hand("DEX3USB-DESC-02")
 class OtherRelease(ReferenceDevice):
-    """Says it is release 2.00."""
+    """Reports release 2.00."""
 
     release = 0x0200
 
@@ -117,7 +117,7 @@ class Streams(ReferenceDevice):
 
 @wrong_hand("DEX3USB-XCHG-04")
 class OneAtATime(ReferenceDevice):
-    """Throws both commands away when the second comes before the first is answered."""
+    """Drops both commands when the second comes before the first is answered."""
 
     def answer(self) -> None:
         if self.answers and self.answers[0][0] > self.now:
@@ -158,21 +158,21 @@ class Padded(ReferenceDevice):
 
 @wrong_hand("DEX3USB-SIZE-02")
 class BigFramesOnly(ReferenceDevice):
-    """Takes command frames of 1234 bytes only."""
+    """Accepts only command frames of 1234 bytes."""
 
     accepts = MappingProxyType({1234: 240})
 
 
 @wrong_hand("DEX3USB-SIZE-02")
 class SmallFramesOnly(ReferenceDevice):
-    """Takes command frames of 734 bytes only."""
+    """Accepts only command frames of 734 bytes."""
 
     accepts = MappingProxyType({734: 140})
 
 
 @wrong_hand("DEX3USB-HEAD-01")
 class OtherHead(ReferenceDevice):
-    """Begins its states with the head of a command."""
+    """Sends states with the head of a command."""
 
     def frame(self) -> bytes:
         return b"\xfe\xfd" + super().frame()[2:]
@@ -180,7 +180,7 @@ class OtherHead(ReferenceDevice):
 
 @wrong_hand("DEX3USB-CRC-01")
 class StaleCrc(ReferenceDevice):
-    """Changes the frame after its CRC was made, now and then."""
+    """Changes some frames after their CRC was computed."""
 
     count = 0
 
@@ -201,7 +201,7 @@ class MotorCrc(ReferenceDevice):
 
 @wrong_hand("DEX3USB-CRC-03")
 class SensorCrc(ReferenceDevice):
-    """Fills in a sensor's temperature after its CRC was made."""
+    """Writes a sensor's temperature after the CRC was computed."""
 
     def sensor_packet(self, number: int, elements: int) -> bytes:
         packet = super().sensor_packet(number, elements)
@@ -210,7 +210,7 @@ class SensorCrc(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PACK-01")
 class Rubbish(ReferenceDevice):
-    """Leaves two bytes of rubbish behind the packets of a bus."""
+    """Sends two undefined bytes after the packets of a bus."""
 
     def wrap(self, buses: list[bytes]) -> bytes:
         return super().wrap([*buses[:2], buses[2] + b"\xaa\x55", *buses[3:]])
@@ -218,7 +218,7 @@ class Rubbish(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PACK-02")
 class SixMotors(ReferenceDevice):
-    """Leaves a motor out of the state now and then."""
+    """Leaves a motor out of some states."""
 
     count = 0
 
@@ -229,7 +229,7 @@ class SixMotors(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PACK-04", also=("DEX3USB-SENS-01",))
 class EightSensors(ReferenceDevice):
-    """Has no sensor in one place of the palm."""
+    """Lacks one sensor packet of the palm."""
 
     sensors = ReferenceDevice.sensors[:-1]
 
@@ -259,7 +259,7 @@ class Unpowered(ReferenceDevice):
 
 @wrong_hand("DEX3USB-VALUE-02")
 class Faulty(ReferenceDevice):
-    """Reports a winding too hot from the start."""
+    """Reports an overheated winding from the start."""
 
     def error(self, joint: int) -> int:
         return 0x200 if joint == 2 else 0
@@ -270,7 +270,7 @@ class Faulty(ReferenceDevice):
 
 @wrong_hand("DEX3USB-MODE-01")
 class AlwaysFoc(ReferenceDevice):
-    """Reports FOC whatever it was commanded."""
+    """Reports FOC whatever status was commanded."""
 
     def status(self, joint: int) -> int:
         return FOC
@@ -286,7 +286,7 @@ class LockFollows(ReferenceDevice):
 
 @wrong_hand("DEX3USB-MOVE-01")
 class JointCounts(ReferenceDevice):
-    """Takes positions for joint side, 108 times as far."""
+    """Obeys positions as if they were on the joint side of the gears: 108 times as far."""
 
     def order(self, joint: int, data: bytes) -> Motor:
         order = super().order(joint, data)
@@ -307,7 +307,7 @@ class Backwards(ReferenceDevice):
 
 @wrong_hand("DEX3USB-MOVE-02")
 class Coupled(ReferenceDevice):
-    """Drags the index finger along while the middle one moves."""
+    """The index finger moves along with the middle one."""
 
     def counts(self, joint: int) -> tuple[int, int, int]:
         torque, speed, position = super().counts(joint)
@@ -318,7 +318,7 @@ class Coupled(ReferenceDevice):
 
 @wrong_hand("DEX3USB-MOVE-03")
 class ZeroElsewhere(ReferenceDevice):
-    """Reports a position 2.5 rad off, and takes commands likewise."""
+    """Reports a position 2.5 rad off, and obeys commands likewise."""
 
     shift = 2.5
 
@@ -336,7 +336,7 @@ class ZeroElsewhere(ReferenceDevice):
 
 @wrong_hand("DEX3USB-UNIT-01", also=("DEX3USB-UNIT-02",))
 class RadiansASecond(ReferenceDevice):
-    """Reports speed in units a hundred times as fine."""
+    """Reports speed in a unit a hundred times finer."""
 
     def counts(self, joint: int) -> tuple[int, int, int]:
         torque, speed, position = super().counts(joint)
@@ -357,7 +357,7 @@ class TenthTorque(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PROT-01")
 class SilentTrip(ReferenceDevice):
-    """Stops in silence but does not report it."""
+    """Stops after the time-out but does not report it."""
 
     def motor_packet(self, joint: int) -> bytes:
         kept, self.tripped[joint] = self.tripped[joint], False
@@ -368,7 +368,7 @@ class SilentTrip(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PROT-02")
 class FlagOnly(ReferenceDevice):
-    """Reports the time-out and goes on driving, until the next command."""
+    """Reports the time-out but drives on until the next command."""
 
     def advance(self, seconds: float) -> None:
         self.quiet = seconds > 1
@@ -389,7 +389,7 @@ class SlowTrip(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PROT-03")
 class ForgivesItself(ReferenceDevice):
-    """Clears the time-out on any command, once it has been told."""
+    """Clears the time-out on any command, once it was reported."""
 
     def __init__(self, side: Side) -> None:
         super().__init__(side)
@@ -409,7 +409,7 @@ class ForgivesItself(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PROT-04")
 class NeverForgives(ReferenceDevice):
-    """Stays tripped for good."""
+    """Stays tripped for ever."""
 
     def command(self, joint: int, order: Motor) -> None:
         kept = self.tripped[joint]
@@ -419,7 +419,7 @@ class NeverForgives(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PROT-05")
 class AlwaysProtected(ReferenceDevice):
-    """Trips whether or not the protection was enabled."""
+    """Trips even without protection."""
 
     def protected(self, joint: int) -> bool:
         return True
@@ -453,7 +453,7 @@ class TrustsPackets(ReferenceDevice):
 
 @wrong_hand("DEX3USB-BAD-03")
 class FillsUp(ReferenceDevice):
-    """Takes the rest of a short frame from the one before."""
+    """Completes a short frame with bytes of the one before."""
 
     last = b""
 
@@ -468,7 +468,7 @@ class FillsUp(ReferenceDevice):
 
 @wrong_hand("DEX3USB-BAD-04")
 class CutsOff(ReferenceDevice):
-    """Takes the beginning of a frame that is too long."""
+    """Obeys the beginning of a frame that is too long."""
 
     def receive(self, data: bytes) -> None:
         super().receive(data[:1234])
@@ -476,7 +476,7 @@ class CutsOff(ReferenceDevice):
 
 @wrong_hand("DEX3USB-BAD-05")
 class BelievesSizes(ReferenceDevice):
-    """Takes a size past the buffer for a full one."""
+    """Obeys a frame whose bus size is larger than its buffer."""
 
     def good_frame(self, data: bytes) -> bool:
         past = len(data) in self.accepts and max(_sizes(data)) > self.accepts[len(data)]
@@ -485,7 +485,7 @@ class BelievesSizes(ReferenceDevice):
 
 @wrong_hand("DEX3USB-BAD-06")
 class IdModulo(ReferenceDevice):
-    """Takes ids modulo the number of a finger's motors."""
+    """Obeys motor ids modulo the number of a finger's motors."""
 
     def packet(self, bus: int, data: bytes) -> None:
         number = data[2] & 15
@@ -497,7 +497,7 @@ class IdModulo(ReferenceDevice):
 
 @wrong_hand("DEX3USB-BAD-07")
 class Sulks(ReferenceDevice):
-    """Answers nothing for half a second after a damaged frame."""
+    """Answers nothing for 0.5 s after a damaged frame."""
 
     until = 0.0
 
@@ -513,7 +513,7 @@ class Sulks(ReferenceDevice):
 
 @wrong_hand("DEX3USB-BAD-08")
 class NoBroadcast(ReferenceDevice):
-    """Takes id 15 for a motor that it does not have."""
+    """Ignores packets with id 15, the broadcast."""
 
     def is_for(self, number: int, own: int) -> bool:
         return number == own
@@ -524,7 +524,7 @@ class NoBroadcast(ReferenceDevice):
 
 @wrong_hand("DEX3USB-CONN-01")
 class OnceOnly(ReferenceDevice):
-    """Answers no more once the interface was released."""
+    """Answers nothing after the interface was released once."""
 
     gone = False
 
