@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from benchmarks import Result
 from dexkit.conformance.judge import judge
-from dexkit.conformance.view import Recording
+from dexkit.conformance.recording import Recording
 from dexkit.traces import Recorder, open_trace, sample_path
 
 _TARGET = 200.0

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from dexkit.clock import RealClock
-from dexkit.conformance.phases import Beats, Stall
+from dexkit.conformance.stimulus_record import Beats, Stall
 from dexkit.threads import Worker
 
 __all__ = ["Heartbeat"]

@@ -1,25 +1,27 @@
-"""Judge a recording: every selected requirement, each side, in the catalogue's order."""
+"""The judging engine: from a recording to verdicts, for hands, robots and USB.
+
+Every selected requirement is judged for each subject, in the catalogue's order. What differs from
+layer to layer is data, in :mod:`dexkit.conformance.layers`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.checks import Check, Context, Outcome, all_checks
+from dexkit.conformance.checks import check_of
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.verdicts import Judgement, excuse
-from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import Side
 
-__all__ = ["judge"]
-
-_SILENT = 0.5
-"""Seconds without state, before the end of what a failure is about, that are no mere gap."""
+__all__ = ["judge", "judge_layer"]
 
 
 def judge(
@@ -36,28 +38,16 @@ def judge(
     :param subject: what to say of what was judged.
     """
     claims = claims or Claims()
-    every = claims.apply(catalogue(recording.model.name, recording.layer))
     wanted = None if requirements is None else {r.id for r in requirements}
-    checks = all_checks()
-    if recording.layer == "robot":
-        from dexkit.conformance.checks.robot import robot_checks
 
-        checks = robot_checks()
-    results: list[Result] = []
-    for side in recording.judged:
-        found: dict[str, Result] = {}
-        for requirement in every:
-            judgement = Judgement(requirement, side, claims, found)
-            found[requirement.id] = _judge_one(recording, judgement, recording.sides[side], checks)
-        results += found.values()
-    order = {r.id: i for i, r in enumerate(every)}
-    results.sort(key=lambda r: order[r.requirement.id])
+    def results_of(name: str, part: Any) -> list[Result]:
+        every = claims.apply(catalogue(recording.model.name, name))
+        return judge_layer(layer(name), part, every, claims)
+
+    results = results_of(recording.layer, recording)
     if recording.usb is not None:
-        from dexkit.conformance.usb.judge import judge_usb
-
-        usb = claims.apply(catalogue(recording.model.name, "usb"))
         judged = {str(side) for side in recording.judged}
-        results += [r for r in judge_usb(recording.usb, usb, claims) if r.side in judged]
+        results += [r for r in results_of("usb", recording.usb) if r.side in judged]
     about = {
         "model": recording.model.name,
         "dialect": recording.dialect.name,
@@ -77,74 +67,47 @@ def judge(
     )
 
 
+def judge_layer(
+    layer: Layer[RecordingT, ViewT, ContextT],
+    recording: RecordingT,
+    requirements: Sequence[Requirement],
+    claims: Claims | None = None,
+) -> list[Result]:
+    """What is found for every requirement and subject of one layer, in the requirements' order.
+
+    :param requirements: all those of the layer that are about the model, at the levels that
+        ``claims`` gives them: some are judged by what came before them.
+    :param claims: what the vendor claims of the hand.
+    """
+    claims = claims or Claims()
+    whole = layer.whole(recording)
+    results: list[Result] = []
+    for subject, view in layer.subjects(recording).items():
+        found: dict[str, Result] = {}
+        for requirement in requirements:
+            judgement = Judgement(requirement, subject, claims, found)
+            context = layer.context(recording, view, requirement)
+            found[requirement.id] = _judge_one(layer, judgement, context, whole)
+        results += found.values()
+    order = {r.id: i for i, r in enumerate(requirements)}
+    return sorted(results, key=lambda r: order[r.requirement.id])
+
+
 def _judge_one(
-    recording: Recording, judgement: Judgement, hand: SideView, checks: Mapping[str, Check]
+    layer: Layer[Any, Any, ContextT],
+    judgement: Judgement,
+    context: ContextT,
+    whole: tuple[float, float] | None,
 ) -> Result:
+    for precondition in layer.preconditions:
+        decided = precondition(judgement, context)
+        if decided:
+            return decided
     requirement = judgement.requirement
-    dialect = recording.dialect.name
-    if dialect not in requirement.dialects:
-        return judgement.not_applicable(f"does not apply to the dialect {dialect}")
-    unclaimed = judgement.not_claimed()
-    if unclaimed:
-        return unclaimed
-    context = Context(recording, hand, requirement)
-    missing = _missing(context)
-    if missing:
-        return judgement.not_applicable(missing)
-    return judgement.blocked() or judgement.of(
-        lambda: _in_silence(context, checks[requirement.id](context)),
-        lambda outcome: excuse(recording, requirement, outcome, (0.0, recording.duration)),
+    return judgement.of(
+        lambda: layer.refine(context, check_of(requirement)(context)),
+        lambda outcome: excuse(context.recording, requirement, outcome, whole),
     )
-
-
-def _in_silence(context: Context, outcome: Outcome) -> Outcome:
-    """The outcome; a failure where the hand had fallen silent for good has that as its cause."""
-    states, commands = context.states, context.commands
-    ends = [e.end_s for e in outcome.evidence if e.end_s is not None]
-    if not ends and len(commands):  # no state, so no place either
-        ends = [float(commands.t[-1])]
-    if outcome.met is not False or not len(states) or not ends:
-        return outcome
-    last = float(states.t[-1])
-    if max(ends) < last + _SILENT:
-        return outcome
-    return replace(
-        outcome,
-        cause=f"The hand fell silent for good at {last:.1f} s: has its service ended, or does it "
-        "hang? Its own log may say why.",
-    )
-
-
-_NOT_OURS = (
-    "the kit ends and starts only a service that it has started itself (not --backend external)"
-)
-_REMEDY = {
-    "squeeze": "put something between the fingers, and say where it is felt (--object {side}=PCT)",
-    "shutdown": _NOT_OURS,
-    "service-restart": _NOT_OURS,
-}
-"""What to do, or why not, where a stimulus was not applied."""
-
-
-def _missing(context: Context) -> str:
-    """What the recording lacks for this requirement, or nothing."""
-    requirement, recording = context.requirement, context.recording
-    if requirement.phase:
-        if recording.stimulus is None:
-            return f"needs the stimulus '{requirement.phase}', which only a live run applies"
-        why = _REMEDY.get(requirement.phase, "")
-        why = f": {why.format(side=context.side)}" if why else ""
-        if not recording.phases(requirement.phase):
-            return f"the stimulus '{requirement.phase}' was not applied in this run{why}"
-        other = requirement.needs.startswith("other-")
-        if not other and not context.phases():
-            to = f"the {context.side} hand"
-            return f"the stimulus '{requirement.phase}' was not applied to {to}{why}"
-    if requirement.needs == "endpoints" and not recording.endpoints:
-        return "the recording does not say who published and subscribed (record dds_endpoints)"
-    if requirement.needs in ("commands", "session") and not len(context.commands):
-        return "no commands to this hand in the recording"
-    return ""
 
 
 def _harness(recording: Recording) -> dict[str, float]:

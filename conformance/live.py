@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.clock import RealClock
+from dexkit.conformance.backend_processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.motor_messages import Wire
 from dexkit.conformance.phased_script import play
-from dexkit.conformance.phases import RECORD, Stimulus
-from dexkit.conformance.processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli import (
     Action,
@@ -35,7 +35,7 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
-from dexkit.conformance.wire import Wire
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.freshness import PauseWatch

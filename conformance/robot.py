@@ -1,8 +1,8 @@
 """A robot as the kit sees it: its dialect, its messages, and a recording of it.
 
-A robot is judged like a hand that has no sides: where a hand has a side, it has
-:data:`~dexkit.conformance.phases.ROBOT`. Its joints are those of the used motor slots, in their
-order. What is its own: a CRC in each message, and slots that are not used.
+A robot has no sides: where a hand has a side, it has
+:data:`~dexkit.conformance.stimulus_record.ROBOT`. Its joints are those of the used motor slots, in
+their order. What hands do not have: a CRC in each message, and slots that are not used.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.phases import RECORD, ROBOT, Stimulus
-from dexkit.conformance.view import Commands, Recording, SideView, States, TraceLike
-from dexkit.conformance.wire import Motor, Motors, Wire
+from dexkit.conformance.motor_messages import Motor, Motors, Wire
+from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
+from dexkit.conformance.stimulus_record import RECORD, ROBOT, Stimulus
 from dexkit.errors import ConformanceError, UsageError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 
-from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
 from dexkit.robots import G1, H1, ROBOTS

@@ -10,10 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import ROBOT
-from dexkit.conformance.processes import (
+from dexkit.conformance.backend_processes import (
     BODY_EMULATORS,
     EMULATED,
     EXTERNAL,
@@ -21,6 +18,9 @@ from dexkit.conformance.processes import (
     SIMULATED,
     RigOptions,
 )
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.robot import recording_of, robot_dialect
@@ -28,7 +28,7 @@ from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.script import DEFAULT_OBJECTS
 from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.view import Recording, sides_of
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side

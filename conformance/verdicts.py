@@ -36,9 +36,9 @@ from typing import Protocol
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.phases import IDLE, Lost
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import BUSY, TOO_BUSY, Result, Verdict
+from dexkit.conformance.stimulus_record import IDLE, Lost
 from dexkit.hand import Side
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]

@@ -7,9 +7,9 @@ from dataclasses import replace
 from functools import cache
 
 from dexkit.conformance.mutants import plan_for
-from dexkit.conformance.phases import RECORD, Beats, Stall, Stimulus
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Result, RunResult, Verdict
-from dexkit.conformance.view import Recording
+from dexkit.conformance.stimulus_record import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side

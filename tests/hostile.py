@@ -177,7 +177,7 @@ def judged_result(folder: Path) -> tuple[dict[str, Any], Path]:
     import json
 
     from dexkit.conformance.judge import judge
-    from dexkit.conformance.view import Recording
+    from dexkit.conformance.recording import Recording
     from dexkit.traces import open_trace, sample_path
 
     path = sample_path("dex1_hand_dropout")

@@ -133,7 +133,11 @@ _UNUSED = (
     *("cyclonedds", "pytest", "numpy.ma", "mcap.writer", "dexkit.dds", "dexkit.service"),
     *("dexkit.teleop", "dexkit.drivers", "dexkit.emulators", "dexkit.backends"),
     *("dexkit.conformance.mutants", "dexkit.conformance.stimuli", "dexkit.conformance.live"),
-    *("dexkit.conformance.usb.view", "dexkit.conformance.report.html", "dexkit.traces.recorder"),
+    *(
+        "dexkit.conformance.usb.recording",
+        "dexkit.conformance.report.html",
+        "dexkit.traces.recorder",
+    ),
     *("dexkit.messages.unitree_go", "dexkit.messages.unitree_hg"),
 )
 

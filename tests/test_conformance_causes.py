@@ -8,8 +8,8 @@ import pytest
 from dexkit.conformance.checks.causes import of_positions, of_scale, of_type
 from dexkit.conformance.mutants import mutants, run_mutant
 from dexkit.conformance.mutants.trials import HandTrial
+from dexkit.conformance.recording import joints_of
 from dexkit.conformance.results import Verdict
-from dexkit.conformance.view import joints_of
 from dexkit.hand import Side
 from dexkit.models import dialect
 from tests.conformance_helpers import of
@@ -89,7 +89,7 @@ def test_a_wrong_hand_is_told_its_own_mistake(mutant: str, requirement: str, say
 
 def test_what_passes_has_no_cause() -> None:
     from dexkit.conformance.judge import judge
-    from dexkit.conformance.view import Recording
+    from dexkit.conformance.recording import Recording
     from tests.conformance_helpers import short_run
 
     assert of(judge(Recording.of(short_run())), "DEX1-RATE-01").cause == ""

@@ -12,11 +12,11 @@ import dexkit.conformance
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.wording import hand_name
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.verdicts import Excuse, Judgement
-from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from tests.conformance_helpers import of, short_run

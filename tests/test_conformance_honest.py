@@ -12,8 +12,8 @@ import pytest
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import gripper, plan_for
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import BUSY, Overall, RunResult, Verdict
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side

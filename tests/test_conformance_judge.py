@@ -10,11 +10,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dexkit.conformance.checks import REGISTRY
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import RECORD, Phase, Stimulus
+from dexkit.conformance.recording import Recording, detect_dialect, sides_of
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Verdict, read_json, worst
-from dexkit.conformance.view import Recording, detect_dialect, sides_of
+from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.hand import Side
@@ -203,8 +204,7 @@ def test_a_check_that_breaks_is_the_kits_error(monkeypatch: pytest.MonkeyPatch) 
     def broken(context: object) -> None:
         raise ZeroDivisionError("1/0")
 
-    checks = {**judge.__globals__["all_checks"](), "DEX1-RATE-01": broken}
-    monkeypatch.setitem(judge.__globals__, "all_checks", lambda: checks)
+    monkeypatch.setitem(REGISTRY, "DEX1-RATE-01", broken)
     result = judged(short_run())
     assert of(result, "DEX1-RATE-01").verdict is Verdict.ERROR
     assert "ZeroDivisionError: 1/0" in of(result, "DEX1-RATE-01").reason

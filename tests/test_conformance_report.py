@@ -12,17 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.conformance.judge import judge
+from dexkit.conformance.judge import judge, judge_layer
+from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import gripper, mutants, plan_for
 from dexkit.conformance.mutants import usb as wrong_usb
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.evidence import evidence
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.plots import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
-from dexkit.conformance.usb.judge import judge_usb
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.hand import Side
@@ -252,7 +252,7 @@ def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
     for device, title in kinds.items():
         kills = next(m.kills for m in mutants() if m.made is device)
         usb = run_virtual_usb(device(Side.LEFT))
-        found = next(r for r in judge_usb(usb, every) if r.requirement.id == kills)
+        found = next(r for r in judge_layer(USB, usb, every) if r.requirement.id == kills)
         (figure,) = evidence(found, replace(view, usb=usb))
         parsed(figure)
         assert title in figure

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.compare import Comparison, render_comparison
 from dexkit.conformance.report.html import render
-from dexkit.conformance.view import Recording
 from dexkit.traces import open_trace, sample_path
 from tests.optional import chromium
 from tests.report_helpers import result_of_every_kind

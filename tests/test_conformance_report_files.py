@@ -14,6 +14,7 @@ from rich.console import Console
 
 from dexkit.cli import cli
 from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import badge_text, render_badge
 from dexkit.conformance.report.compare import (
     Comparison,
@@ -27,7 +28,6 @@ from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.report.wording import VERDICTS
 from dexkit.conformance.results import RunResult, Verdict, read_json
 from dexkit.conformance.session import SuiteOptions, judge_recording
-from dexkit.conformance.view import Recording
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path

@@ -14,14 +14,14 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.check import command
-from dexkit.conformance.checks.robot import robot_checks
+from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, free_domain, record_run
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import Outcome, try_one
 from dexkit.conformance.mutants.robot import CdrCrc, NoCrc, WaitsForCommands
-from dexkit.conformance.phases import ROBOT, Stimulus
-from dexkit.conformance.processes import RigOptions
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.requirements.page import BEGIN, END, catalogue_page
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
@@ -35,9 +35,9 @@ from dexkit.conformance.robot import (
 )
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import SCRIPTS, Plan, phases_for
+from dexkit.conformance.stimulus_record import ROBOT, Stimulus
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
-from dexkit.conformance.wire import Motor
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import decode
@@ -122,11 +122,11 @@ def blamed(robot: type[ReferenceRobot], model: str, *phases: str) -> set[str]:
 
 def _one_of_each() -> list[Mutant]:
     """A wrong robot for each check of a MUST, and what only a G1 has."""
-    checks, level = robot_checks(), {r.id: r.level for r in catalogue(None, "robot")}
+    by_id = {r.id: r for r in catalogue(None, "robot")}
     found: dict[object, Mutant] = {}
     for mutant in mutants("robot"):
-        if level[mutant.kills] is Level.MUST and mutant.model == "h1":
-            found.setdefault(checks[mutant.kills], mutant)
+        if by_id[mutant.kills].level is Level.MUST and mutant.model == "h1":
+            found.setdefault(check_of(by_id[mutant.kills]), mutant)
     only_g1 = [m for m in mutants() if m.kills in ("G1-MACH-01", "G1-SAFE-05", "G1-SAFE-03")]
     return [*found.values(), *only_g1]
 
@@ -140,7 +140,7 @@ def test_a_wrong_robot_is_caught(mutant: Mutant) -> None:
 def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> None:
     every = catalogue(name, "robot")
     assert {m.kills for m in mutants() if m.model == name} == {r.id for r in every}
-    assert {r.id for r in every} <= set(robot_checks())
+    assert all(check_of(r) for r in every)
     negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
     negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
     found = [r for r in every if r.id.partition("-")[2].startswith(negative)]

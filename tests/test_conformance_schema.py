@@ -11,10 +11,10 @@ import pytest
 
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import ROBOT
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
 from dexkit.conformance.results import VERSION, Overall, Stage, Verdict
-from dexkit.conformance.view import Recording
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
 from tests.conformance_helpers import short_run

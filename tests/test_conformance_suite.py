@@ -13,18 +13,18 @@ from pathlib import Path
 
 import pytest
 
+from dexkit.conformance.backend_processes import EXTERNAL, RigOptions
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, record_run
 from dexkit.conformance.mutants import any_model, plan_for
 from dexkit.conformance.mutants.registry import mix
-from dexkit.conformance.processes import EXTERNAL, RigOptions
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.selection import QUICK, length, quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.on_dds import ServiceOnDds

@@ -15,17 +15,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dexkit.conformance.backend_processes import Tool
+from dexkit.conformance.checks import check_of
+from dexkit.conformance.judge import judge_layer
+from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import mutants
 from dexkit.conformance.mutants.matrix import Outcome, try_one
 from dexkit.conformance.mutants.trials import run_usb_mutant
-from dexkit.conformance.processes import Tool
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.requirements.page import BEGIN, END
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
-from dexkit.conformance.usb.checks import CHECKS
-from dexkit.conformance.usb.judge import judge_usb
 from dexkit.conformance.usb.page import catalogue_page
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -36,9 +37,9 @@ from dexkit.conformance.usb.record import (
     UsbRecord,
     topic,
 )
+from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
 from dexkit.conformance.usb.script import BUSES, DAMAGES
-from dexkit.conformance.usb.view import UsbRecording
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.errors import ConformanceError, TraceUnsupported
 from dexkit.hand import Side
@@ -149,7 +150,7 @@ def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
     assert trace.topics == ["usb/dex3/right/in", "usb/dex3/right/out"]
     read = UsbRecording.of(trace)
     assert read is not None
-    assert judge_usb(read.since(live.origin_ns), usb()) == judge_usb(live, usb())
+    assert judge_layer(USB, read.since(live.origin_ns), usb()) == judge_layer(USB, live, usb())
 
 
 @pytest.mark.parametrize(
@@ -167,7 +168,7 @@ def test_a_damaged_record_is_said(record: dict[str, str]) -> None:
 def test_every_requirement_has_a_check_and_a_device_that_breaks_it() -> None:
     ids = {r.id for r in usb()}
     assert len(ids) >= 40
-    assert set(CHECKS) == ids
+    assert all(check_of(r) for r in usb())
     assert {m.kills for m in mutants("usb")} == ids
     kinds = set(DAMAGES)
     hand = run_virtual_usb(ReferenceDevice(Side.LEFT)).sides[Side.LEFT]
@@ -185,7 +186,7 @@ def test_the_documented_catalogue_is_the_current_one() -> None:
 
 @pytest.mark.parametrize("side", list(Side))
 def test_a_good_device_passes(side: Side) -> None:
-    results = judge_usb(run_virtual_usb(ReferenceDevice(side)), usb())
+    results = judge_layer(USB, run_virtual_usb(ReferenceDevice(side)), usb())
     assert [r.explain() for r in results if r.verdict is not Verdict.PASS] == []
     assert len(results) == len(usb())
 
@@ -217,14 +218,14 @@ def test_what_failed_is_said_with_its_place() -> None:
 
 
 def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
-    from dexkit.conformance.phases import Beats
+    from dexkit.conformance.stimulus_record import Beats
 
     recording = run_virtual_usb(BY_NAME["Slow"].made(Side.LEFT))
     hand = recording.sides[Side.LEFT]
     first = min(p.begin_ns for p in hand.phases("burst"))
     for late_us, verdict in ((5_000, Verdict.BLOCKED), (100, Verdict.WARN)):
         beats = Beats(first, list(range(0, 9_000_000, 10_000)), [late_us] * 900)
-        results = judge_usb(replace(recording, beats=beats), usb())
+        results = judge_layer(USB, replace(recording, beats=beats), usb())
         (rate,) = [r for r in results if r.requirement.id == "DEX3USB-RATE-01"]
         assert rate.verdict is verdict
         assert ("too busy" in rate.reason) is (verdict is Verdict.BLOCKED)
@@ -240,7 +241,7 @@ def test_a_speed_is_not_judged_by_a_few_samples() -> None:
         if 15e6 < t.submitted_ns - phase.begin_ns < 120e6
     }
     few = replace(hand, transfers=[t for t in hand.transfers if t.done_ns not in gone])
-    results = judge_usb(replace(recording, sides={Side.LEFT: few}), usb())
+    results = judge_layer(USB, replace(recording, sides={Side.LEFT: few}), usb())
     (unit,) = [r for r in results if r.requirement.id == "DEX3USB-UNIT-01"]
     assert (unit.verdict, unit.reason) == (Verdict.NOT_APPLICABLE, "no motion to judge by")
 
@@ -270,7 +271,7 @@ def test_an_emulated_hand_passes_and_a_faulty_one_beside_it_does_not(
     recording = UsbRecording.of(open_trace(tmp_path / "run.mcap"))
     assert recording is not None
     assert set(recording.sides) == set(Side)
-    results = judge_usb(recording, usb())
+    results = judge_layer(USB, recording, usb())
     # how fast it is on a test machine says nothing
     wrong = [r for r in results if r.verdict not in ACCEPTABLE and not r.requirement.realtime]
     assert [r.explain() for r in wrong if r.side == "left"] == []

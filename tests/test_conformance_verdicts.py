@@ -16,12 +16,12 @@ from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.operator import LateState
-from dexkit.conformance.phases import Beats, Lost
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import BUSY, TOO_BUSY, Evidence, Result, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
+from dexkit.conformance.stimulus_record import Beats, Lost
 from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
-from dexkit.conformance.view import Recording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run, with_beats

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from dexkit.backends import BackendOptions, backend
 from dexkit.clock import ManualClock
 from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Overall, Verdict
-from dexkit.conformance.view import Recording
 from dexkit.emulators.sim_dex5 import SimDex5, sim_dex5
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side

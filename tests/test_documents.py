@@ -17,8 +17,8 @@ from dexkit import documents
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.results import read_json
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.drivers.ezgripper.config import Store
 from dexkit.errors import DexkitError, OutputError, UsageError

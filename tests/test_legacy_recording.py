@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Overall, RunResult, Verdict
-from dexkit.conformance.view import Recording
 from dexkit.hand import Side
 from dexkit.models import dialect
 from dexkit.traces import Recorder, open_trace, sample_path

@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.mutants import command
-from dexkit.conformance.checks import all_checks
+from dexkit.conformance.checks import check_of
+from dexkit.conformance.layers import layer
 from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import Outcome, Score, chosen, essential, try_one
-from dexkit.conformance.mutants.trials import REFERENCES
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.hand import Side
@@ -33,7 +33,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
 )
 def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
     plan = plan_for(dialect, sides=sides)
-    result = run_mutant(REFERENCES["dds", plan.dialect.model], plan)
+    result = run_mutant(layer("dds").reference(plan.dialect.model), plan)
     bad = [r.explain() for r in result.results if r.verdict not in GOOD]
     assert not bad, "\n".join(bad)
     assert result.overall is Overall.PASS
@@ -56,7 +56,8 @@ def name_of(given: Mutant) -> str:
 
 
 # one of each check: what the models share is shown with the first
-OF_EACH_CHECK = {all_checks()[t.kills]: t for t in reversed(ESSENTIAL) if t.layer == "dds"}
+HAND = {r.id: r for r in catalogue()}
+OF_EACH_CHECK = {check_of(HAND[t.kills]): t for t in reversed(ESSENTIAL) if t.layer == "dds"}
 
 
 @pytest.mark.parametrize("given", OF_EACH_CHECK.values(), ids=name_of)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from dexkit.conformance.motor_messages import Wire
 from dexkit.conformance.stimuli import Action, Observation, Plan, Send, Session, script_for
-from dexkit.conformance.wire import Wire
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
 from dexkit.teleop import Dex1Client

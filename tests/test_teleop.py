@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.conformance.view import Recording
+from dexkit.conformance.recording import Recording
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import DEX3_1, DIALECTS, MODELS
@@ -415,7 +415,7 @@ def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
 
 @pytest.mark.parametrize("name", list(DIALECTS))
 def test_positions_come_back_from_the_wire(name: str) -> None:
-    from dexkit.conformance.wire import Wire
+    from dexkit.conformance.motor_messages import Wire
 
     spoken = DIALECTS[name]
     joints = len(MODELS[spoken.model].joints[LEFT])

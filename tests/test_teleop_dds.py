@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from dexkit.cli import cli
-from dexkit.conformance.view import Recording
+from dexkit.conformance.recording import Recording
 from dexkit.dds import DdsNode
 from dexkit.errors import DexkitError, UsageError
 from dexkit.freshness import PAUSE

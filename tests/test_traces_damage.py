@@ -18,8 +18,8 @@ from mcap.writer import CompressionType
 
 from dexkit.cli import main
 from dexkit.conformance.judge import judge
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.view import Recording
 from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.messages import message_type
 from dexkit.messages.columns import Columns

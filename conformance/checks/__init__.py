@@ -11,32 +11,40 @@ several joints have.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from typing import Any, Generic, Protocol, TypeVar
 
-from dexkit.conformance.phases import Phase
-from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.recording import Commands, Recording, SideView, States
+from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
-from dexkit.conformance.view import Commands, Recording, SideView, States
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side
 
-__all__ = ["Check", "Context", "Late", "Outcome", "all_checks", "check"]
+__all__ = [
+    "CHECK_MODULES",
+    "REGISTRY",
+    "BaseContext",
+    "Check",
+    "Context",
+    "Late",
+    "Outcome",
+    "check",
+    "check_of",
+]
 
-_MODULES = (
-    "discovery",
-    "timing",
-    "fields",
-    "members",
-    "motion",
-    "force",
-    "safety",
-    "lifecycle",
-    "tracking",
-    "fingers",
-    "operator",
+_HAND = (
+    *("discovery", "timing", "fields", "members", "motion", "force", "safety"),
+    *("lifecycle", "tracking", "fingers", "operator"),
 )
-
+CHECK_MODULES: Mapping[str, Sequence[str]] = {
+    "dds": tuple(f"{__name__}.{name}" for name in _HAND),
+    "robot": tuple(
+        f"{__name__}.{n}" for n in ("robot", "discovery", "timing", "fields", "lifecycle")
+    ),
+    "usb": ("dexkit.conformance.usb.checks",),
+}
+"""The modules that register the checks of each layer."""
 
 STROKE_S = 1.0
 """Seconds that a hand takes for a stroke, as Unitree's client leads it."""
@@ -91,13 +99,63 @@ class Outcome:
         return replace(self, late=Late(sizes, how, max(0.0, float(best))))
 
 
-@dataclass(frozen=True)
-class Context:
-    """One requirement to be judged for one side of a recording."""
+class Located(Protocol):
+    """A recording whose seconds can be turned into log times."""
 
-    recording: Recording
-    hand: SideView
+    def log_time(self, seconds: float) -> int:
+        """The log time, nanoseconds, of a second of the recording."""
+        ...
+
+
+RecordingT = TypeVar("RecordingT", bound=Located, covariant=True)
+ViewT = TypeVar("ViewT", covariant=True)
+
+
+@dataclass(frozen=True)
+class BaseContext(Generic[RecordingT, ViewT]):
+    """One requirement to be judged for one subject; each layer adds access to its data.
+
+    :param recording: the layer's recording, decoded.
+    :param hand: the part of it that is about the subject.
+    """
+
+    recording: RecordingT
+    hand: ViewT
     requirement: Requirement
+
+    def place(self, topic: str, seconds: float, end: float | None = None) -> Evidence:
+        """A point in time, or an interval, on a topic of the recording (seconds)."""
+        return Evidence(
+            topic=topic,
+            time_s=round(seconds, 4),
+            log_time_ns=self.recording.log_time(seconds),
+            end_s=None if end is None else round(end, 4),
+        )
+
+    def passed(self, figure: str, observed: str = "", **values: float) -> Outcome:
+        """The requirement is met."""
+        return Outcome(True, figure, observed, values=_plain(values))
+
+    def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
+        """It is not met."""
+        return Outcome(False, figure, observed, evidence=places, values=_plain(values))
+
+    def skipped(self, reason: str) -> Outcome:
+        """It cannot be judged with this recording."""
+        return Outcome(None, reason=reason)
+
+    def absent(self, reason: str) -> Outcome:
+        """Not judged: the hand lacks this unit; a failure only where the vendor claims it."""
+        return Outcome(None, reason=reason, absent=True)
+
+
+def _plain(values: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class Context(BaseContext[Recording, SideView]):
+    """One requirement to be judged for one side of a recording of DDS topics."""
 
     @property
     def side(self) -> Side:
@@ -146,80 +204,44 @@ class Context:
         """Where this side touches its object, as far as is known."""
         return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
 
-    # -- outcomes ---------------------------------------------------------------------------
-
     def at(self, topic: str, seconds: float, end: float | None = None) -> Evidence:
         """A place in the recording."""
-        return Evidence(
-            topic=topic,
-            time_s=round(seconds, 4),
-            log_time_ns=self.recording.log_time(seconds),
-            end_s=None if end is None else round(end, 4),
-        )
-
-    def passed(self, figure: str, observed: str = "", **values: float) -> Outcome:
-        """The requirement is met."""
-        return Outcome(True, figure, observed, values=_plain(values))
-
-    def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
-        """It is not."""
-        return Outcome(False, figure, observed, evidence=places, values=_plain(values))
-
-    def skipped(self, reason: str) -> Outcome:
-        """It cannot be judged here."""
-        return Outcome(None, reason=reason)
-
-    def absent(self, reason: str) -> Outcome:
-        """Not judged: the hand does not do this, for which only who claims it has to answer."""
-        return Outcome(None, reason=reason, absent=True)
+        return self.place(topic, seconds, end)
 
 
-def _plain(values: Mapping[str, float]) -> dict[str, float]:
-    return {name: float(value) for name, value in values.items()}
+Check = Callable[[Any], Outcome]
+"""A function of its layer's context. The layer gives it that; see
+:mod:`dexkit.conformance.layers`."""
+CheckT = TypeVar("CheckT", bound=Check)
+REGISTRY: dict[str, Check] = {}
+"""Checks by requirement id, of those modules that have been imported."""
 
 
-Check = Callable[[Context], Outcome]
-_REGISTRY: dict[str, Check] = {}
+def check(*requirement_ids: str) -> Callable[[CheckT], CheckT]:
+    """Register the decorated function as the check of these requirements, of whichever layer."""
 
-
-def check(*requirement_ids: str) -> Callable[[Check], Check]:
-    """Register the decorated function as the check of these requirements."""
-
-    def register(function: Check) -> Check:
+    def register(function: CheckT) -> CheckT:
         for name in requirement_ids:
-            assert name not in _REGISTRY, f"{name} has two checks"
-            _REGISTRY[name] = function
+            assert name not in REGISTRY, f"{name} has two checks"
+            REGISTRY[name] = function
         return function
 
     return register
 
 
-class _Checks(Mapping[str, Check]):
-    """Every check, by requirement id; their modules are loaded as far as one is looked for."""
+def check_of(requirement: Requirement) -> Check:
+    """The check that is registered for a requirement, else for the one that it is ``like``.
 
-    def __init__(self) -> None:
-        self._modules = iter(_MODULES)
+    Modules of checks are imported one after the other until one registers it.
 
-    def __getitem__(self, name: str) -> Check:
-        for module in self._modules if name not in _REGISTRY else ():
-            importlib.import_module(f"{__name__}.{module}")
-            if name in _REGISTRY:
-                break
-        return _REGISTRY[name] if name in _REGISTRY else self._every()[name]
-
-    def _every(self) -> Mapping[str, Check]:
-        for module in self._modules:
-            importlib.import_module(f"{__name__}.{module}")
-        return {r.id: _REGISTRY[r.like] for r in catalogue() if r.like} | _REGISTRY
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._every())
-
-    def __len__(self) -> int:
-        return len(self._every())
-
-
-@cache
-def all_checks() -> Mapping[str, Check]:
-    """Every check, by requirement id; what is like another requirement has the same."""
-    return _Checks()
+    :raises KeyError: there is none.
+    """
+    modules = CHECK_MODULES[requirement.layer]
+    for name in filter(None, (requirement.id, requirement.like)):
+        for module in modules:
+            if name in REGISTRY:
+                return REGISTRY[name]
+            importlib.import_module(module)
+        if name in REGISTRY:
+            return REGISTRY[name]
+    raise KeyError(requirement.id)

@@ -11,7 +11,7 @@ def _endpoints(ctx: Context, topic: str, kind: str) -> list[TraceEndpoint]:
     return [e for e in ctx.recording.endpoints if e.topic == topic and e.kind == kind]
 
 
-@check("DEX1-TOPIC-01", "DEX3-TOPIC-01")
+@check("DEX1-TOPIC-01", "DEX3-TOPIC-01", "H1-TOPIC-01")
 def state_topic(ctx: Context) -> Outcome:
     """The state topic carries samples of the right type."""
     dialect = ctx.recording.dialect
@@ -59,7 +59,7 @@ def _absent(ctx: Context) -> str:
     return ""
 
 
-@check("DEX1-TOPIC-02", "DEX3-TOPIC-02")
+@check("DEX1-TOPIC-02", "DEX3-TOPIC-02", "H1-TOPIC-02")
 def command_topic(ctx: Context) -> Outcome:
     """Somebody subscribes to the command topic with the right type."""
     topic, wanted = ctx.commands.topic, ctx.recording.dialect.cmd_type
@@ -76,7 +76,7 @@ def command_topic(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-QOS-01", "DEX3-QOS-01")
+@check("DEX1-QOS-01", "DEX3-QOS-01", "H1-QOS-01")
 def command_qos(ctx: Context) -> Outcome:
     """The command reader is compatible with a RELIABLE, VOLATILE writer."""
     readers = _endpoints(ctx, ctx.commands.topic, "reader")
@@ -92,7 +92,7 @@ def command_qos(ctx: Context) -> Outcome:
     return ctx.passed(shown.durability.lower(), f"the reader asks for {_qos(shown)}")
 
 
-@check("DEX1-QOS-02", "DEX3-QOS-02")
+@check("DEX1-QOS-02", "DEX3-QOS-02", "H1-QOS-02")
 def state_qos(ctx: Context) -> Outcome:
     """The state writer is reliable."""
     writers = _endpoints(ctx, ctx.states.topic, "writer")

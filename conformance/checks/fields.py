@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
-from dexkit.conformance.view import joints_of
+from dexkit.conformance.recording import joints_of
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
@@ -16,7 +16,7 @@ Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
 _STAND_S = 0.1  # seconds without motion that are a stand
 
 
-@check("DEX1-FIELD-01", "DEX3-FIELD-01")
+@check("DEX1-FIELD-01", "DEX3-FIELD-01", "H1-FIELD-01")
 def length(ctx: Context) -> Outcome:
     """Samples decode and have one motor a hand."""
     states, wanted = ctx.states, ctx.recording.dialect.length
@@ -33,7 +33,7 @@ def length(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-FIELD-02", "DEX3-FIELD-02")
+@check("DEX1-FIELD-02", "DEX3-FIELD-02", "H1-FIELD-02")
 def finite(ctx: Context) -> Outcome:
     """No NaN, no infinity."""
     states = ctx.states

@@ -14,8 +14,8 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
+from dexkit.conformance.motor_messages import Wire
 from dexkit.conformance.parts import PARTS, Parts
-from dexkit.conformance.wire import Wire
 from dexkit.hand import Floats, JointMode
 from dexkit.models import model
 

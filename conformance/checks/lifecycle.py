@@ -6,11 +6,11 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
-from dexkit.conformance.wire import Wire
+from dexkit.conformance.motor_messages import Wire
 from dexkit.hand import JointMode
 
 
-@check("DEX1-START-01", "DEX3-START-01")
+@check("DEX1-START-01", "DEX3-START-01", "H1-START-01")
 def state_first(ctx: Context) -> Outcome:
     """State is there before the first command."""
     first_state = float(ctx.states.t[0])
@@ -35,7 +35,7 @@ def state_first(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-LIFE-01", "DEX3-LIFE-01")
+@check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")
 def late_joiner(ctx: Context) -> Outcome:
     """What a subscriber received that was created in mid-session."""
     phase = ctx.phases()[-1]

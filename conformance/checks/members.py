@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.figures import median
+from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
 __all__: list[str] = []

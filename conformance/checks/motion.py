@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
-from dexkit.conformance.view import Recording
 from dexkit.hand import Side
 from dexkit.teleop import client_for
 from dexkit.teleop.feel import Feel, Step, feel

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
-from functools import cache
-from typing import cast
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dexkit.conformance.checks import (
-    STROKE_S,
-    Check,
-    Context,
-    Outcome,
-    discovery,
-    fields,
-    lifecycle,
-    timing,
-)
-from dexkit.conformance.phases import Phase
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
 from dexkit.conformance.robot import RobotRecording
 from dexkit.conformance.stimuli.robot import STEP
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 from dexkit.messages import Columns
 
-__all__ = ["robot_checks"]
+__all__ = ["RobotContext"]
 
 _SOME = 20  # states at the end of a phase, or before it, over which is averaged
 _END = 0.06  # s after a phase in which its last command may still have an effect
@@ -36,22 +24,25 @@ _LATE = 1.0  # s by which a state may be late on a busy machine
 _STICKS = struct.Struct("<4x5f")  # in wireless_remote: behind head and keys
 
 
-def _recording(ctx: Context) -> RobotRecording:
-    return cast(RobotRecording, ctx.recording)
+@dataclass(frozen=True)
+class RobotContext(Context):
+    """One requirement to be judged for the robot of a recording."""
+
+    recording: RobotRecording
+
+    @property
+    def low(self) -> Columns:
+        """All members of the states."""
+        found = self.recording.low
+        assert found is not None, "states are there: H1-TOPIC-01 has not failed"
+        return found
 
 
-def _low(ctx: Context) -> Columns:
-    """All members of the states."""
-    found = _recording(ctx).low
-    assert found is not None, "states are there: H1-TOPIC-01 has not failed"
-    return found
-
-
-def _at(ctx: Context, row: int) -> float:
+def _at(ctx: RobotContext, row: int) -> float:
     return float(ctx.states.t[row])
 
 
-def _wrong_rows(ctx: Context, bad: ArrayLike, figure: str, what: str) -> Outcome:
+def _wrong_rows(ctx: RobotContext, bad: ArrayLike, figure: str, what: str) -> Outcome:
     """A failure in the samples where ``bad`` is true."""
     rows = np.flatnonzero(bad)
     places = [ctx.at(ctx.states.topic, _at(ctx, int(i))) for i in rows[:5]]
@@ -62,7 +53,8 @@ def _wrong_rows(ctx: Context, bad: ArrayLike, figure: str, what: str) -> Outcome
 # ------------------------------------------------------------------------------------ discovery
 
 
-def one_publisher(ctx: Context) -> Outcome:
+@check("H1-TOPIC-03")
+def one_publisher(ctx: RobotContext) -> Outcome:
     """Writers of the state topic."""
     writers = [
         e for e in ctx.recording.endpoints if (e.topic, e.kind) == (ctx.states.topic, "writer")
@@ -77,19 +69,21 @@ def one_publisher(ctx: Context) -> Outcome:
 # ------------------------------------------------------------------------------------ integrity
 
 
-def state_crc(ctx: Context) -> Outcome:
+@check("H1-CRC-01")
+def state_crc(ctx: RobotContext) -> Outcome:
     """The CRC of every state."""
-    intact = _recording(ctx).intact
+    intact = ctx.recording.intact
     if intact.all():
         return ctx.passed("right", f"{len(intact)} states")
-    crc = _low(ctx)["crc"]
+    crc = ctx.low["crc"]
     outcome = _wrong_rows(ctx, ~intact, f"{int((~intact).sum())} wrong", "the CRC is wrong")
     return outcome.because("The field is never set.") if not np.any(crc > 0) else outcome
 
 
-def client_crc(ctx: Context) -> Outcome:
+@check("H1-CLIENT-01")
+def client_crc(ctx: RobotContext) -> Outcome:
     """The CRC of the commands that the kit has not spoilt."""
-    intact, t = _recording(ctx).commands_intact, ctx.commands.t
+    intact, t = ctx.recording.commands_intact, ctx.commands.t
     counts = np.ones(len(t), dtype=np.bool_)
     for phase in ctx.phases("wrong-crc"):
         begin, end = ctx.span(phase)
@@ -104,7 +98,8 @@ def client_crc(ctx: Context) -> Outcome:
     )
 
 
-def client_rate(ctx: Context) -> Outcome:
+@check("H1-CLIENT-02")
+def client_rate(ctx: RobotContext) -> Outcome:
     """The mean rate of commands."""
     steps = np.diff(ctx.commands.t)
     steady = steps[steps <= 0.1]
@@ -117,9 +112,10 @@ def client_rate(ctx: Context) -> Outcome:
     return ctx.failed(f"{rate:.0f} Hz", text)
 
 
-def tick_goes_on(ctx: Context) -> Outcome:
+@check("H1-TICK-01")
+def tick_goes_on(ctx: RobotContext) -> Outcome:
     """Steps of tick, and for how long it stands still."""
-    tick, clock = _low(ctx)["tick"], ctx.states.clock
+    tick, clock = ctx.low["tick"], ctx.states.clock
     if len(tick) < 2:
         return ctx.skipped("fewer than two states")
     steps = np.diff(tick)
@@ -140,9 +136,10 @@ def tick_goes_on(ctx: Context) -> Outcome:
     ).if_late(longest - ctx.tolerance("max_hold_s"))
 
 
-def tick_rate(ctx: Context) -> Outcome:
+@check("H1-TICK-02")
+def tick_rate(ctx: RobotContext) -> Outcome:
     """How fast tick counts."""
-    tick, clock = _low(ctx)["tick"], ctx.states.clock
+    tick, clock = ctx.low["tick"], ctx.states.clock
     seconds = float(clock[-1] - clock[0]) if len(clock) else 0.0
     if seconds < ctx.tolerance("min_observed_s"):
         return ctx.skipped("less than a second of state in the recording")
@@ -157,7 +154,8 @@ def tick_rate(ctx: Context) -> Outcome:
 # --------------------------------------------------------------------------------------- fields
 
 
-def within_limits(ctx: Context) -> Outcome:
+@check("H1-FIELD-03")
+def within_limits(ctx: RobotContext) -> Outcome:
     """Positions against each joint's limits."""
     low = np.array([j.q_min for j in ctx.joints]) - ctx.tolerance("margin_rad")
     high = np.array([j.q_max for j in ctx.joints]) + ctx.tolerance("margin_rad")
@@ -175,7 +173,8 @@ def within_limits(ctx: Context) -> Outcome:
     )
 
 
-def speed_of_q(ctx: Context) -> Outcome:
+@check("H1-FIELD-04")
+def speed_of_q(ctx: RobotContext) -> Outcome:
     """Speeds against the change of q, of each joint while it is moved."""
     window, worst, name = ctx.tolerance("window_s"), 0.0, ""
     for phase in ctx.phases():
@@ -199,9 +198,10 @@ def speed_of_q(ctx: Context) -> Outcome:
     return ctx.failed(f"{worst:.2f} rad/s", text)
 
 
-def unused_still(ctx: Context) -> Outcome:
+@check("H1-FIELD-05")
+def unused_still(ctx: RobotContext) -> Outcome:
     """q, dq and tau_est of the slots without a motor."""
-    low, robot = _low(ctx), _recording(ctx).robot
+    low, robot = ctx.low, ctx.recording.robot
     unused = [slot for slot in range(robot.slots) if slot not in robot.used]
     for member in ("q", "dq", "tau_est"):
         values = low[f"motor_state[].{member}"][:, unused]
@@ -219,9 +219,10 @@ _BYTES = (
 )
 
 
-def byte_temperatures(ctx: Context) -> Outcome:
+@check("H1-TEMP-01")
+def byte_temperatures(ctx: RobotContext) -> Outcome:
     """The largest of the temperatures that are one byte."""
-    low, top = _low(ctx), 0.0
+    low, top = ctx.low, 0.0
     for member in _BYTES:
         values = np.nan_to_num(low[member]).reshape(len(low), -1).max(axis=1)
         bad = values > ctx.tolerance("max_c")
@@ -231,11 +232,12 @@ def byte_temperatures(ctx: Context) -> Outcome:
     return ctx.passed(f"{top:.0f}", f"at most {top:.0f} degrees")
 
 
-def motor_temperatures(ctx: Context) -> Outcome:
+@check("H1-TEMP-02")
+def motor_temperatures(ctx: RobotContext) -> Outcome:
     """Temperatures of the used motors."""
-    robot = _recording(ctx).robot
+    robot = ctx.recording.robot
     path = "temperature" if robot.family == "unitree_go" else "temperature[0]"
-    values = _low(ctx)[f"motor_state[].{path}"][:, list(robot.used)]
+    values = ctx.low[f"motor_state[].{path}"][:, list(robot.used)]
     bad = ~((values >= ctx.tolerance("min_c")) & (values <= ctx.tolerance("max_c")))
     if not bad.any():
         return ctx.passed(f"{values.min():.0f} to {values.max():.0f}")
@@ -245,9 +247,10 @@ def motor_temperatures(ctx: Context) -> Outcome:
     return _wrong_rows(ctx, bad.any(axis=1), f"{values[row, joint]:.0f}", what)
 
 
-def unit_quaternion(ctx: Context) -> Outcome:
+@check("H1-IMU-01")
+def unit_quaternion(ctx: RobotContext) -> Outcome:
     """Length of the quaternion."""
-    length = np.linalg.norm(_low(ctx)["imu_state.quaternion"], axis=1)
+    length = np.linalg.norm(ctx.low["imu_state.quaternion"], axis=1)
     bad = ~(np.abs(length - 1.0) <= ctx.tolerance("tolerance"))
     if not bad.any():
         return ctx.passed(f"{length.mean():.3f}")
@@ -255,9 +258,10 @@ def unit_quaternion(ctx: Context) -> Outcome:
     return _wrong_rows(ctx, bad, f"{first:.3f}", f"its length is {first:.3f}")
 
 
-def same_attitude(ctx: Context) -> Outcome:
+@check("H1-IMU-02")
+def same_attitude(ctx: RobotContext) -> Outcome:
     """Angles against the quaternion."""
-    low = _low(ctx)
+    low = ctx.low
     w, x, y, z = low["imu_state.quaternion"].T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
@@ -272,11 +276,12 @@ def same_attitude(ctx: Context) -> Outcome:
     return _wrong_rows(ctx, bad, f"{first:.2f} rad", what)
 
 
-def feels_gravity(ctx: Context) -> Outcome:
+@check("H1-IMU-03")
+def feels_gravity(ctx: RobotContext) -> Outcome:
     """Accelerometer and gyroscope before anything is commanded."""
     begin, end = ctx.span(ctx.phases()[0])
     rows = ctx.states.between(begin, end)
-    low = _low(ctx)
+    low = ctx.low
     force = np.linalg.norm(low["imu_state.accelerometer"][rows], axis=1)
     turning = np.linalg.norm(low["imu_state.gyroscope"][rows], axis=1)
     if not len(force):
@@ -289,9 +294,10 @@ def feels_gravity(ctx: Context) -> Outcome:
     return ctx.failed(f"{g:.2f} m/s^2", text, ctx.at(ctx.states.topic, begin, end))
 
 
-def frame_head(ctx: Context) -> Outcome:
+@check("H1-HEAD-01")
+def frame_head(ctx: RobotContext) -> Outcome:
     """The frame's first bytes."""
-    low = _low(ctx)
+    low = ctx.low
     bad = (low["head"] != (0xFE, 0xEF)).any(axis=1) | (low["level_flag"] != 0xFF)
     if not bad.any():
         return ctx.passed("FE EF FF")
@@ -300,9 +306,10 @@ def frame_head(ctx: Context) -> Outcome:
     return _wrong_rows(ctx, bad, told, f"head and level_flag are {told}")
 
 
-def battery(ctx: Context) -> Outcome:
+@check("H1-BMS-01")
+def battery(ctx: RobotContext) -> Outcome:
     """Charge and voltages."""
-    low = _low(ctx)
+    low = ctx.low
     soc, volts = low["bms_state.soc"], low["power_v"]
     cells = low["bms_state.cell_vol"].sum(axis=1) / 1e3
     bad = ~((soc >= 1) & (soc <= 100))
@@ -315,18 +322,20 @@ def battery(ctx: Context) -> Outcome:
     return _wrong_rows(ctx, bad, told, f"{told}, cells of {cells[row]:.1f} V together")
 
 
-def foot_forces(ctx: Context) -> Outcome:
+@check("H1-FOOT-01")
+def foot_forces(ctx: RobotContext) -> Outcome:
     """The smallest foot force."""
-    force = _low(ctx)["foot_force"].min(axis=1)
+    force = ctx.low["foot_force"].min(axis=1)
     bad = force < ctx.tolerance("min_force")
     if not bad.any():
         return ctx.passed(f"{force.min(initial=0.0):.0f}")
     return _wrong_rows(ctx, bad, f"{force.min():.0f}", f"a foot force of {force.min():.0f}")
 
 
-def remote(ctx: Context) -> Outcome:
+@check("H1-REMOTE-01")
+def remote(ctx: RobotContext) -> Outcome:
     """The remote's sticks."""
-    low = _low(ctx)
+    low = ctx.low
     same = low.constant("wireless_remote")  # nobody touches it in most recordings
     values = low["wireless_remote"] if same is None else same
     rows = np.ascontiguousarray(np.nan_to_num(values)).astype(np.uint8)
@@ -341,18 +350,20 @@ def remote(ctx: Context) -> Outcome:
     return _wrong_rows(ctx, wrong, "rubbish", f"sticks at {told}")
 
 
-def machine_told(ctx: Context) -> Outcome:
+@check("G1-MACH-01")
+def machine_told(ctx: RobotContext) -> Outcome:
     """The machine's kind."""
-    kinds = np.unique(_low(ctx)["mode_machine"][_low(ctx).ok])
+    kinds = np.unique(ctx.low["mode_machine"][ctx.low.ok])
     told = ", ".join(f"{k:.0f}" for k in kinds)
     if len(kinds) == 1 and kinds[0] > 0:
         return ctx.passed(told)
     return ctx.failed(told, f"mode_machine is {told}")
 
 
-def mode_told(ctx: Context) -> Outcome:
+@check("H1-MODE-01")
+def mode_told(ctx: RobotContext) -> Outcome:
     """The mode bytes while motors are held, and of the one that was turned off."""
-    robot = _recording(ctx).robot
+    robot = ctx.recording.robot
     for phase in (*ctx.phases("hold"), *ctx.phases()):
         begin, end = ctx.span(phase)
         modes = ctx.states.mode[ctx.states.between(begin + (end - begin) / 2, end)]
@@ -377,12 +388,12 @@ def mode_told(ctx: Context) -> Outcome:
 # --------------------------------------------------------------------------------------- motion
 
 
-def _index(ctx: Context, phase: Phase) -> int:
+def _index(ctx: RobotContext, phase: Phase) -> int:
     """The joint that a phase is about."""
-    return _recording(ctx).robot.used.index(int(phase.params["slot"]))
+    return ctx.recording.robot.used.index(int(phase.params["slot"]))
 
 
-def _silent(ctx: Context, phase: Phase) -> Outcome:
+def _silent(ctx: RobotContext, phase: Phase) -> Outcome:
     """No state where one is needed: a robot that has died of it, or one that was late."""
     begin, end = ctx.span(phase)
     if len(_q(ctx, end, end + _LATE)):
@@ -391,12 +402,13 @@ def _silent(ctx: Context, phase: Phase) -> Outcome:
     return ctx.failed("no state", f"no state during '{phase.name}', nor after it", place)
 
 
-def _q(ctx: Context, begin: float, end: float) -> Floats:
+def _q(ctx: RobotContext, begin: float, end: float) -> Floats:
     """Positions in [begin, end], shape (n, joints)."""
     return ctx.states.q[ctx.states.between(begin, end)]
 
 
-def follows(ctx: Context) -> Outcome:
+@check("H1-MOVE-01", "H1-SAFE-04", "H1-LIFE-02")
+def follows(ctx: RobotContext) -> Outcome:
     """Where each step of a joint ends."""
     worst, where, name = -1.0, None, ""
     for phase in ctx.phases():
@@ -420,7 +432,8 @@ def follows(ctx: Context) -> Outcome:
     return outcome.if_late(STROKE_S * worst / STEP)
 
 
-def independent(ctx: Context) -> Outcome:
+@check("H1-MOVE-02")
+def independent(ctx: RobotContext) -> Outcome:
     """How far other joints move along."""
     worst, text, where = -1.0, "", (0.0, 0.0)
     for phase in ctx.phases():
@@ -440,7 +453,9 @@ def independent(ctx: Context) -> Outcome:
     return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
 
 
-def stays(ctx: Context) -> Outcome:
+@check("H1-CRC-02", "H1-MODE-02", "H1-GAIN-04")
+@check("H1-SAFE-01", "H1-SAFE-02", "H1-SAFE-03", "G1-SAFE-05")
+def stays(ctx: RobotContext) -> Outcome:
     """How far joints move during commands that are to have no effect."""
     worst, text, where = -1.0, "", (0.0, 0.0)
     for phase in ctx.phases():
@@ -461,7 +476,8 @@ def stays(ctx: Context) -> Outcome:
     return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
 
 
-def stiffness(ctx: Context) -> Outcome:
+@check("H1-GAIN-01")
+def stiffness(ctx: RobotContext) -> Outcome:
     """How far a soft joint gives way."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -479,14 +495,15 @@ def stiffness(ctx: Context) -> Outcome:
     return ctx.failed(f"{way:.3f} rad", text, ctx.at(ctx.states.topic, begin, end))
 
 
-def _speed(ctx: Context, phase: Phase, begin: float, end: float) -> float | None:
+def _speed(ctx: RobotContext, phase: Phase, begin: float, end: float) -> float | None:
     """The mean speed of the phase's joint in [begin, end], rad/s."""
     rows = ctx.states.between(begin, end)
     t, q = ctx.states.clock[rows], ctx.states.q[rows, _index(ctx, phase)]
     return float((q[-1] - q[0]) / (t[-1] - t[0])) if len(t) > 1 and t[-1] > t[0] else None
 
 
-def velocity(ctx: Context) -> Outcome:
+@check("H1-GAIN-02")
+def velocity(ctx: RobotContext) -> Outcome:
     """The speed of a joint that is commanded one."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -500,7 +517,8 @@ def velocity(ctx: Context) -> Outcome:
     return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, begin, end))
 
 
-def torque(ctx: Context) -> Outcome:
+@check("H1-GAIN-03")
+def torque(ctx: RobotContext) -> Outcome:
     """How far a torque turns a joint."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -516,7 +534,8 @@ def torque(ctx: Context) -> Outcome:
     return ctx.failed(f"{far:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
 
 
-def torque_told(ctx: Context) -> Outcome:
+@check("H1-FORCE-01")
+def torque_told(ctx: RobotContext) -> Outcome:
     """tau_est while only tau is commanded."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -534,7 +553,8 @@ def torque_told(ctx: Context) -> Outcome:
 # ------------------------------------------------------------------------------------- watchdog
 
 
-def damps(ctx: Context) -> Outcome:
+@check("H1-WDOG-01")
+def damps(ctx: RobotContext) -> Outcome:
     """When a driven joint stands still after the last command."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -548,7 +568,8 @@ def damps(ctx: Context) -> Outcome:
     return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, after, end))
 
 
-def state_in_silence(ctx: Context) -> Outcome:
+@check("H1-WDOG-02")
+def state_in_silence(ctx: RobotContext) -> Outcome:
     """Gaps of the state while nothing is commanded."""
     limit, longest = ctx.tolerance("max_gap_s"), 0.0
     for phase in ctx.phases():
@@ -564,7 +585,8 @@ def state_in_silence(ctx: Context) -> Outcome:
     return ctx.passed(f"{longest * 1e3:.0f} ms", f"the longest gap is {longest * 1e3:.1f} ms")
 
 
-def resumes(ctx: Context) -> Outcome:
+@check("H1-WDOG-03")
+def resumes(ctx: RobotContext) -> Outcome:
     """The jump when commands come again, and the step after that."""
     hold = next(p for p in ctx.phases() if not p.targets)
     begin, end = ctx.span(hold)
@@ -579,7 +601,8 @@ def resumes(ctx: Context) -> Outcome:
     return follows(ctx)
 
 
-def bridges(ctx: Context) -> Outcome:
+@check("H1-WDOG-04")
+def bridges(ctx: RobotContext) -> Outcome:
     """The speed of a driven joint in a short pause."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -591,65 +614,3 @@ def bridges(ctx: Context) -> Outcome:
     if speed / wanted >= ctx.tolerance("low_part"):
         return ctx.passed(f"{speed:.2f} rad/s", text)
     return ctx.failed(f"{speed:.2f} rad/s", text, ctx.at(ctx.states.topic, begin, end))
-
-
-_CHECKS: Mapping[str, Check] = {
-    "TOPIC-01": discovery.state_topic,
-    "TOPIC-02": discovery.command_topic,
-    "TOPIC-03": one_publisher,
-    "QOS-01": discovery.command_qos,
-    "QOS-02": discovery.state_qos,
-    "START-01": lifecycle.state_first,
-    "FIELD-01": fields.length,
-    "FIELD-02": fields.finite,
-    "FIELD-03": within_limits,
-    "FIELD-04": speed_of_q,
-    "FIELD-05": unused_still,
-    "CRC-01": state_crc,
-    "CRC-02": stays,
-    "RATE-01": timing.mean_rate,
-    "RATE-02": timing.vendor_rate,
-    "RATE-03": timing.no_gap,
-    "ORDER-01": timing.order,
-    "TICK-01": tick_goes_on,
-    "TICK-02": tick_rate,
-    "TEMP-01": byte_temperatures,
-    "TEMP-02": motor_temperatures,
-    "IMU-01": unit_quaternion,
-    "IMU-02": same_attitude,
-    "IMU-03": feels_gravity,
-    "HEAD-01": frame_head,
-    "BMS-01": battery,
-    "FOOT-01": foot_forces,
-    "REMOTE-01": remote,
-    "MACH-01": machine_told,
-    "MODE-01": mode_told,
-    "MODE-02": stays,
-    "MOVE-01": follows,
-    "MOVE-02": independent,
-    "GAIN-01": stiffness,
-    "GAIN-02": velocity,
-    "GAIN-03": torque,
-    "GAIN-04": stays,
-    "FORCE-01": torque_told,
-    "SAFE-01": stays,
-    "SAFE-02": stays,
-    "SAFE-03": stays,
-    "SAFE-04": follows,
-    "SAFE-05": stays,
-    "WDOG-01": damps,
-    "WDOG-02": state_in_silence,
-    "WDOG-03": resumes,
-    "WDOG-04": bridges,
-    "LIFE-01": lifecycle.late_joiner,
-    "LIFE-02": follows,
-    "CLIENT-01": client_crc,
-    "CLIENT-02": client_rate,
-}
-"""By what follows the robot's name in a requirement's id."""
-
-
-@cache
-def robot_checks() -> Mapping[str, Check]:
-    """Every check of robots, by requirement id."""
-    return {r.id: _CHECKS[r.id.partition("-")[2]] for r in catalogue(None, "robot")}

@@ -10,7 +10,7 @@ import numpy as np
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.checks.motion import Step, steps, steps_of
 from dexkit.conformance.checks.timing import gaps, slow, too_slow
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 
 

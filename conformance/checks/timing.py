@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.figures import median
+from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
 # stimuli whose own requirements judge the state's flow
@@ -70,7 +70,7 @@ def _too_short(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-RATE-01", "DEX3-RATE-01")
+@check("DEX1-RATE-01", "DEX3-RATE-01", "H1-RATE-01")
 def mean_rate(ctx: Context) -> Outcome:
     """Mean rate outside of gaps."""
     clock = ctx.states.clock
@@ -94,7 +94,7 @@ def mean_rate(ctx: Context) -> Outcome:
     return ctx.passed(f"{rate:.1f} Hz", f"{rate:.1f} Hz over {seconds:.1f} s", rate_hz=rate)
 
 
-@check("DEX1-RATE-02", "DEX3-RATE-02")
+@check("DEX1-RATE-02", "DEX3-RATE-02", "H1-RATE-02")
 def vendor_rate(ctx: Context) -> Outcome:
     """Mean rate compared with the vendor's."""
     measured = _rate(ctx)
@@ -111,7 +111,7 @@ def vendor_rate(ctx: Context) -> Outcome:
     return too_slow(ctx, outcome, rate, _observed(ctx)[0])
 
 
-@check("DEX1-RATE-03", "DEX3-RATE-03")
+@check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03")
 def no_gap(ctx: Context) -> Outcome:
     """Longest silence of the state."""
     limit = ctx.tolerance("max_gap_s")
@@ -157,7 +157,7 @@ def regular(ctx: Context) -> Outcome:
     return outcome.if_late(p99 - ctx.tolerance("max_p99_s"), how="p99")
 
 
-@check("DEX1-ORDER-01", "DEX3-ORDER-01")
+@check("DEX1-ORDER-01", "DEX3-ORDER-01", "H1-ORDER-01")
 def order(ctx: Context) -> Outcome:
     """Source timestamps rise from sample to sample."""
     sent = ctx.states.sent

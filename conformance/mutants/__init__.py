@@ -11,7 +11,7 @@ from functools import cache
 
 from dexkit.conformance.mutants import any_model, fingers, gripper, operator, robot, usb
 from dexkit.conformance.mutants.registry import Mutant, expand
-from dexkit.conformance.mutants.trials import REFERENCES, plan_for, run_mutant
+from dexkit.conformance.mutants.trials import plan_for, run_mutant
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant"]
 
@@ -26,5 +26,5 @@ def mutants(layer: str | None = None) -> tuple[Mutant, ...]:
     :param layer: only those of that layer.
     """
     if layer is None:
-        return expand(REFERENCES)
+        return expand()
     return tuple(m for m in mutants() if m.layer == layer)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.virtual import Sample, Service
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.messages import message_type
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import (
@@ -23,7 +24,6 @@ from dexkit.conformance.virtual.fingers import (
     Flags,
     Ints,
 )
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Floats, Side
 
 # --------------------------------------------------------------------- discovery and start-up

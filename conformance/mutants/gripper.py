@@ -9,9 +9,9 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import LEFT, wrong_hand
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.messages import message_type
 

@@ -9,12 +9,12 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.any_model import Delayed
 from dexkit.conformance.mutants.registry import wrong_hand
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, model
 

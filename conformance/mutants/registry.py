@@ -12,17 +12,16 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from dexkit.conformance.layers import layer
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.hand import Side
 
-__all__ = ["BOTH", "LEFT", "Mutant", "References", "expand", "mix", "wrong_hand"]
+__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "wrong_hand"]
 
 LEFT = (Side.LEFT,)
 BOTH = (Side.LEFT, Side.RIGHT)
 
 C = TypeVar("C", bound=type[Any])
-References = Mapping[tuple[str, str], type[Any]]
-"""The class that meets every requirement, by layer and model."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +78,7 @@ class _Declaration:
     whole: bool
 
 
+_References = Mapping[tuple[str, str], type[Any]]  # by layer and model
 _declared: list[_Declaration] = []
 
 
@@ -119,16 +119,18 @@ def mix(fault: type[Any], reference: type[C]) -> type[C]:
     return type(fault.__name__, (fault, reference), {"__doc__": fault.__doc__})
 
 
-def expand(references: References) -> tuple[Mutant, ...]:
+def expand() -> tuple[Mutant, ...]:
     """Every wrong hand that has been declared, in the order of the requirements' catalogues."""
     every = catalogue(None, None)
+    places = dict.fromkeys((r.layer, r.model) for r in every)
+    references = {(name, model): layer(name).reference(model) for name, model in places}
     found = [m for d in _declared for m in _mutants(d, every, references)]
     order = {r.id: i for i, r in enumerate(every)}
     return tuple(sorted(found, key=lambda m: order[m.kills]))
 
 
 def _mutants(
-    declared: _Declaration, every: tuple[Requirement, ...], references: References
+    declared: _Declaration, every: tuple[Requirement, ...], references: _References
 ) -> Iterator[Mutant]:
     base = _base(declared.made, references)
     by_id = {r.id: r for r in every}
@@ -145,8 +147,8 @@ def _mutants(
                 continue
             if requirement.id != name and place in elsewhere:
                 continue
-            reference = references.get(place)
-            if reference is None or not issubclass(reference, base):
+            reference = references[place]
+            if not issubclass(reference, base):
                 continue
             yield Mutant(
                 *place,
@@ -174,6 +176,6 @@ def _is_like(requirement: Requirement, name: str, by_id: Mapping[str, Requiremen
     return True
 
 
-def _base(made: type[Any], references: References) -> type[Any]:
+def _base(made: type[Any], references: _References) -> type[Any]:
     """The class under a fault that references are made of, too."""
     return next(c for c in made.__mro__ if any(issubclass(r, c) for r in references.values()))

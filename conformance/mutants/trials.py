@@ -10,39 +10,27 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, Protocol
+from typing import Protocol
 
-from dexkit.conformance.judge import judge
+from dexkit.conformance.judge import judge, judge_layer
+from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants.registry import Mutant
-from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.conformance.robot import recording_of, robot_dialect
 from dexkit.conformance.stimuli import SCRIPTS, Plan, Session, phases_for
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
-from dexkit.conformance.usb.judge import judge_usb
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.conformance.virtual import Service, run_virtual
-from dexkit.conformance.virtual.dex5 import Dex5Service
-from dexkit.conformance.virtual.fingers import Dex3Service
-from dexkit.conformance.virtual.gripper import ReferenceService
-from dexkit.conformance.virtual.robot import ReferenceRobot
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, dialect, model
+from dexkit.models import dialect, model
 from dexkit.robots import ROBOTS
 
-__all__ = ["REFERENCES", "TRIALS", "plan_for", "run_mutant", "run_usb_mutant"]
+__all__ = ["TRIALS", "plan_for", "run_mutant", "run_usb_mutant"]
 
 SESSION_SECONDS = 4.0
-REFERENCES: dict[tuple[str, str], type[Any]] = {
-    ("dds", DEX1_1.name): ReferenceService,
-    ("dds", DEX3_1.name): Dex3Service,
-    ("dds", DEX5_1.name): Dex5Service,
-    **{("robot", name): ReferenceRobot for name in ROBOTS},
-    ("usb", DEX3_1.name): ReferenceDevice,
-}
-"""The class that meets every requirement, by layer and model."""
 _BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
 
 
@@ -95,7 +83,7 @@ def run_usb_mutant(
     device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
 ) -> list[Result]:
     """Judge a USB device on the virtual clock."""
-    return judge_usb(run_virtual_usb(device(side)), requirements)
+    return judge_layer(USB, run_virtual_usb(device(side)), requirements)
 
 
 def _blamed(results: Sequence[Result]) -> set[str]:

@@ -13,16 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.recording import Recording, SideView
 from dexkit.conformance.report.plots import Band, Level, Line, Range, chart, histogram
 from dexkit.conformance.report.wording import whose
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence, Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.usb.frames import NO_VALUE
 from dexkit.conformance.usb.record import Transfer
-from dexkit.conformance.usb.view import UsbRecording, UsbSide
-from dexkit.conformance.view import Recording, SideView
+from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, JointSpec, Side
 from dexkit.untrusted import html as escape

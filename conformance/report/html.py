@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.evidence import evidence
 from dexkit.conformance.report.overview import overview
 from dexkit.conformance.report.wording import (
@@ -40,7 +41,6 @@ from dexkit.conformance.results import (
     worst,
 )
 from dexkit.conformance.stimuli.operator import OPERATOR
-from dexkit.conformance.view import Recording
 from dexkit.documents import write_file
 from dexkit.untrusted import html as escape
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dexkit.conformance.recording import Recording, SideView
 from dexkit.conformance.report.evidence import command_and_state, operated, phase_bands
 from dexkit.conformance.report.plots import Band, Level, Line, chart, histogram
 from dexkit.conformance.report.wording import subject, whose
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
-from dexkit.conformance.view import Recording, SideView
 from dexkit.hand import JointSpec
 from dexkit.untrusted import html as escape
 

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
-from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 
@@ -159,7 +159,7 @@ def part(result: RunResult) -> str:
 
 def nature(result: RunResult) -> str:
     """``emulated``, ``simulated``, ``recorded``, or empty: how real the hand was."""
-    from dexkit.conformance.processes import BODY_EMULATORS, SIMULATED
+    from dexkit.conformance.backend_processes import BODY_EMULATORS, SIMULATED
 
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":

@@ -48,10 +48,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.parts import PARTS, Parts
 from dexkit.conformance.stimuli.hand import HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
-from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import JointMode, Side
 
 __all__ = ["FingerScript"]

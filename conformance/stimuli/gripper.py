@@ -37,9 +37,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
-from dexkit.conformance.wire import Motor, Motors
 from dexkit.hand import Side
 
 __all__ = ["GripperScript"]

@@ -8,7 +8,8 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.motor_messages import Motors, Wire
+from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli.operator import OPERATOR, operate
 from dexkit.conformance.stimuli.script import (
     Join,
@@ -25,8 +26,7 @@ from dexkit.conformance.stimuli.script import (
     StopService,
 )
 from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.view import joints_of
-from dexkit.conformance.wire import Motors, Wire
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.freshness import PAUSE
 from dexkit.hand import Side
 from dexkit.models import HandModel, model

@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from dexkit.conformance.phases import Phase
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Plan, Send, Steps
-from dexkit.conformance.wire import Motor
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, client_for, profile

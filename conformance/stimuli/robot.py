@@ -33,7 +33,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from dexkit.conformance.phases import ROBOT, Phase
+from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.robot import SPOILS, RobotWire
 from dexkit.conformance.stimuli.script import (
     Join,
@@ -45,7 +45,7 @@ from dexkit.conformance.stimuli.script import (
     Send,
     Steps,
 )
-from dexkit.conformance.wire import Motor, Motors
+from dexkit.conformance.stimulus_record import ROBOT, Phase
 from dexkit.freshness import PAUSE
 from dexkit.robots import robot
 

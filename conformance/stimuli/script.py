@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from dexkit.conformance.phased_script import PhasedScript, play
-from dexkit.conformance.phases import Phase
 from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect
 

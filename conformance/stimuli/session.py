@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dexkit.conformance.view import Commands, Recording
-from dexkit.conformance.wire import Motor, Motors
+from dexkit.conformance.motor_messages import Motor, Motors
+from dexkit.conformance.recording import Commands, Recording
 from dexkit.errors import ConformanceError, TraceError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, Dialect, model

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from dexkit.conformance.usb.record import TIMED_OUT, Descriptors
-from dexkit.conformance.usb.view import Endpoint, parse_device
+from dexkit.conformance.usb.recording import Endpoint, parse_device
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID

@@ -10,21 +10,19 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
-from dexkit.conformance.checks import Outcome
-from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.checks import BaseContext, Outcome, check
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.usb.frames import NO_VALUE, STATE_SIZE, Scale, read_command
 from dexkit.conformance.usb.record import UsbPhase, topic
+from dexkit.conformance.usb.recording import Answer, Exchange, Floats, UsbRecording, UsbSide
 from dexkit.conformance.usb.script import BUSES, DRIVEN, FREE
-from dexkit.conformance.usb.view import Answer, Exchange, Floats, UsbRecording, UsbSide
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
 
-__all__ = ["CHECKS", "UsbCheck", "UsbContext"]
+__all__ = ["UsbContext"]
 
 _ORDINARY = ("exchange", "burst", "move", "lock", "pause", "drive", "tripped", "clear")
 """Phases in which every command is a good one, followed by a wait for its answer."""
@@ -35,12 +33,8 @@ _DAMAGED = ("malformed", "broadcast", "short")
 
 
 @dataclass(frozen=True)
-class UsbContext:
-    """One requirement to be judged for one hand."""
-
-    recording: UsbRecording
-    hand: UsbSide
-    requirement: Requirement
+class UsbContext(BaseContext[UsbRecording, UsbSide]):
+    """One requirement to be judged for the USB transfers of one hand."""
 
     def tolerance(self, name: str) -> float:
         """A figure of the requirement."""
@@ -52,52 +46,17 @@ class UsbContext:
 
     def at(self, seconds: float, end: float | None = None, *, inward: bool = True) -> Evidence:
         """A place in the recording."""
-        return Evidence(
-            topic=topic(self.hand.side, inward=inward),
-            time_s=round(seconds, 4),
-            log_time_ns=self.recording.origin_ns + round(seconds * 1e9),
-            end_s=None if end is None else round(end, 4),
-        )
+        return self.place(topic(self.hand.side, inward=inward), seconds, end)
 
     def over(self, phase: UsbPhase) -> Evidence:
         """A phase as a place."""
         return self.at(*self.hand.span(phase))
 
-    def passed(self, figure: str, observed: str = "", **values: float) -> Outcome:
-        """The requirement is met."""
-        return Outcome(True, figure, observed, values={k: float(v) for k, v in values.items()})
-
-    def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
-        """It is not."""
-        plain = {k: float(v) for k, v in values.items()}
-        return Outcome(False, figure, observed, evidence=places[:5], values=plain)
-
-    def skipped(self, reason: str) -> Outcome:
-        """It cannot be judged here."""
-        return Outcome(None, reason=reason)
-
-
-UsbCheck = Callable[[UsbContext], Outcome]
-CHECKS: dict[str, UsbCheck] = {}
-"""Every check, by requirement id."""
-F = TypeVar("F", bound=UsbCheck)
-
-
-def check(name: str) -> Callable[[F], F]:
-    """Register the decorated function as the check of ``DEX3USB-name``."""
-
-    def register(function: F) -> F:
-        assert f"DEX3USB-{name}" not in CHECKS, f"{name} has two checks"
-        CHECKS[f"DEX3USB-{name}"] = function
-        return function
-
-    return register
-
 
 # ------------------------------------------------------------------------------- descriptors
 
 
-@check("DESC-01")
+@check("DEX3USB-DESC-01")
 def _ids(c: UsbContext) -> Outcome:
     device, wanted = c.hand.device, (VENDOR_ID, PRODUCT_ID[c.hand.side])
     told = f"{device.vendor:04X}:{device.product:04X}"
@@ -110,14 +69,14 @@ def _ids(c: UsbContext) -> Outcome:
     return c.failed(told, f"the {c.hand.side} hand's device is {told}{what}")
 
 
-@check("DESC-02")
+@check("DEX3USB-DESC-02")
 def _release(c: UsbContext) -> Outcome:
     release = c.hand.device.release
     told = f"{release >> 8:x}.{release & 0xFF:02x}"
     return c.passed(told) if release == 0x0100 else c.failed(told, f"bcdDevice is {told}")
 
 
-@check("DESC-03")
+@check("DEX3USB-DESC-03")
 def _strings(c: UsbContext) -> Outcome:
     device = c.hand.device
     wanted = (MANUFACTURER, PRODUCT[c.hand.side])
@@ -127,7 +86,7 @@ def _strings(c: UsbContext) -> Outcome:
     return c.failed(device.name or "none", f"the strings are {told}")
 
 
-@check("DESC-04")
+@check("DEX3USB-DESC-04")
 def _speed(c: UsbContext) -> Outcome:
     speed = c.hand.record.descriptors.speed
     if not speed:
@@ -136,7 +95,7 @@ def _speed(c: UsbContext) -> Outcome:
     return c.passed(name) if speed == 3 else c.failed(name, f"it runs at {name} speed")
 
 
-@check("DESC-05")
+@check("DEX3USB-DESC-05")
 def _endpoints(c: UsbContext) -> Outcome:
     endpoints = c.hand.device.endpoints
     bulk = Counter(e.inward for e in endpoints if e.bulk)
@@ -146,7 +105,7 @@ def _endpoints(c: UsbContext) -> Outcome:
     return c.failed(f"{bulk.total()} bulk", f"interface 0 has {told or 'no endpoints'}")
 
 
-@check("DESC-06")
+@check("DEX3USB-DESC-06")
 def _packet_size(c: UsbContext) -> Outcome:
     sizes = sorted({e.size for e in c.hand.device.endpoints if e.bulk})
     told = ", ".join(map(str, sizes))
@@ -164,7 +123,7 @@ def _ordinary(c: UsbContext) -> Iterator[Exchange]:
             yield from c.hand.exchanges(phase)
 
 
-@check("XCHG-01")
+@check("DEX3USB-XCHG-01")
 def _answered(c: UsbContext) -> Outcome:
     exchanges = list(_ordinary(c))
     silent = [x for x in exchanges if x.answer is None]
@@ -175,7 +134,7 @@ def _answered(c: UsbContext) -> Outcome:
     return c.failed(told, f"{len(silent)} of {len(exchanges)} commands got no answer", *places)
 
 
-@check("XCHG-02")
+@check("DEX3USB-XCHG-02")
 def _once(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     sent = sum(not t.inward for t in c.hand.during(phase))
@@ -187,7 +146,7 @@ def _once(c: UsbContext) -> Outcome:
     return c.failed(told, observed, *(c.at(a.t) for a in answers[sent:]))
 
 
-@check("XCHG-03")
+@check("DEX3USB-XCHG-03")
 def _unasked(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     begin, end = c.hand.span(phase)
@@ -200,7 +159,7 @@ def _unasked(c: UsbContext) -> Outcome:
     return c.failed(f"{len(found)} frames", observed, *(c.at(a.t) for a in found))
 
 
-@check("XCHG-04")
+@check("DEX3USB-XCHG-04")
 def _two(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = len(c.hand.answers_in(phase))
@@ -227,7 +186,7 @@ def _bursts(c: UsbContext) -> list[tuple[UsbPhase, list[float], float]]:
     return sorted(found, key=lambda burst: -burst[2])
 
 
-@check("RATE-01")
+@check("DEX3USB-RATE-01")
 def _rate(c: UsbContext) -> Outcome:
     bursts = _bursts(c)
     if not bursts:
@@ -241,7 +200,7 @@ def _rate(c: UsbContext) -> Outcome:
     return outcome.if_late(1 / rate - 1 / c.tolerance("min_rate_hz"), how="mean")
 
 
-@check("RATE-02")
+@check("DEX3USB-RATE-02")
 def _latency(c: UsbContext) -> Outcome:
     bursts = _bursts(c)
     if not bursts:
@@ -275,14 +234,14 @@ def _all(
     return c.failed(told, f"{told} frames have {what}", *(c.at(a.t) for a in wrong))
 
 
-@check("SIZE-01")
+@check("DEX3USB-SIZE-01")
 def _size(c: UsbContext) -> Outcome:
     sizes = Counter(a.reading.length for a in c.hand.answers)
     told = ", ".join(f"{n} bytes ({times})" for n, times in sizes.most_common(4))
     return _all(c, lambda a: a.reading.length == STATE_SIZE, f"another size: {told}")
 
 
-@check("SIZE-02")
+@check("DEX3USB-SIZE-02")
 def _both_sizes(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     joint = phase.params["joint"]
@@ -295,32 +254,32 @@ def _both_sizes(c: UsbContext) -> Outcome:
     return c.failed(f"not {size}", observed, c.over(phase))
 
 
-@check("HEAD-01")
+@check("DEX3USB-HEAD-01")
 def _head(c: UsbContext) -> Outcome:
     heads = {a.reading.head.hex(" ") for a in c.hand.answers} - {"fc fd"}
     return _all(c, lambda a: a.reading.head == b"\xfc\xfd", f"the head {', '.join(sorted(heads))}")
 
 
-@check("CRC-01")
+@check("DEX3USB-CRC-01")
 def _frame_crc(c: UsbContext) -> Outcome:
     return _all(c, lambda a: a.reading.crc_right, "a wrong CRC")
 
 
-@check("CRC-02")
+@check("DEX3USB-CRC-02")
 def _motor_crc(c: UsbContext) -> Outcome:
     if not any(a.reading.motors for a in c.hand.answers):
         return c.skipped("no motor packet came")
     return _all(c, lambda a: all(m.intact for m in a.reading.motors), "a damaged motor packet")
 
 
-@check("CRC-03")
+@check("DEX3USB-CRC-03")
 def _sensor_crc(c: UsbContext) -> Outcome:
     if not any(a.reading.sensors for a in c.hand.answers):
         return c.skipped("no sensor packet came")
     return _all(c, lambda a: all(s.intact for s in a.reading.sensors), "a damaged sensor packet")
 
 
-@check("PACK-01")
+@check("DEX3USB-PACK-01")
 def _whole(c: UsbContext) -> Outcome:
     odd = next((a.reading.strange[0] for a in c.hand.answers if a.reading.strange), "")
     return _all(c, lambda a: not a.reading.strange, odd)
@@ -335,7 +294,7 @@ def _to_all(c: UsbContext) -> list[Answer]:
     return [x.answer for x in _ordinary(c) if x.answer is not None]
 
 
-@check("PACK-02")
+@check("DEX3USB-PACK-02")
 def _seven(c: UsbContext) -> Outcome:
     def good(answer: Answer) -> bool:
         places = _places(answer)
@@ -348,7 +307,7 @@ def _seven(c: UsbContext) -> Outcome:
     return _all(c, good, f"{len(odd)} motors (bus.id): {told}", answers)
 
 
-@check("PACK-03")
+@check("DEX3USB-PACK-03")
 def _map(c: UsbContext) -> Outcome:
     answers = _to_all(c)
     odd = next((_places(a) for a in answers if _places(a) != sorted(BUSES)), [])
@@ -357,7 +316,7 @@ def _map(c: UsbContext) -> Outcome:
     return _all(c, lambda a: _places(a) == good, f"motors at (bus.id) {told}", answers)
 
 
-@check("PACK-04")
+@check("DEX3USB-PACK-04")
 def _nine(c: UsbContext) -> Outcome:
     def good(answer: Answer) -> bool:
         places = [(s.bus, s.id) for s in answer.reading.sensors]
@@ -367,7 +326,7 @@ def _nine(c: UsbContext) -> Outcome:
     return _all(c, good, f"{', '.join(map(str, counts))} sensor packets, or one twice")
 
 
-@check("SENS-01")
+@check("DEX3USB-SENS-01")
 def _elements(c: UsbContext) -> Outcome:
     def elements(answer: Answer) -> int:
         return sum(p != NO_VALUE for s in answer.reading.sensors for p in s.pressure)
@@ -377,7 +336,7 @@ def _elements(c: UsbContext) -> Outcome:
     return _all(c, lambda a: elements(a) == 33, f"{told} values that are not {NO_VALUE}")
 
 
-@check("VALUE-01")
+@check("DEX3USB-VALUE-01")
 def _supply(c: UsbContext) -> Outcome:
     volts = np.array([a.reading.pin_v for a in c.hand.answers])
     low, high = c.tolerance("min_v"), c.tolerance("max_v")
@@ -389,7 +348,7 @@ def _supply(c: UsbContext) -> Outcome:
     return outcome
 
 
-@check("VALUE-02")
+@check("DEX3USB-VALUE-02")
 def _errors(c: UsbContext) -> Outcome:
     (phase,) = c.hand.phases("exchange")
     answers = c.hand.answers_in(phase)
@@ -442,7 +401,7 @@ def _quiet_motors(
     return c.passed(f"{most:.3f} rad", moved=most)
 
 
-@check("MODE-01")
+@check("DEX3USB-MODE-01")
 def _mode(c: UsbContext) -> Outcome:
     judged = 0
     for phase in c.hand.record.phases:
@@ -460,7 +419,7 @@ def _mode(c: UsbContext) -> Outcome:
     return c.passed("0 and 1") if judged else c.skipped("no answer to judge by")
 
 
-@check("MODE-02")
+@check("DEX3USB-MODE-02")
 def _lock(c: UsbContext) -> Outcome:
     return _quiet_motors(c, c.phases(), lambda phase: "although it was to lock")
 
@@ -470,7 +429,7 @@ def _moves(c: UsbContext) -> Iterator[tuple[UsbPhase, int, float, float]]:
         yield phase, phase.params["joint"], phase.params["begin"], phase.params["target"]
 
 
-@check("MOVE-01")
+@check("DEX3USB-MOVE-01")
 def _follows(c: UsbContext) -> Outcome:
     parts: dict[str, float] = {}
     wrong = []
@@ -487,7 +446,7 @@ def _follows(c: UsbContext) -> Outcome:
     return c.failed(told, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
 
 
-@check("MOVE-02")
+@check("DEX3USB-MOVE-02")
 def _others(c: UsbContext) -> Outcome:
     most = 0.0
     earlier: set[int] = set()
@@ -504,7 +463,7 @@ def _others(c: UsbContext) -> Outcome:
     return c.passed(f"{most:.3f} rad", moved=most)
 
 
-@check("MOVE-03")
+@check("DEX3USB-MOVE-03")
 def _limits(c: UsbContext) -> Outcome:
     margin = c.tolerance("margin")
     beyond = 0.0
@@ -520,7 +479,7 @@ def _limits(c: UsbContext) -> Outcome:
     return c.passed(f"{beyond:.3f} rad beyond")
 
 
-@check("UNIT-01")
+@check("DEX3USB-UNIT-01")
 def _speed_unit(c: UsbContext) -> Outcome:
     ratios: dict[str, float] = {}
     for phase, joint, _, _ in _moves(c):
@@ -539,7 +498,7 @@ def _speed_unit(c: UsbContext) -> Outcome:
     return _ratio(c, ratios, "the integrated speed is {:.2f} of the way of {}")
 
 
-@check("UNIT-02")
+@check("DEX3USB-UNIT-02")
 def _torque_unit(c: UsbContext) -> Outcome:
     ratios: dict[str, float] = {}
     for phase, joint, _, _ in _moves(c):
@@ -591,7 +550,7 @@ def _named(c: UsbContext, joints: list[int]) -> str:
     return ", ".join(c.hand.joints[i].name for i in joints)
 
 
-@check("PROT-01")
+@check("DEX3USB-PROT-01")
 def _trips(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)
@@ -627,7 +586,7 @@ def _driven(c: UsbContext, joint: int) -> float | None:
 _NO_SPEED = "the motor was not driven before the silence, so its stop proves nothing"
 
 
-@check("PROT-02")
+@check("DEX3USB-PROT-02")
 def _stops(c: UsbContext) -> Outcome:
     (silence,) = c.phases()
     driven = _driven(c, DRIVEN)
@@ -640,7 +599,7 @@ def _stops(c: UsbContext) -> Outcome:
     return c.failed(told, observed, c.over(silence), driven_s=driven)
 
 
-@check("PROT-03")
+@check("DEX3USB-PROT-03")
 def _stays(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)
@@ -658,7 +617,7 @@ def _stays(c: UsbContext) -> Outcome:
     return c.failed(f"{moved:.2f} rad", observed, c.over(phase), moved=moved)
 
 
-@check("PROT-04")
+@check("DEX3USB-PROT-04")
 def _cleared(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)
@@ -675,7 +634,7 @@ def _cleared(c: UsbContext) -> Outcome:
     return c.failed(told, f"after clearing it went {told}", c.over(phase))
 
 
-@check("PROT-05")
+@check("DEX3USB-PROT-05")
 def _disabled(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)
@@ -698,7 +657,7 @@ def _disabled(c: UsbContext) -> Outcome:
     return c.failed(told, f"after the silence it went {told}", c.over(phase))
 
 
-@check("PROT-06")
+@check("DEX3USB-PROT-06")
 def _early(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)
@@ -723,15 +682,15 @@ def _harmless(name: str, *kinds: str) -> None:
         return _quiet_motors(c, phases, lambda p: f"on the frame '{p.params['kind']}'")
 
 
-_harmless("BAD-01", "frame-crc")
-_harmless("BAD-02", "packet-crc", "packet-head")
-_harmless("BAD-03", "truncated")
-_harmless("BAD-04", "over-long")
-_harmless("BAD-05", "size-241", "size-huge")
-_harmless("BAD-06", "wrong-id")
+_harmless("DEX3USB-BAD-01", "frame-crc")
+_harmless("DEX3USB-BAD-02", "packet-crc", "packet-head")
+_harmless("DEX3USB-BAD-03", "truncated")
+_harmless("DEX3USB-BAD-04", "over-long")
+_harmless("DEX3USB-BAD-05", "size-241", "size-huge")
+_harmless("DEX3USB-BAD-06", "wrong-id")
 
 
-@check("BAD-07")
+@check("DEX3USB-BAD-07")
 def _goes_on(c: UsbContext) -> Outcome:
     judged = 0
     for phase in c.hand.record.phases:
@@ -746,7 +705,7 @@ def _goes_on(c: UsbContext) -> Outcome:
     return c.passed(f"{judged} answers") if judged else c.skipped("no good command was sent after")
 
 
-@check("BAD-08")
+@check("DEX3USB-BAD-08")
 def _broadcast(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     begin, target = phase.params["begin"], phase.params["target"]
@@ -764,7 +723,7 @@ def _broadcast(c: UsbContext) -> Outcome:
 # -------------------------------------------------------------------------------- connection
 
 
-@check("CONN-01")
+@check("DEX3USB-CONN-01")
 def _again(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     exchanges = c.hand.exchanges(phase)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from dexkit.conformance.phases import Beats, Stall, stalls_of, time_of
+from dexkit.conformance.stimulus_record import Beats, Stall, stalls_of, time_of
 from dexkit.conformance.usb import RECORD
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported

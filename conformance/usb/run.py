@@ -21,6 +21,7 @@ from dexkit.conformance.usb.record import (
     UsbRecord,
     topic,
 )
+from dexkit.conformance.usb.recording import Endpoint
 from dexkit.conformance.usb.script import (
     Action,
     Alone,
@@ -32,7 +33,6 @@ from dexkit.conformance.usb.script import (
     UsbScript,
     Wait,
 )
-from dexkit.conformance.usb.view import Endpoint
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
 from dexkit.traces.recorder import Recorder

@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.service import Sample, Service
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel

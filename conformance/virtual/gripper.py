@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.service import Service
-from dexkit.conformance.wire import Motor
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, Dialect
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.phases import ROBOT
 from dexkit.conformance.robot import RobotWire
+from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.conformance.virtual.service import Sample, Service
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
-from dexkit.conformance.wire import Motor
 from dexkit.errors import WireError
 from dexkit.hand import Side
 from dexkit.models import Dialect

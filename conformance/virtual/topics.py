@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
+from dexkit.conformance.motor_messages import Wire
 from dexkit.conformance.phased_script import play
-from dexkit.conformance.phases import RECORD, Stimulus
 from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli import (
     Action,
@@ -21,9 +21,9 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.conformance.virtual.service import Sample, Service
-from dexkit.conformance.wire import Wire
 from dexkit.hand import Side
 
 __all__ = ["ORIGIN_NS", "log_time_ns", "run_virtual"]

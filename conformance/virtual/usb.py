@@ -25,6 +25,7 @@ from dexkit.conformance.usb.frames import (
     crc,
 )
 from dexkit.conformance.usb.record import TIMED_OUT, Descriptors, SideRecord, Transfer
+from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.conformance.usb.script import BUSES as MAP
 from dexkit.conformance.usb.script import (
     Action,
@@ -37,7 +38,6 @@ from dexkit.conformance.usb.script import (
     UsbScript,
     Wait,
 )
-from dexkit.conformance.usb.view import UsbRecording, UsbSide
 from dexkit.conformance.virtual.topics import ORIGIN_NS, log_time_ns
 from dexkit.hand import Side
 from dexkit.models import DEX3_1

@@ -81,10 +81,10 @@ def command(
     """
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
+    from dexkit.conformance.recording import sides_of
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import catalogue, select
     from dexkit.conformance.robot import recording_of, robot_in
-    from dexkit.conformance.view import sides_of
     from dexkit.traces import open_trace
 
     view, model_name, also = None, None, ""

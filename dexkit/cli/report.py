@@ -11,8 +11,8 @@ from dexkit.documents import write_file
 from dexkit.errors import UsageError
 
 if TYPE_CHECKING:
+    from dexkit.conformance.recording import Recording
     from dexkit.conformance.results import RunResult
-    from dexkit.conformance.view import Recording
 
 _SIDES = ("left", "right")
 _FILE = click.Path(path_type=Path)
@@ -97,8 +97,8 @@ def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
 
     :raises UsageError: the one that was named is not the one that was judged.
     """
+    from dexkit.conformance.recording import Recording
     from dexkit.conformance.report.wording import moment
-    from dexkit.conformance.view import Recording
     from dexkit.hand import Side
     from dexkit.traces import open_trace
 

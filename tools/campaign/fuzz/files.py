@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, Writer
 from dexkit.backends import BackendOptions
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.phases import Stimulus
+from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.compare import (
     Comparison,
@@ -32,8 +32,8 @@ from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import render_markdown
 from dexkit.conformance.report.terminal import print_result
 from dexkit.conformance.results import read_json
+from dexkit.conformance.stimulus_record import Stimulus
 from dexkit.conformance.usb.record import UsbRecord
-from dexkit.conformance.view import Recording
 from dexkit.console import Console
 from dexkit.doctor.environment import uri_problem
 from dexkit.drivers.dex1_serial import settings as dex1_settings

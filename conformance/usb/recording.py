@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.phases import Beats, Lost, Stall
+from dexkit.conformance.stimulus_record import Beats, Lost, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -270,6 +270,10 @@ class UsbRecording:
         sides = {s: replace(side, origin_ns=origin_ns) for s, side in self.sides.items()}
         return UsbRecording(origin_ns, sides, self.stalls, self.beats)
 
+    def log_time(self, seconds: float) -> int:
+        """The log time, nanoseconds, of a second of the recording."""
+        return self.origin_ns + round(seconds * 1e9)
+
     def starved(self, begin: float, end: float) -> float:
         """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         if end <= begin:
@@ -288,10 +292,8 @@ class UsbRecording:
         """Median and 99th percentile, seconds, by which the kit itself was late in [begin, end];
         None if that is not known.
         """
-        times = (self.origin_ns + round(t * 1e9) for t in (begin, end))
-        return self.beats.lateness(*times)
+        return self.beats.lateness(self.log_time(begin), self.log_time(end))
 
     def lost(self, begin: float, end: float) -> Lost | None:
         """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
-        times = (self.origin_ns + round(t * 1e9) for t in (begin, end))
-        return self.beats.lost(*times)
+        return self.beats.lost(self.log_time(begin), self.log_time(end))

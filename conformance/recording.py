@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.figures import median
-from dexkit.conformance.phases import RECORD, Lost, Phase, Stimulus
+from dexkit.conformance.median import median
+from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
 from dexkit.conformance.usb import RECORD as USB_RECORD
-from dexkit.conformance.wire import Wire
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side
 from dexkit.messages.columns import Columns
@@ -27,7 +27,7 @@ from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 
 if TYPE_CHECKING:
-    from dexkit.conformance.usb.view import UsbRecording
+    from dexkit.conformance.usb.recording import UsbRecording
 
 __all__ = [
     "Commands",
@@ -329,7 +329,7 @@ def joints_of(dialect: Dialect, side: Side) -> tuple[JointSpec, ...]:
 def _usb(trace: TraceLike) -> UsbRecording | None:
     if USB_RECORD not in trace.metadata:
         return None
-    from dexkit.conformance.usb.view import UsbRecording  # few recordings have it
+    from dexkit.conformance.usb.recording import UsbRecording  # few recordings have it
 
     return UsbRecording.of(trace)
 

@@ -1,0 +1,88 @@
+"""The layers at which a device is judged: a hand's DDS topics, a robot's DDS topics, a hand's USB.
+
+A :class:`Layer` is the data by which the one engine (:mod:`dexkit.conformance.judge`) goes from a
+recording to verdicts. Each layer is in a module of its own, imported when it is asked for:
+
+* :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
+* :mod:`~dexkit.conformance.layers.robot`: ``robot``, the low-level DDS topics of robots;
+* :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from dexkit.conformance.checks import BaseContext, Outcome
+from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.results import Result
+from dexkit.conformance.verdicts import Judgement
+
+if TYPE_CHECKING:
+    from dexkit.hand import Side
+
+__all__ = ["Layer", "Precondition", "claimed", "layer", "not_blocked"]
+
+
+RecordingT = TypeVar("RecordingT")
+ViewT = TypeVar("ViewT")
+ContextT = TypeVar("ContextT", bound=BaseContext[Any, Any])
+
+Precondition = Callable[[Judgement, ContextT], "Result | None"]
+"""The result, where a requirement is not to be checked at all."""
+
+
+@dataclass(frozen=True)
+class Layer(Generic[RecordingT, ViewT, ContextT]):
+    """How one layer is judged.
+
+    :param name: one of :data:`~dexkit.conformance.requirements.LAYERS`; it selects the catalogue
+        and, in :data:`~dexkit.conformance.checks.CHECK_MODULES`, the checks.
+    :param subjects: the part of a recording that is about each subject to be judged.
+    :param context: what a check of the layer gets.
+    :param preconditions: what is asked before the check, in this order; the first that has a
+        result decides.
+    :param refine: adds to an outcome what the recording says beside the check.
+    :param whole: begin and end of the recording, seconds, as the place of failures that have
+        none; None where such a failure cannot be excused by a busy machine.
+    :param script: the stimulus script of a model, by the model's name.
+    :param reference: the simulated device of a model that meets every requirement, likewise.
+    """
+
+    name: str
+    subjects: Callable[[RecordingT], Mapping[Side, ViewT]]
+    context: Callable[[RecordingT, ViewT, Requirement], ContextT]
+    preconditions: Sequence[Precondition[ContextT]]
+    refine: Callable[[ContextT, Outcome], Outcome]
+    whole: Callable[[RecordingT], tuple[float, float] | None]
+    script: Callable[[str], type]
+    reference: Callable[[str], type]
+
+    def requirements(self, model: str | None = None) -> tuple[Requirement, ...]:
+        """The layer's requirements, in their order.
+
+        :param model: only those of that model; None for all.
+        """
+        return catalogue(model, self.name)
+
+
+_MODULES = {"dds": "hand", "robot": "robot", "usb": "usb"}
+
+
+def layer(name: str) -> Layer[Any, Any, Any]:
+    """The layer of that name, one of :data:`~dexkit.conformance.requirements.LAYERS`."""
+    module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+    found: Layer[Any, Any, Any] = module.LAYER
+    return found
+
+
+def claimed(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
+    """A precondition: the vendor does not disclaim the unit that the requirement is about."""
+    return judgement.not_claimed()
+
+
+def not_blocked(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
+    """A precondition: nothing has failed that the requirement depends on."""
+    return judgement.blocked()

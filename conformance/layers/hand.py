@@ -1,0 +1,122 @@
+"""The layer ``dds``: hands, judged by what a recording holds of their DDS topics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from dexkit.conformance.checks import Context, Outcome
+from dexkit.conformance.layers import Layer, claimed, not_blocked
+from dexkit.conformance.recording import Recording, SideView
+from dexkit.conformance.results import Result
+from dexkit.conformance.verdicts import Judgement
+from dexkit.hand import Side
+
+__all__ = ["LAYER", "applies_to_dialect", "recorded", "subjects", "whole", "with_silence"]
+
+_SILENT = 0.5
+"""Seconds without state, at the end of a failure's place, that are no mere gap."""
+_NOT_OURS = (
+    "the kit ends and starts only a service that it has started itself (not --backend external)"
+)
+_REMEDY = {
+    "squeeze": "put something between the fingers, and say where it is felt (--object {side}=PCT)",
+    "shutdown": _NOT_OURS,
+    "service-restart": _NOT_OURS,
+}
+"""What to do, or why not, where a stimulus was not applied."""
+
+
+def subjects(recording: Recording) -> Mapping[Side, SideView]:
+    """The subjects to be judged."""
+    return {side: recording.sides[side] for side in recording.judged}
+
+
+def whole(recording: Recording) -> tuple[float, float]:
+    """Begin and end of the recording, seconds."""
+    return 0.0, recording.duration
+
+
+def applies_to_dialect(judgement: Judgement, context: Context) -> Result | None:
+    """A precondition: the requirement is about the recording's dialect."""
+    dialect = context.recording.dialect.name
+    if dialect in judgement.requirement.dialects:
+        return None
+    return judgement.not_applicable(f"does not apply to the dialect {dialect}")
+
+
+def recorded(judgement: Judgement, context: Context) -> Result | None:
+    """A precondition: the recording has the stimulus, endpoints or commands that are needed."""
+    missing = _missing(context)
+    return judgement.not_applicable(missing) if missing else None
+
+
+def _missing(context: Context) -> str:
+    """What the recording lacks for this requirement, or nothing."""
+    requirement, recording = context.requirement, context.recording
+    if requirement.phase:
+        if recording.stimulus is None:
+            return f"needs the stimulus '{requirement.phase}', which only a live run applies"
+        why = _REMEDY.get(requirement.phase, "")
+        why = f": {why.format(side=context.side)}" if why else ""
+        if not recording.phases(requirement.phase):
+            return f"the stimulus '{requirement.phase}' was not applied in this run{why}"
+        other = requirement.needs.startswith("other-")
+        if not other and not context.phases():
+            to = f"the {context.side} hand"
+            return f"the stimulus '{requirement.phase}' was not applied to {to}{why}"
+    if requirement.needs == "endpoints" and not recording.endpoints:
+        return "the recording does not say who published and subscribed (record dds_endpoints)"
+    if requirement.needs in ("commands", "session") and not len(context.commands):
+        return "no commands to this hand in the recording"
+    return ""
+
+
+def with_silence(context: Context, outcome: Outcome) -> Outcome:
+    """The outcome; a failure after the last state of all gets that as its cause."""
+    states, commands = context.states, context.commands
+    ends = [e.end_s for e in outcome.evidence if e.end_s is not None]
+    if not ends and len(commands):  # no state, so no place either
+        ends = [float(commands.t[-1])]
+    if outcome.met is not False or not len(states) or not ends:
+        return outcome
+    last = float(states.t[-1])
+    if max(ends) < last + _SILENT:
+        return outcome
+    return replace(
+        outcome,
+        cause=f"The hand fell silent for good at {last:.1f} s: has its service ended, or does it "
+        "hang? Its own log may say why.",
+    )
+
+
+def _script(model: str) -> type:
+    from dexkit.conformance.stimuli import SCRIPTS
+
+    return SCRIPTS[model]
+
+
+def _reference(model: str) -> type:
+    from dexkit.conformance.virtual.dex5 import Dex5Service
+    from dexkit.conformance.virtual.fingers import Dex3Service
+    from dexkit.conformance.virtual.gripper import ReferenceService
+    from dexkit.models import DEX1_1, DEX3_1, DEX5_1
+
+    references = {
+        DEX1_1.name: ReferenceService,
+        DEX3_1.name: Dex3Service,
+        DEX5_1.name: Dex5Service,
+    }
+    return references[model]
+
+
+LAYER: Layer[Recording, SideView, Context] = Layer(
+    name="dds",
+    subjects=subjects,
+    context=Context,
+    preconditions=(applies_to_dialect, claimed, recorded, not_blocked),
+    refine=with_silence,
+    whole=whole,
+    script=_script,
+    reference=_reference,
+)
