@@ -17,7 +17,7 @@ from dexkit.cli.check import command
 from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.live import LiveOptions, free_domain, record_run
+from dexkit.conformance.live import LiveOptions, record_run
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import Outcome, try_one
@@ -46,6 +46,7 @@ from dexkit.traces import Recorder, TraceEndpoint, open_trace
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import crc_of, verify_payload
 from tests.conformance_helpers import copy_of, short_run
+from tests.dds_helpers import free_domain
 from tests.test_conformance_schema import validate
 
 NAMES = list(ROBOTS)
