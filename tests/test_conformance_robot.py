@@ -142,10 +142,6 @@ def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> 
     every = catalogue(name, "robot")
     assert {m.kills for m in mutants() if m.model == name} == {r.id for r in every}
     assert all(check_of(r) for r in every)
-    negative = ("SAFE", "WDOG", "CRC", "MODE-02", "GAIN-04", "MOVE-02", "ORDER", "RATE-03")
-    negative += ("TOPIC-03", "QOS-01", "FIELD-02", "FIELD-05", "TICK-01", "LIFE-02")
-    found = [r for r in every if r.id.partition("-")[2].startswith(negative)]
-    assert len(found) >= len(every) / 3
 
 
 @pytest.mark.parametrize("name", NAMES)
