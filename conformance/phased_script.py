@@ -33,7 +33,7 @@ class PhasedScript(ABC, Generic[A, O, P]):
     """A stimulus that marks its phases.
 
     :param start: what is known before the first action.
-    :param say: told what happens, in plain words.
+    :param say: called with progress messages for the user.
     :ivar phases: what was done when, on the recording's clock; kept with the recording.
     """
 

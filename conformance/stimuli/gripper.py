@@ -25,7 +25,7 @@ resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
-shutdown       the service is told to end, and started again
+shutdown       the service is stopped and started again
 service-       a step after that
 restart
 ============== =====================================================================================

@@ -340,7 +340,7 @@ class HandScript(Script):
 
     def _service_restart(self) -> Steps:
         """End the service and start it again, where the kit can."""
-        self._say("the service is told to end, and started again")
+        self._say("the service is stopped and started again")
         phase = self._begin("shutdown", self.plan.sides)
         yield from self._do(StopService())
         if not self._obs.stopped:

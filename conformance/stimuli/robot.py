@@ -6,13 +6,13 @@ middle of its range. All but the first two phases are about one joint, the right
 ============== =====================================================================================
 listen         nothing is sent; state must flow, and nothing move
 hold           every motor holds where it is
-joint          each joint in turn by a fifth of a radian; ``params["slot"]`` says which
+joint          each joint in turn by a fifth of a radian; its slot is ``params["slot"]``
 stiffness      a quarter of the client's kp, and a torque against it
 velocity       kp 0, a speed, kd
 torque         kp and kd 0, a torque, until the joint has moved
 limp           kp 0, and a q elsewhere
 off            mode 0, and a command that asks to move
-wrong-crc      commands that ask to move, with wrong CRCs; ``params["kind"]`` says which
+wrong-crc      commands that ask to move, with wrong CRCs; their kind is ``params["kind"]``
 nan            commands that ask to move, with NaN or infinity somewhere; ``params["kind"]``
 unused         a slot without a motor is driven
 machine        commands for another machine (robots whose messages have ``mode_machine``)

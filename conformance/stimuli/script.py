@@ -68,7 +68,7 @@ class Role(Enum):
 
 @dataclass(frozen=True)
 class Observation:
-    """What a player tells the script.
+    """What a player has observed after an action.
 
     :param now_ns: the recording's clock.
     :param q: newest pose of each side that has published one; dq likewise.

@@ -12,7 +12,7 @@ burst          commands to lock as fast as they are answered; three times, at di
 pair           two commands at once
 move           each motor in turn to a new position, by 0.2 rad; the others hold
 lock           position commands with status 0: nothing may move
-malformed      damaged frames that ask every motor to move; ``params["kind"]`` says which damage
+malformed      damaged frames that ask every motor to move; their kind is ``params["kind"]``
 broadcast      one packet with id 15 on the middle finger's bus
 short          the other size of the command frame, with a small step of the index finger
 pause          0.6 s without a command, protected: too short to trip
@@ -86,7 +86,7 @@ _LONGEST = 4096  # room for an answer, bytes; BUF_SIZE of the manual
 
 @dataclass(frozen=True)
 class Observation:
-    """What a player tells the script.
+    """What a player has observed after an action.
 
     :param status: of the transfer: 0, or a negative errno.
     :param data: bytes from the device.
