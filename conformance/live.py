@@ -18,6 +18,7 @@ from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.phased_script import play
 from dexkit.conformance.robot import wire_for
 from dexkit.conformance.stimuli import (
     Action,
@@ -239,19 +240,15 @@ class _Driver:
 
     def go_through(self, script: Script, stop: threading.Event) -> bool:
         """Run the script; False when it was stopped."""
-        steps = script.run()
-        action = next(steps)
-        while not stop.is_set():
-            self.sole.poll()
-            self._do(action)
-            dead = self.rig.dead()
-            if dead is not None:
-                raise ConformanceError(f"{dead!r} has ended", hint=dead.last_words)
-            try:
-                action = steps.send(self._observe())
-            except StopIteration:
-                return True
-        return False
+        return play(script, self._carry_out, stop.is_set)
+
+    def _carry_out(self, action: Action) -> Observation:
+        self.sole.poll()
+        self._do(action)
+        dead = self.rig.dead()
+        if dead is not None:
+            raise ConformanceError(f"{dead!r} has ended", hint=dead.last_words)
+        return self._observe()
 
     def _do(self, action: Action) -> None:
         if isinstance(action, Send):

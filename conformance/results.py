@@ -345,6 +345,7 @@ class RunResult:
 
 def _result_dict(result: Result) -> dict[str, Any]:
     requirement = asdict(result.requirement)
+    del requirement["negative"]  # about the catalogue, no part of the format
     requirement["level"] = str(result.requirement.level)
     requirement["plots"] = [str(plot) for plot in result.requirement.plots]
     return {

@@ -22,7 +22,7 @@ T = TypeVar("T")
 class Lazy(Generic[T]):
     """An object of type ``T`` that is imported by :meth:`load`.
 
-    :param target: ``package.module:attribute``.
+    :param target: ``package.module:attribute``, or ``package.module`` for the module itself.
     """
 
     target: str

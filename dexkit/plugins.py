@@ -35,7 +35,7 @@ def where(error: BaseException) -> str:
 
 
 def import_object(target: str, error_class: type[DexkitError], *, hint: str) -> object:
-    """The object at ``package.module:attribute``.
+    """The object at ``package.module:attribute``, or the module at ``package.module``.
 
     :param error_class: raised, naming the cause, when it cannot be imported.
     :param hint: what the target should be, for an attribute that is not there.
@@ -48,7 +48,7 @@ def import_object(target: str, error_class: type[DexkitError], *, hint: str) -> 
             f"cannot load {target}: {type(error).__name__}: {error}",
             hint=_import_hint(error, module_name),
         ) from error
-    for part in attribute.split("."):
+    for part in attribute.split(".") if attribute else ():
         if not hasattr(value, part):
             raise error_class(
                 f"cannot load {target}: there is no {part!r} in {module_name}", hint=hint

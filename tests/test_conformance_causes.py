@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.checks.causes import of_positions, of_scale, of_type
-from dexkit.conformance.mutants import MUTANTS, run_mutant
+from dexkit.conformance.mutants import mutants, run_mutant
+from dexkit.conformance.mutants.trials import HandTrial
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.results import Verdict
 from dexkit.hand import Side
@@ -77,8 +78,8 @@ def test_types_of_another_hand_are_told() -> None:
     ],
 )
 def test_a_wrong_hand_is_told_its_own_mistake(mutant: str, requirement: str, says: str) -> None:
-    wrong = next(m for m in MUTANTS if m.name == mutant and m.kills == requirement)
-    result = run_mutant(wrong.service, wrong.plan)
+    wrong = next(m for m in mutants() if m.name == mutant and m.kills == requirement)
+    result = run_mutant(wrong.made, HandTrial().plan(wrong))
     found = next(
         r for r in result.results if (r.requirement.id, r.verdict) == (requirement, Verdict.FAIL)
     )

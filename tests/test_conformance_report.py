@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.judge import judge, judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.mutants import MUTANTS, gripper, plan_for
+from dexkit.conformance.mutants import gripper, mutants, plan_for
+from dexkit.conformance.mutants import usb as wrong_usb
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.html import render
@@ -22,9 +23,8 @@ from dexkit.conformance.report.labels import VERDICTS
 from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
-from dexkit.conformance.usb import mutants as usb_mutants
-from dexkit.conformance.usb.virtual import run_virtual as run_usb
 from dexkit.conformance.virtual import run_virtual
+from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
 from tests.conformance_helpers import copy_of, of, short_run
@@ -201,7 +201,7 @@ def test_text_has_contrast(failing: str, theme: str) -> None:
 
 
 PLAN = plan_for(sides=(Side.LEFT,))
-WRONG = {m.name: m.service for m in MUTANTS if m.model == "dex1-1"}
+WRONG = {m.name: m.made for m in mutants() if m.model == "dex1-1"}
 
 
 @pytest.mark.parametrize(
@@ -242,16 +242,16 @@ def test_a_failure_shows_the_plots_of_its_requirement(
 
 def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
     kinds = {
-        usb_mutants.StaleCrc: "transfer from the hand",
-        usb_mutants.Backwards: "joint positions in the answers",
-        usb_mutants.OtherRelease: "<td>2.00</td>",
-        usb_mutants.Slow: "from command to answer",
+        wrong_usb.StaleCrc: "transfer from the hand",
+        wrong_usb.Backwards: "joint positions in the answers",
+        wrong_usb.OtherRelease: "<td>2.00</td>",
+        wrong_usb.Slow: "from command to answer",
     }
     view = Recording.of(short_run())
     every = catalogue("dex3-1", "usb")
     for device, title in kinds.items():
-        kills = next(m.kills for m in usb_mutants.MUTANTS if m.device is device)
-        usb = run_usb(device(Side.LEFT))
+        kills = next(m.kills for m in mutants() if m.made is device)
+        usb = run_virtual_usb(device(Side.LEFT))
         found = next(r for r in judge_layer(USB, usb, every) if r.requirement.id == kills)
         (figure,) = plots_of(found, replace(view, usb=usb))
         parsed(figure)

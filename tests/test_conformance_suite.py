@@ -16,9 +16,8 @@ import pytest
 from dexkit.conformance.backend_processes import EXTERNAL, RigOptions
 from dexkit.conformance.judge import judge
 from dexkit.conformance.live import LiveOptions, record_run
-from dexkit.conformance.mutants import plan_for, shared
-from dexkit.conformance.mutants.live import LiveMutant
-from dexkit.conformance.mutants.shared import of
+from dexkit.conformance.mutants import any_model, plan_for
+from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements
@@ -28,6 +27,7 @@ from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
+from dexkit.conformance.virtual.on_dds import ServiceOnDds
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
 from dexkit.models import dialect, model
@@ -202,7 +202,7 @@ def run_live(
     wanted = select(requirements(), prefixes=[prefix])
     path = tmp_path / "run.mcap"
     rig = RigOptions(EXTERNAL, sides, chosen, domain)
-    with LiveMutant(service(chosen, sides, {}), domain):
+    with ServiceOnDds(service(chosen, sides, {}), domain):
         assert record_run(LiveOptions(rig, phases_for(wanted)), path)
     return judge(Recording.of(open_trace(path), sides=sides), requirements=wanted)
 
@@ -214,7 +214,7 @@ def test_a_good_hand_passes_on_dds(tmp_path: Path) -> None:
 
 def test_a_hand_that_waits_for_a_command_is_caught_on_dds(tmp_path: Path) -> None:
     result = run_live(
-        of(shared.SilentUntilCommanded, ReferenceService),
+        mix(any_model.SilentUntilCommanded, ReferenceService),
         "DEX1-START",
         tmp_path,
         sides=(Side.LEFT,),
@@ -224,7 +224,7 @@ def test_a_hand_that_waits_for_a_command_is_caught_on_dds(tmp_path: Path) -> Non
 
 def test_a_hand_that_asks_for_history_is_caught_on_dds(tmp_path: Path) -> None:
     result = run_live(
-        of(shared.DemandsHistory, ReferenceService), "DEX1-QOS", tmp_path, sides=(Side.LEFT,)
+        mix(any_model.DemandsHistory, ReferenceService), "DEX1-QOS", tmp_path, sides=(Side.LEFT,)
     )
     assert failed(result) == {("DEX1-QOS-01", "left")}
 

@@ -19,11 +19,13 @@ from dexkit.conformance.backend_processes import Tool
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
+from dexkit.conformance.mutants import mutants
+from dexkit.conformance.mutants.matrix import Outcome, try_one
+from dexkit.conformance.mutants.trials import run_usb_mutant
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
-from dexkit.conformance.usb.mutants import MUTANTS, try_mutant
 from dexkit.conformance.usb.record import (
     RECORD,
     SCHEMA,
@@ -36,7 +38,7 @@ from dexkit.conformance.usb.record import (
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
 from dexkit.conformance.usb.script import BUSES, DAMAGES
-from dexkit.conformance.usb.virtual import ReferenceDevice, run_virtual
+from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.errors import ConformanceError, TraceUnsupported
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
@@ -44,7 +46,7 @@ from dexkit.traces import open_trace
 from dexkit.traces.recorder import Recorder
 from dexkit.wire import crc32, dex3_usb
 
-BY_NAME = {m.name: m for m in MUTANTS}
+BY_NAME = {m.name: m for m in mutants("usb")}
 ACCEPTABLE = {Verdict.PASS, Verdict.NOT_APPLICABLE}
 
 
@@ -131,7 +133,7 @@ def test_a_transfer_comes_back(data: bytes, status: int, when: int) -> None:
 
 
 def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
-    live = run_virtual(ReferenceDevice(Side.RIGHT))
+    live = run_virtual_usb(ReferenceDevice(Side.RIGHT))
     (hand,) = live.sides.values()
     with Recorder(tmp_path / "run.mcap") as recorder:
         for transfer in hand.transfers:
@@ -165,11 +167,9 @@ def test_every_requirement_has_a_check_and_a_device_that_breaks_it() -> None:
     ids = {r.id for r in usb()}
     assert len(ids) >= 40
     assert all(check_of(r) for r in usb())
-    assert {m.kills for m in MUTANTS} == ids
-    assert all(m.summary for m in MUTANTS)
-    assert len(BY_NAME) == len(MUTANTS)
+    assert {m.kills for m in mutants("usb")} == ids
     kinds = set(DAMAGES)
-    hand = run_virtual(ReferenceDevice(Side.LEFT)).sides[Side.LEFT]
+    hand = run_virtual_usb(ReferenceDevice(Side.LEFT)).sides[Side.LEFT]
     assert {p.params["kind"] for p in hand.phases("malformed")} == kinds
     assert {r.phase for r in usb()} - {None} <= {p.name for p in hand.record.phases}
 
@@ -182,7 +182,7 @@ def test_the_documented_schema_is_the_current_one() -> None:
 
 @pytest.mark.parametrize("side", list(Side))
 def test_a_good_device_passes(side: Side) -> None:
-    results = judge_layer(USB, run_virtual(ReferenceDevice(side)), usb())
+    results = judge_layer(USB, run_virtual_usb(ReferenceDevice(side)), usb())
     assert [r.explain() for r in results if r.verdict is not Verdict.PASS] == []
     assert len(results) == len(usb())
 
@@ -190,12 +190,11 @@ def test_a_good_device_passes(side: Side) -> None:
 @pytest.mark.parametrize("name", BY_NAME)
 def test_a_wrong_device_is_caught_for_the_right_reason(name: str) -> None:
     mutant = BY_NAME[name]
-    blamed = try_mutant(mutant.device, usb())[1]
-    assert blamed == {mutant.kills, *mutant.also}, mutant.summary
+    assert try_one(mutant) == Outcome(mutant), mutant.summary
 
 
 def test_a_deaf_device_is_not_asked_for_long() -> None:
-    results, _ = try_mutant(BY_NAME["Deaf"].device, usb())
+    results = run_usb_mutant(BY_NAME["Deaf"].made, usb())
     assert {r.verdict for r in results if r.requirement.needs != "nothing"} == {
         Verdict.FAIL,  # no answer
         Verdict.PASS,  # and nothing unasked
@@ -204,7 +203,7 @@ def test_a_deaf_device_is_not_asked_for_long() -> None:
 
 
 def test_what_failed_is_said_with_its_place() -> None:
-    results, _ = try_mutant(BY_NAME["SlowTrip"].device, usb())
+    results = run_usb_mutant(BY_NAME["SlowTrip"].made, usb())
     (failed,) = [r for r in results if r.verdict is Verdict.FAIL]
     assert failed.requirement.id == "DEX3USB-PROT-02"
     assert 1.3 < failed.values["driven_s"] < 1.5
@@ -217,7 +216,7 @@ def test_what_failed_is_said_with_its_place() -> None:
 def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
     from dexkit.conformance.stimulus_record import Beats
 
-    recording = run_virtual(BY_NAME["Slow"].device(Side.LEFT))
+    recording = run_virtual_usb(BY_NAME["Slow"].made(Side.LEFT))
     hand = recording.sides[Side.LEFT]
     first = min(p.begin_ns for p in hand.phases("burst"))
     for late_us, verdict in ((5_000, Verdict.BLOCKED), (100, Verdict.WARN)):
@@ -229,7 +228,7 @@ def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
 
 
 def test_a_speed_is_not_judged_by_a_few_samples() -> None:
-    recording = run_virtual(ReferenceDevice(Side.LEFT))
+    recording = run_virtual_usb(ReferenceDevice(Side.LEFT))
     hand = recording.sides[Side.LEFT]
     gone = {
         t.done_ns

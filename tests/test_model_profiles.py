@@ -155,9 +155,13 @@ def forget() -> None:
     """What was found out about installed packages."""
     from dexkit import lazy
     from dexkit.conformance import requirements, selection
+    from dexkit.conformance.mutants import registry
 
     importlib.invalidate_caches()
     dexkit.models._plugins = None
+    registry._declared[:] = [
+        d for d in registry._declared if d.made.__module__.startswith("dexkit")
+    ]
     for cached in (
         *(requirements.catalogue, requirements._files, requirements._requirements),
         *(requirements._document, selection.length, mutants, lazy._load),

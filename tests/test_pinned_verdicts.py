@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from dexkit.conformance.mutants.matrix import Score, Trial, chosen, trials, try_one
+from dexkit.conformance.mutants import Mutant, mutants
+from dexkit.conformance.mutants.matrix import Score, chosen, cost, try_one
 from tests.pinned import BLAMED, SAMPLE_VERDICTS, blamed, blamed_sets, key, load, sample_verdicts
 
 WHERE = "see tests/pinned/__init__.py"
@@ -15,21 +16,21 @@ def test_samples_get_the_pinned_verdicts() -> None:
 
 
 def test_every_wrong_hand_is_pinned_with_the_requirements_that_it_breaks() -> None:
-    declared = {key(t): sorted({t.kills, *t.also}) for t in trials()}
+    declared = {key(m): sorted({m.kills, *m.also}) for m in mutants()}
     assert declared == load(BLAMED), WHERE
 
 
-def one_of_each_layer() -> list[Trial]:
-    found: dict[tuple[str, str], Trial] = {}
-    for trial in sorted(trials(), key=lambda t: (t.cost, t.name)):
-        found.setdefault((trial.layer, trial.model), trial)
+def one_of_each_layer() -> list[Mutant]:
+    found: dict[tuple[str, str], Mutant] = {}
+    for mutant in sorted(mutants(), key=lambda m: (cost(m), m.name)):
+        found.setdefault((mutant.layer, mutant.model), mutant)
     return list(found.values())
 
 
 def test_one_wrong_hand_of_each_layer_gets_the_pinned_blame() -> None:
     pinned = load(BLAMED)
-    for trial in one_of_each_layer():
-        assert blamed(try_one(trial)) == pinned[key(trial)], f"{key(trial)}: {WHERE}"
+    for mutant in one_of_each_layer():
+        assert blamed(try_one(mutant)) == pinned[key(mutant)], f"{key(mutant)}: {WHERE}"
 
 
 @pytest.mark.soak

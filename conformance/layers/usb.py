@@ -28,7 +28,7 @@ def _script(model: str) -> type:
 
 
 def _reference(model: str) -> type:
-    from dexkit.conformance.usb.virtual import ReferenceDevice
+    from dexkit.conformance.virtual.usb import ReferenceDevice
 
     return ReferenceDevice
 

@@ -1,165 +1,35 @@
-"""Deliberately wrong hands: each does one thing wrong, and the checks must notice exactly that.
+"""Deliberately wrong hands, robots and USB devices: each has one fault, and the checks must find
+exactly that.
 
-A mutant is a small change of its model's reference service or of its hand. :attr:`Mutant.kills` is
-the requirement that must catch it; ``also`` names what cannot but fail with it. No other
-requirement may fail or warn: it would be caught for the wrong reason.
+A wrong hand is a small change of a reference that meets every requirement, declared by the
+decorator :func:`~dexkit.conformance.mutants.registry.wrong_hand`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 
-from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import fingers, gripper, operator, shared
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import RunResult, Verdict
-from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
-from dexkit.conformance.stimuli.operator import OPERATOR
-from dexkit.conformance.stimuli.script import default_objects
-from dexkit.conformance.virtual import Service, run_virtual
-from dexkit.conformance.virtual.fingers import FingerService
-from dexkit.hand import Side
-from dexkit.models import DEX1_1, HandModel, dialect, model, model_plugins
+from dexkit.conformance.mutants import any_model, fingers, gripper, operator, robot, usb
+from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
+from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.models import model_plugins
 
-__all__ = ["MUTANTS", "Mutant", "mutants", "plan_for", "run_mutant", "trial"]
+__all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
-SESSION_SECONDS = 4.0
-LEFT = (Side.LEFT,)
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """One wrong hand.
-
-    :param model: the hand model that it is a bad copy of.
-    :param kills: the requirement that must catch it.
-    :param also: requirements that fail or warn with it.
-    :param sides: the hands that are needed to see it.
-    :param brief: only the phases that its requirement needs are gone through: it does everything
-        right and only tells of it wrongly, or it is a wrong hand of any model, and another
-        model's has gone through all of them.
-    :param dialect: where it is wrong in one dialect only; empty for the model's first.
-    """
-
-    name: str
-    model: str
-    service: type[Service]
-    kills: str
-    also: tuple[str, ...] = ()
-    sides: tuple[Side, ...] = tuple(Side)
-    brief: bool = False
-    dialect: str = ""
-
-    @property
-    def plan(self) -> Plan:
-        """The stimulus that shows it: all of it, or what its requirement needs."""
-        full = plan_for(self.dialect or model(self.model).dialects[0].name, sides=self.sides)
-        if "-OPER-" not in self.kills:
-            # eleven seconds that show an operator what the other phases show already
-            full = replace(full, phases=full.phases - {OPERATOR})
-        return self.short_plan if self.brief else full
-
-    @property
-    def short_plan(self) -> Plan:
-        """No more than what shows it."""
-        full = plan_for(self.dialect or model(self.model).dialects[0].name, sides=self.sides)
-        wanted = select(catalogue(self.model), prefixes=[self.kills, *self.also])
-        return replace(full, phases=phases_for(wanted) | {script_class(self.model).motion})
-
-    @property
-    def summary(self) -> str:
-        """What it does wrong, in a line."""
-        return (self.service.__doc__ or "").strip().splitlines()[0]
-
-
-def _dex1(service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
-    name = service.__name__
-    sides = LEFT if name in gripper.ALONE else tuple(Side)
-    spoken = gripper.DIALECTS.get(name, "")
-    return Mutant(name, DEX1_1.name, service, kills, also, sides, dialect=spoken)
-
-
-def _fingers(hand: str, service: type[Service], kills: str, also: tuple[str, ...]) -> Mutant:
-    name = service.__name__
-    sides = tuple(Side) if name in fingers.BOTH else LEFT
-    brief = name in fingers.TOLD or (hasattr(shared, name) and name not in shared.DILUTED)
-    return Mutant(name, hand, service, kills, also, sides, brief)
-
-
-MUTANTS: tuple[Mutant, ...] = (
-    *(_dex1(*entry) for entry in (*gripper.ZOO, *operator.ZOO[DEX1_1.name])),
-    *(
-        _fingers(hand, *entry)
-        for hand, zoo in fingers.ZOOS.items()
-        for entry in (*zoo, *operator.ZOO[hand])
-    ),
-)
-"""Those of dexkit's own models."""
+MODULES = (any_model, gripper, fingers, operator, robot, usb)
+"""Where wrong hands are declared."""
 
 
 @cache
-def mutants() -> tuple[Mutant, ...]:
-    """Those of every model, other packages' included.
+def mutants(layer: str | None = None) -> tuple[Mutant, ...]:
+    """Every wrong hand, of other packages' models as well.
 
+    :param layer: only those of that layer.
     :raises ModelBroken: the wrong hands of another package's model cannot be loaded.
     """
-    others = [
-        _fingers(plugin.model.name, *entry)
-        for plugin in model_plugins()
-        if plugin.model
-        for entry in _of_plugin(plugin.model)
-    ]
-    return MUTANTS + tuple(others)
-
-
-def _of_plugin(hand: HandModel) -> Iterator[tuple[type[Service], str, tuple[str, ...]]]:
-    """The wrong hands of its package, and those of dexkit that break what it is like."""
-    if hand.wrong_hands is not None:
-        yield from hand.wrong_hands.load()
-    reference = hand.reference.load()
-    requirements = catalogue(hand.name)
-    if requirements and issubclass(reference, FingerService):
-        yield from fingers.zoo(requirements[0].id.partition("-")[0], reference, (), {})
-
-
-@cache
-def _session(model_name: str) -> Session | None:
-    if not model(model_name).session:
-        return None
-    return Session.default(model_name).first_seconds(SESSION_SECONDS)
-
-
-def plan_for(dialect_name: str = "unitree_go", *, sides: Sequence[Side] = tuple(Side)) -> Plan:
-    """Every stimulus, with an object in the right hand."""
-    chosen = dialect(dialect_name)
-    return Plan(
-        dialect=chosen,
-        sides=tuple(sides),
-        objects=default_objects(chosen, sides),
-        session=_session(chosen.model),
-        phases=phases_for(catalogue(chosen.model)),
-    )
-
-
-def run_mutant(service: type[Service], plan: Plan | None = None) -> RunResult:
-    """Judge one service, on the virtual clock."""
-    chosen = plan or plan_for()
-    trace = run_virtual(chosen, service)
-    recording = Recording.of(trace, dialect_name=chosen.dialect.name, sides=chosen.sides)
-    return judge(recording, subject={"backend": f"virtual {service.__name__}"})
-
-
-def trial(mutant: Mutant, result: RunResult) -> Mapping[str, set[str]]:
-    """What went wrong in a mutant's trial: ``missed`` and ``wrongly`` blamed requirements."""
-    blamed = {
-        r.requirement.id
-        for r in result.results
-        if r.verdict in (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
-    }
-    return {
-        "missed": {mutant.kills, *mutant.also} - blamed,
-        "wrongly": blamed - {mutant.kills, *mutant.also},
-    }
+    if layer is None:
+        for plugin in model_plugins():
+            if plugin.model and plugin.model.wrong_hands:
+                plugin.model.wrong_hands.load()
+        return expand()
+    return tuple(m for m in mutants() if m.layer == layer)

@@ -1,26 +1,22 @@
 """Wrong hands of several joints.
 
-Each is mixed into the reference service of a model by :func:`zoo`, and its ``wrong``, if it has
-one, into the reference hand.
+Each is mixed into the reference service of a model, and its ``hand_fault``, if it has one, into
+the mechanics of the reference's hands. A Dex5-1 has declarations of its own where its softer gains
+make other requirements fail: it oscillates less, and comes to rest more slowly.
 """
-
-# ruff: noqa: D102  (each class says what it does wrong; its methods only override)
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants import shared
-from dexkit.conformance.mutants.shared import of
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.virtual import Sample, Service
-from dexkit.conformance.virtual.dex5 import Dex5Service
+from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import (
     Dex3Service,
     FingerHand,
@@ -29,11 +25,11 @@ from dexkit.conformance.virtual.fingers import (
     Ints,
 )
 from dexkit.hand import Floats, Side
-from dexkit.models import DEX3_1, DEX5_1
 
 # --------------------------------------------------------------------- discovery and start-up
 
 
+@wrong_hand("DEX3-TOPIC-03", brief=True)
 class NoLowRate(Dex3Service):
     """Publishes no low-rate copy."""
 
@@ -41,8 +37,9 @@ class NoLowRate(Dex3Service):
         return []
 
 
+@wrong_hand("DEX3-TOPIC-03", brief=True)
 class LowRateIsFull(Dex3Service):
-    """Publishes the low-rate copy as often as the state."""
+    """Publishes the low-rate copy at the rate of the state."""
 
     low_period = Dex3Service.period
 
@@ -53,17 +50,19 @@ class _Zero(FingerHand):
         self.q = [0.0] * len(self.q)
 
 
+@wrong_hand("DEX3-START-02")
 class RestsAtZero(FingerService):
     """Rests with every joint at exactly 0."""
 
-    wrong = _Zero
+    hand_fault = _Zero
 
 
 # ------------------------------------------------------------------------------------ fields
 
 
+@wrong_hand("DEX3-FIELD-02")
 class NanVelocity(FingerService):
-    """Divides by a time step of zero at rest, in one joint."""
+    """Publishes NaN as dq of one joint at rest."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
@@ -71,8 +70,9 @@ class NanVelocity(FingerService):
             motors["dq"][5] = math.nan
 
 
+@wrong_hand("DEX3-FIELD-03", sides=BOTH)
 class Unmirrored(FingerService):
-    """Has the left hand's signs on the right one, in both directions."""
+    """Has the left hand's signs on the right one, in commands and states."""
 
     def signs(self, side: Side) -> Floats:
         """-1 for the joints of the right hand that are mirrored."""
@@ -99,6 +99,7 @@ class Unmirrored(FingerService):
         return tuple((self.signs(side) * super().positions(side)).tolist())
 
 
+@wrong_hand("DEX3-FIELD-04")
 class TurnedVelocity(FingerService):
     """Publishes dq with the wrong sign."""
 
@@ -107,6 +108,7 @@ class TurnedVelocity(FingerService):
         motors["dq"] = -motors["dq"]
 
 
+@wrong_hand("DEX3-FIELD-05", brief=True)
 class TurnedAcceleration(FingerService):
     """Publishes ddq with the wrong sign."""
 
@@ -116,7 +118,7 @@ class TurnedAcceleration(FingerService):
 
 
 class _Filled(FingerService):
-    """Motors that say something else of themselves, or a hand that does."""
+    """Publishes a fixed wrong value in a member of motors, sensor packets or the message."""
 
     motor: tuple[str, Any] | None = None
     whole: tuple[str, Any] | None = None
@@ -135,24 +137,28 @@ class _Filled(FingerService):
         return message
 
 
+@wrong_hand("DEX3-FIELD-06", brief=True)
 class Kelvin(_Filled):
     """Publishes its motors' temperatures in kelvins."""
 
     motor = ("temperature", (303, 313))
 
 
+@wrong_hand("DEX3-FIELD-07", brief=True)
 class RawSupply(_Filled):
     """Publishes the converter's count as the supply voltage."""
 
     whole = ("power_v", 22696.0)
 
 
+@wrong_hand("DEX3-FIELD-08", brief=True)
 class FaultForAStatus(_Filled):
     """Publishes a status of its own as the hand's faults."""
 
     whole = ("error", (7, 0))
 
 
+@wrong_hand("DEX3-FIELD-09", brief=True)
 class CountsInReserve(FingerService):
     """Counts its states in a reserved word of the first motor."""
 
@@ -161,20 +167,23 @@ class CountsInReserve(FingerService):
         motors["reserve"][0] = hand.version
 
 
+@wrong_hand("DEX3-SENS-05", brief=True)
 class HotSensors(_Filled):
     """Publishes the sensors' temperatures in hundredths of a degree."""
 
     packet = ("temperature", (2500.0,) * 12)
 
 
+@wrong_hand("DEX3-SENS-06", brief=True)
 class UnsetLost(_Filled):
-    """Publishes memory that was never set as the sensors' count of lost packets."""
+    """Publishes uninitialised memory as the sensors' count of lost packets."""
 
     packet = ("lost", 0xCCCCCCCC)
 
 
+@wrong_hand("DEX3-IMU-02", brief=True)
 class NanGyroscope(FingerService):
-    """Publishes NaN for an angular velocity that it does not know."""
+    """Publishes NaN as its angular velocity."""
 
     def message(self, count: int) -> Any:
         message = super().message(count)
@@ -182,6 +191,7 @@ class NanGyroscope(FingerService):
         return message
 
 
+@wrong_hand("DEX3-MODE-01")
 class IdsFromOne(FingerService):
     """Counts its motors from 1."""
 
@@ -190,6 +200,7 @@ class IdsFromOne(FingerService):
         motors["mode"] += 1
 
 
+@wrong_hand("DEX3-SENS-01", brief=True)
 class OddPackets(FingerService):
     """Publishes ten sensor packets."""
 
@@ -200,6 +211,7 @@ class OddPackets(FingerService):
         return np.concatenate((felt, felt[:1]))
 
 
+@wrong_hand("DEX3-SENS-02", sides=BOTH, brief=True)
 class NanPressure(FingerService):
     """Publishes NaN where there is no sensor."""
 
@@ -208,6 +220,7 @@ class NanPressure(FingerService):
         return np.where(felt == 30000.0, math.nan, felt)
 
 
+@wrong_hand("DEX3-SENS-03", sides=BOTH, brief=True)
 class ZeroForNoValue(FingerService):
     """Publishes 0 where there is no sensor."""
 
@@ -216,22 +229,25 @@ class ZeroForNoValue(FingerService):
         return np.where(felt == 30000.0, 0.0, felt)
 
 
+@wrong_hand("DEX3-SENS-03", brief=True)
 class SevenPackets(FingerService):
     """Publishes the SDK's default of seven packets."""
 
     sensors = 7
 
 
+@wrong_hand("DEX3-SENS-04", sides=BOTH)
 class Numb(FingerService):
-    """Never feels a touch."""
+    """Publishes a pressure of 0 at every touch."""
 
     def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
         return np.where(felt == 30000.0, felt, 0.0)
 
 
+@wrong_hand("DEX3-IMU-01", brief=True)
 class LongQuaternion(FingerService):
-    """Publishes the raw counts of its attitude."""
+    """Publishes raw counts as its quaternion."""
 
     def quaternion(self) -> list[float]:
         return [16384.0, 0.0, 0.0, 0.0]
@@ -247,8 +263,9 @@ def _reordered(order: tuple[int, ...]) -> Callable[[tuple[Motor, ...]], tuple[Mo
     return reorder
 
 
-class IndexFirst(FingerService):
-    """Takes the commands of the right hand index finger first, as xr_teleoperate's enum says."""
+@wrong_hand("DEX3-JOINT-01", sides=BOTH)
+class IndexFirst(Dex3Service):
+    """Obeys the right hand's commands index finger first, as xr_teleoperate's enum lists them."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         if side is Side.RIGHT:
@@ -256,15 +273,17 @@ class IndexFirst(FingerService):
         super().motors(side, motors)
 
 
+@wrong_hand("DEX5-JOINT-01")
 class ThumbFirst(FingerService):
-    """Takes the commands thumb first, as the URDF numbers the fingers."""
+    """Obeys commands thumb first, as the URDF numbers the fingers."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         super().motors(side, _reordered((*range(4, 20), *range(4)))(motors))
 
 
+@wrong_hand("DEX3-JOINT-01")
 class CoupledFinger(FingerService):
-    """Has the second joint of a finger follow the first a little."""
+    """The second joint of a finger follows the first a little."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         coupled = list(motors)
@@ -281,14 +300,16 @@ class _Backwards(FingerHand):
         super().take(turned, mode)
 
 
+@wrong_hand("DEX3-MOVE-01")
 class OneJointBackwards(FingerService):
-    """Turns the sign of one joint."""
+    """Moves one joint backwards."""
 
-    wrong = _Backwards
+    hand_fault = _Backwards
 
 
+@wrong_hand("DEX3-MOVE-02")
 class OtherScale(FingerService):
-    """Goes only part of the way from its rest."""
+    """Moves only 75 % of the way from its rest pose."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         rest = self.hand.model.rest_q[side]
@@ -307,10 +328,12 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
+@wrong_hand("DEX3-MOVE-03", also=("DEX3-SAFE-06",), whole=True)
+@wrong_hand("DEX5-MOVE-03", whole=True)
 class Hunts(FingerService):
-    """Shakes a joint about its target."""
+    """One joint oscillates about its goal."""
 
-    wrong = _Hunts
+    hand_fault = _Hunts
 
 
 class _Weak(FingerHand):
@@ -319,10 +342,12 @@ class _Weak(FingerHand):
         self.viscous = max(self.client_kp.min() / 15, 3 * self.viscous)
 
 
+@wrong_hand("DEX3-MOVE-04")
+@wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01",))
 class Slow(FingerService):
-    """Has stiff grease in its gears."""
+    """Has high friction: it moves slowly."""
 
-    wrong = _Weak
+    hand_fault = _Weak
 
 
 class _Springy(FingerHand):
@@ -336,14 +361,18 @@ class _Springy(FingerHand):
         super().take(undamped, mode)
 
 
+@wrong_hand("DEX3-MOVE-05")
+@wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01"))
 class Undamped(FingerService):
-    """Applies little of kd where there is a kp."""
+    """Applies 15 % of kd where kp is not 0."""
 
-    wrong = _Springy
+    hand_fault = _Springy
 
 
+@wrong_hand("DEX3-SIDE-01", also=("DEX3-MOVE-07",), sides=BOTH)
+@wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)
 class Coupled(FingerService):
-    """The left hand's first finger leaks into the right one."""
+    """The goal of the left hand's first finger leaks into the right one's."""
 
     left = 0.0
 
@@ -381,10 +410,12 @@ class _Creeps(FingerHand):
         super().step(dt)
 
 
+@wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04",))
+@wrong_hand("DEX5-MOVE-07")
 class Creeps(FingerService):
-    """Creeps the last part of the way with one finger."""
+    """One joint creeps the last part of the way to its goal."""
 
-    wrong = _Creeps
+    hand_fault = _Creeps
 
 
 class _IgnoresZeroGains(FingerHand):
@@ -396,10 +427,11 @@ class _IgnoresZeroGains(FingerHand):
         super().take(own, mode)
 
 
+@wrong_hand("DEX3-GAIN-01")
 class DefaultsForZeroGains(FingerService):
-    """Takes zero gains for gains that were not set, and uses its own."""
+    """Uses its own gains where kp and kd are 0."""
 
-    wrong = _IgnoresZeroGains
+    hand_fault = _IgnoresZeroGains
 
 
 class _OwnStiffness(FingerHand):
@@ -410,17 +442,19 @@ class _OwnStiffness(FingerHand):
         super().take(own, mode)
 
 
+@wrong_hand("DEX3-GAIN-02")
 class OwnStiffness(FingerService):
-    """Uses its own stiffness whenever there is any."""
+    """Uses its own gains wherever kp is not 0."""
 
-    wrong = _OwnStiffness
+    hand_fault = _OwnStiffness
 
 
 # --------------------------------------------------------------------------------- mode byte
 
 
+@wrong_hand("DEX3-MODE-02", also=("DEX3-LIFE-05",))
 class AlwaysDriven(FingerService):
-    """Says that its motors are driven whatever it does."""
+    """Publishes that its motors are driven, whatever their state."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
@@ -433,10 +467,11 @@ class _IgnoresStatus(FingerHand):
         return np.ones_like(status), guarded
 
 
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
 class IgnoresStatus(FingerService):
-    """Drives whatever the mode byte says."""
+    """Drives its motors whatever the mode byte of the command is."""
 
-    wrong = _IgnoresStatus
+    hand_fault = _IgnoresStatus
 
 
 class _Ris(FingerHand):
@@ -444,12 +479,14 @@ class _Ris(FingerHand):
         return (mode >> 4) & 7, mode >= 0x80
 
 
+@wrong_hand("DEX5-MODE-01")
 class DecodesRis(FingerService):
-    """Takes the mode byte for a Dex3-1's: 1 is id 1 with status 0, which locks."""
+    """Decodes the mode byte as a Dex3-1's: 1 is id 1 with status 0, which locks."""
 
-    wrong = _Ris
+    hand_fault = _Ris
 
 
+@wrong_hand("DEX3-MODE-04")
 class GoesById(FingerService):
     """Sorts a command's motors by the id in their mode byte."""
 
@@ -462,6 +499,8 @@ class GoesById(FingerService):
 # ------------------------------------------------------------------------------------- force
 
 
+@wrong_hand("DEX3-FORCE-01", sides=BOTH)
+@wrong_hand("DEX5-FORCE-01", also=("DEX5-FORCE-03",), sides=BOTH)
 class TurnedForce(FingerService):
     """Publishes tau_est with the wrong sign."""
 
@@ -470,14 +509,16 @@ class TurnedForce(FingerService):
         motors["tau_est"] = -motors["tau_est"]
 
 
+@wrong_hand("DEX5-FORCE-03", sides=BOTH)
 class FingersInNewtonMetres(FingerService):
-    """Publishes all torques in N m, the fingers' too."""
+    """Publishes the fingers' torques in N m, as the other joints'."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] *= self.torque_units[: len(motors)]
 
 
+@wrong_hand("DEX3-FORCE-02", brief=True)
 class MilliNewtonMetres(FingerService):
     """Publishes tau_est in mN m."""
 
@@ -495,10 +536,11 @@ class _NegativeGains(FingerHand):
         self.kp, self.kd = rows[3].copy(), np.abs(rows[4])
 
 
+@wrong_hand("DEX3-SAFE-06")
 class NegativeGains(FingerService):
-    """Takes a negative stiffness as it comes."""
+    """Applies a negative kp."""
 
-    wrong = _NegativeGains
+    hand_fault = _NegativeGains
 
 
 def _values(motor: Motor) -> tuple[float, ...]:
@@ -516,10 +558,11 @@ class _NanPerJoint(FingerHand):
         )
 
 
+@wrong_hand("DEX3-SAFE-01")
 class RejectsOnlyTheBadJoint(FingerService):
-    """Leaves out the joint with a NaN and moves the others."""
+    """Ignores only the joint whose command is NaN, and moves the others."""
 
-    wrong = _NanPerJoint
+    hand_fault = _NanPerJoint
 
 
 class _NanInTheLast(FingerHand):
@@ -529,10 +572,11 @@ class _NanInTheLast(FingerHand):
         super().command((*kept, motors[-1]))
 
 
+@wrong_hand("DEX3-SAFE-01")
 class LooksAtTheLastJoint(FingerService):
-    """Tests the last joint alone for NaN, and lets any other that has one go limp."""
+    """Checks only the last joint for NaN; any other joint with a NaN goes limp."""
 
-    wrong = _NanInTheLast
+    hand_fault = _NanInTheLast
 
 
 class _NoLimits(FingerHand):
@@ -542,14 +586,16 @@ class _NoLimits(FingerHand):
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
+@wrong_hand("DEX3-SAFE-02")
 class NoLimits(FingerService):
-    """Goes half a radian beyond the limits."""
+    """Follows goals up to 0.5 rad beyond its limits."""
 
-    wrong = _NoLimits
+    hand_fault = _NoLimits
 
 
+@wrong_hand("DEX3-SAFE-04")
 class FillsUpWithZeros(FingerService):
-    """Fills up a short command with zeros."""
+    """Fills a command that is too short with zeros."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
@@ -567,10 +613,11 @@ class _KeepsSpeed(FingerHand):
         self.tripped = self.tripped | self.guarded
 
 
+@wrong_hand("DEX3-WDOG-01")
 class KeepsDriving(FingerService):
-    """Keeps the last velocity for ever, unless protected."""
+    """Keeps driving by the last velocity after the time-out, unless protected."""
 
-    wrong = _KeepsSpeed
+    hand_fault = _KeepsSpeed
 
 
 class _AlwaysBrakes(FingerHand):
@@ -593,10 +640,11 @@ class _AlwaysBrakes(FingerHand):
             self.law_kd = [self.brake] * n
 
 
+@wrong_hand("DEX3-HOLD-01")
 class LetsGo(FingerService):
-    """Brakes in every silence, protected or not."""
+    """Brakes after the time-out even without protection."""
 
-    wrong = _AlwaysBrakes
+    hand_fault = _AlwaysBrakes
 
 
 class _LatchesWithoutGuard(FingerHand):
@@ -611,10 +659,11 @@ class _LatchesWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
+@wrong_hand("DEX3-WDOG-03")
 class StuckAfterSilence(FingerService):
-    """Takes no command any more after a silence without protection."""
+    """Obeys no command after a silence without protection."""
 
-    wrong = _LatchesWithoutGuard
+    hand_fault = _LatchesWithoutGuard
 
 
 class _SleepsWithoutGuard(FingerHand):
@@ -630,10 +679,11 @@ class _SleepsWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
+@wrong_hand("DEX3-WDOG-03")
 class SleepsWithoutGuard(FingerService):
-    """Takes a while after a silence without protection until it listens again."""
+    """Ignores commands for 2 s after a silence without protection."""
 
-    wrong = _SleepsWithoutGuard
+    hand_fault = _SleepsWithoutGuard
 
 
 # ---------------------------------------------------------------------- time-out protection
@@ -654,10 +704,11 @@ class _HoldsOnly(FingerHand):
             self.late = None
 
 
+@wrong_hand("DEX3-GUARD-01")
 class HoldsWhenGuarded(FingerService):
-    """Takes the time-out bit for news about the next command: keeps going to the position."""
+    """Applies the time-out protection only when the next command comes: it moves on to its goal."""
 
-    wrong = _HoldsOnly
+    hand_fault = _HoldsOnly
 
 
 class _Silent(FingerHand):
@@ -666,10 +717,11 @@ class _Silent(FingerHand):
         self.mode = self.mode & 0x7F
 
 
+@wrong_hand("DEX3-GUARD-02")
 class TripsInSecret(FingerService):
-    """Does not say that the protection has tripped."""
+    """Does not publish that the protection has tripped."""
 
-    wrong = _Silent
+    hand_fault = _Silent
 
 
 class _Unlatched(FingerHand):
@@ -678,10 +730,11 @@ class _Unlatched(FingerHand):
         self.tripped = np.zeros_like(self.tripped)
 
 
+@wrong_hand("DEX3-GUARD-03")
 class ClearsByItself(FingerService):
-    """Goes on with the next command, bit 7 or not."""
+    """Obeys the next command after a trip, whether or not bit 7 is set."""
 
-    wrong = _Unlatched
+    hand_fault = _Unlatched
 
 
 class _ForEver(FingerHand):
@@ -703,194 +756,17 @@ class _ForEver(FingerHand):
             self.tripped_at = self.now
 
 
+@wrong_hand("DEX3-GUARD-04")
 class SlowToClear(FingerService):
-    """Stays tripped for two seconds after it was cleared."""
+    """Stays tripped for 2 s after it was cleared."""
 
-    wrong = _ForEver
+    hand_fault = _ForEver
 
 
-class QuietWhenTripped(FingerService):
+@wrong_hand("DEX3-WDOG-02")
+class QuietWhenTripped(Dex3Service):
     """Publishes no state while its protection has tripped."""
 
     def publish(self) -> list[Sample]:
         tripped = any(hand.tripped.any() for hand in self.hands.values())
         return [] if tripped else super().publish()
-
-
-_Entry: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
-
-_SHARED: dict[str, tuple[type[Service], ...]] = {
-    "TOPIC-01": (shared.OldTopic, shared.OtherStateType),
-    "TOPIC-02": (shared.OtherCommandType,),
-    "QOS-01": (shared.DemandsHistory,),
-    "QOS-02": (shared.BestEffortWriter,),
-    "START-01": (shared.SilentUntilCommanded,),
-    "RATE-01": (shared.SlowPublisher,),
-    "RATE-02": (shared.HalfRate,),
-    "RATE-03": (shared.Hiccup,),
-    "RATE-04": (shared.Bursts,),
-    "ORDER-01": (shared.RepeatsOldStates,),
-    "FRESH-01": (shared.StaleState,),
-    "FIELD-01": (shared.OneTooMany, shared.EmptyNowAndThen),
-    "JOINT-01": (shared.Frozen,),
-    "SAFE-01": (shared.NanIsZero,),
-    "SAFE-03": (shared.EmptyIsZero, shared.DiesOfEmpty),
-    "SAFE-05": (shared.TakesTheLast,),
-    "SAFE-07": (shared.TakesAnyType, shared.DiesOfAnyType),
-    "SAFE-08": (shared.QueuesCommands, shared.StopsInABurst),
-    "SAFE-09": (shared.GivesUpOnTwo, shared.StaysWithTheNewest),
-    "ORDER-02": (shared.DropsOldStamps,),
-    "LOAD-01": (shared.StuttersUnderLoad, shared.WaitsForItsReaders),
-    "FRESH-02": (shared.FreezesOnce,),
-    "MOVE-06": (shared.KicksBack,),
-    "WDOG-02": (shared.QuietInSilence,),
-    "LIFE-01": (shared.ServesOnlyTheFirst,),
-    "LIFE-02": (shared.BoundToOneClient,),
-    "LIFE-03": (shared.DeafAfterRestart, shared.SilentAfterRestart),
-    "LIFE-04": (shared.HangsAtTheEnd, shared.LeavesItsName),
-    "LIFE-05": (shared.LeavesItDriven,),
-    "TRACK-01": (shared.WaitsForRest,),
-    "TRACK-02": (shared.Delayed,),
-}
-
-_OWN: tuple[_Entry, ...] = (
-    (RestsAtZero, "START-02", ()),
-    (NanVelocity, "FIELD-02", ()),
-    (Unmirrored, "FIELD-03", ()),
-    (TurnedVelocity, "FIELD-04", ()),
-    (TurnedAcceleration, "FIELD-05", ()),
-    (Kelvin, "FIELD-06", ()),
-    (RawSupply, "FIELD-07", ()),
-    (FaultForAStatus, "FIELD-08", ()),
-    (CountsInReserve, "FIELD-09", ()),
-    (NanGyroscope, "IMU-02", ()),
-    (MilliNewtonMetres, "FORCE-02", ()),
-    (Creeps, "MOVE-07", ("MOVE-04",)),
-    (NegativeGains, "SAFE-06", ()),
-    (CoupledFinger, "JOINT-01", ()),
-    (OneJointBackwards, "MOVE-01", ()),
-    (OtherScale, "MOVE-02", ()),
-    (Hunts, "MOVE-03", ("SAFE-06",)),
-    (Slow, "MOVE-04", ()),
-    (Undamped, "MOVE-05", ()),
-    (Coupled, "SIDE-01", ("MOVE-07",)),
-    # a hand that answers to the other side's topic does not answer to its own
-    (shared.Swapped, "SIDE-01", ("JOINT-01",)),
-    (DefaultsForZeroGains, "GAIN-01", ()),
-    (OwnStiffness, "GAIN-02", ()),
-    (AlwaysDriven, "MODE-02", ("LIFE-05",)),
-    (IgnoresStatus, "MODE-03", ("MODE-02",)),
-    (LongQuaternion, "IMU-01", ()),
-    (TurnedForce, "FORCE-01", ()),
-    (RejectsOnlyTheBadJoint, "SAFE-01", ()),
-    (LooksAtTheLastJoint, "SAFE-01", ()),
-    (NoLimits, "SAFE-02", ()),
-    (FillsUpWithZeros, "SAFE-04", ()),
-    (KeepsDriving, "WDOG-01", ()),
-    (StuckAfterSilence, "WDOG-03", ()),
-    (SleepsWithoutGuard, "WDOG-03", ()),
-)
-
-_DEX3: tuple[_Entry, ...] = (
-    (NoLowRate, "TOPIC-03", ()),
-    (LowRateIsFull, "TOPIC-03", ()),
-    (HotSensors, "SENS-05", ()),
-    (UnsetLost, "SENS-06", ()),
-    (IndexFirst, "JOINT-01", ()),
-    (IdsFromOne, "MODE-01", ()),
-    (GoesById, "MODE-04", ()),
-    (OddPackets, "SENS-01", ()),
-    (NanPressure, "SENS-02", ()),
-    (ZeroForNoValue, "SENS-03", ()),
-    (SevenPackets, "SENS-03", ()),
-    (Numb, "SENS-04", ()),
-    (QuietWhenTripped, "WDOG-02", ()),
-    (LetsGo, "HOLD-01", ()),
-    (HoldsWhenGuarded, "GUARD-01", ()),
-    (TripsInSecret, "GUARD-02", ()),
-    (ClearsByItself, "GUARD-03", ()),
-    (SlowToClear, "GUARD-04", ()),
-)
-
-_DEX5: tuple[_Entry, ...] = (
-    # what sees that nothing moves comes first
-    (shared.Frozen, "MODE-01", ()),
-    (DecodesRis, "MODE-01", ()),
-    (ThumbFirst, "JOINT-01", ()),
-    (FingersInNewtonMetres, "FORCE-03", ()),
-)
-
-
-_DEX5_ALSO: dict[str, tuple[str, ...]] = {
-    # softer gains swing less, and come to rest more slowly
-    "Creeps": (),
-    "Hunts": (),
-    "Slow": ("TRACK-01",),
-    "Undamped": ("GAIN-02", "SAFE-02", "TRACK-01"),
-    "Coupled": ("MOVE-02",),
-    "TurnedForce": ("FORCE-03",),
-}
-"""What else fails with a wrong hand where it is another than of a Dex3-1."""
-
-
-def _on(mixin: type[Service], reference: type[FingerService]) -> type[FingerService]:
-    """The wrong hand that the reference becomes with ``mixin``, and with its ``wrong`` hand."""
-    if issubclass(mixin, reference):
-        return mixin
-    made = of(mixin, reference)
-    wrong: type[FingerHand] | None = getattr(mixin, "wrong", None)
-    if wrong is not None:
-        made.hand = type(wrong.__name__, (wrong, reference.hand), {})
-    return made
-
-
-def zoo(
-    prefix: str,
-    reference: type[FingerService],
-    own: tuple[_Entry, ...],
-    others: Mapping[str, tuple[str, ...]],
-) -> tuple[tuple[type[FingerService], str, tuple[str, ...]], ...]:
-    """The wrong hands of a model, for what its catalogue has.
-
-    :param prefix: of its requirements' ids.
-    :param own: those that only this model has.
-    :param others: what else fails with some of them, by name, if not the same as usual.
-    """
-    named = {mixin.__name__ for mixin, _, _ in own}
-    ids = {r.id for r in catalogue(reference.hand.model.name)}
-    shares = [(mixin, kills, ()) for kills, mixins in _SHARED.items() for mixin in mixins]
-    return tuple(
-        (
-            _on(mixin, reference),
-            f"{prefix}-{kills}",
-            tuple(
-                f"{prefix}-{name}"
-                for name in others.get(mixin.__name__, also)
-                if f"{prefix}-{name}" in ids
-            ),
-        )
-        for mixin, kills, also in (
-            *(entry for entry in (*shares, *_OWN) if entry[0].__name__ not in named),
-            *own,
-        )
-        if f"{prefix}-{kills}" in ids
-    )
-
-
-ZOOS = {
-    DEX3_1.name: zoo("DEX3", Dex3Service, _DEX3, {}),
-    DEX5_1.name: zoo("DEX5", Dex5Service, _DEX5, _DEX5_ALSO),
-}
-"""By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
-BOTH = (
-    *("Unmirrored", "IndexFirst", "Coupled", "Swapped", "Numb", "TurnedForce"),
-    *("NanPressure", "ZeroForNoValue", "FingersInNewtonMetres"),
-)
-"""What is wrong of the right hand, of both together, or in touch; the others show it in the left
-hand alone, in half the time."""
-TOLD = (
-    *("NoLowRate", "LowRateIsFull", "OddPackets", "SevenPackets", "NanPressure", "ZeroForNoValue"),
-    *("LongQuaternion", "NanGyroscope", "TurnedAcceleration", "Kelvin", "RawSupply"),
-    *("FaultForAStatus", "CountsInReserve", "HotSensors", "UnsetLost", "MilliNewtonMetres"),
-)
-"""What tells wrongly of a hand that does everything right."""

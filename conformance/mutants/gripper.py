@@ -1,6 +1,7 @@
-"""Wrong grippers."""
+"""Wrong grippers.
 
-# ruff: noqa: D102  (each class says what it does wrong; its methods only override)
+Where a fault is in the left hand alone, the object would hold the right one away from 0.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants import shared
-from dexkit.conformance.mutants.shared import of
+from dexkit.conformance.mutants.registry import LEFT, wrong_hand
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from dexkit.messages import message_type
@@ -22,12 +22,13 @@ class _Fields(ReferenceService):
     """A service whose state is changed on the way out."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        raise AssertionError("a mutant says what it changes")
+        raise NotImplementedError
 
     def fields(self, side: Side) -> dict[str, Any]:
         return self.change(super().fields(side), side)
 
 
+@wrong_hand("DEX1-FIELD-02")
 class NanVelocity(_Fields):
     """Divides by a time step of zero at rest."""
 
@@ -36,7 +37,7 @@ class NanVelocity(_Fields):
 
 
 class _InUnit(_Fields):
-    """Takes or publishes another unit than radians, ``full`` where it is open."""
+    """Obeys or publishes another unit than radians: ``full`` when open."""
 
     full = 100.0
     takes = publishes = True
@@ -60,18 +61,21 @@ class _InUnit(_Fields):
         return {**fields, **{name: self.scale * fields[name] for name in ("q", "dq", "ddq")}}
 
 
+@wrong_hand("DEX1-FIELD-03")
 class Percent(_InUnit):
     """Publishes percent of the stroke instead of radians."""
 
     takes = False
 
 
+@wrong_hand("DEX1-MOVE-01")
 class PercentCommands(_InUnit):
-    """Takes percent of the stroke instead of radians."""
+    """Obeys q as percent of the stroke instead of radians."""
 
     publishes = False
 
 
+@wrong_hand("DEX1-FIELD-03")
 class Degrees(_InUnit):
     """Publishes degrees instead of radians."""
 
@@ -80,7 +84,7 @@ class Degrees(_InUnit):
 
 
 class _OtherScale(ReferenceHand):
-    """Counts in another unit, and is as quick in it as a good hand is in radians."""
+    """Computes in another unit, and is as fast in it as a good hand is in radians."""
 
     full = 100.0
     tau_max = 120.0
@@ -94,14 +98,16 @@ class _OtherScale(ReferenceHand):
         return {**super().fields(), "tau_est": 0.1 * self.tau}
 
 
+@wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
 class PercentBothWays(ReferenceService):
-    """Takes and publishes percent; begins nearly closed, where percent look like radians."""
+    """Obeys and publishes percent; starts nearly closed, where percent look like radians."""
 
     hand = _OtherScale
 
 
+@wrong_hand("DEX1-FIELD-14", sides=LEFT)
 class PercentWithin(PercentBothWays):
-    """Takes and publishes percent, of commands that it has clamped to 5.4."""
+    """Obeys and publishes percent, after it has clamped q to 0 to 5.4."""
 
     def command(self, side: Side, motor: Motor) -> None:
         if math.isfinite(motor.q):
@@ -113,12 +119,14 @@ class _InDegrees(_OtherScale):
     full = math.degrees(5.4)
 
 
+@wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
 class DegreesBothWays(ReferenceService):
-    """Takes and publishes degrees; begins nearly closed, where degrees look like radians."""
+    """Obeys and publishes degrees; starts nearly closed, where degrees look like radians."""
 
     hand = _InDegrees
 
 
+@wrong_hand("DEX1-MOVE-01")
 class Normalised(_InUnit):
     """Publishes 0 to 1 instead of radians."""
 
@@ -126,25 +134,29 @@ class Normalised(_InUnit):
     takes = False
 
 
+@wrong_hand("DEX1-MOVE-02", also=("DEX1-MOVE-01",))
 class NormalisedCommands(_InUnit):
-    """Takes 0 to 1 instead of radians."""
+    """Obeys q as 0 to 1 instead of radians."""
 
     full = 1.0
     publishes = False
 
 
+@wrong_hand("DEX1-MOVE-01")
 class NormalisedBothWays(_InUnit):
-    """Takes and publishes 0 to 1 instead of radians."""
+    """Obeys and publishes 0 to 1 instead of radians."""
 
     full = 1.0
 
 
+@wrong_hand("DEX1-MOVE-01")
 class Metres(_InUnit):
-    """Takes and publishes the opening in metres instead of radians."""
+    """Obeys and publishes the opening in metres instead of radians."""
 
     full = 0.09
 
 
+@wrong_hand("DEX1-FIELD-04")
 class TurnedVelocity(_Fields):
     """Publishes dq with the wrong sign."""
 
@@ -153,7 +165,7 @@ class TurnedVelocity(_Fields):
 
 
 class _Filled(_Fields):
-    """One member of the state holds what it should not."""
+    """One member of the state has a fixed wrong value."""
 
     member = ""
     value: object = 0
@@ -162,18 +174,21 @@ class _Filled(_Fields):
         return {**fields, self.member: self.value}
 
 
+@wrong_hand("DEX1-FIELD-05")
 class OtherRobotsMode(_Filled):
-    """Publishes the mode byte of an H1's motors."""
+    """Publishes the mode byte of an H1's motors, 0x0A."""
 
     member, value = "mode", 0x0A
 
 
+@wrong_hand("DEX1-FIELD-05", also=("DEX1-LIFE-05",))
 class AlwaysDriven(_Filled):
-    """Says all the time that the motor is driven."""
+    """Publishes mode 1, driven, all the time."""
 
     member, value = "mode", 1
 
 
+@wrong_hand("DEX1-FIELD-06")
 class TurnedAcceleration(_Fields):
     """Publishes ddq with the wrong sign."""
 
@@ -181,6 +196,7 @@ class TurnedAcceleration(_Fields):
         return {**fields, "ddq": -fields["ddq"]}
 
 
+@wrong_hand("DEX1-FIELD-06")
 class AccelerationPerSample(_Fields):
     """Publishes the change of dq from sample to sample as ddq."""
 
@@ -188,26 +204,30 @@ class AccelerationPerSample(_Fields):
         return {**fields, "ddq": fields["ddq"] * self.period}
 
 
+@wrong_hand("DEX1-FIELD-07")
 class NanRaw(_Filled):
     """Publishes NaN for a raw value that it does not know."""
 
     member, value = "q_raw", math.nan
 
 
+@wrong_hand("DEX1-FIELD-08")
 class HotByte(_Filled):
-    """Publishes the raw register of its thermometer."""
+    """Publishes 200 degrees Celsius: a raw register as the temperature."""
 
     member, value = "temperature", 200
 
 
+@wrong_hand("DEX1-FIELD-09")
 class UnsetLost(_Filled):
-    """Publishes memory that was never set as a count of lost packets."""
+    """Publishes uninitialised memory as the count of lost packets."""
 
     member, value = "lost", 0xCCCCCCCC
 
 
+@wrong_hand("DEX1-FIELD-10")
 class CountsInReserve(_Fields):
-    """Counts its samples in a reserved word."""
+    """Counts its states in a reserved word."""
 
     count = 0
 
@@ -217,18 +237,21 @@ class CountsInReserve(_Fields):
         return {**fields, "reserve": reserve}
 
 
+@wrong_hand("DEX1-FIELD-11", dialect="unitree_hg")
 class Millivolts(_Filled):
     """Publishes vol in millivolts."""
 
     member, value = "vol", 12000.0
 
 
+@wrong_hand("DEX1-FIELD-12", dialect="unitree_hg")
 class StatusInMotorstate(_Filled):
     """Publishes a status of its own as the motor's faults."""
 
     member, value = "motorstate", 3
 
 
+@wrong_hand("DEX1-FIELD-13", dialect="unitree_hg")
 class NanAttitude(ReferenceService):
     """Publishes NaN for an attitude that it does not know."""
 
@@ -243,6 +266,7 @@ class _AtZero(ReferenceHand):
         self.q = 0.0
 
 
+@wrong_hand("DEX1-START-02", sides=LEFT, dialect="unitree_actuator")
 class RestsAtZero(ReferenceService):
     """Rests exactly at 0, in both hands."""
 
@@ -252,6 +276,7 @@ class RestsAtZero(ReferenceService):
 # ----------------------------------------------------------------------------------- motion
 
 
+@wrong_hand("DEX1-MOVE-01")
 class Inverted(ReferenceService):
     """Takes 0 for open."""
 
@@ -259,6 +284,7 @@ class Inverted(ReferenceService):
         super().command(side, replace(motor, q=self.dialect.q_open - motor.q, dq=-motor.dq))
 
 
+@wrong_hand("DEX1-MOVE-02")
 class OtherScale(ReferenceService):
     """Scales commands as if fully open were 2 pi."""
 
@@ -273,8 +299,9 @@ class _Hunts(ReferenceHand):
         return super().motor_torque() + shake
 
 
+@wrong_hand("DEX1-MOVE-03", whole=True)
 class Hunts(ReferenceService):
-    """Shakes about its target."""
+    """Oscillates about its goal."""
 
     hand = _Hunts
 
@@ -291,6 +318,8 @@ class _Slow(ReferenceHand):
         return super().motor_torque()
 
 
+# a session is faster than this hand can go
+@wrong_hand("DEX1-MOVE-04", also=("DEX1-TRACK-01",))
 class Slow(ReferenceService):
     """Moves at 2.6 rad/s at most."""
 
@@ -302,6 +331,7 @@ class _Springy(ReferenceHand):
     viscous = 0.15
 
 
+@wrong_hand("DEX1-MOVE-05")
 class Overshoots(ReferenceService):
     """Has too little damping."""
 
@@ -330,14 +360,16 @@ class _Creeps(ReferenceHand):
         return 0.5 * (wanted - self.dq) + friction
 
 
+@wrong_hand("DEX1-MOVE-07")
 class Creeps(ReferenceService):
-    """Creeps the last three millimetres."""
+    """Creeps the last 3 mm to its goal."""
 
     hand = _Creeps
 
 
+@wrong_hand("DEX1-MOVE-08")
 class ShortStroke(ReferenceService):
-    """Keeps a margin of 5 % from its stops."""
+    """Stays 5 % of the stroke away from its stops."""
 
     def command(self, side: Side, motor: Motor) -> None:
         low, high = 0.05 * self.dialect.q_open, 0.95 * self.dialect.q_open
@@ -345,8 +377,9 @@ class ShortStroke(ReferenceService):
         super().command(side, replace(motor, q=q))
 
 
+@wrong_hand("DEX1-SIDE-01")
 class Coupled(ReferenceService):
-    """The left hand's target leaks into the right hand."""
+    """The left hand's goal leaks into the right hand's."""
 
     left = 0.0
 
@@ -363,8 +396,9 @@ class _IgnoresGains(ReferenceHand):
         return super().accept(Motor(q=motor.q))
 
 
+@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05",))
 class IgnoresGains(ReferenceService):
-    """Goes to q whatever the gains are."""
+    """Moves to q whatever the gains are."""
 
     hand = _IgnoresGains
 
@@ -372,6 +406,7 @@ class IgnoresGains(ReferenceService):
 # ------------------------------------------------------------------------------------ force
 
 
+@wrong_hand("DEX1-FORCE-01")
 class NoForce(_Fields):
     """Does not fill tau_est."""
 
@@ -379,6 +414,7 @@ class NoForce(_Fields):
         return {**fields, "tau_est": 0.0}
 
 
+@wrong_hand("DEX1-FORCE-02")
 class ForceAtRest(_Fields):
     """Reports the holding current as force, while it is driven."""
 
@@ -388,6 +424,7 @@ class ForceAtRest(_Fields):
         return {**fields, "tau_est": fields["tau_est"] - 0.4}
 
 
+@wrong_hand("DEX1-FORCE-03")
 class UnsignedForce(_Fields):
     """Reports the size of the force."""
 
@@ -395,6 +432,7 @@ class UnsignedForce(_Fields):
         return {**fields, "tau_est": abs(fields["tau_est"])}
 
 
+@wrong_hand("DEX1-FORCE-04", also=("DEX1-FORCE-02",))
 class MilliNewtonMetres(_Fields):
     """Publishes tau_est in mN m."""
 
@@ -402,6 +440,7 @@ class MilliNewtonMetres(_Fields):
         return {**fields, "tau_est": 1e3 * fields["tau_est"]}
 
 
+@wrong_hand("DEX1-FORCE-05", dialect="unitree_hg")
 class SignedForce(_Fields):
     """Publishes the signed torque where the strength of the grip is expected."""
 
@@ -417,8 +456,9 @@ class _NegativeGains(ReferenceHand):
         return replace(super().accept(motor), kp=motor.kp, kd=motor.kd)
 
 
+@wrong_hand("DEX1-SAFE-05")
 class NegativeGains(ReferenceService):
-    """Takes negative gains as they come."""
+    """Applies negative gains."""
 
     hand = _NegativeGains
 
@@ -431,8 +471,9 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
+@wrong_hand("DEX1-SAFE-02")
 class NoLimits(ReferenceService):
-    """Follows a q far outside the stroke, through its stops."""
+    """Follows a q far outside the stroke."""
 
     hand = _NoLimits
 
@@ -441,6 +482,8 @@ class _NoWatchdog(ReferenceHand):
     timeout = math.inf
 
 
+# its mode byte is true, which a client cannot tell from a stuck byte
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
 class NoWatchdog(ReferenceService):
     """Follows the last command for ever."""
 
@@ -456,8 +499,9 @@ class _SnapsOpen(ReferenceHand):
         return super().motor_torque()
 
 
+@wrong_hand("DEX1-WDOG-01")
 class SnapsOpenAtTheTimeOut(ReferenceService):
-    """Opens when commands end, and then brakes: drops what it holds."""
+    """Opens after the time-out and then brakes: it drops its object."""
 
     hand = _SnapsOpen
 
@@ -472,8 +516,9 @@ class _Sleeps(ReferenceHand):
             super().command(motor)
 
 
+@wrong_hand("DEX1-WDOG-03")
 class SleepsAfterSilence(ReferenceService):
-    """Takes a while after a silence until it listens again."""
+    """Ignores commands for a while after a silence."""
 
     hand = _Sleeps
 
@@ -483,8 +528,9 @@ class _InfiniteGains(ReferenceHand):
         super().command(replace(motor, kp=min(motor.kp, 1e3)))
 
 
+@wrong_hand("DEX1-SAFE-01")
 class InfiniteGains(ReferenceService):
-    """Caps the stiffness before it looks whether it is finite."""
+    """Clamps kp before it checks that it is finite."""
 
     hand = _InfiniteGains
 
@@ -499,110 +545,8 @@ class _Latches(ReferenceHand):
         return self.tripped or super().braking
 
 
+@wrong_hand("DEX1-WDOG-03")
 class LatchesTheBrake(ReferenceService):
-    """Brakes in silence, and never lets go again."""
+    """Brakes after a silence and never releases."""
 
     hand = _Latches
-
-
-DIALECTS = {
-    **dict.fromkeys(
-        ("Millivolts", "StatusInMotorstate", "NanAttitude", "SignedForce"), "unitree_hg"
-    ),
-    "RestsAtZero": "unitree_actuator",
-}
-"""The dialect of those that are wrong in one dialect only."""
-ALONE = ("RestsAtZero", "PercentBothWays", "PercentWithin", "DegreesBothWays")
-"""Those that are seen in a left hand alone: an object would hold the right one away from 0."""
-ZOO: tuple[tuple[type[ReferenceService], str, tuple[str, ...]], ...] = (
-    (of(shared.OldTopic, ReferenceService), "DEX1-TOPIC-01", ()),
-    (of(shared.OtherStateType, ReferenceService), "DEX1-TOPIC-01", ()),
-    (of(shared.OtherCommandType, ReferenceService), "DEX1-TOPIC-02", ()),
-    (of(shared.DemandsHistory, ReferenceService), "DEX1-QOS-01", ()),
-    (of(shared.BestEffortWriter, ReferenceService), "DEX1-QOS-02", ()),
-    (of(shared.SilentUntilCommanded, ReferenceService), "DEX1-START-01", ()),
-    (RestsAtZero, "DEX1-START-02", ()),
-    (of(shared.SlowPublisher, ReferenceService), "DEX1-RATE-01", ()),
-    (of(shared.HalfRate, ReferenceService), "DEX1-RATE-02", ()),
-    (of(shared.Hiccup, ReferenceService), "DEX1-RATE-03", ()),
-    (of(shared.Bursts, ReferenceService), "DEX1-RATE-04", ()),
-    (of(shared.RepeatsOldStates, ReferenceService), "DEX1-ORDER-01", ()),
-    (of(shared.StaleState, ReferenceService), "DEX1-FRESH-01", ()),
-    (of(shared.FreezesOnce, ReferenceService), "DEX1-FRESH-02", ()),
-    (of(shared.OneTooMany, ReferenceService), "DEX1-FIELD-01", ()),
-    (of(shared.EmptyNowAndThen, ReferenceService), "DEX1-FIELD-01", ()),
-    (NanVelocity, "DEX1-FIELD-02", ()),
-    (Percent, "DEX1-FIELD-03", ()),
-    (PercentBothWays, "DEX1-FIELD-03", ()),
-    (Degrees, "DEX1-FIELD-03", ()),
-    (DegreesBothWays, "DEX1-FIELD-03", ()),
-    (PercentWithin, "DEX1-FIELD-14", ()),
-    (TurnedVelocity, "DEX1-FIELD-04", ()),
-    (OtherRobotsMode, "DEX1-FIELD-05", ()),
-    (AlwaysDriven, "DEX1-FIELD-05", ("DEX1-LIFE-05",)),
-    (TurnedAcceleration, "DEX1-FIELD-06", ()),
-    (AccelerationPerSample, "DEX1-FIELD-06", ()),
-    (NanRaw, "DEX1-FIELD-07", ()),
-    (HotByte, "DEX1-FIELD-08", ()),
-    (UnsetLost, "DEX1-FIELD-09", ()),
-    (CountsInReserve, "DEX1-FIELD-10", ()),
-    (Millivolts, "DEX1-FIELD-11", ()),
-    (StatusInMotorstate, "DEX1-FIELD-12", ()),
-    (NanAttitude, "DEX1-FIELD-13", ()),
-    (Inverted, "DEX1-MOVE-01", ()),
-    (PercentCommands, "DEX1-MOVE-01", ()),
-    (Normalised, "DEX1-MOVE-01", ()),
-    (NormalisedBothWays, "DEX1-MOVE-01", ()),
-    (Metres, "DEX1-MOVE-01", ()),
-    (NormalisedCommands, "DEX1-MOVE-02", ("DEX1-MOVE-01",)),
-    (of(shared.Frozen, ReferenceService), "DEX1-MOVE-01", ()),
-    (OtherScale, "DEX1-MOVE-02", ()),
-    (Hunts, "DEX1-MOVE-03", ()),
-    # a session is faster than this hand can go
-    (Slow, "DEX1-MOVE-04", ("DEX1-TRACK-01",)),
-    (Overshoots, "DEX1-MOVE-05", ()),
-    (of(shared.KicksBack, ReferenceService), "DEX1-MOVE-06", ()),
-    (Creeps, "DEX1-MOVE-07", ()),
-    (ShortStroke, "DEX1-MOVE-08", ()),
-    (Coupled, "DEX1-SIDE-01", ()),
-    # a hand that answers to the other side's topic does not answer to its own
-    (of(shared.Swapped, ReferenceService), "DEX1-SIDE-01", ("DEX1-MOVE-01",)),
-    (IgnoresGains, "DEX1-GAIN-01", ("DEX1-SAFE-05",)),
-    (NoForce, "DEX1-FORCE-01", ()),
-    (ForceAtRest, "DEX1-FORCE-02", ()),
-    (UnsignedForce, "DEX1-FORCE-03", ()),
-    (MilliNewtonMetres, "DEX1-FORCE-04", ("DEX1-FORCE-02",)),
-    (SignedForce, "DEX1-FORCE-05", ()),
-    (of(shared.NanIsZero, ReferenceService), "DEX1-SAFE-01", ()),
-    (InfiniteGains, "DEX1-SAFE-01", ()),
-    (NoLimits, "DEX1-SAFE-02", ()),
-    (of(shared.EmptyIsZero, ReferenceService), "DEX1-SAFE-03", ()),
-    (of(shared.DiesOfEmpty, ReferenceService), "DEX1-SAFE-03", ()),
-    (of(shared.TakesTheLast, ReferenceService), "DEX1-SAFE-04", ()),
-    (NegativeGains, "DEX1-SAFE-05", ()),
-    (of(shared.TakesAnyType, ReferenceService), "DEX1-SAFE-06", ()),
-    (of(shared.DiesOfAnyType, ReferenceService), "DEX1-SAFE-06", ()),
-    (of(shared.QueuesCommands, ReferenceService), "DEX1-SAFE-07", ()),
-    (of(shared.StopsInABurst, ReferenceService), "DEX1-SAFE-07", ()),
-    (of(shared.GivesUpOnTwo, ReferenceService), "DEX1-SAFE-08", ()),
-    (of(shared.StaysWithTheNewest, ReferenceService), "DEX1-SAFE-08", ()),
-    (of(shared.DropsOldStamps, ReferenceService), "DEX1-ORDER-02", ()),
-    (of(shared.StuttersUnderLoad, ReferenceService), "DEX1-LOAD-01", ()),
-    (of(shared.WaitsForItsReaders, ReferenceService), "DEX1-LOAD-01", ()),
-    # it says the truth, which a client cannot tell from a stuck byte
-    (NoWatchdog, "DEX1-WDOG-01", ("DEX1-FIELD-05",)),
-    (SnapsOpenAtTheTimeOut, "DEX1-WDOG-01", ()),
-    (of(shared.QuietInSilence, ReferenceService), "DEX1-WDOG-02", ()),
-    (LatchesTheBrake, "DEX1-WDOG-03", ()),
-    (SleepsAfterSilence, "DEX1-WDOG-03", ()),
-    (of(shared.ServesOnlyTheFirst, ReferenceService), "DEX1-LIFE-01", ()),
-    (of(shared.BoundToOneClient, ReferenceService), "DEX1-LIFE-02", ()),
-    (of(shared.DeafAfterRestart, ReferenceService), "DEX1-LIFE-03", ()),
-    (of(shared.SilentAfterRestart, ReferenceService), "DEX1-LIFE-03", ()),
-    (of(shared.HangsAtTheEnd, ReferenceService), "DEX1-LIFE-04", ()),
-    (of(shared.LeavesItsName, ReferenceService), "DEX1-LIFE-04", ()),
-    (of(shared.LeavesItDriven, ReferenceService), "DEX1-LIFE-05", ()),
-    (of(shared.WaitsForRest, ReferenceService), "DEX1-TRACK-01", ()),
-    (of(shared.Delayed, ReferenceService), "DEX1-TRACK-02", ()),
-)
-"""(mutant, requirement that must catch it, requirements that cannot but fail with it)."""

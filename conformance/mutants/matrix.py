@@ -1,4 +1,5 @@
-"""All wrong hands against all requirements: who is caught, by what, and what nobody proves.
+"""The matrix of all wrong hands and all requirements: which fault each requirement finds, and which
+requirement no wrong hand proves.
 
 ``dexkit mutants`` prints it, the tests demand that it is perfect.
 """
@@ -16,50 +17,37 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from dexkit.conformance import mutants as dds
-from dexkit.conformance.mutants import robot, shared
+from dexkit.conformance.mutants import Mutant, mutants
+from dexkit.conformance.mutants.trials import TRIALS
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
-from dexkit.conformance.usb import mutants as usb
 from dexkit.console import Console
 from dexkit.documents import write_file
-from dexkit.models import DEX3_1, model
 
-__all__ = ["Outcome", "Score", "Trial", "chosen", "essential", "trials", "try_one"]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One wrong hand to be tried.
-
-    :param kills: the requirement that must catch it; ``also`` what cannot but fail with it.
-    :param cost: seconds that it takes, roughly, in units of the shortest.
-    """
-
-    layer: str
-    model: str
-    name: str
-    kills: str
-    also: tuple[str, ...]
-    summary: str
-    cost: float = 1.0
+__all__ = ["Outcome", "Score", "chosen", "cost", "essential", "try_one"]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a trial showed.
+    """What the trial of a wrong hand showed.
 
-    :param missed: requirements that should have caught it and did not.
-    :param wrongly: requirements that found fault with it and should not have.
+    :param missed: requirements that should have failed or warned, and did not.
+    :param wrongly: requirements that failed or warned, and should not have.
     """
 
-    trial: Trial
+    mutant: Mutant
     missed: tuple[str, ...] = ()
     wrongly: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, mutant: Mutant, blamed: set[str]) -> Outcome:
+        """Compare the requirements that failed or warned with those that were declared."""
+        due = {mutant.kills, *mutant.also}
+        return cls(mutant, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
 
     @property
     def name(self) -> str:
         """The wrong hand's name."""
-        return self.trial.name
+        return self.mutant.name
 
     @property
     def good(self) -> bool:
@@ -67,75 +55,45 @@ class Outcome:
         return not self.missed and not self.wrongly
 
 
-def _cost(mutant: dds.Mutant) -> float:
-    per_phase = 1 if model(mutant.model).dialects[0].is_gripper else 2
-    return len(mutant.sides) * (1 if mutant.brief else 3) * per_phase
-
-
-def trials() -> tuple[Trial, ...]:
-    """Every wrong hand, on the topics and on USB, and every wrong robot."""
-    found = [
-        Trial(
-            "dds",
-            m.model,
-            m.name,
-            m.kills,
-            m.also,
-            m.summary,
-            _cost(m),
-        )
-        for m in dds.mutants()
-    ]
-    return (
-        *found,
-        *(Trial("usb", DEX3_1.name, m.name, m.kills, m.also, m.summary, 0.5) for m in usb.MUTANTS),
-        *(Trial("robot", m.model, m.name, m.kills, m.also, m.summary, 4.0) for m in robot.MUTANTS),
-    )
-
-
 def chosen(
     model: str | None = None, prefixes: Sequence[str] = ()
-) -> tuple[tuple[Requirement, ...], tuple[Trial, ...]]:
+) -> tuple[tuple[Requirement, ...], tuple[Mutant, ...]]:
     """The requirements of a model whose id begins so, and the wrong hands that prove them.
 
     :raises UsageError: a prefix matches nothing.
     """
     requirements = select(catalogue(model, None), prefixes=prefixes)
     wanted = {r.id for r in requirements}
-    return requirements, tuple(t for t in trials() if t.kills in wanted)
+    return requirements, tuple(m for m in mutants() if m.kills in wanted)
 
 
-def essential(given: Sequence[Trial]) -> tuple[Trial, ...]:
+def cost(mutant: Mutant) -> float:
+    """Roughly how long a trial takes, in units of the shortest on DDS."""
+    return TRIALS[mutant.layer].cost(mutant)
+
+
+def essential(given: Sequence[Mutant]) -> tuple[Mutant, ...]:
     """The cheapest wrong hand of each MUST."""
     musts = {r.id for r in catalogue(None, None) if r.level is Level.MUST}
-    found: dict[str, Trial] = {}
-    for trial in sorted(given, key=lambda t: t.cost):
-        if trial.kills in musts:
-            found.setdefault(trial.kills, trial)
+    found: dict[str, Mutant] = {}
+    for mutant in sorted(given, key=cost):
+        if mutant.kills in musts:
+            found.setdefault(mutant.kills, mutant)
     return tuple(found.values())
 
 
-def try_one(trial: Trial, *, short: bool = False) -> Outcome:
-    """Run a wrong hand on a virtual clock, and judge it by everything.
+def try_one(mutant: Mutant, *, short: bool = False) -> Outcome:
+    """Run a wrong hand on a virtual clock, and judge it by every requirement.
 
-    :param short: go through no more phases than show it, where that is fair.
+    :param short: apply only the phases that show the fault, where that is fair.
     """
-    if trial.layer == "usb":
-        wrong = next(m for m in usb.MUTANTS if (m.name, m.kills) == (trial.name, trial.kills))
-        _, blamed = usb.try_mutant(wrong.device, catalogue(trial.model, "usb"))
-        return _outcome(trial, blamed)
-    if trial.layer == "robot":
-        bad = next(m for m in robot.MUTANTS if (m.model, m.name) == (trial.model, trial.name))
-        return _outcome(trial, bad.blamed(short=short))
-    mutant = next(m for m in dds.mutants() if (m.model, m.name) == (trial.model, trial.name))
-    plan = mutant.short_plan if short and mutant.name not in shared.DILUTED else mutant.plan
-    found = dds.trial(mutant, dds.run_mutant(mutant.service, plan))
-    return Outcome(trial, tuple(sorted(found["missed"])), tuple(sorted(found["wrongly"])))
+    return Outcome.of(mutant, TRIALS[mutant.layer].blamed(mutant, short=short))
 
 
-def _outcome(trial: Trial, blamed: set[str]) -> Outcome:
-    due = {trial.kills, *trial.also}
-    return Outcome(trial, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
+def _blamed(key: tuple[str, str, str]) -> set[str]:
+    """In a process of its own: classes that were mixed cannot be sent there, their keys can."""
+    mutant = next(m for m in mutants() if m.key == key)
+    return TRIALS[mutant.layer].blamed(mutant, short=False)
 
 
 def _ignore_interrupts() -> None:
@@ -145,13 +103,13 @@ def _ignore_interrupts() -> None:
 
 @dataclass
 class Score:
-    """The matrix: what every trial showed of the requirements."""
+    """The matrix: the outcome of every trial, by requirement."""
 
     requirements: Sequence[Requirement]
     outcomes: list[Outcome] = field(default_factory=list)
 
     def run(
-        self, given: Sequence[Trial], stop: object = None, jobs: int | None = None
+        self, given: Sequence[Mutant], stop: object = None, jobs: int | None = None
     ) -> Iterator[Outcome]:
         """Try them in processes of their own; yields each as it is done.
 
@@ -159,14 +117,13 @@ class Score:
         :param jobs: processes; one a processor by default.
         """
         context = multiprocessing.get_context("spawn")
-        ordered = sorted(given, key=lambda t: -t.cost)
+        ordered = sorted(given, key=lambda m: -cost(m))
         pool = ProcessPoolExecutor(jobs, context, _ignore_interrupts)
         try:
-            waiting = {pool.submit(try_one, trial) for trial in ordered}
+            waiting = {pool.submit(_blamed, mutant.key): mutant for mutant in ordered}
             while waiting and not stop:
-                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-                for future in done:
-                    self.outcomes.append(future.result())
+                for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                    self.outcomes.append(Outcome.of(waiting.pop(future), future.result()))
                     yield self.outcomes[-1]
         finally:
             # not as a context manager: that would run what is still waiting
@@ -177,12 +134,12 @@ class Score:
         return [
             o
             for o in self.outcomes
-            if o.trial.kills == requirement.id and requirement.id not in o.missed
+            if o.mutant.kills == requirement.id and requirement.id not in o.missed
         ]
 
     @property
     def unproven(self) -> list[Requirement]:
-        """Requirements that no wrong hand is caught by."""
+        """Requirements that no wrong hand proves."""
         return [r for r in self.requirements if not self.killers(r)]
 
     @property
@@ -201,15 +158,15 @@ class Score:
             "mutants": [
                 {
                     "name": o.name,
-                    "layer": o.trial.layer,
-                    "model": o.trial.model,
-                    "kills": o.trial.kills,
-                    "also": list(o.trial.also),
-                    "summary": o.trial.summary,
+                    "layer": o.mutant.layer,
+                    "model": o.mutant.model,
+                    "kills": o.mutant.kills,
+                    "also": list(o.mutant.also),
+                    "summary": o.mutant.summary,
                     "missed": list(o.missed),
                     "wrongly": list(o.wrongly),
                 }
-                for o in sorted(self.outcomes, key=lambda o: (o.trial.kills, o.name))
+                for o in sorted(self.outcomes, key=lambda o: (o.mutant.kills, o.name))
             ],
         }
 
@@ -218,7 +175,7 @@ class Score:
         write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
 
     def print(self, console: Console, *, verbose: bool = False) -> None:
-        """The score by area, and whatever is not as it should be."""
+        """The score by area, and what is not as it should be."""
         table = Table(box=None, pad_edge=False)
         for name in ("", "MUST", "SHOULD", "INFO", "wrong hands"):
             table.add_column(name, justify="left" if not name else "right")
@@ -232,12 +189,12 @@ class Score:
                 those = [r for r in group if r.level is level]
                 proven = sum(bool(self.killers(r)) for r in those)
                 cells.append(f"{proven}/{len(those)}" if those else "")
-            count = sum(o.trial.kills in ids for o in self.outcomes)
+            count = sum(o.mutant.kills in ids for o in self.outcomes)
             table.add_row(f"{prefix} {area}", *cells, str(count))
         console.print(table)
         if verbose:
-            for o in sorted(self.outcomes, key=lambda o: o.trial.kills):
-                console.print(f"{o.trial.kills:14} {o.name}: {escape(o.trial.summary)}")
+            for o in sorted(self.outcomes, key=lambda o: o.mutant.kills):
+                console.print(f"{o.mutant.kills:14} {o.name}: {escape(o.mutant.summary)}")
         for requirement in self.unproven:
             console.print(
                 f"[red]unproven[/]  {requirement.id} ({requirement.level}): no wrong hand is "
@@ -248,7 +205,7 @@ class Score:
                 console.print(f"[red]survived[/]  {o.name} was not caught by {', '.join(o.missed)}")
             if o.wrongly:
                 console.print(
-                    f"[red]stray[/]     {o.name} (of {o.trial.kills}) was also blamed for "
+                    f"[red]stray[/]     {o.name} (of {o.mutant.kills}) was also blamed for "
                     f"{', '.join(o.wrongly)}"
                 )
         proven = len(self.requirements) - len(self.unproven)

@@ -1,35 +1,30 @@
-"""Wrong hands that only an operator notices: with Unitree's client in the loop.
+"""Wrong hands whose fault shows only in a closed loop, with a model of Unitree's client.
 
-Each keeps every MUST; what is wrong shows where commands depend on states.
+Each meets every MUST; the fault shows where commands depend on states.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants import shared
+from dexkit.conformance.mutants.any_model import Delayed
+from dexkit.conformance.mutants.registry import wrong_hand
 from dexkit.conformance.virtual import Service
-from dexkit.conformance.virtual.dex5 import Dex5Service
-from dexkit.conformance.virtual.fingers import Dex3Service, FingerService
+from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, DEX5_1, model
-
-__all__ = ["ZOO"]
-
-_Entry: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
+from dexkit.models import model
 
 
 class _PerJoint(Service):
-    """Changes what each joint is told, where it is something finite."""
+    """Changes the goal of each joint, where it is finite."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
-        self.told: dict[tuple[Side, int], tuple[float, float]] = {}
+        self.obeyed: dict[tuple[Side, int], tuple[float, float]] = {}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         if all(math.isfinite(m.q) for m in motors):
@@ -40,7 +35,7 @@ class _PerJoint(Service):
         super().motors(side, motors)
 
     def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
-        """The target that is obeyed in place of ``q``."""
+        """The goal that is obeyed in place of ``q``, rad."""
         raise AssertionError  # overridden
 
     def stroke(self, joint: tuple[Side, int]) -> float:
@@ -57,18 +52,23 @@ class _DeadBand(_PerJoint):
 
     def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
         if abs(q - here) >= self.band * self.stroke(joint):
-            self.told[joint] = (q, self.now)
-        return self.told.setdefault(joint, (here, self.now))[0]
+            self.obeyed[joint] = (q, self.now)
+        return self.obeyed.setdefault(joint, (here, self.now))[0]
 
 
+# where the client's filter stays within the dead band, nothing moves any more
+@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-04",))
 class DeadBand(_DeadBand, ReferenceService):
-    """Ignores a target nearer than 0.14 rad: where the client sticks there, it never goes on."""
+    """Ignores a goal nearer than 0.14 rad: the client waits there and never moves on."""
 
     band = 0.14 / 5.4
 
 
+@wrong_hand("DEX3-OPER-02")
+# it rests nearer to where the script moves it after the restart
+@wrong_hand("DEX5-OPER-02", also=("DEX5-LIFE-03",))
 class FingerDeadBand(_DeadBand, FingerService):
-    """Ignores a target nearer than a fifteenth of a joint's range."""
+    """Ignores a goal nearer than a fifteenth of the joint's range."""
 
     band = 1 / 15
 
@@ -82,20 +82,24 @@ class _Coarse(_PerJoint):
         return round(q / grid) * grid
 
 
+@wrong_hand("DEX1-OPER-04")
 class CoarseTargets(_Coarse, ReferenceService):
-    """Goes to the nearest of nineteen places."""
+    """Moves to the nearest of 19 positions."""
 
     grid = 1 / 18
 
 
+@wrong_hand("DEX3-OPER-04", also=("DEX3-MOVE-04",))
+@wrong_hand("DEX5-OPER-04")
 class CoarseFingers(_Coarse, FingerService):
-    """Goes to the nearest of twenty-one places."""
+    """Moves to the nearest of 21 positions."""
 
     grid = 1 / 20
 
 
+@wrong_hand("DEX1-OPER-02", also=("DEX1-OPER-01", "DEX1-OPER-05"))
 class LateState(ReferenceService):
-    """Says where it was 60 ms ago, in ever fresh messages."""
+    """Publishes the position of 60 ms ago in fresh messages."""
 
     late = 0.06
 
@@ -112,8 +116,9 @@ class LateState(ReferenceService):
         return {**found, **past[0][1]}
 
 
+@wrong_hand("DEX1-OPER-03")
 class RunsAhead(_PerJoint, ReferenceService):
-    """Goes where moving targets will soon be, and so too far when they stop."""
+    """Extrapolates moving goals by 70 ms, and overshoots when they stop."""
 
     lead, memory = 0.07, 0.1
     """Seconds ahead, and over which the targets' speed is smoothed."""
@@ -123,7 +128,7 @@ class RunsAhead(_PerJoint, ReferenceService):
         self.speed: dict[tuple[Side, int], float] = {}
 
     def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
-        before, since = self.told.get(joint, (q, self.now))
+        before, since = self.obeyed.get(joint, (q, self.now))
         step, seconds = q - before, self.now - since
         if abs(step) > 0.04 * self.stroke(joint):  # a jump is no speed
             self.speed[joint] = 0.0
@@ -131,7 +136,7 @@ class RunsAhead(_PerJoint, ReferenceService):
             speed = self.speed.get(joint, 0.0)
             part = min(1.0, seconds / self.memory)
             self.speed[joint] = speed + part * (step / seconds - speed)
-        self.told[joint] = (q, self.now)
+        self.obeyed[joint] = (q, self.now)
         return q + self.lead * self.speed.get(joint, 0.0)
 
 
@@ -144,25 +149,26 @@ class _SlowToWake(_PerJoint):
         self.awake: dict[tuple[Side, int], float] = {}
 
     def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
-        before, since = self.told.get(joint, (q, self.now))
+        before, since = self.obeyed.get(joint, (q, self.now))
         if abs(q - before) > 1e-4 * self.stroke(joint):
             if self.now - since > self.sleeps_after:
                 self.awake[joint] = self.now + self.wakes_in
             if self.now >= self.awake.get(joint, 0.0):
-                self.told[joint] = (q, self.now)
+                self.obeyed[joint] = (q, self.now)
                 return q
-            self.told[joint] = (before, self.now)
-        elif joint not in self.told:
-            self.told[joint] = (q, self.now)
+            self.obeyed[joint] = (before, self.now)
+        elif joint not in self.obeyed:
+            self.obeyed[joint] = (q, self.now)
         return before
 
 
+@wrong_hand("DEX1-OPER-05")
 class SlowToWake(_SlowToWake, ReferenceService):
-    """Sleeps when its target rests, and needs 0.2 s to wake."""
+    """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
 
 
 class _OpenEnd(_PerJoint):
-    """Does something else near the open end of a joint."""
+    """Obeys another goal near the open end of a joint."""
 
     near = 0.08
     """Part of the joint's closing that counts as that."""
@@ -180,77 +186,36 @@ class _OpenEnd(_PerJoint):
         raise AssertionError  # overridden
 
 
+@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05",))
+# its session begins at the open end
+@wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01"))
 class SlowToLeave(_OpenEnd, FingerService):
-    """Leaves the open end of a joint at a tenth of its range a second."""
+    """Leaves the open end of a joint at a tenth of its range per second."""
 
     speed = 0.1
 
     def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
         taken = goal
         if here < self.near and goal > here:
-            before, since = self.told.get(joint, (here, self.now))
+            before, since = self.obeyed.get(joint, (here, self.now))
             taken = min(goal, max(before, 0.0) + self.speed * (self.now - since))
-        self.told[joint] = (taken, self.now)
+        self.obeyed[joint] = (taken, self.now)
         return taken
 
 
+@wrong_hand("DEX3-OPER-03")
 class Springs(_OpenEnd, FingerService):
-    """Goes a quarter too far for half a second when it comes from the open end of a joint."""
+    """Moves 25 % too far for 0.5 s when it leaves the open end of a joint."""
 
     def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
         if here < self.near:
-            self.told[joint] = (here, self.now)
-        _, left = self.told.get(joint, (here, -1.0))
+            self.obeyed[joint] = (here, self.now)
+        _, left = self.obeyed.get(joint, (here, -1.0))
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-class LateFingers(shared.Delayed, FingerService):
-    """Carries out each command 0.15 s late."""
-
-
-_FINGERS: tuple[_Entry, ...] = (
-    (SlowToLeave, "OPER-01", ("OPER-05",)),
-    (FingerDeadBand, "OPER-02", ()),
-    (Springs, "OPER-03", ()),
-    (CoarseFingers, "OPER-04", ()),
-    (LateFingers, "OPER-05", ("TRACK-02",)),
-)
-
-
-def _zoo(
-    prefix: str, reference: type[FingerService], others: Mapping[type[Service], tuple[str, ...]]
-) -> tuple[_Entry, ...]:
-    """The wrong hands of a model; ``others`` says what else fails only with this one."""
-    return tuple(
-        (
-            shared.of(mixin, reference),
-            f"{prefix}-{kills}",
-            tuple(f"{prefix}-{a}" for a in (*also, *others.get(mixin, ()))),
-        )
-        for mixin, kills, also in _FINGERS
-    )
-
-
-ZOO: dict[str, tuple[_Entry, ...]] = {
-    DEX1_1.name: (
-        # where the client's filter sticks within the dead band, nothing moves any more
-        (DeadBand, "DEX1-OPER-01", ("DEX1-OPER-04",)),
-        (LateState, "DEX1-OPER-02", ("DEX1-OPER-01", "DEX1-OPER-05")),
-        (RunsAhead, "DEX1-OPER-03", ()),
-        (CoarseTargets, "DEX1-OPER-04", ()),
-        (SlowToWake, "DEX1-OPER-05", ()),
-    ),
-    DEX3_1.name: _zoo("DEX3", Dex3Service, {CoarseFingers: ("MOVE-04",)}),
-    # its session begins at the open end, and it rests nearer to where it is brought first
-    DEX5_1.name: _zoo(
-        "DEX5",
-        Dex5Service,
-        {
-            SlowToLeave: ("TRACK-01",),
-            FingerDeadBand: ("LIFE-03",),
-            # its delay is long beside what the light joints take
-            LateFingers: ("OPER-02",),
-        },
-    ),
-}
-"""By model: (mutant, requirement that must catch it, requirements that cannot but fail with it)."""
+@wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02",))
+# its delay is long beside the time that the light joints take
+@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02"))
+class LateFingers(Delayed, FingerService):
+    """Obeys each command 0.15 s late."""

@@ -1,25 +1,16 @@
-"""Bodies that are wrong in one way each; see :mod:`dexkit.conformance.mutants`.
-
-Each is tried as an H1 and as a G1, where the requirement that it breaks is about both.
-"""
+"""Wrong robots: each is made as an H1 and as a G1, where both have the requirement."""
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.judge import judge
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Verdict
-from dexkit.conformance.robot import robot_dialect, robot_recording
-from dexkit.conformance.stimuli import Plan, phases_for
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
+from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.virtual import MemoryTrace, Sample
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.hand import Floats, Side
 from dexkit.messages import decode, message_type
@@ -27,8 +18,6 @@ from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
 from dexkit.traces import TraceEndpoint
 from dexkit.wire.crc32 import crc32_words
-
-__all__ = ["MUTANTS", "RobotMutant", "run_robot_mutant"]
 
 _EARLY = 0.8  # s: while the kit only listens
 
@@ -43,6 +32,7 @@ class _OtherFamily(ReferenceRobot):
         return other.cmd_type, other.state_type
 
 
+@wrong_hand("H1-TOPIC-01")
 class OtherState(_OtherFamily):
     """Publishes the other family's LowState_."""
 
@@ -57,8 +47,9 @@ class OtherState(_OtherFamily):
         return kind.encode(kind.cls())
 
 
+@wrong_hand("H1-TOPIC-02", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
 class OtherCommands(_OtherFamily):
-    """Listens for the other family's LowCmd_."""
+    """Subscribes to the other family's LowCmd_."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -67,28 +58,32 @@ class OtherCommands(_OtherFamily):
         self.command_type = self.others[0]
 
 
+@wrong_hand("H1-TOPIC-03")
 class Twins(ReferenceRobot):
-    """Two of them publish."""
+    """Two publishers send its state."""
 
     def endpoints(self) -> list[TraceEndpoint]:
         every = super().endpoints()
         return every + [e for e in every if e.kind == "writer"]
 
 
+@wrong_hand("H1-QOS-01", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
 class AsksForMore(ReferenceRobot):
-    """Asks for the commands from before it came."""
+    """Requests TRANSIENT_LOCAL commands, which no official client offers."""
 
     reader_durability = "TransientLocal"
 
 
+@wrong_hand("H1-QOS-02")
 class BestEffort(ReferenceRobot):
-    """Offers its state without reliability."""
+    """Publishes its state with best-effort reliability."""
 
     writer_reliability = "best_effort"
 
 
+@wrong_hand("H1-START-01")
 class WaitsForCommands(ReferenceRobot):
-    """Says nothing until it is commanded."""
+    """Publishes nothing before the first command."""
 
     def publish(self) -> list[Sample]:
         return super().publish() if self.orders is not None else []
@@ -97,16 +92,18 @@ class WaitsForCommands(ReferenceRobot):
 # ------------------------------------------------------------------------------------ integrity
 
 
+@wrong_hand("H1-FIELD-01")
 class CutShort(ReferenceRobot):
-    """Its first states lack the last word."""
+    """Its first states lack their last four bytes."""
 
     def sealed(self) -> bytes:
         payload = super().sealed()
         return payload[:-4] if self.now < _EARLY else payload
 
 
+@wrong_hand("H1-FIELD-02")
 class NotANumber(ReferenceRobot):
-    """Divides by a time of zero at first."""
+    """Publishes NaN as ddq of one motor at first."""
 
     def message(self) -> Any:
         state = super().message()
@@ -114,6 +111,7 @@ class NotANumber(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-CRC-01")
 class CdrCrc(ReferenceRobot):
     """Computes the CRC over the CDR bytes."""
 
@@ -122,8 +120,9 @@ class CdrCrc(ReferenceRobot):
         return payload[:-4] + crc32_words(payload[4:-4]).to_bytes(4, "little")
 
 
+@wrong_hand("H1-CRC-01")
 class NoCrc(ReferenceRobot):
-    """Leaves the CRC 0."""
+    """Publishes a CRC of 0."""
 
     def sealed(self) -> bytes:
         return super().sealed()[:-4] + bytes(4)
@@ -132,42 +131,48 @@ class NoCrc(ReferenceRobot):
 # ----------------------------------------------------------------------------------------- rate
 
 
+@wrong_hand("H1-RATE-01")
 class Slow(ReferenceRobot):
-    """Publishes 100 times a second."""
+    """Publishes at 100 Hz."""
 
     period = 0.01
 
 
+@wrong_hand("H1-RATE-02")
 class Leisurely(ReferenceRobot):
-    """Publishes 333 times a second."""
+    """Publishes at 333 Hz."""
 
     period = 0.003
 
 
+@wrong_hand("H1-RATE-03")
 class Stumbles(ReferenceRobot):
-    """Says nothing for a fifth of a second."""
+    """Publishes nothing for 0.2 s once."""
 
     def publish(self) -> list[Sample]:
         return [] if 0.5 < self.now < 0.7 else super().publish()
 
 
+@wrong_hand("H1-ORDER-01")
 class Repeats(ReferenceRobot):
-    """Sends some states twice."""
+    """Publishes some states twice."""
 
     def publish(self) -> list[Sample]:
         found = super().publish()
         return found * 2 if self.now < _EARLY and self.ticks() % 50 == 0 else found
 
 
+@wrong_hand("H1-TICK-01")
 class NoTick(ReferenceRobot):
-    """Leaves tick 0."""
+    """Publishes a tick of 0."""
 
     def ticks(self) -> int:
         return 0
 
 
+@wrong_hand("H1-TICK-02")
 class CountsStates(ReferenceRobot):
-    """Counts states instead of milliseconds."""
+    """Counts states instead of milliseconds in tick."""
 
     def ticks(self) -> int:
         return super().ticks() // 2
@@ -176,8 +181,9 @@ class CountsStates(ReferenceRobot):
 # --------------------------------------------------------------------------------------- fields
 
 
+@wrong_hand("H1-FIELD-03")
 class TurnedOnce(ReferenceRobot):
-    """One encoder counts from a turn further."""
+    """Publishes one joint a full turn off."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -188,16 +194,18 @@ class TurnedOnce(ReferenceRobot):
             values[slot] += 2 * math.pi
 
 
+@wrong_hand("H1-FIELD-04")
 class NoSpeed(ReferenceRobot):
-    """Leaves dq 0."""
+    """Publishes dq as 0."""
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
         q, dq, tau = super().shown()
         return q, np.zeros_like(dq), tau
 
 
+@wrong_hand("H1-FIELD-05")
 class Ghost(ReferenceRobot):
-    """Tells of a motor where none is."""
+    """Publishes a position in a slot without a motor."""
 
     def message(self) -> Any:
         state = super().message()
@@ -206,44 +214,50 @@ class Ghost(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-TEMP-01")
 class NoSensor(ReferenceRobot):
-    """Takes 255 for "no temperature"."""
+    """Publishes a temperature of 255 where it has none."""
 
     def warmth(self) -> Any:
         return 255
 
 
+@wrong_hand("H1-TEMP-02")
 class Frozen(ReferenceRobot):
-    """Leaves the motors' temperatures 0."""
+    """Publishes motor temperatures of 0."""
 
     def warmth(self) -> Any:
         return 0 if self.robot.motor_temperatures == 1 else (0, 0)
 
 
+@wrong_hand("H1-IMU-01")
 class NoAttitude(ReferenceRobot):
-    """Leaves the quaternion 0."""
+    """Publishes a quaternion of zeros."""
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         return (0.0,) * 4, (0.0,) * 3
 
 
+@wrong_hand("H1-IMU-02")
 class WLast(ReferenceRobot):
-    """Writes the quaternion with w last."""
+    """Publishes the quaternion with w last."""
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         (w, x, y, z), rpy = super().attitude()
         return (x, y, z, w), rpy
 
 
+@wrong_hand("H1-IMU-03")
 class InG(ReferenceRobot):
-    """Tells accelerations in g."""
+    """Publishes accelerations in g."""
 
     def gravity(self) -> tuple[float, float, float]:
         return (0.0, 0.0, 1.0)
 
 
+@wrong_hand("H1-HEAD-01")
 class NoHead(ReferenceRobot):
-    """Leaves the head 0."""
+    """Publishes a head of 0."""
 
     def message(self) -> Any:
         state = super().message()
@@ -251,8 +265,9 @@ class NoHead(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-BMS-01")
 class Empty(ReferenceRobot):
-    """Has an empty battery."""
+    """Publishes a battery charge of 0 %."""
 
     def message(self) -> Any:
         state = super().message()
@@ -260,8 +275,9 @@ class Empty(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-FOOT-01")
 class Hangs(ReferenceRobot):
-    """Its feet pull."""
+    """Publishes a negative foot force."""
 
     def message(self) -> Any:
         state = super().message()
@@ -269,22 +285,25 @@ class Hangs(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-REMOTE-01")
 class RemoteRubbish(ReferenceRobot):
-    """Does not clear the remote's bytes."""
+    """Publishes uninitialised bytes of the remote control."""
 
     def remote(self) -> bytes:
         return b"\xaa\x55" * 20
 
 
+@wrong_hand("H1-REMOTE-01")
 class ShiftedRemote(ReferenceRobot):
-    """Writes the sticks without the two bytes before them."""
+    """Publishes the remote control's sticks two bytes too early."""
 
     def remote(self) -> bytes:
         return struct.pack("<H5f18x", 0, 0.5, 0.7, -0.3, 0.9, -0.25)
 
 
+@wrong_hand("G1-MACH-01")
 class NoMachine(ReferenceRobot):
-    """Leaves mode_machine 0."""
+    """Publishes a mode_machine of 0."""
 
     def message(self) -> Any:
         state = super().message()
@@ -292,8 +311,9 @@ class NoMachine(ReferenceRobot):
         return state
 
 
+@wrong_hand("H1-MODE-01")
 class NoMode(ReferenceRobot):
-    """Leaves the mode bytes 0."""
+    """Publishes mode bytes of 0."""
 
     def modes(self) -> list[int]:
         return [0] * self.robot.slots
@@ -302,8 +322,9 @@ class NoMode(ReferenceRobot):
 # --------------------------------------------------------------------------------------- motion
 
 
+@wrong_hand("H1-MOVE-01", also=("H1-WDOG-03",))
 class Halfway(ReferenceRobot):
-    """Goes half of each way."""
+    """Moves only half of the way to its goals."""
 
     def obey(self, orders: Orders) -> None:
         if orders is not self.orders:
@@ -312,8 +333,9 @@ class Halfway(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-MOVE-02")
 class Coupled(ReferenceRobot):
-    """Its hip gives way while the elbow moves."""
+    """Its hip moves along with the elbow."""
 
     def live(self, dt: float) -> None:
         elbow, hip = self.robot.slot("right_elbow"), self.robot.slot("right_hip_pitch")
@@ -323,8 +345,9 @@ class Coupled(ReferenceRobot):
             self.q[hip] += 3.0 * (self.q[elbow] - before)
 
 
+@wrong_hand("H1-GAIN-01")
 class OwnGains(ReferenceRobot):
-    """Puts in its own stiffness."""
+    """Uses its own kp wherever kp is not 0."""
 
     def obey(self, orders: Orders) -> None:
         own = np.array(self.robot.client_gains)[:, 0]
@@ -332,6 +355,7 @@ class OwnGains(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-GAIN-02")
 class NoVelocity(ReferenceRobot):
     """Ignores dq."""
 
@@ -340,6 +364,7 @@ class NoVelocity(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-GAIN-03", also=("H1-GAIN-01",))
 class NoTorque(ReferenceRobot):
     """Ignores tau."""
 
@@ -348,8 +373,9 @@ class NoTorque(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-GAIN-04")
 class DefaultGains(ReferenceRobot):
-    """Takes kp 0 for "as usual"."""
+    """Uses its own kp where kp is 0."""
 
     def obey(self, orders: Orders) -> None:
         own = np.array(self.robot.client_gains)[:, 0]
@@ -358,8 +384,9 @@ class DefaultGains(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-FORCE-01")
 class NoForce(ReferenceRobot):
-    """Leaves tau_est 0."""
+    """Publishes tau_est as 0."""
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
         q, dq, tau = super().shown()
@@ -369,22 +396,25 @@ class NoForce(ReferenceRobot):
 # --------------------------------------------------------------------------------------- safety
 
 
+@wrong_hand("H1-MODE-02", also=("H1-MODE-01",))
 class NoModes(ReferenceRobot):
-    """Does not look at the mode byte."""
+    """Ignores the mode byte of commands."""
 
     def follows(self, orders: Orders) -> Any:
         return np.ones(self.robot.slots, dtype=np.bool_)
 
 
+@wrong_hand("H1-CRC-02")
 class TrustsAll(ReferenceRobot):
-    """Does not check the CRC."""
+    """Does not check the CRC of commands."""
 
     def intact(self, payload: bytes) -> bool:
         return True
 
 
+@wrong_hand("H1-SAFE-01")
 class Sanitises(ReferenceRobot):
-    """Takes 0 for what is no number, and obeys the rest."""
+    """Replaces NaN and infinity by 0, and obeys the rest."""
 
     def accepts(self, orders: Orders) -> bool:
         for name in ("q", "dq", "tau", "kp", "kd"):
@@ -393,8 +423,9 @@ class Sanitises(ReferenceRobot):
         return super().accepts(orders)
 
 
+@wrong_hand("H1-SAFE-02")
 class Packed(ReferenceRobot):
-    """Has a joint in the slot without a motor."""
+    """Obeys the slot without a motor as a joint's."""
 
     def obey(self, orders: Orders) -> None:
         unused = [s for s in range(self.robot.slots) if s not in self.robot.used]
@@ -403,8 +434,9 @@ class Packed(ReferenceRobot):
         super().obey(orders)
 
 
+@wrong_hand("H1-SAFE-03")
 class Untyped(_OtherFamily):
-    """Takes whatever is on its command topic."""
+    """Decodes and obeys any type that is published on its command topic."""
 
     def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
         message = decode(type_name, payload)
@@ -418,8 +450,9 @@ class Untyped(_OtherFamily):
         self.obey(orders)
 
 
+@wrong_hand("H1-SAFE-04")
 class Sulks(ReferenceRobot):
-    """Follows nothing for a while after a NaN."""
+    """Ignores commands for about 2 s after a NaN."""
 
     until = -math.inf
 
@@ -429,6 +462,7 @@ class Sulks(ReferenceRobot):
         return super().accepts(orders) and self.now >= self.until
 
 
+@wrong_hand("G1-SAFE-05")
 class AnyMachine(ReferenceRobot):
     """Obeys commands for another machine."""
 
@@ -439,30 +473,34 @@ class AnyMachine(ReferenceRobot):
 # ------------------------------------------------------------------------------------- watchdog
 
 
+@wrong_hand("H1-WDOG-01")
 class GoesOn(ReferenceRobot):
     """Has no time-out."""
 
     timeout = math.inf
 
 
+@wrong_hand("H1-WDOG-02")
 class AnswersOnly(ReferenceRobot):
-    """Says nothing while it is told nothing."""
+    """Publishes nothing 0.5 s after the last command."""
 
     def publish(self) -> list[Sample]:
         waited = self.now - self.heard
         return [] if 0.5 < waited < math.inf else super().publish()
 
 
+@wrong_hand("H1-WDOG-03", also=("H1-LIFE-02",))
 class Latches(ReferenceRobot):
-    """Follows nothing any more after a time-out."""
+    """Obeys no command after a time-out."""
 
     def obey(self, orders: Orders) -> None:
         if self.now - self.heard <= self.timeout or self.orders is None:
             super().obey(orders)
 
 
+@wrong_hand("H1-WDOG-04")
 class Nervous(ReferenceRobot):
-    """Times out after a seventh of a second."""
+    """Times out after 0.15 s."""
 
     timeout = 0.15
 
@@ -470,22 +508,25 @@ class Nervous(ReferenceRobot):
 # ----------------------------------------------------------------------------------- life cycle
 
 
+@wrong_hand("H1-LIFE-01")
 class KnowsItsReaders(ReferenceRobot):
-    """Serves only those who were there at first."""
+    """Its states reach only subscribers that were there when it started."""
 
     serves_late_readers = False
 
 
+@wrong_hand("H1-LIFE-02")
 class Loyal(ReferenceRobot):
-    """Follows the first client only."""
+    """Obeys only the first client."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         if client == 0:
             super().receive(topic, payload, client)
 
 
+@wrong_hand("H1-CLIENT-01")
 class ForgetfulClient(ReferenceRobot):
-    """Its client does not set the CRC now and then."""
+    """Its client sends some commands without a CRC."""
 
     @classmethod
     def recorded(cls, trace: MemoryTrace) -> None:
@@ -494,133 +535,12 @@ class ForgetfulClient(ReferenceRobot):
                 rows[::100] = [(a, b, data[:-4] + bytes(4)) for a, b, data in rows[::100]]
 
 
+@wrong_hand("H1-CLIENT-02")
 class SlowClient(ReferenceRobot):
-    """Its client sends every fourth command only."""
+    """Its client sends only every fourth command."""
 
     @classmethod
     def recorded(cls, trace: MemoryTrace) -> None:
         for (topic, _), rows in trace.rows.items():
             if topic == "rt/lowcmd":
                 del rows[1::4], rows[1::3], rows[1::2]
-
-
-# ---------------------------------------------------------------------------------------- the zoo
-
-
-@dataclass(frozen=True)
-class RobotMutant:
-    """One wrong robot.
-
-    :param model: the robot that it is a bad copy of.
-    :param kills: the requirement that must catch it.
-    :param also: requirements that fail or warn with it.
-    """
-
-    model: str
-    service: type[ReferenceRobot]
-    kills: str
-    also: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Its class's name."""
-        return self.service.__name__
-
-    @property
-    def summary(self) -> str:
-        """What it does wrong, in a line."""
-        return (self.service.__doc__ or "").strip().splitlines()[0]
-
-    def blamed(self, *, short: bool = False) -> set[str]:
-        """The requirements that find fault with it.
-
-        :param short: go through no more phases than show it.
-        """
-        every = catalogue(self.model, "robot")
-        if not short:
-            return run_robot_mutant(self.service, self.model, phases_for(every))
-        needed = select(every, prefixes=[self.kills, *self.also])
-        phases = phases_for(needed)
-        if not any(r.phase == "joint" for r in needed):
-            phases -= {"joint"}  # by far the longest: all of them were moved for the others
-        return run_robot_mutant(self.service, self.model, phases)
-
-
-def run_robot_mutant(service: type[ReferenceRobot], model: str, phases: frozenset[str]) -> set[str]:
-    """The requirements that find fault with a robot on the virtual clock."""
-    trace = run_virtual(Plan(robot_dialect(model), (ROBOT,), phases=phases), service)
-    service.recorded(trace)
-    bad = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
-    results = judge(robot_recording(trace, model)).results
-    return {r.requirement.id for r in results if r.verdict in bad}
-
-
-_DEAF = ("MOVE-01", "MODE-01", "WDOG-03")
-_ZOO: tuple[tuple[type[ReferenceRobot], str, tuple[str, ...]], ...] = (
-    (OtherState, "TOPIC-01", ()),
-    (OtherCommands, "TOPIC-02", _DEAF),
-    (Twins, "TOPIC-03", ()),
-    (AsksForMore, "QOS-01", _DEAF),
-    (BestEffort, "QOS-02", ()),
-    (WaitsForCommands, "START-01", ()),
-    (CutShort, "FIELD-01", ()),
-    (NotANumber, "FIELD-02", ()),
-    (CdrCrc, "CRC-01", ()),
-    (NoCrc, "CRC-01", ()),
-    (Slow, "RATE-01", ()),
-    (Leisurely, "RATE-02", ()),
-    (Stumbles, "RATE-03", ()),
-    (Repeats, "ORDER-01", ()),
-    (NoTick, "TICK-01", ()),
-    (CountsStates, "TICK-02", ()),
-    (TurnedOnce, "FIELD-03", ()),
-    (NoSpeed, "FIELD-04", ()),
-    (Ghost, "FIELD-05", ()),
-    (NoSensor, "TEMP-01", ()),
-    (Frozen, "TEMP-02", ()),
-    (NoAttitude, "IMU-01", ()),
-    (WLast, "IMU-02", ()),
-    (InG, "IMU-03", ()),
-    (NoHead, "HEAD-01", ()),
-    (Empty, "BMS-01", ()),
-    (Hangs, "FOOT-01", ()),
-    (RemoteRubbish, "REMOTE-01", ()),
-    (ShiftedRemote, "REMOTE-01", ()),
-    (NoMachine, "MACH-01", ()),
-    (NoMode, "MODE-01", ()),
-    (Halfway, "MOVE-01", ("WDOG-03",)),
-    (Coupled, "MOVE-02", ()),
-    (OwnGains, "GAIN-01", ()),
-    (NoVelocity, "GAIN-02", ()),
-    (NoTorque, "GAIN-03", ("GAIN-01",)),
-    (DefaultGains, "GAIN-04", ()),
-    (NoForce, "FORCE-01", ()),
-    (NoModes, "MODE-02", ("MODE-01",)),
-    (TrustsAll, "CRC-02", ()),
-    (Sanitises, "SAFE-01", ()),
-    (Packed, "SAFE-02", ()),
-    (Untyped, "SAFE-03", ()),
-    (Sulks, "SAFE-04", ()),
-    (AnyMachine, "SAFE-05", ()),
-    (GoesOn, "WDOG-01", ()),
-    (AnswersOnly, "WDOG-02", ()),
-    (Latches, "WDOG-03", ("LIFE-02",)),
-    (Nervous, "WDOG-04", ()),
-    (KnowsItsReaders, "LIFE-01", ()),
-    (Loyal, "LIFE-02", ()),
-    (ForgetfulClient, "CLIENT-01", ()),
-    (SlowClient, "CLIENT-02", ()),
-)
-
-
-def _mutants() -> Iterator[RobotMutant]:
-    for model in ROBOTS:
-        known = {r.id for r in catalogue(model, "robot")}
-        prefix = model.upper()
-        for service, kills, also in _ZOO:
-            if f"{prefix}-{kills}" in known:
-                names = tuple(f"{prefix}-{name}" for name in also)
-                yield RobotMutant(model, service, f"{prefix}-{kills}", names)
-
-
-MUTANTS: tuple[RobotMutant, ...] = tuple(_mutants())

@@ -72,6 +72,7 @@ _KEYS = {
     "id",
     "area",
     "level",
+    "negative",
     "title",
     "sentence",
     "rationale",
@@ -92,6 +93,7 @@ _KEYS = {
 }
 _OPTIONAL = {
     "like",
+    "negative",
     "after",
     "dialects",
     "tolerances",
@@ -110,6 +112,7 @@ _TYPES: Mapping[str, type] = {
     "plots": list,
     "tolerances": dict,
     "realtime": bool,
+    "negative": bool,
     "repeat": int,
 }
 """Types of values that are not texts."""
@@ -156,6 +159,8 @@ class Requirement:
     :param expected: the norm in a few words for reports, tolerances filled in; the sentence
         where nothing shorter says it.
     :param capability: one of :data:`CAPABILITIES`, where it is about a unit that a hand may lack.
+    :param negative: whether it is about what a hand must not do, or about its reaction to bad
+        input or another participant.
     :param repeat: how often its stimulus is applied.
     :param plots: what shows a failure, unless its check names other plots.
     :param like: the requirement of another model that it is taken from, and whose check judges
@@ -181,6 +186,7 @@ class Requirement:
     cause: str = ""
     expected: str = ""
     capability: str = ""
+    negative: bool = False
     repeat: int = 1
     like: str = ""
     plots: tuple[Plot, ...] = ()
@@ -385,6 +391,7 @@ def _parse(
             cause=entry.get("cause", ""),
             expected=_filled(entry.get("expected", entry["sentence"]), tolerances, where),
             capability=entry.get("capability", ""),
+            negative=bool(entry.get("negative", False)),
             repeat=entry.get("repeat", 1),
             like=entry.get("like", ""),
             plots=_plots(entry["plots"], where) if "plots" in entry else _PLOTS[layer],

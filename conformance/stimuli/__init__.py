@@ -1,10 +1,8 @@
-"""What the kit does to a hand, sans-IO: a script that says what to send when.
+"""The stimuli for hands and robots on DDS topics, as scripts (see
+:mod:`dexkit.conformance.phased_script`).
 
-A script's ``run`` is a generator. It yields an :data:`Action`, its runner carries it out, and
-sends back an :class:`Observation`. The live runner does so on DDS, the virtual one with a hand
-in memory on a virtual clock; the script cannot tell them apart. What was done when is noted in
-``phases`` and travels with the recording. Each model has its own: :mod:`~.stimuli.gripper` and
-:mod:`~.stimuli.fingers`, on the common ground of :mod:`~.stimuli.script`.
+Grippers have :mod:`~.stimuli.gripper`, hands of several joints :mod:`~.stimuli.fingers`; both
+share :mod:`~.stimuli.hand`. Robots have :mod:`~.stimuli.robot`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The stimulus for hands of several joints.
 
-Both hands do the same at once, except where their independence is the subject. Poses are told by
+Both hands do the same at once, except where their independence is the subject. Poses are given by
 how far the flexing joints are closed, in percent, as the object is. The phases of the mode byte's
 id and time-out bit are for the Dex3-1 alone.
 
@@ -36,7 +36,7 @@ resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
-shutdown       the service is told to end, and started again
+shutdown       the service is stopped and started again
 service-       a step after that
 restart
 ============== =====================================================================================
@@ -49,7 +49,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Script, Steps
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
 from dexkit.hand import JointMode, Side
 from dexkit.models import JointRoles
 
@@ -78,7 +79,7 @@ _BAD = {
 }
 
 
-class FingerScript(Script):
+class FingerScript(HandScript):
     """The script of a hand of several joints."""
 
     motion = "joint"
@@ -235,7 +236,7 @@ class FingerScript(Script):
         )
 
     def _broken(self, joint: int, field: str, value: float) -> dict[Side, Motors]:
-        """One bad field in one joint; all of them are told to go far, to show if one is taken."""
+        """One bad field in one joint; all joints have far goals, to show if one is obeyed."""
         far = self._other_place()
         hands: dict[Side, Motors] = {}
         for s, pose in far.items():
@@ -245,7 +246,7 @@ class FingerScript(Script):
         return hands
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
-        """Two motors with each other's id, the first of them told to go elsewhere."""
+        """Two motors with each other's id, and a goal elsewhere for the first."""
         first, other = self._roles.crossed
         target = self._other_place()[side][first]
         crossed = list(motors)

@@ -25,7 +25,7 @@ resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
 restart        the client goes away, another comes, and makes a step
-shutdown       the service is told to end, and started again
+shutdown       the service is stopped and started again
 service-       a step after that
 restart
 ============== =====================================================================================
@@ -38,7 +38,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Script, Steps
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
 
 __all__ = ["GripperScript"]
@@ -54,7 +55,7 @@ _BAD = {
 }
 
 
-class GripperScript(Script):
+class GripperScript(HandScript):
     """The script of a gripper."""
 
     def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:

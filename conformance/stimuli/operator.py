@@ -1,13 +1,12 @@
 """An operator at the hand, through the model of Unitree's teleoperation client: a closed loop.
 
-Everything else in the script is commanded whatever the hand answers. Here what is commanded
-depends on the states, as with the genuine client: a hand that says late where it is is commanded
-slowly. What is done is the profile ``feel`` of :mod:`dexkit.teleop.profiles`, kept clear of an
-object; the phase's parameters are enough to know where the operator wanted the hand at any time
-(:func:`operator_of`).
+In all other phases the commands do not depend on the hand's answers. Here they depend on the
+states, as with the genuine client: a hand whose state is late is commanded slowly. The operator's
+motion is the profile ``feel`` of :mod:`dexkit.teleop.profiles`, kept clear of an object; the
+phase's parameters are enough to compute the operator's goal at any time (:func:`operator_of`).
 
-The client learns the newest state each time its receiving thread would have read one; that a
-silent side stops the other's states, too, is not part of this phase.
+The client gets the newest state each time its receiving thread would have read one. That a silent
+side stops the other's states, too, is not part of this phase.
 """
 
 from __future__ import annotations
@@ -16,13 +15,14 @@ import math
 from typing import TYPE_CHECKING
 
 from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.stimuli.script import Plan, Send, Steps
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, client_for, profile
 
 if TYPE_CHECKING:
-    from dexkit.conformance.stimuli.script import Plan, Script, Steps
+    from dexkit.conformance.stimuli.hand import HandScript
 
 __all__ = ["OPERATOR", "operate", "operator_of"]
 
@@ -31,11 +31,11 @@ OPERATOR = "operator"
 PROFILE = "feel"
 _CLEAR = 0.1  # of the stroke: room left to the object
 _DEEPEST = 0.5  # how far the profile closes a hand of several joints
-_POLL = 0.001  # seconds between two looks for a state that is waited for
+_POLL = 0.001  # s between two reads while the client waits for a state
 
 
 def _most(plan: Plan, side: Side) -> float:
-    """How far a side may close, as :class:`~dexkit.teleop.Operator` takes it."""
+    """How far a side may close, 0 to 1, as :class:`~dexkit.teleop.Operator` takes it."""
     touch = plan.objects.get(side)
     if touch is None:
         return 1.0
@@ -45,15 +45,13 @@ def _most(plan: Plan, side: Side) -> float:
 
 
 def operator_of(phase: Phase, dialect: Dialect) -> Operator:
-    """The operator of a phase, from what is in the recording."""
+    """The operator of a phase, from its parameters in the recording."""
     most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in phase.sides}
     return Operator(profile(phase.params["profile"], dialect.model), dialect, most=most)
 
 
-def operate(script: Script) -> Steps:
+def operate(script: HandScript) -> Steps:
     """The phase."""
-    from dexkit.conformance.stimuli.script import Send  # which loads this module when it is used
-
     plan = script.plan
     if not plan.dialect.has_client:
         return  # no client of Unitree's speaks it, and none of the requirements applies
@@ -81,7 +79,7 @@ def operate(script: Script) -> Steps:
         while True:
             wakes = max(client.receiver.wakes_at, now + _POLL)
             wake = tick if math.isinf(wakes) else min(tick, begin + round(wakes * 1e9))
-            script._obs = yield Send(payloads, wake)
+            yield from script._do(Send(payloads, wake))
             payloads = []
             if script._obs.now_ns >= tick:
                 break

@@ -1,4 +1,4 @@
-"""What the kit does to a robot; see :mod:`dexkit.conformance.stimuli`.
+"""The stimulus for a robot; see :mod:`dexkit.conformance.stimuli`.
 
 Commands come at xr_teleoperate's rate with its gains; a joint is moved by a ramp, toward the
 middle of its range. All but the first two phases are about one joint, the right elbow.
@@ -6,13 +6,13 @@ middle of its range. All but the first two phases are about one joint, the right
 ============== =====================================================================================
 listen         nothing is sent; state must flow, and nothing move
 hold           every motor holds where it is
-joint          each joint in turn by a fifth of a radian; ``params["slot"]`` says which
+joint          each joint in turn by a fifth of a radian; its slot is ``params["slot"]``
 stiffness      a quarter of the client's kp, and a torque against it
 velocity       kp 0, a speed, kd
 torque         kp and kd 0, a torque, until the joint has moved
 limp           kp 0, and a q elsewhere
 off            mode 0, and a command that asks to move
-wrong-crc      commands that ask to move, with wrong CRCs; ``params["kind"]`` says which
+wrong-crc      commands that ask to move, with wrong CRCs; their kind is ``params["kind"]``
 nan            commands that ask to move, with NaN or infinity somewhere; ``params["kind"]``
 unused         a slot without a motor is driven
 machine        commands for another machine (robots whose messages have ``mode_machine``)
@@ -39,9 +39,7 @@ from dexkit.conformance.robot import SPOILS, RobotWire
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
-    Observation,
     Plan,
-    Pose,
     Restart,
     Role,
     Script,
@@ -49,7 +47,6 @@ from dexkit.conformance.stimuli.script import (
     Steps,
 )
 from dexkit.conformance.stimulus_record import ROBOT, Phase
-from dexkit.hand import Side
 from dexkit.robots import robot
 
 __all__ = ["STEP", "RobotScript"]
@@ -71,17 +68,11 @@ class RobotScript(Script):
     motion = "joint"
 
     def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        self.plan = plan
-        self.phases: list[Phase] = []
-        self._say = say
+        super().__init__(plan, say)
         self._robot = robot(plan.dialect.model)
         self._coder = RobotWire(plan.dialect)
         self._joints = {ROBOT: tuple(self._robot.joint(slot) for slot in self._robot.used)}
-        self._goal = {}
-        self._next_ns = 0
-        self._age_s = 0.0
         self._period_ns = round(1e9 / self._robot.teleop_rate)
-        self._obs = Observation(0)
         self._slot = self._robot.slot(_JOINT)
         self._start: dict[int, float] = {}
         self._order: list[Motor] = [_NOTHING] * self._robot.slots
@@ -89,19 +80,19 @@ class RobotScript(Script):
         self._dry = False
 
     def length(self) -> float:
-        """Seconds that :meth:`run` takes with a robot that is where it should at once."""
+        """Seconds that :meth:`run` takes with a robot that reaches its goals at once."""
         self._dry = True
         return super().length()
 
     def run(self) -> Steps:
         """The whole script."""
-        self._obs = yield Send([], 0)
+        yield from self._do(Send([], 0))
         self._next_ns = self._obs.now_ns
         yield from self._listen()
         if ROBOT not in self._obs.q:
             yield from self._wake()
         if ROBOT not in self._obs.q:
-            self._say("no state: nothing more can be asked of this robot")
+            self._say("no state: the rest of the script is left out")
             return
         self._start = dict(zip(self._robot.used, self._obs.q[ROBOT], strict=True))
         self._goal = {ROBOT: self._obs.q[ROBOT]}
@@ -114,13 +105,14 @@ class RobotScript(Script):
         yield from self._keep(0.2)
 
     def _wake(self) -> Steps:
-        """Commands that only damp: does it wait for some before it tells its state?"""
+        """Send commands that only damp, for a robot that waits for some before it publishes."""
         for slot in self._robot.used:
             _, kd = self._robot.client_gains[slot]
             self._order[slot] = Motor(kp=0.0, kd=kd, mode=self._robot.enable[slot])
         yield from self._keep(0.3)
 
     def _provoke(self) -> Steps:
+        """Every phase after the first two."""
         parts: list[tuple[str, Callable[[], Steps]]] = [
             ("joint", self._every_joint),
             ("stiffness", self._stiffness),
@@ -147,21 +139,12 @@ class RobotScript(Script):
 
     # -- orders -----------------------------------------------------------------------------
 
-    def _home(self, side: Side) -> Pose:
-        return tuple(self._start.values())
-
-    def _other_place(self) -> dict[Side, Pose]:
-        return {ROBOT: self._home(ROBOT)}
-
-    def _motors(self, side: Side, pose: Pose) -> Motors:
-        return self._order
-
     def _holding(self, slot: int, q: float) -> Motor:
         kp, kd = self._robot.client_gains[slot]
         return Motor(q=q, kp=kp, kd=kd, mode=self._robot.enable[slot])
 
     def _here(self, slot: int) -> float:
-        """Where the joint is."""
+        """The joint's position, rad."""
         pose = self._obs.q.get(ROBOT, tuple(self._start.values()))
         return pose[self._robot.used.index(slot)]
 
@@ -175,17 +158,15 @@ class RobotScript(Script):
             yield from self._send([])
             return
         own = self._obs.machine or self._robot.mode_machine or 0
-        told = own if machine is None else machine
-        key = (tuple(order), told, spoil)
+        sent = own if machine is None else machine
+        key = (tuple(order), sent, spoil)
         if key != self._sent[0]:  # they are held for long, and encoded once
-            self._sent = (key, self._coder.low_command(order, told, spoil))
+            self._sent = (key, self._coder.low_command(order, sent, spoil))
         yield from self._send([(self._robot.cmd_topic, self._sent[1])])
 
     def _keep(self, seconds: float) -> Steps:
         """Send the order as it is."""
-        end = self._obs.now_ns + round(seconds * 1e9)
-        while self._obs.now_ns < end:
-            yield from self._put(self._order)
+        yield from self._repeat(seconds, lambda: self._put(self._order))
 
     def _with(self, **changes: float | int) -> list[Motor]:
         """The order with the joint's command changed."""
@@ -194,12 +175,12 @@ class RobotScript(Script):
         return order
 
     def _ramp(self, goals: dict[int, float], seconds: float) -> Steps:
-        """Lead joints to where they are to be."""
+        """Move joints to their goals by a ramp."""
         start = {slot: self._order[slot].q for slot in goals}
         seen, reached, part = self._obs.now_ns, 0.004, 0.0
         while part < 1.0:
             now = self._obs.now_ns
-            # no leap to where it would be if the kit had not stood still
+            # if the kit stood still, the ramp goes on from where it was: no jump
             reached, seen = reached + min((now - seen) * 1e-9, PAUSE), now
             part = min(1.0, reached / seconds)
             for slot, goal in goals.items():
@@ -208,11 +189,11 @@ class RobotScript(Script):
             yield from self._put(self._order)
 
     def _catch(self) -> None:
-        """From now on the joint is held where it is."""
+        """Hold the joint where it is from now on."""
         self._order[self._slot] = self._holding(self._slot, self._here(self._slot))
 
     def _home_again(self) -> Steps:
-        """Back to where everything was at first, not as a phase."""
+        """Move every joint back to its first position, not as a phase."""
         away = {s: q for s, q in self._start.items() if self._order[s].q != q}
         if away:
             yield from self._ramp(away, _RAMP)
@@ -281,7 +262,7 @@ class RobotScript(Script):
         yield from self._keep(0.2)
 
     def _refused(self, name: str, **changes: float | int) -> Steps:
-        """A command that asks to move, and is to have no effect."""
+        """A command with a goal elsewhere that must have no effect, as a phase."""
         phase = self._phase(name)
         held = self._order
         goal = held[self._slot].q + self._inward(self._slot, STEP)
@@ -293,15 +274,13 @@ class RobotScript(Script):
     # -- bad commands -----------------------------------------------------------------------
 
     def _wish(self, **changes: float) -> list[Motor]:
-        """The joint is asked to move, by a command that is to be ignored."""
+        """The order with a goal elsewhere for the joint, for a command that must be ignored."""
         goal = self._order[self._slot].q + self._inward(self._slot, STEP)
         return self._with(**{"q": goal, **changes})
 
     def _bad(self, name: str, send: Callable[[], Steps], seconds: float, **params: str) -> Steps:
         phase = self._phase(name, **params)
-        while self._elapsed(phase) < seconds:
-            yield from send()
-        self._end(phase)
+        yield from self._through(phase, seconds, send)
         yield from self._keep(0.1)
 
     def _wrong_crc(self) -> Steps:
@@ -336,9 +315,8 @@ class RobotScript(Script):
 
         def send() -> Steps:
             self._next_ns += self._period_ns
-            self._obs = yield Send(
-                [(self._robot.cmd_topic, payload)], self._next_ns, by=Role.STRANGER
-            )
+            payloads = [(self._robot.cmd_topic, payload)]
+            yield from self._do(Send(payloads, self._next_ns, by=Role.STRANGER))
 
         yield from self._keep(0.1)
         yield from self._bad("foreign", send, 0.3)
@@ -352,9 +330,7 @@ class RobotScript(Script):
         self._order = self._with(kp=0.0, dq=speed)
         yield from self._keep(0.3)
         phase = self._phase(name, speed=repr(speed))
-        while self._elapsed(phase) < seconds:
-            yield from self._wait(0.02)
-        self._end(phase)
+        yield from self._through(phase, seconds, lambda: self._wait(0.02))
         self._catch()
         if name == "silence" and "resume" in self.plan.phases:
             yield from self._resume()

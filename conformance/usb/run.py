@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from dexkit.clock import RealClock
 from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.phased_script import play
 from dexkit.conformance.usb.access import UsbHost, bulk_pair, open_device
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -102,18 +103,13 @@ def _play(
         return SideRecord(told, list(plan.buses), trouble="there is no pair of bulk endpoints")
     script = UsbScript(plan, say)
     player = _Player(side, host, pair, recorder, turn)
-    steps = script.run()
-    action = next(steps)
     try:
-        while not stop.is_set():
-            action = steps.send(player.carry_out(action))
-        script.trouble = "it was stopped"
-    except StopIteration:
-        pass
+        if not play(script, player.carry_out, stop.is_set):
+            script.trouble = "it was stopped"
     finally:
         player.end_turn()
         if not script.finished:  # stopped, deaf or broken: leave no motor driven
-            player.carry_out(Out(script.lock()))
+            player.carry_out(Out(script.lock_frame()))
             player.carry_out(In(_LAST_ANSWER))
     phases = [p for p in script.phases if p.end_ns]
     return SideRecord(told, list(plan.buses), phases, script.trouble)

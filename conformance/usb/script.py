@@ -1,13 +1,9 @@
-"""What the kit does to one hand on USB, sans-IO: a script that says what to send when.
-
-:meth:`UsbScript.run` is a generator. It yields an :data:`Action`, its runner carries it out on a
-real device or on a virtual one, and sends back an :class:`Observation`. What was done when is in
-:attr:`UsbScript.phases` and travels with the recording.
+"""The stimulus for one hand on USB, as a script; see :mod:`dexkit.conformance.phased_script`.
 
 Order of the phases: what may disturb a hand comes after what needs it undisturbed. Commands that
-move something enable the time-out protection, except where its absence is what is tried. A runner
-that ends the script early sends :meth:`UsbScript.lock`; one that is killed cannot
-(docs/conformance-usb.md says what it leaves).
+move something enable the time-out protection, except where its absence is tested. A player that
+ends the script early sends :meth:`UsbScript.lock_frame`; one that is killed cannot
+(docs/conformance-usb.md says in which state it leaves the hand).
 
 ============== =====================================================================================
 quiet          no command is sent; nothing may come
@@ -16,7 +12,7 @@ burst          commands to lock as fast as they are answered; three times, at di
 pair           two commands at once
 move           each motor in turn to a new position, by 0.2 rad; the others hold
 lock           position commands with status 0: nothing may move
-malformed      damaged frames that ask every motor to move; ``params["kind"]`` says which damage
+malformed      damaged frames that ask every motor to move; their kind is ``params["kind"]``
 broadcast      one packet with id 15 on the middle finger's bus
 short          the other size of the command frame, with a small step of the index finger
 pause          0.6 s without a command, protected: too short to trip
@@ -34,6 +30,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dexkit.conformance.phased_script import PhasedScript
 from dexkit.conformance.usb.frames import (
     Motor,
     Scale,
@@ -89,10 +86,10 @@ _LONGEST = 4096  # room for an answer, bytes; BUF_SIZE of the manual
 
 @dataclass(frozen=True)
 class Observation:
-    """What a runner tells the script.
+    """What a player has observed after an action.
 
     :param status: of the transfer: 0, or a negative errno.
-    :param data: what came.
+    :param data: bytes from the device.
     """
 
     now_ns: int
@@ -158,10 +155,10 @@ class Plan:
 
 
 class _NoAnswer(Exception):
-    """The device has stopped answering; there is no point in going on."""
+    """The device has stopped answering: the script ends."""
 
 
-class UsbScript:
+class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
     """The stimulus for one hand.
 
     :ivar trouble: why it ended early, or empty.
@@ -169,15 +166,12 @@ class UsbScript:
     """
 
     def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(Observation(0), say)
         self.plan = plan
-        self.phases: list[UsbPhase] = []
         self.trouble = ""
         self.finished = False
-        self._say = say
         self._joints = DEX3_1.joints[plan.side]
         self._size = 1234
-        self._now = 0
-        self._next = 0
         self._q: list[float] = []
         self._missed = 0
 
@@ -192,31 +186,26 @@ class UsbScript:
                 yield from self._protection()
                 yield from self._burst()
                 yield from self._reopen()
-            yield from self._exchange(self.lock())
+            yield from self._exchange(self.lock_frame())
             self.finished = True
         except _NoAnswer:
             self.trouble = f"{_GIVE_UP} commands in a row were not answered"
         for phase in self.phases:
-            phase.end_ns = phase.end_ns or self._now
+            phase.end_ns = phase.end_ns or self._obs.now_ns
 
-    def lock(self) -> bytes:
-        """A frame that locks every motor, whatever the script was about."""
+    def lock_frame(self) -> bytes:
+        """A frame that locks every motor, to be sent at any time."""
         return self._frame(Motor())
 
     # -- one transfer ---------------------------------------------------------------------------
 
-    def _do(self, action: Action) -> Generator[Action, Observation, Observation]:
-        seen = yield action
-        self._now = seen.now_ns
-        return seen
-
     def _wait(self, seconds: float) -> Steps:
-        yield from self._do(Wait(self._now + round(seconds * 1e9)))
+        yield from self._do(Wait(self._obs.now_ns + round(seconds * 1e9)))
 
     def _pace(self) -> Steps:
         """Wait for the next tick; ticks that were missed are gone."""
-        self._next = max(self._next + round(self.plan.period * 1e9), self._now)
-        yield from self._do(Wait(self._next))
+        self._next_ns = max(self._next_ns + round(self.plan.period * 1e9), self._obs.now_ns)
+        yield from self._do(Wait(self._next_ns))
 
     def _exchange(self, frame: bytes) -> Steps:
         """One command, one answer."""
@@ -241,9 +230,9 @@ class UsbScript:
 
     def _silence(self, seconds: float) -> Generator[Action, Observation, int]:
         """Listen without having sent anything; how many frames came."""
-        end, frames = self._now + round(seconds * 1e9), 0
-        while self._now < end:
-            seen = yield from self._do(In((end - self._now) / 1e9))
+        end, frames = self._obs.now_ns + round(seconds * 1e9), 0
+        while self._obs.now_ns < end:
+            seen = yield from self._do(In((end - self._obs.now_ns) / 1e9))
             if seen.status:
                 break
             frames += 1
@@ -279,39 +268,36 @@ class UsbScript:
         return pack_command(buses, size or self._size, **frame)
 
     def _holding(self, *, protect: bool = True) -> list[Motor]:
-        """Everybody stays where it is."""
+        """Commands that hold every joint where it is."""
         return [Motor(1, q=q, kp=_KP, kd=_KD, protect=protect) for q in self._q]
 
     def _inward(self, joint: int, step: float = _STEP) -> float:
-        """Where a step toward the middle of the joint's range leads."""
+        """The goal of a step toward the middle of the joint's range, rad."""
         spec = self._joints[joint]
         return self._q[joint] + (step if self._q[joint] < (spec.q_min + spec.q_max) / 2 else -step)
 
-    def _wishes(self, motors: Sequence[Motor]) -> list[Motor]:
-        """Everybody is asked to move inward."""
+    def _goals(self, motors: Sequence[Motor]) -> list[Motor]:
+        """The same commands with every goal inward."""
         return [replace(m, q=self._inward(i)) for i, m in enumerate(motors)]
 
     # -- phases ---------------------------------------------------------------------------------
 
     def _begin(self, name: str, **params: Any) -> UsbPhase:
-        phase = UsbPhase(name, self._now, params=params)
-        self.phases.append(phase)
-        return phase
-
-    def _end(self, phase: UsbPhase) -> None:
-        phase.end_ns = self._now
+        return self._mark(UsbPhase(name, self._obs.now_ns, params=params))
 
     def _during(self, seconds: float, frame: bytes) -> Steps:
         """Send the same command, once a tick."""
-        end = self._now + round(seconds * 1e9)
-        self._next = self._now
-        while self._now < end:
+
+        def exchange() -> Steps:
             yield from self._exchange(frame)
             yield from self._pace()
 
+        self._next_ns = self._obs.now_ns
+        yield from self._repeat(seconds, exchange)
+
     def _talk(self) -> Steps:
-        self._say("asking it a few things, without moving")
-        yield from self._silence(0.1)  # what somebody else has left unread
+        self._say("exchanging frames without motion")
+        yield from self._silence(0.1)  # reads what another program has left unread
         phase = self._begin("quiet")
         yield from self._silence(0.15)
         self._end(phase)
@@ -368,7 +354,7 @@ class UsbScript:
             yield from self._during(0.2, self._frame(hold))
             self._end(phase)
 
-        locked = [replace(m, status=0) for m in self._wishes(self._holding())]
+        locked = [replace(m, status=0) for m in self._goals(self._holding())]
         yield from self._during(0.05, self._frame(Motor(protect=True)))
         phase = self._begin("lock", status=0)
         yield from self._during(0.2, self._frame(locked))
@@ -376,13 +362,13 @@ class UsbScript:
         yield from self._burst()
 
     def _settle(self, seconds: float) -> Steps:
-        """Everybody stays; a time-out that has tripped is cleared first."""
+        """Hold every joint; a time-out that has tripped is cleared first."""
         yield from self._exchange(self._frame(self._holding(protect=False)))
         yield from self._during(seconds, self._frame(self._holding()))
 
     def _damaged(self, kind: str) -> bytes:
         hold = self._holding()
-        wish = self._wishes(hold)
+        wish = self._goals(hold)
         if kind == "frame-crc":
             return self._frame(wish, spoil=True)
         if kind == "packet-crc":
@@ -400,7 +386,7 @@ class UsbScript:
             joint = self._joints[DRIVEN]
             stray = motor_packet(9, wish[DRIVEN], joint)
             return self._frame(hold, extra={bus: [stray]})
-        # the wishes are on the bus whose size is wrong
+        # the goals are on the bus whose size is wrong
         mixed = [wish[i] if i in mine else hold[i] for i in range(len(hold))]
         size = 0xFFFFFFFF if kind == "size-huge" else (240 if self._size == 1234 else 140) + 1
         return self._frame(mixed, sizes={bus: size})
@@ -481,7 +467,7 @@ class UsbScript:
         yield from self._wait(1.5)
         self._end(phase)
 
-        # the first answer tells where everybody is; only then is somebody asked to move
+        # the first answer has the positions; goals elsewhere come after it
         phase = self._begin("tripped")
         yield from self._exchange(self._frame(motors))
         motors = self._holding()

@@ -1,4 +1,4 @@
-"""Reference services of hands of several joints, and that of the Dex3-1."""
+"""Hands of several joints that meet every requirement: what they share, and the Dex3-1."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.virtual.service import Sample, Service
 from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
@@ -91,7 +91,7 @@ class FingerHand:
         self.changed()
 
     def command(self, motors: tuple[Motor, ...]) -> None:
-        """A command came; one field that is not finite rejects all of it."""
+        """Take a command; one field that is not finite rejects all of it."""
         if motors is self.newest and self.heard != math.inf:
             self.heard = self.now
             return  # the same once more changes nothing
@@ -103,7 +103,7 @@ class FingerHand:
         self.changed()
 
     def take(self, rows: Floats, mode: Ints) -> None:
-        """Obey from here on: q within the limits, status and time-out bit from the mode byte."""
+        """Put a command in force: q within the limits, status and time-out bit of the mode byte."""
         self.goal = np.minimum(np.maximum(rows[0], self.low), self.high)
         self.speed, self.push = rows[1:3]
         self.kp, self.kd = np.maximum(rows[3:], 0.0)
@@ -111,15 +111,15 @@ class FingerHand:
         self.tripped = self.tripped & self.guarded
 
     def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        """What mode bytes say: what each motor is to do, and whether it is protected."""
+        """Each motor's status and whether its time-out protection is on, from the mode bytes."""
         raise AssertionError  # overridden
 
-    def told(self) -> Ints:
+    def mode_bytes(self) -> Ints:
         """The mode bytes of a state."""
         raise AssertionError  # overridden
 
     def expire(self) -> None:
-        """No command for longer than the time-out: nothing is left driven by a velocity."""
+        """The time-out has passed without a command: nothing is left driven by a velocity."""
         self.speed = np.zeros_like(self.speed)
         self.push = np.zeros_like(self.push)
 
@@ -129,9 +129,9 @@ class FingerHand:
         self.changed()
 
     def changed(self) -> None:
-        """Work out what follows from the command in force."""
+        """Compute the control law of the command in force."""
         self.driven: Flags = (self.status == JointMode.FOC) & ~self.tripped
-        self.mode = self.told()
+        self.mode = self.mode_bytes()
         self.law_on = self.driven.tolist()
         self.law_q = self.goal.tolist()
         self.law_kp = np.where(self.driven, self.kp, 0.0).tolist()
@@ -161,7 +161,7 @@ class FingerHand:
         self.rests = not any(before) and not any(self.dq)
 
     def move(self, dt: float, pull: list[float]) -> None:
-        """Let torques work, and the law's damping.
+        """One step of the mechanics under ``pull`` (N m) and the law's damping.
 
         Implicit in damping and stiffness, so that a stiff law is stable at this step. Plain
         numbers: there are too few joints for numpy to be quick.
@@ -194,7 +194,7 @@ class FingerHand:
         self.tau = [t if on else 0.0 for t, on in zip(tau_, self.law_on, strict=True)]
 
     def pressures(self) -> Floats:
-        """Shape (n_sensors, 12): what the sensor packets hold."""
+        """Shape (n_sensors, 12): the values of the sensor packets."""
         return np.zeros((0, 12))
 
 
@@ -212,7 +212,7 @@ class Dex3Hand(FingerHand):
         """Status in bits 4 to 6, protection in bit 7."""
         return (mode >> 4) & 7, mode >= 0x80
 
-    def told(self) -> Ints:
+    def mode_bytes(self) -> Ints:
         """The same, and the motor's index."""
         return np.asarray(self.index | self.driven << 4 | self.tripped << 7)
 
@@ -248,13 +248,22 @@ _UNTOUCHED = _untouched()
 class FingerService(Service):
     """Such hands on their topics."""
 
+    fault_sides = (Side.LEFT,)  # several joints take long
     tick = 0.002
     period = 0.002
     hand: type[FingerHand]
+    hand_fault: type[FingerHand] | None = None
+    """Mixed into the hands of a wrong hand's reference."""
     sensors = 0
     """Sensor packets in a state."""
     attitude: Sequence[float] = (0.0, 0.0, 0.0, 0.0)
     """The quaternion: there is no IMU."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        fault, hand = cls.hand_fault, getattr(cls, "hand", None)
+        if fault is not None and hand is not None and not issubclass(hand, fault):
+            cls.hand = type(fault.__name__, (fault, hand), {})
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
@@ -267,15 +276,15 @@ class FingerService(Service):
         self.torque_units: Floats = np.array(units)
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        """One side's part of a command message."""
+        """Take one side's part of a command message."""
         self.hands[side].command(motors)
 
     def positions(self, side: Side) -> Pose:
-        """Where a hand is."""
+        """The pose of a hand."""
         return tuple(self.hands[side].q)
 
     def brake(self) -> None:
-        """Let go of the hands."""
+        """Brake the hands."""
         for hand in self.hands.values():
             hand.release()
 
@@ -302,7 +311,7 @@ class FingerService(Service):
         return self._sent[side][1]
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
-        """What the motors say of themselves."""
+        """Fill in the motors of a state."""
         n = len(motors)
         motors["mode"] = hand.mode[:n]
         before, dt = hand.gained
@@ -311,7 +320,7 @@ class FingerService(Service):
         motors["values"] = np.array((hand.q, hand.dq, ddq, tau)).T[:n]
 
     def pressures(self, hand: FingerHand) -> Floats:
-        """What its sensor packets hold."""
+        """Shape (n_sensors, 12): the values of its sensor packets."""
         return hand.pressures()
 
     def quaternion(self) -> Sequence[float]:
@@ -319,7 +328,7 @@ class FingerService(Service):
         return self.attitude
 
     def message(self, count: int) -> Any:
-        """What does not change: so many motors, sensor packets, attitude."""
+        """A state with all that never changes: number of motors, sensor packets, attitude."""
         motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
         packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
         message = self.wire.state.cls()
@@ -350,7 +359,7 @@ class Dex3Service(FingerService):
     low_due = 0.0
 
     def publish(self) -> list[Sample]:
-        """One state of everybody, now and then on the low-rate topic as well."""
+        """One state of every hand, at the low rate on the low-rate topic as well."""
         samples = super().publish()
         if self.now + 1e-9 < self.low_due:
             return samples

@@ -1,4 +1,4 @@
-"""A gripper that does everything right."""
+"""A gripper that meets every requirement."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.virtual import Service
+from dexkit.conformance.virtual.service import Service
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, Dialect
 
@@ -45,14 +45,14 @@ class ReferenceHand:
         self.heard = -math.inf
 
     def command(self, motor: Motor) -> None:
-        """A command came."""
+        """Take a command; one field that is not finite rejects it."""
         fields = (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
         if all(math.isfinite(x) for x in fields):
             self.goal = self.accept(motor)
             self.heard = self.now
 
     def accept(self, motor: Motor) -> Motor:
-        """Within the limits."""
+        """The command that is put in force: within the limits."""
         q = min(max(motor.q, 0.0), self.stroke)
         return Motor(q, motor.dq, motor.tau, max(motor.kp, 0.0), max(motor.kd, 0.0))
 
@@ -62,7 +62,7 @@ class ReferenceHand:
         return self.goal is None or self.now - self.heard > self.timeout
 
     def motor_torque(self) -> float:
-        """What the motor does, N m."""
+        """The motor's torque, N m."""
         goal = self.goal
         if goal is None or self.braking:
             return 0.0
@@ -87,7 +87,7 @@ class ReferenceHand:
         self.goal = None
 
     def contact(self) -> float:
-        """Force of stops and object."""
+        """Torque of stops and object, N m."""
         floor = 0.0 if self.touch is None else self.touch
         if self.q < floor:
             return self.stiffness * (floor - self.q)
@@ -121,11 +121,11 @@ class ReferenceService(Service):
         self.hands = {s: self.hand(dialect.q_open, touch.get(s)) for s in self.sides}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        """One side's part of a command message."""
+        """Take one side's part of a command message."""
         self.command(side, motors[0])
 
     def command(self, side: Side, motor: Motor) -> None:
-        """A gripper's motor is commanded."""
+        """Command a gripper's motor."""
         if self.dialect.interface_specification and math.isfinite(motor.q):
             # the interface specification: gains and feed-forward of a command are not used, the
             # ends snap
@@ -134,7 +134,7 @@ class ReferenceService(Service):
         self.hands[side].command(motor)
 
     def positions(self, side: Side) -> Pose:
-        """Where a gripper is."""
+        """The pose of a gripper."""
         return (self.hands[side].q,)
 
     def live(self, dt: float) -> None:
@@ -143,12 +143,12 @@ class ReferenceService(Service):
             hand.step(dt)
 
     def brake(self) -> None:
-        """Let go of the grippers."""
+        """Brake the grippers."""
         for hand in self.hands.values():
             hand.release()
 
     def fields(self, side: Side) -> dict[str, Any]:
-        """What a side's motor says of itself."""
+        """The state of a side's motor, by member."""
         found: dict[str, Any] = {**self.hands[side].fields(), "temperature": 35}
         # the interface specification: mode 0, 25 degrees, 12 V, no sign
         if self.dialect.interface_specification:

@@ -1,8 +1,8 @@
-"""A good robot in memory: what the checks must find nothing wrong with.
+"""A robot in memory that meets every requirement.
 
 It shares no code with the emulated robots that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
-friction. What it does wrong is left to :mod:`dexkit.conformance.mutants.robot`.
+friction. The wrong robots in :mod:`dexkit.conformance.mutants.robot` override its methods.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from dexkit.conformance.robot import RobotWire
-from dexkit.conformance.virtual import MemoryTrace, Sample, Service
+from dexkit.conformance.stimulus_record import ROBOT
+from dexkit.conformance.virtual.service import Sample, Service
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import decode, message_type
@@ -39,10 +40,12 @@ class Orders:
 
 
 class ReferenceRobot(Service):
-    """An H1 or a G1 that does everything right.
+    """An H1 or a G1 that meets every requirement.
 
     :ivar q: of all slots, rad; ``dq`` and ``tau`` likewise.
     """
+
+    fault_sides = (ROBOT,)
 
     tick = 0.002
     period = 0.002
@@ -72,14 +75,10 @@ class ReferenceRobot(Service):
         self._last: tuple[bytes, Orders | None] = (b"", None)
         self._state: Any = message_type(dialect.state_type).cls()
 
-    @classmethod
-    def recorded(cls, trace: MemoryTrace) -> None:
-        """Change the recording: a client that is wrong is not a robot, but is found in the same."""
-
     # -- commands ---------------------------------------------------------------------------
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
-        """A command came."""
+        """Take a command message."""
         if payload != self._last[0]:  # most are held for long, and read once
             self._last = (payload, self.read(payload))
         orders = self._last[1]
@@ -87,7 +86,7 @@ class ReferenceRobot(Service):
             self.obey(orders)
 
     def read(self, payload: bytes) -> Orders | None:
-        """The numbers of a command, if it is a whole one."""
+        """The numbers of a command; None where its CRC is wrong."""
         return Orders(decode(self.dialect.cmd_type, payload)) if self.intact(payload) else None
 
     def intact(self, payload: bytes) -> bool:
@@ -98,16 +97,16 @@ class ReferenceRobot(Service):
             return False
 
     def accepts(self, orders: Orders) -> bool:
-        """Whether a command is one to be obeyed."""
+        """Whether a command is put in force."""
         return self.finite(orders) and orders.machine in (None, self.machine)
 
     def finite(self, orders: Orders) -> bool:
-        """Whether its numbers are."""
+        """Whether all numbers of a command are finite."""
         every = (orders.q, orders.dq, orders.tau, orders.kp, orders.kd)
         return bool(np.isfinite(every).all())
 
     def obey(self, orders: Orders) -> None:
-        """Take it."""
+        """Put a command in force."""
         self.orders, self.heard = orders, self.now
 
     # -- mechanics --------------------------------------------------------------------------
@@ -118,7 +117,7 @@ class ReferenceRobot(Service):
         return self.orders is not None and self.now - self.heard <= self.timeout
 
     def follows(self, orders: Orders) -> Any:
-        """Which motors do, shape (slots,)."""
+        """Which motors follow a command, shape (slots,)."""
         return orders.mode == self.enable
 
     def live(self, dt: float) -> None:
@@ -131,7 +130,7 @@ class ReferenceRobot(Service):
         self.dq = (self.q - before) / dt
 
     def move(self, orders: Orders, dt: float) -> None:
-        """Live so long under a command."""
+        """One step of the mechanics under a command."""
         if orders is not self._law[0]:
             self._law = (orders, *self.law(orders, dt))
         _, goal, decay, drift = self._law
@@ -174,7 +173,7 @@ class ReferenceRobot(Service):
         return found
 
     def shown(self) -> tuple[Floats, Floats, Floats]:
-        """q, dq and tau as the state tells them."""
+        """q, dq and tau of the state, shape (slots,) each."""
         return self.q, self.dq, self.tau
 
     def ticks(self) -> int:
@@ -182,7 +181,7 @@ class ReferenceRobot(Service):
         return round(self.now * 1000)
 
     def message(self) -> Any:
-        """The state."""
+        """The state message."""
         state, warmth = self._state, self.warmth()
         q, dq, tau = (values.tolist() for values in self.shown())
         modes = self.modes()
@@ -208,14 +207,14 @@ class ReferenceRobot(Service):
         return 35 if self.robot.motor_temperatures == 1 else (35, 36)
 
     def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Quaternion (w first) and rpy: it hangs a little askew."""
+        """Quaternion (w first) and roll, pitch, yaw, rad: pitched by 0.1 rad."""
         half = 0.05
         return (math.cos(half), 0.0, math.sin(half), 0.0), (0.0, 2 * half, 0.0)
 
     def gravity(self) -> tuple[float, float, float]:
-        """What the accelerometer feels, m/s^2."""
+        """The accelerometer, m/s²."""
         return (-0.98, 0.0, 9.76)
 
     def remote(self) -> bytes:
-        """The remote's bytes: a stick is held."""
+        """The remote's bytes: sticks are held."""
         return struct.pack("<2xH5f16x", 0, 0.5, 0.0, 0.0, 0.0, -0.25)

@@ -8,11 +8,12 @@ client, stimulus script, reference service, wrong hands) is named by a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from dexkit.hand import HandSpec, JointSpec, Side
 from dexkit.lazy import Lazy
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from dexkit.service.dialects import DialectMap
     from dexkit.teleop.client import TeleopClient
     from dexkit.teleop.profiles import Profile
-
-    WrongHand: TypeAlias = tuple[type[Service], str, tuple[str, ...]]
 
 __all__ = [
     "Dialect",
@@ -226,8 +225,8 @@ class HandModel:
     :param session: the recorded session to replay: name of a sample of dexkit, or path of a
         recording; empty where there is none.
     :param reference: service on a virtual clock that does everything right.
-    :param wrong_hands: of a model of another package, the wrong hands that prove its requirements:
-        (service, requirement that must fail, others that fail with it).
+    :param wrong_hands: of a model of another package, the module whose classes have the decorator
+        ``dexkit.conformance.mutants.wrong_hand``: they prove its requirements.
 
     :param layout: how it is drawn; None for a gripper, and where no drawing is needed.
     """
@@ -260,7 +259,7 @@ class HandModel:
     roles: JointRoles | None = None
     objects: Mapping[Side, float] = field(default_factory=dict)
     session: str | Path = ""
-    wrong_hands: Lazy[Sequence[WrongHand]] | None = None
+    wrong_hands: Lazy[ModuleType] | None = None
     layout: HandLayout | None = None
 
     @property

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
-from dexkit.conformance.mutants.matrix import Outcome, Trial
+from dexkit.conformance.mutants import Mutant
+from dexkit.conformance.mutants.matrix import Outcome
 from dexkit.traces import open_trace
 from dexkit.traces.samples import SAMPLES, sample_path
 
@@ -35,20 +36,20 @@ def sample_verdicts() -> dict[str, Verdicts]:
     return {name: verdicts_of(name) for name in SAMPLES}
 
 
-def key(trial: Trial) -> str:
+def key(mutant: Mutant) -> str:
     """The name of a wrong hand in the file."""
-    return f"{trial.layer} {trial.model} {trial.name} ({trial.kills})"
+    return f"{mutant.layer} {mutant.model} {mutant.name} ({mutant.kills})"
 
 
 def blamed(outcome: Outcome) -> list[str]:
     """The requirements that find fault with a wrong hand."""
-    due = {outcome.trial.kills, *outcome.trial.also}
+    due = {outcome.mutant.kills, *outcome.mutant.also}
     return sorted(due - set(outcome.missed) | set(outcome.wrongly))
 
 
 def blamed_sets(outcomes: Iterable[Outcome]) -> dict[str, list[str]]:
     """:func:`blamed` of each wrong hand."""
-    return {key(o.trial): blamed(o) for o in sorted(outcomes, key=lambda o: key(o.trial))}
+    return {key(o.mutant): blamed(o) for o in sorted(outcomes, key=lambda o: key(o.mutant))}
 
 
 def load(path: Path) -> dict[str, object]:

@@ -6,13 +6,11 @@ Of a requirement that is like another one, only the differences are written.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
-from dexkit.conformance.mutants import MUTANTS, robot
+from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Requirement, catalogue, renamed
-from dexkit.conformance.usb import mutants as usb_mutants
 from tools.generate import DOCS
 
 __all__ = ["PAGES", "catalogue_page", "files"]
@@ -33,7 +31,7 @@ PAGES = {
 
 def catalogue_page(layer: str) -> str:
     """Markdown of a layer's requirements, by area."""
-    wrong_hands = _wrong_hands(layer)
+    wrong_hands = mutants(layer)
     lines: list[str] = []
     area = ""
     every = catalogue(layer=layer)
@@ -50,12 +48,6 @@ def catalogue_page(layer: str) -> str:
         killers = [m.name for m in wrong_hands if m.kills == requirement.id]
         lines += _entry(requirement, _judged_from(requirement), killers)
     return "\n".join(lines)
-
-
-def _wrong_hands(layer: str) -> Sequence[Any]:
-    if layer == "robot":
-        return robot.MUTANTS
-    return usb_mutants.MUTANTS if layer == "usb" else MUTANTS
 
 
 def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[str]:

@@ -64,5 +64,5 @@ TWOFINGER_1 = HandModel(
     objects={Side.RIGHT: 60.0},
     quick_seconds=15.0,
     reference=Lazy("twofinger_hand.reference:TwoFingerService"),
-    wrong_hands=Lazy("twofinger_hand.wrong:WRONG_HANDS"),
+    wrong_hands=Lazy("twofinger_hand.wrong"),
 )

@@ -28,7 +28,7 @@ class TwoFingerHand(FingerHand):
         """Only 1 drives; there is no time-out bit."""
         return np.where(mode == JointMode.FOC, mode, 0), np.zeros_like(self.tripped)
 
-    def told(self) -> Ints:
+    def mode_bytes(self) -> Ints:
         """The mode byte of a state: 1 where a joint is driven."""
         return np.asarray(self.driven, dtype=np.intp)
 

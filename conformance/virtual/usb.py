@@ -1,9 +1,8 @@
-"""A good Dex3-1 in memory, on a virtual clock: what the checks must find nothing wrong with.
+"""A Dex3-1 on USB that meets every requirement, in memory on a virtual clock.
 
 It shares no code with the emulated device that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
-friction. What it does wrong is left to :mod:`~dexkit.conformance.usb.mutants`, which override the
-methods below.
+friction. The wrong devices in :mod:`dexkit.conformance.mutants.usb` override its methods.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from collections import deque
 from collections.abc import Mapping
 from functools import cache
 
+from dexkit.conformance.phased_script import play
 from dexkit.conformance.usb.frames import (
     BUSES,
     COMMAND_SIZES,
@@ -27,16 +27,26 @@ from dexkit.conformance.usb.frames import (
 from dexkit.conformance.usb.record import TIMED_OUT, Descriptors, SideRecord, Transfer
 from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.conformance.usb.script import BUSES as MAP
-from dexkit.conformance.usb.script import Alone, In, Observation, Out, Plan, Reopen, UsbScript, Wait
+from dexkit.conformance.usb.script import (
+    Action,
+    Alone,
+    In,
+    Observation,
+    Out,
+    Plan,
+    Reopen,
+    UsbScript,
+    Wait,
+)
+from dexkit.conformance.virtual.topics import ORIGIN_NS, log_time_ns
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
 
-__all__ = ["FOC", "ReferenceDevice", "run_virtual"]
+__all__ = ["FOC", "ReferenceDevice", "run_virtual_usb"]
 
 FOC = 1
 _FRICTION = 0.05  # N·m·s/rad
-_ORIGIN_NS = 1_700_000_000_000_000_000
 _MOTOR_CMD = struct.Struct("<2sBBhhihhI")
 _MOTOR_STATE = struct.Struct("<BbBBhhiIHH")
 _OUT, _IN = 0x02, 0x81
@@ -47,8 +57,11 @@ class ReferenceDevice:
 
     :ivar now: s.
     :ivar q: joint positions, rad; ``tau`` and ``dq`` likewise.
-    :ivar orders: what each joint's motor was last told, SI units.
+    :ivar orders: the last command to each joint's motor, SI units.
     """
+
+    fault_sides = (Side.LEFT,)
+    """The hand that is needed to see a fault of a wrong device."""
 
     latency = 0.0004  # s from command to answer
     timeout = 1.0  # s without a command after which an enabled protection trips
@@ -90,7 +103,7 @@ class ReferenceDevice:
         return {1: MANUFACTURER, 2: PRODUCT[self.side], 3: f"20240618{PRODUCT_ID[self.side]:x}"}
 
     def descriptors(self) -> Descriptors:
-        """Everything it says of itself."""
+        """Device, configuration and string descriptors."""
         device = struct.pack(
             "<BBHBBBBHHHBBBB",
             *(18, 1, 0x0200, 0, 0, 0, 64, self.vendor, self.product, self.release, 1, 2, 3, 1),
@@ -123,20 +136,20 @@ class ReferenceDevice:
     # -- commands -------------------------------------------------------------------------------
 
     def receive(self, data: bytes) -> None:
-        """A command frame, or something else."""
+        """Take a bulk OUT transfer: a command frame, or something else."""
         if self.good_frame(data):
             self.carry_out(data)
             self.answer()
 
     def good_frame(self, data: bytes) -> bool:
-        """Whether a command frame is one."""
+        """Whether a command frame is intact."""
         room = self.accepts.get(len(data))
         if room is None or crc(data[2:-4]) != int.from_bytes(data[-4:], "little"):
             return False
         return all(size <= room for size in struct.unpack_from(f"<{BUSES}I", data, 6))
 
     def carry_out(self, data: bytes) -> None:
-        """Every packet of a good frame."""
+        """Carry out every packet of an intact frame."""
         room = self.accepts[len(data)]
         for bus, size in enumerate(struct.unpack_from(f"<{BUSES}I", data, 6)):
             start = 26 + bus * room
@@ -145,7 +158,7 @@ class ReferenceDevice:
                 self.packet(bus, data[at : at + 20])
 
     def packet(self, bus: int, data: bytes) -> None:
-        """One motor packet."""
+        """Carry out one motor packet."""
         if not self.good_packet(data):
             return
         number = data[2] & 15
@@ -154,11 +167,11 @@ class ReferenceDevice:
                 self.command(joint, self.order(joint, data))
 
     def good_packet(self, data: bytes) -> bool:
-        """Whether a motor packet is one."""
+        """Whether a motor packet is intact."""
         return data[:2] == b"\xfe\xee" and crc(data[:16]) == int.from_bytes(data[16:], "little")
 
     def is_for(self, number: int, own: int) -> bool:
-        """Whether a packet with that id is for the motor with its own."""
+        """Whether a packet with the id ``number`` is for the motor with the id ``own``."""
         return number in (own, 15)
 
     def order(self, joint: int, data: bytes) -> Motor:
@@ -185,7 +198,7 @@ class ReferenceDevice:
     # -- time and mechanics ---------------------------------------------------------------------
 
     def advance(self, seconds: float) -> None:
-        """Live through ``seconds``."""
+        """Let time pass: mechanics and time-out protection."""
         if seconds <= 0:
             return
         begin, self.now = self.now, self.now + seconds
@@ -203,7 +216,7 @@ class ReferenceDevice:
         return self.orders[joint].protect
 
     def driven(self, joint: int) -> bool:
-        """Whether the motor is."""
+        """Whether the motor is driven."""
         return self.orders[joint].status == FOC and not self.tripped[joint]
 
     def move(self, joint: int, order: Motor, seconds: float) -> None:
@@ -295,42 +308,50 @@ def _sensor_packet(number: int, elements: int) -> bytes:
     return body + crc(body).to_bytes(4, "little")
 
 
-def run_virtual(device: ReferenceDevice, plan: Plan | None = None) -> UsbRecording:
-    """The whole script on a device in memory.
+class _Player:
+    """Carries out a script's actions with a device in memory."""
 
-    :param plan: by default one with fewer commands than a live run: there is no noise here.
-    """
-    plan = plan or Plan(device.side, burst=25, period=0.02)
-    told = device.descriptors()
-    script = UsbScript(plan)
-    transfers: list[Transfer] = []
+    def __init__(self, device: ReferenceDevice) -> None:
+        self._device = device
+        self.transfers: list[Transfer] = []
 
-    def now_ns() -> int:
-        return _ORIGIN_NS + round(device.now * 1e9)
-
-    steps = script.run()
-    action = next(steps)
-    while True:
-        begin, status, data = now_ns(), 0, b""
+    def carry_out(self, action: Action) -> Observation:
+        """Do it at once; the device's clock goes on by as long as it takes."""
+        device = self._device
+        begin, status, data = log_time_ns(device.now), 0, b""
         match action:
             case Out(data=sent):
                 status = device.write(sent)
                 device.advance(2e-5)  # a bus carries 1234 bytes in some microframes
-                transfers.append(Transfer(begin, now_ns(), _OUT, status, len(sent), sent))
+                self._put(begin, _OUT, status, len(sent), sent)
             case In(timeout=timeout, length=length):
                 status, data = device.read(timeout)
                 device.advance(1e-5)
-                transfers.append(Transfer(begin, now_ns(), _IN, status, length, data))
+                self._put(begin, _IN, status, length, data)
             case Wait(until_ns=until):
                 device.advance((until - begin) / 1e9)
             case Reopen():
                 device.reopen()
                 device.advance(0.01)
             case Alone():
-                pass
-        try:
-            action = steps.send(Observation(now_ns(), status, data))
-        except StopIteration:
-            break
-    record = SideRecord(told, list(plan.buses), script.phases, script.trouble)
-    return UsbRecording(_ORIGIN_NS, {plan.side: UsbSide(plan.side, record, transfers, _ORIGIN_NS)})
+                pass  # there is no other hand
+        return Observation(log_time_ns(device.now), status, data)
+
+    def _put(self, begin: int, endpoint: int, status: int, requested: int, data: bytes) -> None:
+        done = log_time_ns(self._device.now)
+        self.transfers.append(Transfer(begin, done, endpoint, status, requested, data))
+
+
+def run_virtual_usb(device: ReferenceDevice, plan: Plan | None = None) -> UsbRecording:
+    """Play the script to a device in memory; the recording.
+
+    :param plan: by default one with fewer commands than a live run: there is no noise here.
+    """
+    plan = plan or Plan(device.side, burst=25, period=0.02)
+    descriptors = device.descriptors()
+    script = UsbScript(plan)
+    player = _Player(device)
+    play(script, player.carry_out)
+    record = SideRecord(descriptors, list(plan.buses), script.phases, script.trouble)
+    side = UsbSide(plan.side, record, player.transfers, ORIGIN_NS)
+    return UsbRecording(ORIGIN_NS, {plan.side: side})

@@ -1,26 +1,15 @@
-"""Deliberately wrong devices: each does one thing wrong, and the checks must notice exactly that.
-
-As :mod:`dexkit.conformance.mutants`, for USB: a mutant is a small change of
-:class:`~dexkit.conformance.usb.virtual.ReferenceDevice`. ``kills`` is the requirement that must
-catch it; ``also`` names what cannot but fail with it. No other may fail or warn.
-"""
+"""Wrong Dex3-1 hands on USB."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
-from dexkit.conformance.judge import judge_layer
-from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.mutants.registry import wrong_hand
 from dexkit.conformance.usb.frames import Motor, Scale
-from dexkit.conformance.usb.virtual import FOC, ReferenceDevice, run_virtual
+from dexkit.conformance.virtual.usb import FOC, ReferenceDevice
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID
-
-__all__ = ["MUTANTS", "Mutant", "try_mutant"]
 
 
 def _sizes(frame: bytes) -> list[int]:
@@ -30,20 +19,23 @@ def _sizes(frame: bytes) -> list[int]:
 # ------------------------------------------------------------------------------- descriptors
 
 
+@wrong_hand("DEX3USB-DESC-01")
 class OtherSide(ReferenceDevice):
-    """A left hand that says it is a right one."""
+    """A left hand with the product id of a right one."""
 
     @property
     def product(self) -> int:
         return PRODUCT_ID[Side.RIGHT if self.side is Side.LEFT else Side.LEFT]
 
 
+@wrong_hand("DEX3USB-DESC-02")
 class OtherRelease(ReferenceDevice):
-    """Says it is release 2.00."""
+    """Reports release 2.00."""
 
     release = 0x0200
 
 
+@wrong_hand("DEX3USB-DESC-03")
 class NoSerial(ReferenceDevice):
     """Has no serial number."""
 
@@ -51,6 +43,7 @@ class NoSerial(ReferenceDevice):
         return {**super().strings(), 3: ""}
 
 
+@wrong_hand("DEX3USB-DESC-04")
 class FullSpeed(ReferenceDevice):
     """Runs at full speed, with packets of 64 bytes."""
 
@@ -58,12 +51,14 @@ class FullSpeed(ReferenceDevice):
     endpoints = ((0x02, 2, 64), (0x81, 2, 64))
 
 
+@wrong_hand("DEX3USB-DESC-05")
 class TwoPairs(ReferenceDevice):
     """Has a second pair of bulk endpoints."""
 
     endpoints = (*ReferenceDevice.endpoints, (0x03, 2, 512), (0x84, 2, 512))
 
 
+@wrong_hand("DEX3USB-DESC-06")
 class SmallPackets(ReferenceDevice):
     """Declares packets of 64 bytes at high speed."""
 
@@ -73,6 +68,7 @@ class SmallPackets(ReferenceDevice):
 # ---------------------------------------------------------------------------------- exchange
 
 
+@wrong_hand("DEX3USB-XCHG-01")
 class Deaf(ReferenceDevice):
     """Answers nothing."""
 
@@ -80,6 +76,7 @@ class Deaf(ReferenceDevice):
         pass
 
 
+@wrong_hand("DEX3USB-XCHG-01")
 class DropsAnswers(ReferenceDevice):
     """Does not answer every 25th command."""
 
@@ -91,6 +88,7 @@ class DropsAnswers(ReferenceDevice):
             super().answer()
 
 
+@wrong_hand("DEX3USB-XCHG-02")
 class Echoes(ReferenceDevice):
     """Answers each command twice."""
 
@@ -99,6 +97,7 @@ class Echoes(ReferenceDevice):
         super().answer()
 
 
+@wrong_hand("DEX3USB-XCHG-03")
 class Streams(ReferenceDevice):
     """Sends a state every 50 ms from the start, until the first command."""
 
@@ -116,8 +115,9 @@ class Streams(ReferenceDevice):
         return super().read(timeout)
 
 
+@wrong_hand("DEX3USB-XCHG-04")
 class OneAtATime(ReferenceDevice):
-    """Throws both commands away when the second comes before the first is answered."""
+    """Drops both commands when the second comes before the first is answered."""
 
     def answer(self) -> None:
         if self.answers and self.answers[0][0] > self.now:
@@ -126,12 +126,14 @@ class OneAtATime(ReferenceDevice):
             super().answer()
 
 
+@wrong_hand("DEX3USB-RATE-01")
 class Slow(ReferenceDevice):
     """Needs 1.5 ms for an answer."""
 
     latency = 0.0015
 
 
+@wrong_hand("DEX3USB-RATE-02")
 class Stumbles(ReferenceDevice):
     """Needs 4 ms for every 20th answer."""
 
@@ -146,6 +148,7 @@ class Stumbles(ReferenceDevice):
 # ------------------------------------------------------------------------------------ frames
 
 
+@wrong_hand("DEX3USB-SIZE-01")
 class Padded(ReferenceDevice):
     """Fills its answers up to whole packets of 512 bytes."""
 
@@ -153,27 +156,31 @@ class Padded(ReferenceDevice):
         return super().frame().ljust(1536, b"\0")
 
 
+@wrong_hand("DEX3USB-SIZE-02")
 class BigFramesOnly(ReferenceDevice):
-    """Takes command frames of 1234 bytes only."""
+    """Accepts only command frames of 1234 bytes."""
 
     accepts = MappingProxyType({1234: 240})
 
 
+@wrong_hand("DEX3USB-SIZE-02")
 class SmallFramesOnly(ReferenceDevice):
-    """Takes command frames of 734 bytes only."""
+    """Accepts only command frames of 734 bytes."""
 
     accepts = MappingProxyType({734: 140})
 
 
+@wrong_hand("DEX3USB-HEAD-01")
 class OtherHead(ReferenceDevice):
-    """Begins its states with the head of a command."""
+    """Sends states with the head of a command."""
 
     def frame(self) -> bytes:
         return b"\xfe\xfd" + super().frame()[2:]
 
 
+@wrong_hand("DEX3USB-CRC-01")
 class StaleCrc(ReferenceDevice):
-    """Changes the frame after its CRC was made, now and then."""
+    """Changes some frames after their CRC was computed."""
 
     count = 0
 
@@ -183,6 +190,7 @@ class StaleCrc(ReferenceDevice):
         return frame if self.count % 50 else frame[:-20] + b"\1" + frame[-19:]
 
 
+@wrong_hand("DEX3USB-CRC-02")
 class MotorCrc(ReferenceDevice):
     """Sends motor packets with one wrong bit in the CRC."""
 
@@ -191,23 +199,26 @@ class MotorCrc(ReferenceDevice):
         return packet[:-1] + bytes([packet[-1] ^ 1])
 
 
+@wrong_hand("DEX3USB-CRC-03")
 class SensorCrc(ReferenceDevice):
-    """Fills in a sensor's temperature after its CRC was made."""
+    """Writes a sensor's temperature after the CRC was computed."""
 
     def sensor_packet(self, number: int, elements: int) -> bytes:
         packet = super().sensor_packet(number, elements)
         return packet[:30] + b"\x1e" + packet[31:]
 
 
+@wrong_hand("DEX3USB-PACK-01")
 class Rubbish(ReferenceDevice):
-    """Leaves two bytes of rubbish behind the packets of a bus."""
+    """Sends two undefined bytes after the packets of a bus."""
 
     def wrap(self, buses: list[bytes]) -> bytes:
         return super().wrap([*buses[:2], buses[2] + b"\xaa\x55", *buses[3:]])
 
 
+@wrong_hand("DEX3USB-PACK-02")
 class SixMotors(ReferenceDevice):
-    """Leaves a motor out of the state now and then."""
+    """Leaves a motor out of some states."""
 
     count = 0
 
@@ -216,12 +227,14 @@ class SixMotors(ReferenceDevice):
         return b"" if joint == 6 and self.count % 40 == 0 else super().motor_packet(joint)
 
 
+@wrong_hand("DEX3USB-PACK-04", also=("DEX3USB-SENS-01",))
 class EightSensors(ReferenceDevice):
-    """Has no sensor in one place of the palm."""
+    """Lacks one sensor packet of the palm."""
 
     sensors = ReferenceDevice.sensors[:-1]
 
 
+@wrong_hand("DEX3USB-SENS-01")
 class ZeroForNothing(ReferenceDevice):
     """Sends 0 where there is no sensor element."""
 
@@ -229,12 +242,14 @@ class ZeroForNothing(ReferenceDevice):
         return super().sensor_packet(number, 12)
 
 
+@wrong_hand("DEX3USB-PACK-03")
 class OtherMap(ReferenceDevice):
     """Has the thumb on bus 2 and a finger on bus 0."""
 
     map = ((2, 0), (2, 1), (2, 2), (1, 0), (1, 1), (0, 0), (0, 1))
 
 
+@wrong_hand("DEX3USB-VALUE-01")
 class Unpowered(ReferenceDevice):
     """Reports a supply of 12 V."""
 
@@ -242,8 +257,9 @@ class Unpowered(ReferenceDevice):
         return (11348, 11348, 11348, 596)
 
 
+@wrong_hand("DEX3USB-VALUE-02")
 class Faulty(ReferenceDevice):
-    """Reports a winding too hot from the start."""
+    """Reports an overheated winding from the start."""
 
     def error(self, joint: int) -> int:
         return 0x200 if joint == 2 else 0
@@ -252,13 +268,15 @@ class Faulty(ReferenceDevice):
 # ------------------------------------------------------------------------------------ motion
 
 
+@wrong_hand("DEX3USB-MODE-01")
 class AlwaysFoc(ReferenceDevice):
-    """Reports FOC whatever it was commanded."""
+    """Reports FOC whatever status was commanded."""
 
     def status(self, joint: int) -> int:
         return FOC
 
 
+@wrong_hand("DEX3USB-MODE-02")
 class LockFollows(ReferenceDevice):
     """Follows positions although it is locked."""
 
@@ -266,14 +284,16 @@ class LockFollows(ReferenceDevice):
         return not self.tripped[joint]
 
 
+@wrong_hand("DEX3USB-MOVE-01")
 class JointCounts(ReferenceDevice):
-    """Takes positions for joint side, 108 times as far."""
+    """Obeys positions as if they were on the joint side of the gears: 108 times as far."""
 
     def order(self, joint: int, data: bytes) -> Motor:
         order = super().order(joint, data)
         return replace(order, q=order.q * self.joints[joint].gear_ratio)
 
 
+@wrong_hand("DEX3USB-MOVE-01")
 class Backwards(ReferenceDevice):
     """Moves the first thumb joint the wrong way."""
 
@@ -285,8 +305,9 @@ class Backwards(ReferenceDevice):
             self.q[joint] = min(max(2 * here - self.q[joint], spec.q_min), spec.q_max)
 
 
+@wrong_hand("DEX3USB-MOVE-02")
 class Coupled(ReferenceDevice):
-    """Drags the index finger along while the middle one moves."""
+    """The index finger moves along with the middle one."""
 
     def counts(self, joint: int) -> tuple[int, int, int]:
         torque, speed, position = super().counts(joint)
@@ -295,8 +316,9 @@ class Coupled(ReferenceDevice):
         return torque, speed, position
 
 
+@wrong_hand("DEX3USB-MOVE-03")
 class ZeroElsewhere(ReferenceDevice):
-    """Reports a position 2.5 rad off, and takes commands likewise."""
+    """Reports a position 2.5 rad off, and obeys commands likewise."""
 
     shift = 2.5
 
@@ -312,14 +334,16 @@ class ZeroElsewhere(ReferenceDevice):
         return round(self.shift * Scale(self.joints[joint].gear_ratio).q) if joint == 1 else 0
 
 
+@wrong_hand("DEX3USB-UNIT-01", also=("DEX3USB-UNIT-02",))
 class RadiansASecond(ReferenceDevice):
-    """Reports speed in units a hundred times as fine."""
+    """Reports speed in a unit a hundred times finer."""
 
     def counts(self, joint: int) -> tuple[int, int, int]:
         torque, speed, position = super().counts(joint)
         return torque, max(-32768, min(32767, speed * 100)), position
 
 
+@wrong_hand("DEX3USB-UNIT-02")
 class TenthTorque(ReferenceDevice):
     """Reports torque in the sibling motor's unit, a hundredth of this one."""
 
@@ -331,8 +355,9 @@ class TenthTorque(ReferenceDevice):
 # -------------------------------------------------------------------------------- protection
 
 
+@wrong_hand("DEX3USB-PROT-01")
 class SilentTrip(ReferenceDevice):
-    """Stops in silence but does not report it."""
+    """Stops after the time-out but does not report it."""
 
     def motor_packet(self, joint: int) -> bytes:
         kept, self.tripped[joint] = self.tripped[joint], False
@@ -341,8 +366,9 @@ class SilentTrip(ReferenceDevice):
         return packet
 
 
+@wrong_hand("DEX3USB-PROT-02")
 class FlagOnly(ReferenceDevice):
-    """Reports the time-out and goes on driving, until the next command."""
+    """Reports the time-out but drives on until the next command."""
 
     def advance(self, seconds: float) -> None:
         self.quiet = seconds > 1
@@ -354,14 +380,16 @@ class FlagOnly(ReferenceDevice):
     quiet = False
 
 
+@wrong_hand("DEX3USB-PROT-02")
 class SlowTrip(ReferenceDevice):
     """Trips after 1.4 s."""
 
     timeout = 1.4
 
 
+@wrong_hand("DEX3USB-PROT-03")
 class ForgivesItself(ReferenceDevice):
-    """Clears the time-out on any command, once it has been told."""
+    """Clears the time-out on any command, once it was reported."""
 
     def __init__(self, side: Side) -> None:
         super().__init__(side)
@@ -379,8 +407,9 @@ class ForgivesItself(ReferenceDevice):
         self.lapsed = [False] * len(self.q)
 
 
+@wrong_hand("DEX3USB-PROT-04")
 class NeverForgives(ReferenceDevice):
-    """Stays tripped for good."""
+    """Stays tripped for ever."""
 
     def command(self, joint: int, order: Motor) -> None:
         kept = self.tripped[joint]
@@ -388,13 +417,15 @@ class NeverForgives(ReferenceDevice):
         self.tripped[joint] = kept
 
 
+@wrong_hand("DEX3USB-PROT-05")
 class AlwaysProtected(ReferenceDevice):
-    """Trips whether or not the protection was enabled."""
+    """Trips even without protection."""
 
     def protected(self, joint: int) -> bool:
         return True
 
 
+@wrong_hand("DEX3USB-PROT-06")
 class EarlyTrip(ReferenceDevice):
     """Trips after 0.3 s."""
 
@@ -404,6 +435,7 @@ class EarlyTrip(ReferenceDevice):
 # ----------------------------------------------------------------------------------- damaged
 
 
+@wrong_hand("DEX3USB-BAD-01")
 class TrustsFrames(ReferenceDevice):
     """Does not check the frame's CRC."""
 
@@ -411,6 +443,7 @@ class TrustsFrames(ReferenceDevice):
         return len(data) in self.accepts and max(_sizes(data)) <= self.accepts[len(data)]
 
 
+@wrong_hand("DEX3USB-BAD-02")
 class TrustsPackets(ReferenceDevice):
     """Does not check the packets."""
 
@@ -418,8 +451,9 @@ class TrustsPackets(ReferenceDevice):
         return data[:1] == b"\xfe"
 
 
+@wrong_hand("DEX3USB-BAD-03")
 class FillsUp(ReferenceDevice):
-    """Takes the rest of a short frame from the one before."""
+    """Completes a short frame with bytes of the one before."""
 
     last = b""
 
@@ -432,23 +466,26 @@ class FillsUp(ReferenceDevice):
         super().receive(data)
 
 
+@wrong_hand("DEX3USB-BAD-04")
 class CutsOff(ReferenceDevice):
-    """Takes the beginning of a frame that is too long."""
+    """Obeys the beginning of a frame that is too long."""
 
     def receive(self, data: bytes) -> None:
         super().receive(data[:1234])
 
 
+@wrong_hand("DEX3USB-BAD-05")
 class BelievesSizes(ReferenceDevice):
-    """Takes a size past the buffer for a full one."""
+    """Obeys a frame whose bus size is larger than its buffer."""
 
     def good_frame(self, data: bytes) -> bool:
         past = len(data) in self.accepts and max(_sizes(data)) > self.accepts[len(data)]
         return past or super().good_frame(data)
 
 
+@wrong_hand("DEX3USB-BAD-06")
 class IdModulo(ReferenceDevice):
-    """Takes ids modulo the number of a finger's motors."""
+    """Obeys motor ids modulo the number of a finger's motors."""
 
     def packet(self, bus: int, data: bytes) -> None:
         number = data[2] & 15
@@ -458,8 +495,9 @@ class IdModulo(ReferenceDevice):
         super().packet(bus, data)
 
 
+@wrong_hand("DEX3USB-BAD-07")
 class Sulks(ReferenceDevice):
-    """Answers nothing for half a second after a damaged frame."""
+    """Answers nothing for 0.5 s after a damaged frame."""
 
     until = 0.0
 
@@ -473,8 +511,9 @@ class Sulks(ReferenceDevice):
             super().answer()
 
 
+@wrong_hand("DEX3USB-BAD-08")
 class NoBroadcast(ReferenceDevice):
-    """Takes id 15 for a motor that it does not have."""
+    """Ignores packets with id 15, the broadcast."""
 
     def is_for(self, number: int, own: int) -> bool:
         return number == own
@@ -483,8 +522,9 @@ class NoBroadcast(ReferenceDevice):
 # -------------------------------------------------------------------------------- connection
 
 
+@wrong_hand("DEX3USB-CONN-01")
 class OnceOnly(ReferenceDevice):
-    """Answers no more once the interface was released."""
+    """Answers nothing after the interface was released once."""
 
     gone = False
 
@@ -494,94 +534,3 @@ class OnceOnly(ReferenceDevice):
     def answer(self) -> None:
         if not self.gone:
             super().answer()
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """One wrong device.
-
-    :param kills: the requirement that must catch it.
-    :param also: requirements that fail or warn with it.
-    """
-
-    device: type[ReferenceDevice]
-    kills: str
-    also: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Its class's name."""
-        return self.device.__name__
-
-    @property
-    def summary(self) -> str:
-        """What it does wrong, in a line."""
-        return (self.device.__doc__ or "").strip().splitlines()[0]
-
-
-def _mutant(device: type[ReferenceDevice], kills: str, *also: str) -> Mutant:
-    return Mutant(device, f"DEX3USB-{kills}", tuple(f"DEX3USB-{name}" for name in also))
-
-
-MUTANTS: tuple[Mutant, ...] = (
-    _mutant(OtherSide, "DESC-01"),
-    _mutant(OtherRelease, "DESC-02"),
-    _mutant(NoSerial, "DESC-03"),
-    _mutant(FullSpeed, "DESC-04"),
-    _mutant(TwoPairs, "DESC-05"),
-    _mutant(SmallPackets, "DESC-06"),
-    _mutant(Deaf, "XCHG-01"),
-    _mutant(DropsAnswers, "XCHG-01"),
-    _mutant(Echoes, "XCHG-02"),
-    _mutant(Streams, "XCHG-03"),
-    _mutant(OneAtATime, "XCHG-04"),
-    _mutant(Slow, "RATE-01"),
-    _mutant(Stumbles, "RATE-02"),
-    _mutant(Padded, "SIZE-01"),
-    _mutant(BigFramesOnly, "SIZE-02"),
-    _mutant(SmallFramesOnly, "SIZE-02"),
-    _mutant(OtherHead, "HEAD-01"),
-    _mutant(StaleCrc, "CRC-01"),
-    _mutant(MotorCrc, "CRC-02"),
-    _mutant(SensorCrc, "CRC-03"),
-    _mutant(Rubbish, "PACK-01"),
-    _mutant(SixMotors, "PACK-02"),
-    _mutant(OtherMap, "PACK-03"),
-    _mutant(EightSensors, "PACK-04", "SENS-01"),
-    _mutant(ZeroForNothing, "SENS-01"),
-    _mutant(Unpowered, "VALUE-01"),
-    _mutant(Faulty, "VALUE-02"),
-    _mutant(AlwaysFoc, "MODE-01"),
-    _mutant(LockFollows, "MODE-02"),
-    _mutant(JointCounts, "MOVE-01"),
-    _mutant(Backwards, "MOVE-01"),
-    _mutant(Coupled, "MOVE-02"),
-    _mutant(ZeroElsewhere, "MOVE-03"),
-    _mutant(RadiansASecond, "UNIT-01", "UNIT-02"),
-    _mutant(TenthTorque, "UNIT-02"),
-    _mutant(SilentTrip, "PROT-01"),
-    _mutant(FlagOnly, "PROT-02"),
-    _mutant(SlowTrip, "PROT-02"),
-    _mutant(ForgivesItself, "PROT-03"),
-    _mutant(NeverForgives, "PROT-04"),
-    _mutant(AlwaysProtected, "PROT-05"),
-    _mutant(EarlyTrip, "PROT-06"),
-    _mutant(TrustsFrames, "BAD-01"),
-    _mutant(TrustsPackets, "BAD-02"),
-    _mutant(FillsUp, "BAD-03"),
-    _mutant(CutsOff, "BAD-04"),
-    _mutant(BelievesSizes, "BAD-05"),
-    _mutant(IdModulo, "BAD-06"),
-    _mutant(Sulks, "BAD-07"),
-    _mutant(NoBroadcast, "BAD-08"),
-    _mutant(OnceOnly, "CONN-01"),
-)
-
-
-def try_mutant(
-    device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
-) -> tuple[list[Result], set[str]]:
-    """Judge one device; the results, and the requirements that found fault with it."""
-    results = judge_layer(USB, run_virtual(device(side)), requirements)
-    bad = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
-    return results, {r.requirement.id for r in results if r.verdict in bad}

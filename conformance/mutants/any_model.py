@@ -1,29 +1,20 @@
-"""Wrong hands of any model: each is mixed into a model's reference service by :func:`of`."""
-
-# ruff: noqa: D102  (each class says what it does wrong; its methods only override)
+"""Wrong hands of every model: mixed into the reference service of each."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TypeVar
 
 from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.hand import Side
 from dexkit.messages import message_type
 
-S = TypeVar("S", bound=Service)
-
-
-def of(mixin: type[Service], reference: type[S]) -> type[S]:
-    """The wrong hand that the reference becomes with ``mixin``."""
-    return type(mixin.__name__, (mixin, reference), {"__doc__": mixin.__doc__})
-
-
 # -------------------------------------------------------------------------------- discovery
 
 
+@wrong_hand(("DEX1-TOPIC-01", "DEX3-TOPIC-01"))
 class OldTopic(Service):
     """Publishes on the topic of an older stack."""
 
@@ -31,8 +22,9 @@ class OldTopic(Service):
         return replace(super().sample(topic, sides), topic="rt/unitree_actuator/state")
 
 
+@wrong_hand(("DEX1-TOPIC-01", "DEX3-TOPIC-01"))
 class OtherStateType(Service):
-    """Publishes another type of the family on the right topic."""
+    """Publishes another type of the Dex family on its state topic."""
 
     def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
         go, hg = "unitree_go::msg::dds_::MotorStates_", "unitree_hg::msg::dds_::HandState_"
@@ -40,8 +32,9 @@ class OtherStateType(Service):
         return Sample(topic, kind.name, kind.encode(kind.cls()), self.now)
 
 
+@wrong_hand(("DEX1-TOPIC-02", "DEX3-TOPIC-02"))
 class OtherCommandType(Service):
-    """Subscribes to the right topic with the wrong type."""
+    """Subscribes to its command topic with another type."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -49,14 +42,16 @@ class OtherCommandType(Service):
         self.command_type = hg if self.dialect.cmd_type == go else go
 
 
+@wrong_hand(("DEX1-QOS-01", "DEX3-QOS-01"))
 class DemandsHistory(Service):
-    """Asks for TRANSIENT_LOCAL commands, which no official client offers."""
+    """Requests TRANSIENT_LOCAL commands, which no official client offers."""
 
     reader_durability = "TransientLocal"
 
 
+@wrong_hand(("DEX1-QOS-02", "DEX3-QOS-02"))
 class BestEffortWriter(Service):
-    """Publishes state best effort."""
+    """Publishes its state with best-effort reliability."""
 
     writer_reliability = "best_effort"
 
@@ -64,43 +59,48 @@ class BestEffortWriter(Service):
 # --------------------------------------------------------------------------------- start-up
 
 
+@wrong_hand(("DEX1-START-01", "DEX3-START-01"))
 class SilentUntilCommanded(Service):
     """Publishes nothing before the first command."""
 
-    spoken_to = False
+    commanded = False
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.spoken_to = True
+        self.commanded = True
         super().motors(side, motors)
 
     def publish(self) -> list[Sample]:
-        return super().publish() if self.spoken_to else []
+        return super().publish() if self.commanded else []
 
 
 # --------------------------------------------------------------------------- rate and order
 
 
+@wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
 class SlowPublisher(Service):
     """Publishes at 125 Hz."""
 
     period = 0.008
 
 
+@wrong_hand(("DEX1-RATE-02", "DEX3-RATE-02"))
 class HalfRate(Service):
-    """Publishes at 222 Hz: enough, but not what the vendor does."""
+    """Publishes at 222 Hz: enough for clients, but slower than the vendor's service."""
 
     period = 0.0045
 
 
+@wrong_hand(("DEX1-RATE-03", "DEX3-RATE-03"))
 class Hiccup(Service):
-    """Is silent for 0.3 s once, as when the device is waited for in the publishing thread."""
+    """Publishes nothing for 0.3 s once, as if its publishing thread waits for the device."""
 
     def publish(self) -> list[Sample]:
         return [] if 2.0 < self.now < 2.3 else super().publish()
 
 
+@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
 class Bursts(Service):
-    """Publishes ten states at once."""
+    """Publishes states in bursts of ten."""
 
     together = 10
 
@@ -125,8 +125,9 @@ class Bursts(Service):
         return super().end()
 
 
+@wrong_hand(("DEX1-ORDER-01", "DEX3-ORDER-01"))
 class RepeatsOldStates(Service):
-    """Sends every hundredth state a second time, after the next one."""
+    """Publishes every hundredth state again after the next one."""
 
     count = 0
     old: tuple[Sample, ...] = ()
@@ -141,6 +142,7 @@ class RepeatsOldStates(Service):
         return samples
 
 
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -155,8 +157,9 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), whole=True)
 class FreezesOnce(Service):
-    """Publishes the same values for a third of a second when it first begins to move."""
+    """Publishes the same values for 0.3 s when it first begins to move."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -172,8 +175,10 @@ class FreezesOnce(Service):
         return old if self.now < until else super().payload(sides, length)
 
 
+# of a Dex5-1, the first requirement that finds that nothing moves is about the mode byte
+@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01"))
 class Frozen(Service):
-    """Publishes the first measurement for ever, at full rate."""
+    """Publishes its first measurement for ever, at full rate."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -188,6 +193,7 @@ class Frozen(Service):
 # ----------------------------------------------------------------------------------- fields
 
 
+@wrong_hand(("DEX1-FIELD-01", "DEX3-FIELD-01"))
 class OneTooMany(Service):
     """Publishes a sequence with one motor too many."""
 
@@ -195,8 +201,9 @@ class OneTooMany(Service):
         return super().payload(sides, self.dialect.length + 1)
 
 
+@wrong_hand(("DEX1-FIELD-01", "DEX3-FIELD-01"))
 class EmptyNowAndThen(Service):
-    """Publishes an empty sequence when the device did not answer."""
+    """Publishes an empty sequence in every 500th state."""
 
     count = 0
 
@@ -208,25 +215,28 @@ class EmptyNowAndThen(Service):
 # ----------------------------------------------------------------------------------- motion
 
 
+# a hand that obeys the other side's topic does not obey its own
+@wrong_hand(("DEX1-SIDE-01", "DEX3-SIDE-01"), also=("DEX1-MOVE-01", "DEX3-JOINT-01"), sides=BOTH)
 class Swapped(Service):
-    """Left commands move the right hand."""
+    """Each side obeys the other side's commands."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
 
 
+@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"))
 class KicksBack(Service):
-    """Goes the wrong way for a moment when its target jumps."""
+    """Moves the wrong way for 60 ms when its goal jumps."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
         self.kicks: dict[Side, tuple[float, tuple[Motor, ...]]] = {}
-        self.told: dict[Side, tuple[Motor, ...]] = {}
+        self.newest: dict[Side, tuple[Motor, ...]] = {}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         here = self.positions(side)
-        before = self.told.get(side, motors)
-        self.told[side] = motors
+        before = self.newest.get(side, motors)
+        self.newest[side] = motors
         jumps = [b.q - a.q for a, b in zip(before, motors, strict=True)]
         if any(0.25 < abs(j) < 6.0 for j in jumps) and all(m.kp > 0 for m in motors):
             back = tuple(
@@ -241,8 +251,9 @@ class KicksBack(Service):
 # ----------------------------------------------------------------------------------- safety
 
 
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"))
 class NanIsZero(Service):
-    """Takes NaN and infinity for 0."""
+    """Replaces NaN and infinity by 0."""
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         def zeroed(value: float) -> float:
@@ -257,8 +268,9 @@ class NanIsZero(Service):
         )
 
 
+@wrong_hand(("DEX1-SAFE-03", "DEX3-SAFE-03"))
 class EmptyIsZero(Service):
-    """Takes an empty command for one of zeros, with its default gains."""
+    """Obeys an empty command as goals of 0 with its default gains."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
@@ -270,8 +282,9 @@ class EmptyIsZero(Service):
                 self.motors(side, tuple(motors))
 
 
+@wrong_hand(("DEX1-SAFE-03", "DEX3-SAFE-03"))
 class DiesOfEmpty(Service):
-    """Crashes on a command without motors, and is restarted a second later."""
+    """Crashes on a command without motors, and is restarted 0.4 s later."""
 
     dead_until = 0.0
 
@@ -285,8 +298,9 @@ class DiesOfEmpty(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-04", "DEX3-SAFE-05"))
 class TakesTheLast(Service):
-    """Takes the last motors of an over-long command."""
+    """Obeys the last motors of an over-long command."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         message = self.wire.command.decode(payload)
@@ -297,8 +311,9 @@ class TakesTheLast(Service):
         super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-SAFE-06", "DEX3-SAFE-07"))
 class TakesAnyType(Service):
-    """Decodes whatever is published on its command topic."""
+    """Decodes and obeys any type that is published on its command topic."""
 
     def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
         message = message_type(type_name).decode(payload)
@@ -310,8 +325,9 @@ class TakesAnyType(Service):
                 self.motors(side, tuple(Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in mine))
 
 
+@wrong_hand(("DEX1-SAFE-06", "DEX3-SAFE-07"))
 class DiesOfAnyType(Service):
-    """Crashes on a message of another type, and is restarted half a second later."""
+    """Crashes on a message of another type, and is restarted 0.4 s later."""
 
     dead_until = 0.0
 
@@ -322,8 +338,9 @@ class DiesOfAnyType(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
 class QueuesCommands(Service):
-    """Works off every command it was ever sent, two in each cycle."""
+    """Queues all commands and carries out at most two of them in each cycle."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -339,8 +356,9 @@ class QueuesCommands(Service):
         super().live(dt)
 
 
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
 class StopsInABurst(Service):
-    """Receives in the publishing thread: each waiting command delays the next state."""
+    """Receives in its publishing thread: each waiting command delays the next state."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -354,8 +372,9 @@ class StopsInABurst(Service):
         return [] if self.busy_until > self.now + 0.02 else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-08", "DEX3-SAFE-09"))
 class GivesUpOnTwo(Service):
-    """Ends when a second client commands it, and is restarted half a second later."""
+    """Ends when a second client commands it, and is restarted 0.4 s later."""
 
     dead_until = 0.0
     quarrel = (0, -math.inf)
@@ -371,8 +390,9 @@ class GivesUpOnTwo(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
+@wrong_hand(("DEX1-SAFE-08", "DEX3-SAFE-09"))
 class StaysWithTheNewest(Service):
-    """Keeps to the client that it heard of last, even when that one has gone."""
+    """Obeys only the newest client, even when that one has gone."""
 
     master: int | None = None
 
@@ -388,6 +408,7 @@ class StaysWithTheNewest(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-ORDER-02", "DEX3-ORDER-02"))
 class DropsOldStamps(Service):
     """Ignores commands whose source timestamps are more than a second old."""
 
@@ -396,6 +417,7 @@ class DropsOldStamps(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), whole=True)
 class StuttersUnderLoad(Service):
     """Publishes one state in three while four commands come within 11 ms."""
 
@@ -419,13 +441,15 @@ class StuttersUnderLoad(Service):
         return [] if busy and self.cycle % 3 else super().publish()
 
 
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"))
 class WaitsForItsReaders(Service):
-    """Keeps all samples for a slow reliable reader, and blocks when its history is full."""
+    """Keeps all samples for a slow reliable reader: its writer blocks when the history is full."""
 
     def publish(self) -> list[Sample]:
         return [] if self.loaded and self.now % 0.5 < 0.2 else super().publish()
 
 
+@wrong_hand(("DEX1-WDOG-02", "DEX3-WDOG-02"))
 class QuietInSilence(Service):
     """Publishes only while it is commanded."""
 
@@ -442,14 +466,16 @@ class QuietInSilence(Service):
 # ------------------------------------------------------------------------------- life cycle
 
 
+@wrong_hand(("DEX1-LIFE-01", "DEX3-LIFE-01"))
 class ServesOnlyTheFirst(Service):
-    """Serves only the subscribers that were there when it started."""
+    """Its states reach only subscribers that were there when it started."""
 
     serves_late_readers = False
 
 
+@wrong_hand(("DEX1-LIFE-02", "DEX3-LIFE-02"))
 class BoundToOneClient(Service):
-    """Obeys only the first client that it ever heard."""
+    """Obeys only the first client that ever commanded it."""
 
     master: int | None = None
 
@@ -460,16 +486,18 @@ class BoundToOneClient(Service):
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
 class DeafAfterRestart(Service):
-    """Finds only the clients that come after it."""
+    """After a restart, it gets no commands from clients that were there before."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         if not self.restarted:
             super().receive(topic, payload, client)
 
 
+@wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
 class SilentAfterRestart(Service):
-    """Waits two seconds for its device when it is started a second time."""
+    """Publishes nothing for 2 s after a restart."""
 
     began = 0.0
 
@@ -481,18 +509,21 @@ class SilentAfterRestart(Service):
         return [] if self.restarted and self.now - self.began < 2.0 else super().publish()
 
 
+@wrong_hand(("DEX1-LIFE-04", "DEX3-LIFE-04"))
 class HangsAtTheEnd(Service):
-    """Does not end when it is asked to."""
+    """Does not end on SIGTERM."""
 
     exit_s = None
 
 
+@wrong_hand(("DEX1-LIFE-04", "DEX3-LIFE-04"))
 class LeavesItsName(Service):
-    """Ends without a word, so that its publisher is announced for another ten seconds."""
+    """Ends without closing DDS: its publisher stays in discovery for another 10 s."""
 
     gone_s = 10.0
 
 
+@wrong_hand(("DEX1-LIFE-05", "DEX3-LIFE-05"))
 class LeavesItDriven(Service):
     """Ends without braking."""
 
@@ -503,8 +534,9 @@ class LeavesItDriven(Service):
 # --------------------------------------------------------------------------------- tracking
 
 
+@wrong_hand(("DEX1-TRACK-01", "DEX3-TRACK-01"))
 class WaitsForRest(Service):
-    """Takes a new target only when it has stood still for a tenth of a second."""
+    """Obeys a new goal only when the goal has not changed for 0.1 s."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -529,8 +561,9 @@ class WaitsForRest(Service):
         )
 
 
+@wrong_hand(("DEX1-TRACK-02", "DEX3-TRACK-02"))
 class Delayed(Service):
-    """Carries out each command 0.15 s late."""
+    """Obeys each command 0.15 s late."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -544,12 +577,3 @@ class Delayed(Service):
             _, side, motors = self.queue.pop(0)
             super().motors(side, motors)
         super().live(dt)
-
-
-DILUTED = (
-    *("StuttersUnderLoad", "FreezesOnce", "StaleState", "Hunts"),
-    *("PercentBothWays", "DegreesBothWays"),
-)
-"""What weighs too much in the mean of a short run, shows elsewhere by chance of its phase, or
-shows only after more than its requirement asks for.
-"""

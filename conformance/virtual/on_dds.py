@@ -1,4 +1,4 @@
-"""A mutant (or the reference) on real DDS: to try the live suite on hands that are known."""
+"""A service of the virtual clock on real DDS, to test the live suite on known hands."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import threading
 import time
 
 from dexkit.clock import Rate
-from dexkit.conformance.virtual import Service
+from dexkit.conformance.virtual.service import Service
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.threads import Worker
 
-__all__ = ["LiveMutant"]
+__all__ = ["ServiceOnDds"]
 
 
-class LiveMutant:
-    """Serves a virtual service in real time, from a thread; a context manager.
+class ServiceOnDds:
+    """Runs a service in real time, in a thread; a context manager.
 
-    The hand does what it does on the virtual clock, except what only the virtual wire can do:
-    :attr:`~Service.serves_late_readers`. Clients are told apart by their writers.
+    It behaves as on the virtual clock, except for what only the virtual player can do:
+    :attr:`~Service.serves_late_readers`. Each writer of commands counts as a client.
     """
 
     def __init__(self, service: Service, domain: int, interface: str = "lo") -> None:
@@ -36,9 +36,9 @@ class LiveMutant:
                     qos=Qos(endpoint.reliability, durability),
                     depth=16,
                 )
-        self._thread = Worker("mutant", self._run)
+        self._thread = Worker("virtual service", self._run)
 
-    def __enter__(self) -> LiveMutant:
+    def __enter__(self) -> ServiceOnDds:
         self._thread.start()
         return self
 
@@ -56,7 +56,7 @@ class LiveMutant:
                 for sample in reader.take():
                     client = self._clients.setdefault(sample.writer, len(self._clients))
                     self.service.receive(topic, sample.data, client)
-            # late ticks are lived through, so that the hand does not slow down with the machine
+            # late ticks are made up for, so that the hand does not slow down with the machine
             now = time.monotonic()
             while last + tick <= now:
                 last += tick

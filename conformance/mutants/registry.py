@@ -1,0 +1,181 @@
+"""The registry of wrong hands: a class with the decorator :func:`wrong_hand` is one.
+
+A wrong hand is a small change of a reference that meets every requirement: of a service that
+publishes hands on DDS, of a robot, or of a USB device. The decorator names the requirement that
+must find the fault. It holds for every model whose catalogue has that requirement, or one that is
+``like`` it: the class is mixed into the reference of each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from dexkit.conformance.layers import layer
+from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.hand import Side
+
+__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "wrong_hand"]
+
+LEFT = (Side.LEFT,)
+BOTH = (Side.LEFT, Side.RIGHT)
+
+C = TypeVar("C", bound=type[Any])
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One wrong hand, robot or USB device.
+
+    :param layer: of its requirement, one of :data:`~dexkit.conformance.requirements.LAYERS`.
+    :param made: the reference of the model with the fault in it.
+    :param kills: the requirement that must fail or warn.
+    :param also: requirements that cannot but fail or warn with it. No other may: that would be
+        for the wrong reason.
+    :param sides: the hands that are needed to see the fault.
+    :param dialect: where the fault is in one dialect only; empty for the model's first.
+    :param brief: apply only the phases that its requirements need.
+    :param whole: never leave out phases: a short run does not show the fault reliably.
+    """
+
+    layer: str
+    model: str
+    made: type[Any]
+    kills: str
+    also: tuple[str, ...] = ()
+    sides: tuple[Side, ...] = BOTH
+    dialect: str = ""
+    brief: bool = False
+    whole: bool = False
+
+    @property
+    def name(self) -> str:
+        """The name of its class."""
+        return self.made.__name__
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Layer, model and name: unique, and the same in every process."""
+        return self.layer, self.model, self.name
+
+    @property
+    def summary(self) -> str:
+        """What it does wrong: the first line of its class's docstring."""
+        return (self.made.__doc__ or "").strip().splitlines()[0]
+
+
+@dataclass(frozen=True)
+class _Declaration:
+    """What one decorator declares."""
+
+    made: type[Any]
+    kills: tuple[str, ...]
+    also: tuple[str, ...]
+    sides: tuple[Side, ...] | None
+    dialect: str
+    brief: bool
+    whole: bool
+
+
+_References = Mapping[tuple[str, str], type[Any]]  # by layer and model
+_declared: list[_Declaration] = []
+
+
+def wrong_hand(
+    kills: str | tuple[str, ...],
+    *,
+    also: tuple[str, ...] = (),
+    sides: tuple[Side, ...] | None = None,
+    dialect: str = "",
+    brief: bool = False,
+    whole: bool = False,
+) -> Callable[[C], C]:
+    """Declare a class to be a wrong hand, robot or USB device.
+
+    A second decorator on the same class is for another model, where it fails other requirements.
+
+    :param kills: the id of the requirement that must find the fault; where catalogues number it
+        differently, one id for each. Requirements that are ``like`` it are meant as well.
+    :param also: ids of requirements that cannot but fail with it, for the same models.
+    :param sides: the hands that are needed to see the fault; by default those that the
+        reference's ``fault_sides`` names.
+    :param dialect: see :class:`Mutant`; ``brief`` and ``whole`` likewise. With several ids, all
+        but the first are brief: every phase has been applied to the fault with the first.
+    """
+    ids = (kills,) if isinstance(kills, str) else kills
+
+    def declare(made: C) -> C:
+        _declared.append(_Declaration(made, ids, also, sides, dialect, brief, whole))
+        return made
+
+    return declare
+
+
+def mix(fault: type[Any], reference: type[C]) -> type[C]:
+    """The reference with a fault mixed in; the class itself if it is such a one already."""
+    if issubclass(fault, reference):
+        return fault
+    return type(fault.__name__, (fault, reference), {"__doc__": fault.__doc__})
+
+
+def expand() -> tuple[Mutant, ...]:
+    """Every wrong hand that has been declared, in the order of the requirements' catalogues."""
+    every = catalogue(None, None)
+    places = dict.fromkeys((r.layer, r.model) for r in every)
+    references = {(name, model): layer(name).reference(model) for name, model in places}
+    found = [m for d in _declared for m in _mutants(d, every, references)]
+    order = {r.id: i for i, r in enumerate(every)}
+    return tuple(sorted(found, key=lambda m: order[m.kills]))
+
+
+def _mutants(
+    declared: _Declaration, every: tuple[Requirement, ...], references: _References
+) -> Iterator[Mutant]:
+    base = _base(declared.made, references)
+    by_id = {r.id: r for r in every}
+    elsewhere = {
+        (by_id[name].layer, by_id[name].model)
+        for other in _declared
+        if other.made is declared.made
+        for name in other.kills
+    }
+    for i, name in enumerate(declared.kills):
+        for requirement in every:
+            place = requirement.layer, requirement.model
+            if not _is_like(requirement, name, by_id):
+                continue
+            if requirement.id != name and place in elsewhere:
+                continue
+            reference = references[place]
+            if not issubclass(reference, base):
+                continue
+            yield Mutant(
+                *place,
+                mix(declared.made, reference),
+                requirement.id,
+                tuple(
+                    r.id
+                    for other in declared.also
+                    for r in every
+                    if (r.layer, r.model) == place and _is_like(r, other, by_id)
+                ),
+                declared.sides or reference.fault_sides,
+                declared.dialect,
+                not declared.whole and (declared.brief or i > 0),
+                declared.whole,
+            )
+
+
+def _is_like(requirement: Requirement, name: str, by_id: Mapping[str, Requirement]) -> bool:
+    """Whether a requirement is the named one, or is derived from it by ``like``."""
+    while requirement.id != name:
+        if not requirement.like:
+            return False
+        requirement = by_id[requirement.like]
+    return True
+
+
+def _base(made: type[Any], references: _References) -> type[Any]:
+    """The class under a fault that references are made of, too."""
+    return next(c for c in made.__mro__ if any(issubclass(r, c) for r in references.values()))

@@ -1,0 +1,176 @@
+"""Run a wrong hand on the virtual clock and judge it: one trial for each layer.
+
+Services and robots go through the script for their model's topics, USB devices through that for
+USB; both are judged against every requirement of the layer.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Protocol
+
+from dexkit.conformance.judge import judge, judge_layer
+from dexkit.conformance.layers import recording_of
+from dexkit.conformance.layers.usb import LAYER as USB
+from dexkit.conformance.mutants.registry import Mutant
+from dexkit.conformance.requirements import Requirement, catalogue, select
+from dexkit.conformance.results import Result, RunResult, Verdict
+from dexkit.conformance.robot import robot_dialect
+from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
+from dexkit.conformance.stimuli.operator import OPERATOR
+from dexkit.conformance.stimuli.script import default_objects
+from dexkit.conformance.stimulus_record import ROBOT
+from dexkit.conformance.virtual import Service, run_virtual
+from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
+from dexkit.hand import Side
+from dexkit.models import dialect, model
+from dexkit.robots import ROBOTS
+
+__all__ = ["TRIALS", "plan_for", "run_mutant", "run_usb_mutant"]
+
+SESSION_SECONDS = 4.0
+_BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
+
+
+class Trial(Protocol):
+    """How the wrong hands of a layer are run and judged."""
+
+    def cost(self, mutant: Mutant) -> float:
+        """Roughly how long a run takes, in units of the shortest on DDS."""
+
+    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
+        """The requirements that fail or warn.
+
+        :param short: apply only the phases that show the fault, where that is fair.
+        """
+
+
+@cache
+def _session(model_name: str) -> Session | None:
+    if not model(model_name).session:
+        return None
+    return Session.default(model_name).first_seconds(SESSION_SECONDS)
+
+
+def plan_for(name: str = "unitree_go", *, sides: Sequence[Side] | None = None) -> Plan:
+    """Every phase; for hands with a session to replay and an object in the right hand.
+
+    :param name: of a dialect or a robot.
+    :param sides: by default both hands, or the robot.
+    """
+    if name in ROBOTS:
+        every = catalogue(name, "robot")
+        return Plan(robot_dialect(name), (ROBOT,), phases=phases_for(every))
+    chosen, sides = dialect(name), tuple(sides or Side)
+    return Plan(
+        dialect=chosen,
+        sides=sides,
+        objects=default_objects(chosen, sides),
+        session=_session(chosen.model),
+        phases=phases_for(catalogue(chosen.model)),
+    )
+
+
+def run_mutant(service: type[Service], plan: Plan | None = None) -> RunResult:
+    """Judge a service of hands, or a robot, on the virtual clock."""
+    chosen = plan or plan_for()
+    trace = run_virtual(chosen, service)
+    recording = recording_of(trace, chosen.dialect.name, chosen.sides)
+    return judge(recording, subject={"backend": f"virtual {service.__name__}"})
+
+
+def run_usb_mutant(
+    device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
+) -> list[Result]:
+    """Judge a USB device on the virtual clock."""
+    return judge_layer(USB, run_virtual_usb(device(side)), requirements)
+
+
+def _blamed(results: Sequence[Result]) -> set[str]:
+    return {r.requirement.id for r in results if r.verdict in _BLAMES}
+
+
+class TopicTrial(ABC):
+    """On DDS topics."""
+
+    @abstractmethod
+    def cost(self, mutant: Mutant) -> float:
+        """Roughly how long a run takes, in units of the shortest on DDS."""
+
+    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
+        """The requirements that fail or warn."""
+        return _blamed(run_mutant(mutant.made, self.plan(mutant, short=short)).results)
+
+    def plan(self, mutant: Mutant, *, short: bool = False) -> Plan:
+        """The phases that show the fault: all, or those that its requirements need."""
+        full = self._full(mutant)
+        if mutant.brief or (short and not mutant.whole):
+            ids = [mutant.kills, *mutant.also]
+            needed = select(catalogue(mutant.model, mutant.layer), prefixes=ids)
+            return replace(full, phases=self._short(mutant, needed))
+        if "-OPER-" not in mutant.kills:
+            # eleven seconds that show an operator what the other phases show already
+            full = replace(full, phases=full.phases - {OPERATOR})
+        return full
+
+    @abstractmethod
+    def _full(self, mutant: Mutant) -> Plan:
+        """Every phase."""
+
+    @abstractmethod
+    def _short(self, mutant: Mutant, needed: Sequence[Requirement]) -> frozenset[str]:
+        """The phases that those requirements need."""
+
+
+class HandTrial(TopicTrial):
+    """On the topics of hands."""
+
+    def cost(self, mutant: Mutant) -> float:
+        """Roughly how long a run takes, in units of the shortest on DDS."""
+        one_joint = len(model(mutant.model).joints[Side.LEFT]) == 1
+        return len(mutant.sides) * (1 if mutant.brief else 3) * (1 if one_joint else 2)
+
+    def _full(self, mutant: Mutant) -> Plan:
+        name = mutant.dialect or model(mutant.model).dialects[0].name
+        return plan_for(name, sides=mutant.sides)
+
+    def _short(self, mutant: Mutant, needed: Sequence[Requirement]) -> frozenset[str]:
+        # moved in any case: some faults show only then
+        return phases_for(needed) | {script_class(mutant.model).motion}
+
+
+class RobotTrial(TopicTrial):
+    """On the topics of a robot."""
+
+    def cost(self, mutant: Mutant) -> float:
+        """Roughly how long a run takes, in units of the shortest on DDS."""
+        return 4.0
+
+    def _full(self, mutant: Mutant) -> Plan:
+        return plan_for(mutant.model)
+
+    def _short(self, mutant: Mutant, needed: Sequence[Requirement]) -> frozenset[str]:
+        # every joint in turn takes by far the longest
+        motion = {script_class(mutant.model).motion}
+        return phases_for(needed) - (motion - {r.phase for r in needed})
+
+
+class UsbTrial:
+    """On a hand's USB device."""
+
+    def cost(self, mutant: Mutant) -> float:
+        """Roughly how long a run takes, in units of the shortest on DDS."""
+        return 0.5
+
+    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
+        """The requirements that fail or warn; the script has no short form."""
+        every = catalogue(mutant.model, mutant.layer)
+        (side,) = mutant.sides
+        return _blamed(run_usb_mutant(mutant.made, every, side))
+
+
+TRIALS: Mapping[str, Trial] = {"dds": HandTrial(), "robot": RobotTrial(), "usb": UsbTrial()}
+"""By layer."""

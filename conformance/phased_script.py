@@ -1,0 +1,103 @@
+"""A stimulus as a script without input and output, and the one loop that plays scripts.
+
+A script's :meth:`~PhasedScript.run` is a generator. It yields actions, a player carries each out
+and sends back what it observed. A live player does so on DDS or on USB, a virtual one with a hand
+in memory on a virtual clock; the script cannot tell them apart.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator
+from typing import Generic, Protocol, TypeVar
+
+__all__ = ["PhasedScript", "play"]
+
+
+class _Timed(Protocol):
+    @property
+    def now_ns(self) -> int: ...
+
+
+class _Stretch(Protocol):
+    begin_ns: int
+    end_ns: int
+
+
+A = TypeVar("A")
+O = TypeVar("O", bound=_Timed)  # noqa: E741
+P = TypeVar("P", bound=_Stretch)
+
+
+class PhasedScript(ABC, Generic[A, O, P]):
+    """A stimulus that marks its phases.
+
+    :param start: what is known before the first action.
+    :param say: called with progress messages for the user.
+    :ivar phases: what was done when, on the recording's clock; kept with the recording.
+    """
+
+    def __init__(self, start: O, say: Callable[[str], None] = lambda text: None) -> None:
+        self.phases: list[P] = []
+        self._say = say
+        self._obs = start
+        self._next_ns = 0
+
+    @abstractmethod
+    def run(self) -> Generator[A, O, None]:
+        """The whole script."""
+
+    def _do(self, action: A) -> Generator[A, O, O]:
+        """Have an action carried out; what was observed then."""
+        self._obs = yield action
+        return self._obs
+
+    def _mark(self, phase: P) -> P:
+        """Note that a phase begins."""
+        self.phases.append(phase)
+        return phase
+
+    def _end(self, phase: P) -> None:
+        phase.end_ns = self._obs.now_ns
+
+    def _elapsed(self, phase: P) -> float:
+        """Seconds since a phase began."""
+        return (self._obs.now_ns - phase.begin_ns) / 1e9
+
+    def _repeat(
+        self, seconds: float, step: Callable[[], Generator[A, O, None]]
+    ) -> Generator[A, O, None]:
+        """Do the same for so long."""
+        end = self._obs.now_ns + round(seconds * 1e9)
+        while self._obs.now_ns < end:
+            yield from step()
+
+    def _through(
+        self, phase: P, seconds: float, step: Callable[[], Generator[A, O, None]]
+    ) -> Generator[A, O, None]:
+        """Do the same until a phase has taken so long, and end it."""
+        while self._elapsed(phase) < seconds:
+            yield from step()
+        self._end(phase)
+
+
+def play(
+    script: PhasedScript[A, O, P],
+    carry_out: Callable[[A], O],
+    stopped: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Play a script to its end.
+
+    :param carry_out: carries out an action, and returns what was observed after it.
+    :param stopped: asked before each action.
+    :returns: False when it was stopped.
+    """
+    steps = script.run()
+    action = next(steps)
+    while not stopped():
+        observation = carry_out(action)
+        try:
+            action = steps.send(observation)
+        except StopIteration:
+            return True
+    return False

@@ -1,0 +1,167 @@
+"""A service in memory: what publishes hands on DDS topics, on a virtual clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.robot import wire_for
+from dexkit.conformance.stimuli.script import Pose
+from dexkit.conformance.virtual.memory_trace import MemoryTrace
+from dexkit.errors import WireError
+from dexkit.hand import Side
+from dexkit.models import Dialect
+from dexkit.traces import TraceEndpoint
+
+__all__ = ["Sample", "Service"]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One state on its way to the wire."""
+
+    topic: str
+    type_name: str
+    payload: bytes
+    sent: float
+
+
+class Service:
+    """Publishes and subscribes as a service that meets every requirement.
+
+    Its own hands never move; each model's reference service simulates some.
+
+    :param touch: where each side touches an object, in the plan's terms.
+    """
+
+    fault_sides: tuple[Side, ...] = tuple(Side)
+    """The hands that are needed, by default, to see a fault of a wrong hand."""
+
+    tick = 0.003
+    """Seconds of a step of the virtual clock."""
+    period = 0.003
+    """Seconds from state to state."""
+    serves_late_readers = True
+    reader_durability = "Volatile"
+    writer_reliability = "reliable"
+    exit_s: float | None = 0.2
+    """Seconds from SIGTERM to its end; None is never."""
+    gone_s: float | None = 0.05
+    """Seconds from there until its publishers have vanished from the domain; None is never."""
+    restarted = False
+    """Whether there was a service before this one."""
+    loaded = False
+    """Whether a slow reliable reader is matched."""
+
+    def __init__(
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+    ) -> None:
+        self.dialect = dialect
+        self.wire = wire_for(dialect)
+        self.sides = tuple(sides)
+        self.command_type = dialect.cmd_type
+        self.state_type = dialect.state_type
+        self.now = 0.0
+        self.stamp = 0.0
+        """Source timestamp of the command that is received, in its own time."""
+        self._due = 0.0
+        self._heard: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
+
+    @classmethod
+    def recorded(cls, trace: MemoryTrace) -> None:
+        """Change the recording of a run: a fault of the client shows only there."""
+
+    @property
+    def hears(self) -> bool:
+        """Whether DDS would match its reader with an official client's writer."""
+        matched = self.reader_durability == "Volatile"
+        return matched and self.command_type == self.dialect.cmd_type
+
+    def endpoints(self) -> list[TraceEndpoint]:
+        """Its endpoints, as discovery reports them."""
+        found: dict[str, TraceEndpoint] = {}
+        for side in self.sides:
+            command, state = self.dialect.topics(side)
+            found[command] = TraceEndpoint(
+                command, "reader", "best_effort", self.reader_durability, "", self.command_type
+            )
+            found[state] = TraceEndpoint(
+                state, "writer", self.writer_reliability, "Volatile", "", self.state_type
+            )
+        return list(found.values())
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        """Take a command message.
+
+        :param client: which of the clients there have been sent it, from 0.
+        """
+        for side in self.sides:
+            if self.wire.command_topics[side] != topic:
+                continue
+            if self._heard.get(side, (b"", None))[0] != payload:
+                try:
+                    self._heard[side] = (payload, self.wire.read_command(payload, side))
+                except WireError:
+                    continue
+            motors = self._heard[side][1]
+            if motors is not None:
+                self.motors(side, motors)
+
+    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
+        """Take a message of another type on a command topic: DDS does not deliver it."""
+        return
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        """Take one side's part of a command message."""
+        return
+
+    def begin(self, now: float) -> None:
+        """Start at that time, after a service before it has ended."""
+        self.restarted = True
+        self.now = self._due = now
+
+    def brake(self) -> None:
+        """Brake the hands: the service ends."""
+        return
+
+    def end(self) -> list[Sample]:
+        """End: brake, and publish a last state."""
+        self.brake()
+        self.now += self.tick
+        self.live(self.tick)
+        return self.publish()
+
+    def advance(self, dt: float) -> list[Sample]:
+        """Let time pass; the states that were published meanwhile."""
+        self.now += dt
+        self.live(dt)
+        if self.now + 1e-9 < self._due:
+            return []
+        self._due += self.period
+        return self.publish()
+
+    def positions(self, side: Side) -> Pose:
+        """The pose of a hand."""
+        return (0.0,) * self.wire.joints
+
+    def live(self, dt: float) -> None:
+        """Let time pass in the mechanics."""
+        return
+
+    def publish(self) -> list[Sample]:
+        """One state of every hand."""
+        if self.wire.shared:
+            return [self.sample(self.dialect.state_topic, self.sides)]
+        return [self.sample(self.wire.state_topics[s], (s,)) for s in self.sides]
+
+    def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
+        """The state message of these sides."""
+        return Sample(topic, self.state_type, self.payload(sides), self.now)
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        """The state of these sides on the wire.
+
+        :param length: motors in the sequence, if not the dialect's.
+        """
+        return self.wire.state_payload({}, length)

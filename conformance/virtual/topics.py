@@ -1,0 +1,165 @@
+"""Play a script to a service in memory, on a virtual clock: a conformance run without DDS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.phased_script import play
+from dexkit.conformance.robot import wire_for
+from dexkit.conformance.stimuli import (
+    Action,
+    Join,
+    Leave,
+    Observation,
+    Plan,
+    Restart,
+    Role,
+    Send,
+    StartService,
+    StopService,
+    script_for,
+)
+from dexkit.conformance.stimuli.script import Pose
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.virtual.memory_trace import MemoryTrace
+from dexkit.conformance.virtual.service import Sample, Service
+from dexkit.hand import Side
+
+__all__ = ["ORIGIN_NS", "log_time_ns", "run_virtual"]
+
+ORIGIN_NS = 1_700_000_000_000_000_000
+"""The recording's clock when the virtual one is at 0."""
+_RIVAL = 1000
+"""The second client's number."""
+
+
+def log_time_ns(seconds: float) -> int:
+    """A time of the virtual clock on the recording's."""
+    return ORIGIN_NS + round(seconds * 1e9)
+
+
+class _Poses(Mapping[Side, Pose]):
+    """The newest poses (0) or velocities (1) of all sides, decoded only when they are read."""
+
+    def __init__(self, wire: Wire, newest: Mapping[Side, bytes], which: int) -> None:
+        self._wire, self._newest, self._which = wire, newest, which
+        self._read: dict[Side, tuple[Pose, Pose] | None] = {}
+
+    def _state(self, side: Side) -> tuple[Pose, Pose] | None:
+        if side not in self._read:
+            self._read[side] = self._wire.read_state(self._newest[side], side)
+        return self._read[side]
+
+    def __getitem__(self, side: Side) -> Pose:
+        state = self._state(side)
+        if state is None:
+            raise KeyError(side)
+        return state[self._which]
+
+    def __iter__(self) -> Iterator[Side]:
+        return (s for s in self._newest if self._state(s) is not None)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+class _Player:
+    """Carries out a script's actions with a service in memory.
+
+    :ivar now: s, of the virtual clock.
+    """
+
+    def __init__(self, plan: Plan, service_class: type[Service]) -> None:
+        self.now = 0.0
+        self._plan, self._service_class = plan, service_class
+        self._service = service_class(plan.dialect, plan.sides, plan.objects)
+        self.trace = MemoryTrace(endpoints=self._service.endpoints())
+        self._wire = wire_for(plan.dialect)
+        self._topics = {s: self._wire.state_topics[s] for s in plan.sides}
+        self._newest: dict[str, bytes] = {}
+        self._joined_at: float | None = None
+        self._joined: dict[Side, float] = {}
+        self._stopped: dict[str, float | None] = {}
+        self._clients = 0
+
+    def carry_out(self, action: Action) -> Observation:
+        """Do it at once; the clock goes on by as long as it takes."""
+        if isinstance(action, Send):
+            self._send(action)
+            self._advance((action.until_ns - ORIGIN_NS) / 1e9)
+        elif isinstance(action, (Join, Leave)):
+            comes = isinstance(action, Join)
+            if action.role is Role.MONITOR:
+                self._joined_at = self.now if comes else None
+            elif action.role is Role.LAGGARD:
+                self._service.loaded = comes
+        elif isinstance(action, Restart):
+            self._clients += 1
+            self._advance(self.now + 0.3)
+        elif isinstance(action, StopService):
+            self.now += self._service.tick
+            self._take(self._service.end())
+            self._stopped = {"exit_s": self._service.exit_s, "gone_s": self._service.gone_s}
+        elif isinstance(action, StartService):
+            self.now += 0.5
+            plan = self._plan
+            self._service = self._service_class(plan.dialect, plan.sides, plan.objects)
+            self._service.begin(self.now)
+            self._newest.clear()
+        return self._observe()
+
+    def _advance(self, until: float) -> None:
+        service = self._service
+        while self.now + 1e-9 < until:
+            self.now += service.tick
+            self._take(service.advance(service.tick))
+
+    def _take(self, samples: Iterable[Sample]) -> None:
+        """Record what was published, and pass it to whoever listens."""
+        for sample in samples:
+            log_ns = log_time_ns(self.now) + 100_000
+            sent_ns = log_time_ns(sample.sent)
+            self.trace.put(sample.topic, sample.type_name, log_ns, sent_ns, sample.payload)
+            sides = [s for s, topic in self._topics.items() if topic == sample.topic]
+            if not sides or sample.type_name != self._plan.dialect.state_type:
+                continue
+            self._newest[sample.topic] = sample.payload
+            if self._joined_at is not None and self._service.serves_late_readers:
+                for side in sides:
+                    self._joined.setdefault(side, self.now - self._joined_at)
+
+    def _send(self, action: Send) -> None:
+        self._service.stamp = self.now - action.age_s
+        for topic, payload in action.payloads:
+            if action.by is Role.STRANGER:
+                self._service.foreign(topic, self._wire.foreign.name, payload)
+                continue
+            log_ns = log_time_ns(self.now) + 50_000
+            sent_ns = log_time_ns(self.now - action.age_s)
+            self.trace.put(topic, self._plan.dialect.cmd_type, log_ns, sent_ns, payload)
+            if self._service.hears:
+                client = _RIVAL if action.by is Role.RIVAL else self._clients
+                self._service.receive(topic, payload, client)
+
+    def _observe(self) -> Observation:
+        newest = {s: self._newest[t] for s, t in self._topics.items() if t in self._newest}
+        return Observation(
+            log_time_ns(self.now),
+            _Poses(self._wire, newest, 0),
+            _Poses(self._wire, newest, 1),
+            dict(self._joined),
+            dict(self._stopped),
+            self._wire.machine,
+        )
+
+
+def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
+    """Play the plan's script to a service of that class; the recording."""
+    player = _Player(plan, service_class)
+    script = script_for(plan)
+    play(script, player.carry_out)
+    objects = {s: plan.objects.get(s) for s in plan.sides}
+    player.trace.metadata[RECORD] = Stimulus(phases=script.phases, objects=objects).to_metadata()
+    service_class.recorded(player.trace)
+    return player.trace
