@@ -324,6 +324,7 @@ class RunResult:
 
 def _result_dict(result: Result) -> dict[str, Any]:
     requirement = asdict(result.requirement)
+    del requirement["negative"]  # about the catalogue, no part of the format
     requirement["level"] = str(result.requirement.level)
     return {
         "id": result.requirement.id,
