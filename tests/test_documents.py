@@ -157,7 +157,7 @@ def test_an_error_says_where_and_what_was_expected(tmp_path: Path) -> None:
         (("claims",), [], "claims must be"),
         (("notes",), {}, "notes must be a list, not an object"),
         (("format",), "other", "is not a result file of dexkit"),
-        (("version",), 3, "is version 3 of dexkit-conformance-result"),
+        (("version",), 4, "is version 4 of dexkit-conformance-result"),
         ((), [], "is not a result file of dexkit"),
     ):  # fmt: skip
         (tmp_path / "r.json").write_text(json.dumps(hostile.replaced(good, place, value)))
