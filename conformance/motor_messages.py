@@ -20,7 +20,8 @@ from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
 __all__ = ["Motor", "Motors", "Wire", "mode_byte"]
 
-# the sequence of motors in a message, and the class of one of them, by type
+# The sequence of motors in a message, and the type of one of them. Written down here and not
+# taken from MessageType.motor_sequence: the kit's reading does not depend on what it tests.
 _SEQUENCE = {
     "unitree_go::msg::dds_::MotorCmds_": ("cmds", "unitree_go::msg::dds_::MotorCmd_"),
     "unitree_go::msg::dds_::MotorStates_": ("states", "unitree_go::msg::dds_::MotorState_"),

@@ -27,7 +27,7 @@ from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
 from dexkit.drivers.ezgripper import Calibrate, EZGripper, GripperSettings, calibration, settings
 from dexkit.drivers.ezgripper import gripper as gripper_module
-from dexkit.drivers.ezgripper.bus import DevicePort, PacketHandler, ServoBus, ServoError
+from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus, ServoError
 from dexkit.drivers.ezgripper.calibration import CalibrationFailed
 from dexkit.drivers.ezgripper.control import ControlSettings, Phase
 from dexkit.drivers.ezgripper.discovery import (
@@ -137,40 +137,36 @@ def travel(gripper: EmulatedThread) -> int:
 # --- the packets themselves
 
 
-class _FakePort:
-    """What the SDK needs of a port, with a reply prepared."""
+class _FakePort(DevicePort):
+    """A port with a reply prepared."""
 
-    is_using = False
-
-    def __init__(self, reply: bytes = b"") -> None:
-        self.reply = bytearray(reply)
+    def __init__(self, reply: bytes) -> None:
+        super().__init__("fake", 0.1)
+        self.reply = reply
         self.sent = b""
 
-    def clearPort(self) -> None:  # noqa: N802
+    def clear(self) -> None:
         pass
 
-    def writePort(self, packet: list[int]) -> int:  # noqa: N802
-        self.sent += bytes(packet)
-        return len(packet)
-
-    def readPort(self, length: int) -> bytes:  # noqa: N802
-        taken = bytes(self.reply[:length])
-        del self.reply[:length]
-        return taken
-
-    def setPacketTimeout(self, length: int) -> None:  # noqa: N802
-        pass
-
-    def isPacketTimeout(self) -> bool:  # noqa: N802
+    def write(self, data: bytes) -> bool:
+        self.sent += data
         return True
 
+    def read(self, deadline: float) -> bytes:
+        taken, self.reply = self.reply, b""
+        return taken
 
-def test_stuffing_on_transmit_is_that_of_the_manual_not_of_the_sdk() -> None:
+
+def _bus_on(port: _FakePort) -> ServoBus:
+    bus = ServoBus(port.path, 1_000_000, retries=0)
+    bus._port = port
+    return bus
+
+
+def test_stuffing_on_transmit_is_that_of_the_manual() -> None:
     # docs/sources/mx64-ezgripper.md#a6: write 116 = 0x00FDFFFF, correctly stuffed
     port = _FakePort(bytes.fromhex("FFFFFD00010400 5500 A10C"))
-    packet = [0, 0, 0, 0, 1, 9, 0, 3, 116, 0, 0xFF, 0xFF, 0xFD, 0, 0, 0]
-    _, result, error = PacketHandler().txRxPacket(port, packet)
-    assert (result, error) == (0, 0)
+    assert not _bus_on(port).write(1, 116, bytes.fromhex("FFFFFD00"))
     assert port.sent.hex(" ").upper() == "FF FF FD 00 01 0A 00 03 74 00 FF FF FD FD 00 21 E7"
 
 
@@ -187,11 +183,20 @@ def test_stuffing_on_transmit_is_that_of_the_manual_not_of_the_sdk() -> None:
 )
 def test_stuffing_on_receive(payload: bytes) -> None:
     port = _FakePort(b"\x00\xff garbage first" + dynamixel.status(1, 0, payload))
-    packet = [0, 0, 0, 0, 1, 7, 0, 2, 126, 0, 10, 0, 0, 0]
-    reply, result, _ = PacketHandler().txRxPacket(port, packet)
-    assert result == 0
-    length = reply[5] | reply[6] << 8
-    assert bytes(reply[9 : 7 + length - 2]) == payload
+    assert _bus_on(port).read(1, 126, 10) == (payload, False)
+
+
+def test_a_held_goal_leaves_with_the_next_request_and_only_once() -> None:
+    port = _FakePort(b"")
+    bus = _bus_on(port)
+    bus.retries = 1
+    kind = dynamixel.Instruction
+    bus.write_unacknowledged(1, 102, bytes(2), with_next=True)
+    assert not port.sent
+    with pytest.raises(HandTimeout):
+        bus.read(1, 126, 10)
+    found = [p.instruction for p in dynamixel.PacketParser().feed(port.sent)]
+    assert found == [kind.SYNC_WRITE, kind.READ, kind.READ]
 
 
 # --- opening
@@ -382,7 +387,7 @@ def test_it_follows_measures_and_switches_off(tmp_path: Path) -> None:
         hand.close()
 
 
-@pytest.mark.parametrize("where", ["writePort", "readPort"])
+@pytest.mark.parametrize("where", ["write", "read"])
 def test_ctrl_c_in_an_exchange_switches_the_motor_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:

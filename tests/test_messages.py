@@ -29,6 +29,22 @@ def _hand_state(motors: int, sensors: int) -> hg.HandState_:
     )
 
 
+def test_the_sequence_of_motors_follows_from_the_layout() -> None:
+    found = {
+        kind.name: (kind.motor_sequence, kind.motor_type.cls)
+        for kind in message_types()
+        if kind.layout.name in ("MotorCmds_", "MotorStates_", "HandCmd_", "HandState_")
+    }
+    assert found == {
+        "unitree_go::msg::dds_::MotorCmds_": ("cmds", go.MotorCmd_),
+        "unitree_go::msg::dds_::MotorStates_": ("states", go.MotorState_),
+        "unitree_hg::msg::dds_::HandCmd_": ("motor_cmd", hg.MotorCmd_),
+        "unitree_hg::msg::dds_::HandState_": ("motor_state", hg.MotorState_),
+    }
+    with pytest.raises(UsageError, match="no sequence of motors"):
+        _ = message_type("unitree_go::msg::dds_::MotorCmd_").motor_sequence
+
+
 def test_golden_commands() -> None:
     message = go.MotorCmds_([go.MotorCmd_(mode=1, q=1.5, kp=5.0, kd=0.05)])
     assert encode(message) == GOLDEN_CMDS

@@ -19,6 +19,7 @@ from mcap.reader import make_reader
 
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace, sample_path
+from dexkit.traces.recorder import MAX_CHANNELS
 from tests.each import each
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
 
@@ -195,6 +196,37 @@ def test_invalid_time_is_refused(tmp_path: Path, times: tuple[int, int]) -> None
             recorder.put(CMD, CMD_TYPE, cmd(0.0), *times)
         assert recorder.put(CMD, CMD_TYPE, cmd(0.0), T0)
     assert recorder.written == 1
+
+
+def test_texts_that_no_file_can_hold_are_refused_at_once(tmp_path: Path) -> None:
+    path, bad = tmp_path / "a.mcap", "rt/\ud800"
+    with pytest.raises(UsageError, match="UTF-8"):
+        Recorder(path, metadata={"note": bad})
+    with Recorder(path) as recorder:
+        for call, problem in (
+            (lambda: recorder.put(bad, CMD_TYPE, cmd(0.0), T0), "a topic"),
+            (lambda: recorder.add_channel(bad, CMD_TYPE), "a topic"),
+            (lambda: recorder.add_channel(CMD, CMD_TYPE, {"a": bad}), "'a' of metadata of"),
+            (lambda: recorder.add_foreign_channel("usb", bad, ""), "name of a type"),
+            (lambda: recorder.add_foreign_channel("usb", "a/msg/B", bad), "definition"),
+            (lambda: recorder.add_metadata(bad, {}), "name of a metadata record"),
+            (lambda: recorder.add_metadata("a", {bad: ""}), "a key of metadata 'a'"),
+            (lambda: recorder.add_metadata("a", {"b": bad}), "'b' of metadata 'a'"),
+            (lambda: recorder.add_metadata("a", {"b": 3}), "not int"),  # type: ignore[dict-item]
+        ):
+            with pytest.raises(UsageError, match=problem):
+                call()
+        assert recorder.put(CMD, CMD_TYPE, cmd(1.0), T0)
+    assert open_trace(path).topics == [CMD]
+
+
+def test_more_channels_than_a_file_can_hold_are_refused_at_once(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap")
+    for i in range(MAX_CHANNELS):
+        recorder.add_channel(f"rt/{i}", CMD_TYPE)
+    recorder.add_channel("rt/0", CMD_TYPE)  # known already
+    with pytest.raises(UsageError, match="65535 channels at most"):
+        recorder.put("rt/one-more", CMD_TYPE, cmd(0.0), T0)
 
 
 def test_closing_twice_and_putting_after_is_harmless(tmp_path: Path) -> None:

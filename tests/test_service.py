@@ -6,9 +6,11 @@ import json
 import logging
 import math
 import time
+from itertools import pairwise
 
 import pytest
 
+from dexkit.clock import ManualClock
 from dexkit.errors import (
     BackendBroken,
     DdsError,
@@ -381,6 +383,52 @@ def test_state_beyond_float32_is_not_published() -> None:
     with serve(Broken(), node):
         wait_until(lambda: node.sent)
         assert math.isfinite(newest(node).q)
+
+
+class TestExchangePacing:
+    """The exchange loop alone, on a clock that moves by what the exchanges take on the line."""
+
+    PERIOD = 0.002
+
+    def run(self, durations: list[float]) -> list[tuple[float, float]]:
+        """(begin, end) of each exchange, seconds from the first one."""
+        clock = ManualClock(start=1.0)
+        spans: list[tuple[float, float]] = []
+        left = list(durations)
+
+        class Line(ScriptedHand):
+            def exchange(self, command: HandCommand) -> HandState:
+                begin = clock.now()
+                clock.advance(left.pop(0) if left else 0.0)
+                spans.append((begin, clock.now()))
+                if not left:
+                    service._stop.set()
+                return super().exchange(command)
+
+        service = serve(Line(io_rate=1 / self.PERIOD, clock=clock), FakeNode(), clock=clock)
+        (unit,) = service._units
+        unit.hand.open()
+        unit.core.opened(unit.hand.spec)
+        service._exchange_loop(unit)
+        first = spans[0][0]
+        return [(a - first, b - first) for a, b in spans[: len(durations)]]
+
+    def test_exchanges_in_time_keep_the_period(self) -> None:
+        begins = [a for a, _ in self.run([0.0012] * 20)]
+        assert begins == pytest.approx([i * self.PERIOD for i in range(20)])
+
+    def test_a_late_exchange_is_followed_at_once_and_periods_missed_are_skipped(self) -> None:
+        for late in (0.0021, 0.0039, 0.0041, 0.0075):
+            spans = self.run([0.0012, late, *[0.0005] * 6])
+            assert spans[2][0] == pytest.approx(spans[1][1]), late
+            for (begin, end), (following, _) in pairwise(spans):
+                # one exchange a period, and none before the line is free
+                deadline = (math.floor(begin / self.PERIOD + 1e-6) + 1) * self.PERIOD
+                assert following == pytest.approx(max(end, deadline)), (late, begin)
+
+    def test_a_line_slower_than_the_period_is_never_idle(self) -> None:
+        spans = self.run([0.0021] * 40)
+        assert [a for a, _ in spans[1:]] == pytest.approx([b for _, b in spans[:-1]])
 
 
 class TestConflict:

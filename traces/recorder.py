@@ -29,7 +29,7 @@ from dexkit.messages import MessageType, message_type
 from dexkit.threads import Worker
 from dexkit.traces.recording_file import ChunkIndexes, RecordingFile
 
-__all__ = ["FLUSH_INTERVAL", "Recorder"]
+__all__ = ["FLUSH_INTERVAL", "MAX_CHANNELS", "Recorder"]
 
 #: Seconds between complete chunks in the file; less than half of the half second that may be lost.
 FLUSH_INTERVAL = 0.2
@@ -40,6 +40,8 @@ _WAKE_AT = 512
 _SLICE = 4096
 # Bytes that are written at once at the latest, whatever the time.
 _COMMIT_AT = 4 * 2**20
+#: Channels, each a topic with a type, in one file: their ids are 16-bit numbers from 1 on.
+MAX_CHANNELS = 2**16 - 1
 # mcap times are unsigned 64-bit numbers
 _TIMES = 2**64
 
@@ -97,7 +99,8 @@ class Recorder:
     :param compression: ``"zstd"``, ``"lz4"`` or ``"none"``.
     :param metadata: goes into the metadata record ``dexkit_recorder``, with what the recorder
         adds: version, messages, drops.
-    :raises UsageError: the file exists and ``overwrite`` is False, or a bound makes no sense.
+    :raises UsageError: the file exists and ``overwrite`` is False, a bound makes no sense, or
+        ``metadata`` holds anything but texts.
 
     Each message's mcap sequence number counts what was offered on its topic, so a dropped sample
     is also visible as a gap in the numbers.
@@ -124,7 +127,7 @@ class Recorder:
         self._max_messages = max_messages
         self._max_bytes = max_bytes
         self._compression = _COMPRESSION[compression]
-        self._about = {"version": __version__, **(metadata or {})}
+        self._about = {"version": __version__, **_check_metadata("metadata", metadata or {})}
         self._lock = threading.Lock()
         self._queue: list[_Item | _Metadata] = []
         self._queued = 0
@@ -230,24 +233,31 @@ class Recorder:
     ) -> None:
         """Announce a topic, with metadata for its channel. :meth:`put` does so by itself.
 
-        :raises UsageError: dexkit does not know the type.
+        :raises UsageError: dexkit does not know the type, a text is not one that a file can
+            hold, or there are :data:`MAX_CHANNELS` channels already.
         """
         kind = message_type(type_name)
-        with self._lock:
-            self._channels.setdefault(
-                (topic, type_name),
-                _Channel(topic, kind, {"dds.type": kind.name, **(metadata or {})}),
-            )
+        values = _check_metadata(f"metadata of {topic!r}", metadata or {})
+        self._add(type_name, _Channel(topic, kind, {"dds.type": kind.name, **values}))
 
     def add_foreign_channel(self, topic: str, ros_name: str, ros2msg: str) -> None:
         """Announce a topic that is not on DDS; :meth:`put` then takes its type by ``ros_name``.
 
         :param ros_name: name of the type, ``dexkit_usb/msg/Transfer``.
         :param ros2msg: its definition. Payloads are CDR, as for every other topic.
+        :raises UsageError: as for :meth:`add_channel`.
         """
+        _check_text("the name of a type", ros_name)
+        _check_text(f"the definition of {ros_name}", ros2msg)
+        self._add(ros_name, _Channel(topic, _Foreign(ros_name, ros_name, ros2msg), {}))
+
+    def _add(self, type_name: str, channel: _Channel) -> None:
+        _check_text("a topic", channel.topic)
+        key = (channel.topic, type_name)
         with self._lock:
-            kind = _Foreign(ros_name, ros_name, ros2msg)
-            self._channels.setdefault((topic, ros_name), _Channel(topic, kind, {}))
+            if key not in self._channels and len(self._channels) >= MAX_CHANNELS:
+                raise UsageError(f"a recording holds {MAX_CHANNELS} channels at most")
+            self._channels.setdefault(key, channel)
 
     def put(
         self,
@@ -263,7 +273,7 @@ class Recorder:
         :param log_time_ns: reception, ns since the epoch.
         :param publish_time_ns: DDS source timestamp, ns since the epoch; 0 if unknown.
         :returns: False when it was dropped.
-        :raises UsageError: dexkit does not know the type, or a time is not one.
+        :raises UsageError: a time is not one, or as for :meth:`add_channel`.
         """
         if not (0 <= log_time_ns < _TIMES and 0 <= publish_time_ns < _TIMES):
             raise UsageError(f"not times in ns since the epoch: {log_time_ns}, {publish_time_ns}")
@@ -292,10 +302,15 @@ class Recorder:
         return True
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
-        """Queue a metadata record; of several with one name, readers let later keys win."""
+        """Queue a metadata record; of several with one name, readers let later keys win.
+
+        :raises UsageError: a name, key or value is not a text, or cannot be UTF-8.
+        """
+        _check_text("the name of a metadata record", name)
+        record = _Metadata(name, _check_metadata(f"metadata {name!r}", values))
         with self._lock:
             if not self._closing:
-                self._queue.append(_Metadata(name, dict(values)))
+                self._queue.append(record)
 
     # -- the writer's thread -------------------------------------------------------------------
 
@@ -403,3 +418,24 @@ class Recorder:
         channel.id = self._writer.register_channel(
             channel.topic, "cdr", self._schema_ids[kind.name], channel.metadata
         )
+
+
+def _check_metadata(what: str, values: dict[str, str]) -> dict[str, str]:
+    """A copy of ``values``.
+
+    :raises UsageError: a key or value is not a text, or cannot be UTF-8.
+    """
+    for key, value in values.items():
+        _check_text(f"a key of {what}", key)
+        _check_text(f"{key!r} of {what}", value)
+    return dict(values)
+
+
+def _check_text(what: str, text: object) -> None:
+    """:raises UsageError: it is not a text, or cannot be UTF-8."""
+    if not isinstance(text, str):
+        raise UsageError(f"{what} must be a text, not {type(text).__name__}")
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise UsageError(f"{what} cannot be written as UTF-8: {text[:100]!r}") from None

@@ -43,7 +43,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dexkit.hand import HandState, Side
-from dexkit.messages import MessageType, layout, message_type, unitree_go, unitree_hg
+from dexkit.messages import MessageType, message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect, dialect, model
 from dexkit.service.dialects import HG_CLOSED, HG_OPEN, StateView, dialect_map
 
@@ -70,16 +70,10 @@ class Part:
         self.type: MessageType = message_type(
             spoken.cmd_type if kind == "cmd" else spoken.state_type
         )
-        (sequence,) = (
-            f
-            for f in layout.STRUCTS[self.type.name].fields
-            if f.sequence and "Motor" in f.type.dds_name  # type: ignore[union-attr]
-        )
-        assert isinstance(sequence.type, layout.Struct)
-        self._sequence = sequence.name
-        self._motor: type[Any] = message_type(sequence.type.dds_name).cls
+        self._sequence = self.type.motor_sequence
+        self._motor: type[Any] = self.type.motor_type.cls
         # the message has other members beside the motors
-        self._whole = len(layout.STRUCTS[self.type.name].fields) > 1
+        self._whole = len(self.type.layout.fields) > 1
         self._index = spoken.index
         self._numbers = _NUMBERS[kind]
         self.length = spoken.length

@@ -139,20 +139,17 @@ def _print(data: dict[str, Any]) -> None:
             )
         console.print()
         console.print(table)
+    # in one call: rich needs a fraction of a millisecond for each, and there may be thousands
+    lines = []
     for name, values in data["metadata"].items():
-        console.print(f"\n[bold]{escape(name)}[/bold]")
-        for key, value in values.items():
-            console.print(
-                f"  {escape(key, LONGEST)}: {escape(value)}", highlight=False, soft_wrap=True
-            )
+        lines += ["", f"[bold]{escape(name)}[/bold]"]
+        lines += [f"  {escape(key, LONGEST)}: {escape(value)}" for key, value in values.items()]
     if data["warnings"] or data["notes"]:
-        console.print()
-        for warning in data["warnings"]:
-            console.print(
-                f"[yellow]warning:[/yellow] {escape(warning)}", highlight=False, soft_wrap=True
-            )
-        for note in data["notes"]:
-            console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+        lines.append("")
+        lines += [f"[yellow]warning:[/yellow] {escape(warning)}" for warning in data["warnings"]]
+        lines += [f"note: {escape(note)}" for note in data["notes"]]
+    if lines:
+        console.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 
 def _number(value: float | None, digits: int) -> str:

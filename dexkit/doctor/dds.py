@@ -73,15 +73,11 @@ class _Watch:
 
     def decode(self, data: bytes) -> None:
         try:
-            decoded = message_type(self.endpoint.type_name).decode(data)
+            kind = message_type(self.endpoint.type_name)
+            motors = getattr(kind.decode(data), kind.motor_sequence)
         except DexkitError:
             self.undecodable += 1
             return
-        motors = next(
-            getattr(decoded, name)
-            for name in ("cmds", "states", "motor_cmd", "motor_state")
-            if hasattr(decoded, name)
-        )
         q = [float(motor.q) for motor in motors]
         self.nonzero = self.nonzero or any(q)
         self.q = tuple(q)

@@ -26,6 +26,9 @@ _PACK_ERRORS = (
     ValueError,
 )
 
+# the structs of which one is one motor
+_MOTORS = ("MotorCmd_", "MotorState_")
+
 
 class MessageType:
     """One message type. Get it from :func:`message_type`.
@@ -54,6 +57,32 @@ class MessageType:
         """The dataclass."""
         found: type[Any] = getattr(self._module, self.layout.name)
         return found
+
+    @cached_property
+    def motor_sequence(self) -> str:
+        """Name of the member that holds the motors of a command or state: ``motor_cmd``.
+
+        :raises UsageError: the type has no sequence of motors.
+        """
+        return self._motor_member.name
+
+    @cached_property
+    def motor_type(self) -> MessageType:
+        """Type of one element of :attr:`motor_sequence`.
+
+        :raises UsageError: the type has no sequence of motors.
+        """
+        assert isinstance(self._motor_member.type, layout.Struct)
+        return message_type(self._motor_member.type.dds_name)
+
+    @cached_property
+    def _motor_member(self) -> layout.Field:
+        for member in self.layout.fields:
+            struct = member.type
+            is_motor = isinstance(struct, layout.Struct) and struct.name in _MOTORS
+            if member.sequence and is_motor:
+                return member
+        raise UsageError(f"{self.name} has no sequence of motors")
 
     @cached_property
     def _encode(self) -> Callable[[Any], bytes]:

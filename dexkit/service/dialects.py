@@ -148,6 +148,7 @@ class DialectMap(ABC):
         self.fill = fill
         self._specs = dict(specs)
         self._state_type = message_type(dialect.state_type)
+        self._sequence = message_type(dialect.cmd_type).motor_sequence
         # one joint: its motor is one element of the sequence; more: they are the sequence
         self._first = {
             side: dialect.index[side] if spec.n_joints == 1 else 0 for side, spec in specs.items()
@@ -195,9 +196,10 @@ class DialectMap(ABC):
         """
         return self._state_type.encode(self.state(views))
 
-    @abstractmethod
     def _motor_commands(self, message: Any) -> list[Any]:
         """The motors of a command message."""
+        motors: list[Any] = getattr(message, self._sequence)
+        return motors
 
     def _q_in(self, q: float, joint: JointSpec) -> float:
         # 5.4 as float32 is 1e-7 above 5.4: not a command beyond the limit
@@ -217,10 +219,6 @@ class DialectMap(ABC):
 
 class MotorCmdsMap(DialectMap):
     """Grippers in ``MotorCmds_`` and ``MotorStates_``: all values as they are."""
-
-    def _motor_commands(self, message: Any) -> list[Any]:
-        motors: list[Any] = message.cmds
-        return motors
 
     def state(self, views: Mapping[Side, StateView]) -> unitree_go.MotorStates_:
         """The state message."""
@@ -294,10 +292,6 @@ class InterfaceSpecificationMap(DialectMap):
     def _scale(self, q_max: float) -> float:
         return self.dialect.q_open / q_max
 
-    def _motor_commands(self, message: Any) -> list[Any]:
-        motors: list[Any] = message.motor_cmd
-        return motors
-
     def _q_in(self, q: float, joint: JointSpec) -> float:
         if not math.isfinite(q):
             return q  # for the gate to reject: minus infinity is not "closed"
@@ -339,10 +333,6 @@ class FingerMap(DialectMap):
         """The state message as a DDS sample."""
         (view,) = views.values()
         return self._encoder.encode(view.state, view.fault, view.missed, view.tripped)
-
-    def _motor_commands(self, message: Any) -> list[Any]:
-        motors: list[Any] = message.motor_cmd
-        return motors
 
     def _modes(self, message: Any, side: Side) -> list[int]:
         """The mode bytes of a side's motors."""

@@ -11,15 +11,6 @@ from dexkit.teleop.client import JointCommand, Pose
 
 __all__ = ["ClientWire"]
 
-# the sequence of motors in a command and in a state, and the class of a command's motor, by type
-_COMMANDS = {
-    "unitree_go::msg::dds_::MotorCmds_": ("cmds", "unitree_go::msg::dds_::MotorCmd_"),
-    "unitree_hg::msg::dds_::HandCmd_": ("motor_cmd", "unitree_hg::msg::dds_::MotorCmd_"),
-}
-_STATES = {
-    "unitree_go::msg::dds_::MotorStates_": "states",
-    "unitree_hg::msg::dds_::HandState_": "motor_state",
-}
 _LIMP = JointCommand(0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -34,9 +25,7 @@ class ClientWire:
         self._joints = len(model(spoken.model).joints[Side.LEFT])
         self._command = message_type(spoken.cmd_type)
         self._state = message_type(spoken.state_type)
-        self._sequence, motor = _COMMANDS[spoken.cmd_type]
-        self._motor = message_type(motor).cls
-        self._states = _STATES[spoken.state_type]
+        self._motor = self._command.motor_type.cls
         self.command_topics = {s: spoken.topics(s)[0] for s in Side}
         self.state_topics = {s: spoken.topics(s)[1] for s in Side}
 
@@ -54,7 +43,7 @@ class ClientWire:
 
     def _payload(self, motors: Sequence[JointCommand]) -> bytes:
         message = self._command.cls()
-        setattr(message, self._sequence, [self._motor(**m._asdict()) for m in motors])
+        setattr(message, self._command.motor_sequence, [self._motor(**m._asdict()) for m in motors])
         return self._command.encode(message)
 
     def positions(self, topic: str, data: bytes) -> dict[Side, Pose]:
@@ -62,7 +51,7 @@ class ClientWire:
 
         :raises WireError: it is not of the dialect's state type.
         """
-        motors = getattr(self._state.decode(data), self._states)
+        motors = getattr(self._state.decode(data), self._state.motor_sequence)
         found: dict[Side, Pose] = {}
         for side, its_topic in self.state_topics.items():
             first = self._dialect.index[side]

@@ -1,18 +1,13 @@
-"""The serial line to the servo: dynamixel-sdk on pyserial, made bounded and typed.
+"""The serial line to the servo: DYNAMIXEL Protocol 2.0 transactions on pyserial.
 
-What is different from the plain SDK, and why (docs/sources/mx64-ezgripper.md#a3,
-docs/sources/mx64-ezgripper.md#c3):
+Packets are those of :mod:`dexkit.wire.dynamixel`. The port blocks in ``select`` until bytes or the
+deadline come, so that waiting costs no processor time and does not hold Python's interpreter lock
+against the thread that publishes state. pyserial reports a vanished device as SerialException,
+OSError or termios.error; all become :class:`~dexkit.errors.HandLost`.
 
-- The SDK polls the port without pause while it waits. :class:`DevicePort` blocks in ``select``
-  until bytes or the deadline come, so that a waiting gripper costs no processor time (and does
-  not hold Python's interpreter lock against the thread that publishes state).
-- The SDK's timeout is bytes plus 34 ms on the wall clock, whatever the adapter. Here it is a
-  setting, on the monotonic clock.
-- The SDK sends packets that need byte stuffing unstuffed, and damages some received ones.
-  :class:`PacketHandler` replaces both functions by those of :mod:`dexkit.wire.dynamixel`.
-- A short error status reads as data (its CRC bytes) in the SDK. Here the length is checked.
-- pyserial reports a vanished device as SerialException, OSError or termios.error; all become
-  :class:`~dexkit.errors.HandLost`.
+Why not dynamixel-sdk (docs/sources/mx64-ezgripper.md#a3, docs/sources/mx64-ezgripper.md#c3): it
+polls the port while it waits, does not stuff what it sends, damages some of what it receives, and
+reads the CRC of a short error status as data. It is the client that tests the emulated servo.
 """
 
 from __future__ import annotations
@@ -21,30 +16,15 @@ import os
 import select
 import termios
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import serial
-from dynamixel_sdk import (
-    COMM_RX_CORRUPT,
-    COMM_RX_TIMEOUT,
-    COMM_SUCCESS,
-    PortHandler,
-    Protocol1PacketHandler,
-    Protocol2PacketHandler,
-)
 
 from dexkit.command_age import Promptly
 from dexkit.drivers.serial_port import open_failed, port_errors
-from dexkit.errors import (
-    HandLost,
-    HandRefused,
-    HandTimeout,
-    UsageError,
-)
+from dexkit.errors import HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.wire import dynamixel, mx64
-from dexkit.wire.dynamixel import Instruction
+from dexkit.wire.dynamixel import BROADCAST_ID, Instruction, Packet, PacketParser
 
 __all__ = ["BITS_PER_BYTE", "BusStatistics", "DevicePort", "Ping", "ServoBus", "ServoError"]
 
@@ -53,8 +33,11 @@ BITS_PER_BYTE = 10
 
 _BUFFERED = 0.1
 """Seconds that a USB adapter may hold bytes that the system has handed over."""
-_HEADER = 8
-"""Bytes of a frame before the first parameter (of an instruction) or the error (of a status)."""
+_STATUS = 11
+"""Bytes of a status packet without data."""
+_LONGEST_REQUEST = 64
+"""Bytes that may still be leaving when the wait for the answer begins."""
+_PING_DATA = 3  # model number (2), firmware (1)
 
 
 @dataclass
@@ -93,61 +76,49 @@ class ServoError(HandRefused):
         self.number = number
 
 
-class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
-    """The SDK's port with a receive that sleeps, and a deadline on the monotonic clock.
+class DevicePort:
+    """A serial port whose reads sleep until bytes or a deadline come.
 
     :param path: device path.
-    :param baudrate: bits a second.
-    :param timeout: seconds to wait for a reply beyond the time of its bytes on the line.
+    :param timeout: seconds after which a write is given up.
     """
 
-    is_open: bool
-
-    def __init__(self, path: str, baudrate: int, timeout: float) -> None:
-        super().__init__(path)
-        self.baudrate = baudrate
+    def __init__(self, path: str, timeout: float) -> None:
+        self.path = path
         self.timeout = timeout
-        self._deadline = 0.0
-        self._received = bytearray()
-        self._held = b""
-        self.hold_next = False
-        self.before: Promptly | None = None
+        self._port: serial.Serial | None = None
 
-    # names are the SDK's
-    def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
-        """Open at ``cflag_baud``, for this process alone."""
-        if self.is_open:
-            self.closePort()
-        self._received.clear()
-        self._held = b""
-        self.ser = serial.Serial(self.port_name, cflag_baud, timeout=0, exclusive=True)
-        self.is_open = True
-        self.tx_time_per_byte = BITS_PER_BYTE * 1000.0 / cflag_baud
-        return True
+    @property
+    def is_open(self) -> bool:
+        """Whether it is open."""
+        return self._port is not None
 
-    def closePort(self) -> None:  # noqa: N802
+    def open(self, baudrate: int) -> None:
+        """Open, or open again, for this process alone. Raises as :class:`serial.Serial`."""
+        self.close()
+        self._port = serial.Serial(self.path, baudrate, timeout=0, exclusive=True)
+
+    def close(self) -> None:
         """Close; a port that has gone away is closed as well."""
-        self.is_open = False
-        if self.ser is not None:
+        port, self._port = self._port, None
+        if port is not None:
             try:
-                self.ser.close()
+                port.close()
             except (OSError, termios.error):
                 pass
 
-    def clearPort(self) -> None:  # noqa: N802
-        """Forget what has been received: the SDK calls this before each instruction."""
-        self._received.clear()
-        if not self.hold_next:  # what is held is sent with the next one, which clears
-            self.ser.reset_input_buffer()
+    def clear(self) -> None:
+        """Drop what has been received."""
+        self._opened().reset_input_buffer()
 
-    def readPort(self, length: int) -> bytes:  # noqa: N802
-        """At most ``length`` bytes; fewer only when the deadline has come."""
-        received = self._received
-        fd = self.ser.fileno()
-        while len(received) < length:
-            remaining = self._deadline - time.monotonic()
-            if remaining <= 0:
-                break
+    def flush(self) -> None:
+        """Wait until the system has handed over what was written."""
+        self._opened().flush()
+
+    def read(self, deadline: float) -> bytes:
+        """What has been received, or nothing when the deadline (monotonic seconds) has come."""
+        fd = self._opened().fileno()
+        while (remaining := deadline - time.monotonic()) > 0:
             if not select.select([fd], [], [], remaining)[0]:
                 break
             try:
@@ -156,93 +127,27 @@ class DevicePort(PortHandler):  # type: ignore[misc]  # the SDK has no types
                 continue
             if not data:
                 raise serial.SerialException("the device reports data but has none")
-            received += data
-        taken = bytes(received[: max(length, 0)])
-        del received[: len(taken)]
-        return taken
+            return data
+        return b""
 
-    def writePort(self, packet: list[int]) -> int:  # noqa: N802
-        """Write a whole packet, or as much as goes within the timeout.
-
-        With ``hold_next`` set the packet is kept and leaves together with the next one: one
-        system call and, on a USB adapter, one transfer instead of two. ``before`` is asked right
-        before they do.
-
-        :raises HandTimeout: ``before`` refuses; nothing was written.
-        """
-        data = bytes(packet)
-        if self.hold_next:
-            self.hold_next = False
-            self._held = data
-            return len(data)
-        held = len(self._held)
-        data, self._held = self._held + data, b""
-        before, self.before = self.before, None
-        sent = 0
-        if before is not None:
-            before.check()
+    def write(self, data: bytes) -> bool:
+        """Write; False if the port does not take all of it within the timeout."""
+        fd = self._opened().fileno()
         deadline = time.monotonic() + self.timeout
+        sent = 0
         while sent < len(data):
             try:
-                sent += os.write(self.ser.fileno(), data[sent:])
+                sent += os.write(fd, data[sent:])
             except BlockingIOError:
                 remaining = deadline - time.monotonic()
-                if remaining <= 0 or not select.select([], [self.ser.fileno()], [], remaining)[1]:
-                    break
-        return sent - held
+                if remaining <= 0 or not select.select([], [fd], [], remaining)[1]:
+                    return False
+        return True
 
-    def abandon(self) -> None:
-        """Forget a transaction that was cut short: the SDK would call the port busy for ever."""
-        self.is_using = False
-        self.hold_next = False
-        self._held = b""
-        self.before = None
-
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        """Start the clock for a reply of ``packet_length`` bytes."""
-        # what was written may still be leaving: allow the longest instruction as well
-        line = (packet_length + 64) * self.tx_time_per_byte / 1000.0
-        self._deadline = time.monotonic() + line + self.timeout
-
-    def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
-        """Start the clock for a wait of ``msec`` milliseconds."""
-        self._deadline = time.monotonic() + msec / 1000.0
-
-    def isPacketTimeout(self) -> bool:  # noqa: N802
-        """Whether the deadline has passed."""
-        return time.monotonic() >= self._deadline
-
-
-class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
-    """The SDK's Protocol 2.0 with correct byte stuffing both ways, and the fast CRC."""
-
-    def updateCRC(self, crc_accum: int, data_blk_ptr: list[int], data_blk_size: int) -> int:  # noqa: N802
-        """CRC-16 of the first ``data_blk_size`` bytes."""
-        return dynamixel.crc16(bytes(data_blk_ptr[:data_blk_size]))
-
-    def addStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
-        """Stuff in place, as the SDK's caller expects."""
-        body = bytes(packet[_HEADER - 1 : -2])
-        stuffed = dynamixel.stuff(body)
-        if len(stuffed) != len(body):
-            packet[_HEADER - 1 :] = [*stuffed, 0, 0]
-            _set_length(packet, len(stuffed) + 2)
-        return packet
-
-    def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
-        """Remove the stuffing of a whole received packet."""
-        length = packet[5] | packet[6] << 8
-        end = _HEADER - 1 + length
-        body = bytes(packet[_HEADER - 1 : end - 2])
-        plain = dynamixel.unstuff(body)
-        packet[_HEADER - 1 :] = [*plain, *packet[end - 2 : end]]
-        _set_length(packet, len(plain) + 2)
-        return packet
-
-
-def _set_length(packet: list[int], length: int) -> None:
-    packet[5] = length & 0xFF
-    packet[6] = length >> 8
+    def _opened(self) -> serial.Serial:
+        if self._port is None:
+            raise serial.SerialException("the port is closed")
+        return self._port
 
 
 class ServoBus:
@@ -261,16 +166,14 @@ class ServoBus:
         if timeout <= 0 or retries < 0:
             raise UsageError(f"timeout {timeout} and retries {retries} must not be negative")
         self.path = path
+        self.baudrate = baudrate
         self.timeout = timeout
         self.retries = retries
         self.statistics = BusStatistics()
-        self._packets = PacketHandler()
-        self._port = DevicePort(path, baudrate, timeout)
-
-    @property
-    def baudrate(self) -> int:
-        """Bits a second."""
-        return int(self._port.baudrate)
+        self._port = DevicePort(path, timeout)
+        self._parser = PacketParser(keep_bad=True)
+        self._held = b""  # leaves together with the next packet
+        self._before: Promptly | None = None
 
     @property
     def is_open(self) -> bool:
@@ -283,32 +186,24 @@ class ServoBus:
         :raises HandNotFound: no such device, no permission, or not a serial port.
         :raises HandRefused: another program has it.
         :raises HandLost: it cannot be opened for another reason.
-        :raises UsageError: the SDK does not know the baud rate.
+        :raises UsageError: no servo has this baud rate.
         """
         self.set_baudrate(self.baudrate)
 
     def set_baudrate(self, baudrate: int) -> None:
         """Open, or open again, at another baud rate. Raises as :meth:`open`."""
+        if baudrate not in mx64.BAUD_RATES.values():
+            raise UsageError(
+                f"baud rate {baudrate} is none of a servo's",
+                hint="use " + ", ".join(str(b) for b in mx64.BAUD_RATES.values()),
+            )
+        self._held, self._before = b"", None
+        self.baudrate = baudrate
         try:
-            known = self._port.setBaudRate(baudrate)
+            self._port.open(baudrate)
         except (serial.SerialException, OSError, termios.error, ValueError) as error:
             self.close()
             raise open_failed(self.path, error) from error
-        if not known:
-            raise UsageError(
-                f"baud rate {baudrate} is not supported by dynamixel-sdk",
-                hint="use " + ", ".join(str(b) for b in mx64.BAUD_RATES.values() if b != baudrate),
-            )
-
-    @contextmanager
-    def _line(self) -> Iterator[None]:
-        """A transaction; whatever cuts it short (Ctrl-C, too), the next one can be made."""
-        try:
-            with port_errors(self.path):
-                yield
-        except BaseException:
-            self._port.abandon()
-            raise
 
     def drain(self) -> None:
         """Wait until what was written has left the adapter, whatever it buffers.
@@ -316,12 +211,12 @@ class ServoBus:
         :raises HandLost: the port has gone away.
         """
         with port_errors(self.path):
-            self._port.ser.flush()
+            self._port.flush()
         time.sleep(_BUFFERED)
 
     def close(self) -> None:
         """Close the port; may be called twice."""
-        self._port.closePort()
+        self._port.close()
 
     def wire_time(self, n_bytes: int) -> float:
         """Seconds that ``n_bytes`` take on the line."""
@@ -333,22 +228,44 @@ class ServoBus:
         :raises HandTimeout: nobody with that id answers at this baud rate.
         :raises HandLost: the port has gone away.
         """
-        _, data = self._transact(servo_id, Instruction.PING, b"", 3, retries=retries)
-        return Ping(servo_id, int.from_bytes(data[:2], "little"), data[2])
+        _, data = self._transact(servo_id, Instruction.PING, b"", _PING_DATA, retries=retries)
+        return _ping_of(servo_id, data)
 
     def ping_all(self) -> list[Ping]:
         """Every servo that answers a broadcast; takes about a second
         (docs/sources/mx64-ezgripper.md#c3).
+
+        :raises HandLost: the port has gone away.
         """
-        with self._line():
-            found, _ = self._packets.broadcastPing(self._port)
-        return [Ping(i, model, firmware) for i, (model, firmware) in sorted(found.items())]
+        every = dynamixel.MAX_ID * (self.wire_time(_STATUS + _PING_DATA) + 0.003)
+        found = {}
+        with port_errors(self.path):
+            self._send(dynamixel.encode(BROADCAST_ID, Instruction.PING))
+            deadline = time.monotonic() + every + 0.016
+            parser = PacketParser()
+            while data := self._port.read(deadline):
+                for packet in parser.feed(data):
+                    if packet.is_status and len(packet.params) == 1 + _PING_DATA:
+                        found[packet.id] = _ping_of(packet.id, packet.data)
+        return [found[number] for number in sorted(found)]
 
     def ping_protocol_1(self, servo_id: int) -> int | None:
-        """Model number of a servo that still speaks Protocol 1.0, or None."""
-        with self._line():
-            model, result, _ = Protocol1PacketHandler().ping(self._port, servo_id)
-        return int(model) if result == COMM_SUCCESS else None
+        """Model number of a servo that still speaks Protocol 1.0, or None.
+
+        :raises HandLost: the port has gone away.
+        """
+        body = bytes((servo_id, 4, Instruction.READ, 0, 2))  # the model number is at address 0
+        received = b""
+        with port_errors(self.path):
+            self._send(b"\xff\xff" + body + bytes((~sum(body) & 0xFF,)))
+            deadline = self._deadline(8)
+            while data := self._port.read(deadline):
+                received = (received + data)[-4096:]
+                at = received.find(bytes((0xFF, 0xFF, servo_id, 4)))
+                answer = received[at + 2 : at + 8] if at >= 0 else b""
+                if len(answer) == 6 and sum(answer) & 0xFF == 0xFF:
+                    return int.from_bytes(answer[3:5], "little")
+        return None
 
     def read(self, servo_id: int, address: int, length: int) -> tuple[bytes, bool]:
         """``length`` bytes from ``address``, and whether the servo signals a hardware error.
@@ -385,19 +302,21 @@ class ServoBus:
     ) -> None:
         """Write without a status packet (a Sync Write to one servo): half the time, no reply.
 
-        :param with_next: let it leave together with the next transaction.
+        :param with_next: let it leave together with the next transaction: one system call and, on
+            a USB adapter, one transfer instead of two.
         :param before: asked right before it leaves. What it raises comes from here, or from the
             next transaction.
         :raises HandLost: the port has gone away or takes no more bytes.
         """
-        self._port.hold_next = with_next
-        self._port.before = before
-        with self._line():
-            result = self._packets.syncWriteTxOnly(
-                self._port, address, len(data), [servo_id, *data], 1 + len(data)
-            )
-        if result != COMM_SUCCESS:
-            raise HandLost(f"the port {self.path} takes no more bytes")
+        size = len(data)
+        params = bytes((address & 0xFF, address >> 8, size & 0xFF, size >> 8, servo_id)) + data
+        packet = dynamixel.encode(BROADCAST_ID, Instruction.SYNC_WRITE, params)
+        self._before = before
+        if with_next:
+            self._held = packet
+            return
+        with port_errors(self.path):
+            self._send(packet)
 
     def reboot(self, servo_id: int) -> None:
         """Restart the servo; it stays silent until it has booted.
@@ -416,37 +335,34 @@ class ServoBus:
         *,
         retries: int | None = None,
     ) -> tuple[bool, bytes]:
+        """(alert bit, data) of the answer; ``answer`` is the length that the data must have."""
         attempts = 1 + (self.retries if retries is None else retries)
         statistics = self.statistics
-        packet = [0, 0, 0, 0, servo_id, 0, 0, int(instruction), *params, 0, 0]
-        _set_length(packet, len(params) + 3)
+        request = dynamixel.encode(servo_id, instruction, params)
         problem = ""
         for attempt in range(attempts):
             statistics.transactions += 1
             statistics.retries += attempt > 0
-            with self._line():
-                # the SDK changes the list that it is given
-                reply, result, error = self._packets.txRxPacket(self._port, list(packet))
-            if result == COMM_RX_TIMEOUT:
+            with port_errors(self.path):
+                self._send(request)
+                packet = self._receive(servo_id, self._deadline(_STATUS + answer))
+            if packet is None:
                 statistics.timeouts += 1
                 problem = "does not answer"
                 continue
-            if result == COMM_RX_CORRUPT:
+            if not packet.crc_ok:
                 statistics.corrupt += 1
                 problem = "answers with damaged packets"
                 continue
-            if result != COMM_SUCCESS:
-                raise HandLost(f"the port {self.path} takes no more bytes ({result})")
-            number = error & 0x7F
+            number = packet.error_number
             if number == dynamixel.ErrorNumber.CRC:
                 statistics.corrupt += 1
                 problem = "receives damaged packets"
                 continue
-            data = bytes(reply[_HEADER + 1 : _HEADER + (reply[5] | reply[6] << 8) - 3])
             if number:
                 raise ServoError(_refusal(servo_id, instruction, params, number), number)
-            if len(data) == answer:
-                return bool(error & 0x80), data
+            if len(packet.data) == answer:
+                return packet.alert, packet.data
             # the late answer to something else, for example
             statistics.corrupt += 1
             problem = "answers with packets of the wrong length"
@@ -455,6 +371,43 @@ class ServoBus:
             f"({attempts} attempt(s) at {self.baudrate} baud)",
             hint="check power, cable, id and baud rate",
         )
+
+    def _send(self, packet: bytes) -> None:
+        """Write what is held and ``packet`` at once; what has been received before is dropped."""
+        data, self._held = self._held + packet, b""
+        before, self._before = self._before, None
+        self._port.clear()
+        if before is not None:
+            before.check()
+        if not self._port.write(data):
+            raise HandLost(f"the port {self.path} takes no more bytes")
+
+    def _deadline(self, answer: int) -> float:
+        """When an answer of that many bytes must be there; monotonic seconds."""
+        return time.monotonic() + self.wire_time(answer + _LONGEST_REQUEST) + self.timeout
+
+    def _receive(self, servo_id: int, deadline: float) -> Packet | None:
+        """The servo's status, or a damaged packet (``crc_ok`` False), or None for silence."""
+        parser = self._parser
+        parser.reset()
+        skipped = parser.skipped
+        while data := self._port.read(deadline):
+            for packet in parser.feed(data):
+                if not packet.is_status:
+                    continue
+                if not packet.crc_ok or not packet.params:
+                    return _DAMAGED
+                if packet.id == servo_id:
+                    return packet
+        parser.reset()
+        return _DAMAGED if parser.skipped > skipped else None
+
+
+_DAMAGED = Packet(0, Instruction.STATUS, crc_ok=False)
+
+
+def _ping_of(servo_id: int, data: bytes) -> Ping:
+    return Ping(servo_id, int.from_bytes(data[:2], "little"), data[2])
 
 
 def _refusal(servo_id: int, instruction: Instruction, params: bytes, number: int) -> str:

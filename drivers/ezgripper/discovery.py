@@ -20,7 +20,7 @@ __all__ = [
 
 SCAN_BAUD_RATES = (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600)
 """In the order of likelihood: SAKE's driver, ROBOTIS' and SAKE's factory setting, the others of
-the servo that the SDK can set (docs/sources/mx64-ezgripper.md#b3)."""
+the servo up to 4 Mbaud (docs/sources/mx64-ezgripper.md#b3)."""
 
 _UPGRADE = (
     "upgrade it to Protocol 2.0 with ROBOTIS DYNAMIXEL Wizard 2 (firmware recovery, model "

@@ -179,12 +179,12 @@ class PeerCase(Case):
         client, bench = scene.client, scene.bench
         assert client is not None
         assert bench is not None
+        state = message_type(dialect(bench.dialect_name).state_type)
 
         def q() -> float:
             if client.newest is None:
                 return 0.0
-            message = client.newest.message
-            motors = message.states if hasattr(message, "states") else message.motor_state
+            motors = getattr(client.newest.message, state.motor_sequence)
             return float(sum(abs(m.q) for m in motors))
 
         client.wait_states()

@@ -70,30 +70,34 @@ class _HostilePort(ezgripper_bus.DevicePort):
     """The driver's port with an emulated servo on it, whose answers are tampered with."""
 
     def __init__(self, case: Inputs, line: Bus, clock: ManualClock) -> None:
-        super().__init__("fuzz", 1_000_000, 0.03)
+        super().__init__("fuzz", 0.03)
         self._case, self._bus, self._time = case, line, clock
+        self._received = b""
         self.honest = True
+        self._is_open = False
 
-    def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
-        self.is_open = True
-        self.tx_time_per_byte = 0.01
-        self.ser = SimpleNamespace(  # type: ignore[assignment]
-            reset_input_buffer=self._received.clear, close=lambda: None, flush=lambda: None
-        )
-        return True
+    @property
+    def is_open(self) -> bool:
+        return self._is_open
 
-    def readPort(self, length: int) -> bytes:  # noqa: N802
-        taken = bytes(self._received[: max(length, 0)])
-        del self._received[: len(taken)]
+    def open(self, baudrate: int) -> None:
+        self._is_open = True
+        self._received = b""
+
+    def close(self) -> None:
+        self._is_open = False
+
+    def clear(self) -> None:
+        self._received = b""
+
+    def flush(self) -> None:
+        pass
+
+    def read(self, deadline: float) -> bytes:
+        taken, self._received = self._received, b""
         return taken
 
-    def writePort(self, packet: list[int]) -> int:  # noqa: N802
-        data = bytes(packet)
-        if self.hold_next:
-            self.hold_next = False
-            self._held = data
-            return len(data)
-        data, self._held, held = self._held + data, b"", len(self._held)
+    def write(self, data: bytes) -> bool:
         now = self._time.advance(0.002)
         self._bus.advance_to(now)
         self._bus.receive(data, now)
@@ -101,10 +105,7 @@ class _HostilePort(ezgripper_bus.DevicePort):
         if answer and not self.honest:
             answer = _spoilt(self._case.random, answer, _sealed_status)
         self._received += answer
-        return len(data) - held
-
-    def isPacketTimeout(self) -> bool:  # noqa: N802
-        return not self._received
+        return True
 
 
 def _sealed_status(data: bytes) -> bytes:
