@@ -40,7 +40,7 @@ def import_object(target: str, error_class: type[DexkitError], *, hint: str) -> 
     :param error_class: raised, naming the cause, when it cannot be imported.
     :param hint: what the target should be, for an attribute that is not there.
     """
-    module_name, _, attribute = target.partition(":")
+    module_name, colon, attribute = target.partition(":")
     try:
         value: object = importlib.import_module(module_name)
     except Exception as error:  # a plug-in may raise anything while it is imported
@@ -48,7 +48,7 @@ def import_object(target: str, error_class: type[DexkitError], *, hint: str) -> 
             f"cannot load {target}: {type(error).__name__}: {error}",
             hint=_import_hint(error, module_name),
         ) from error
-    for part in attribute.split(".") if attribute else ():
+    for part in attribute.split(".") if colon else ():
         if not hasattr(value, part):
             raise error_class(
                 f"cannot load {target}: there is no {part!r} in {module_name}", hint=hint
