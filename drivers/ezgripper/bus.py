@@ -116,11 +116,16 @@ class DevicePort:
         self._opened().flush()
 
     def read(self, deadline: float) -> bytes:
-        """What has been received, or nothing when the deadline (monotonic seconds) has come."""
+        """What has been received, or nothing when the deadline (monotonic seconds) has come.
+
+        The port is looked at after the deadline, too: a process that was not scheduled in time
+        has its answer there.
+        """
         fd = self._opened().fileno()
-        while (remaining := deadline - time.monotonic()) > 0:
+        while True:
+            remaining = max(0.0, deadline - time.monotonic())
             if not select.select([fd], [], [], remaining)[0]:
-                break
+                return b""
             try:
                 data = os.read(fd, 4096)
             except BlockingIOError:
@@ -128,7 +133,6 @@ class DevicePort:
             if not data:
                 raise serial.SerialException("the device reports data but has none")
             return data
-        return b""
 
     def write(self, data: bytes) -> bool:
         """Write; False if the port does not take all of it within the timeout."""
@@ -391,7 +395,12 @@ class ServoBus:
         parser = self._parser
         parser.reset()
         skipped = parser.skipped
-        while data := self._port.read(deadline):
+        late = False
+        while not late:
+            late = time.monotonic() >= deadline
+            data = self._port.read(deadline)
+            if not data:
+                break
             for packet in parser.feed(data):
                 if not packet.is_status:
                     continue

@@ -116,6 +116,8 @@ class GripperStatistics:
 _LATENCY_TIMER = 1e-3
 """Seconds, assumed of an adapter whose timer the system does not show: a full-speed USB adapter
 without one is still asked once in a frame of 1 ms."""
+_SETUP_TIMEOUT = 0.25
+"""Seconds to wait for each answer while the servo is set up."""
 _TURNAROUND = 0.5e-3
 """Seconds that the service is given from an answer to its next request. An exchange costs CPython
 0.1 ms of processor time (benchmarks/bench_serial.py); the rest is for what else wants the
@@ -287,8 +289,11 @@ class EZGripper:
             self._spec = self._make_spec(
                 self._spec.side, bus.baudrate, _LATENCY_TIMER if timer is None else timer * 1e-3
             )
+            # nothing moves yet, and a busy computer may delay an answer
+            bus.timeout = max(configuration.timeout, _SETUP_TIMEOUT)
             self._clear_shutdown(servo)
             self._limits = servo.configure()
+            bus.timeout = configuration.timeout
         except BaseException:
             bus.close()
             self._servo = None
