@@ -20,7 +20,7 @@ from mcap.writer import Writer
 
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace
-from dexkit.traces.recording_file import ChunkIndexes
+from dexkit.traces.recording_file import ChunkIndexes, RecordingFile
 from tests.dds_helpers import wait_until
 from tests.each import each
 from tests.trace_helpers import STATE, STATE_TYPE, T0, state
@@ -173,6 +173,28 @@ def test_many_start_together_and_one_records(tmp_path: Path) -> None:
             recorder.close()
         if not open_ones:  # each was in the other's way: told, and nothing is lost
             assert all("being recorded" in e.message for e in refused)
+    assert not part(path).exists()
+
+
+def test_recorder_that_has_not_locked_its_new_file_yet_gives_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between creation and lock another recorder may take the new file for an old recording."""
+    path = tmp_path / "a.mcap"
+    late, early = Recorder(path, overwrite=True), Recorder(path, overwrite=True)
+    lock = RecordingFile._lock
+
+    def late_lock(file: RecordingFile, fd: int, how: int) -> None:
+        monkeypatch.setattr(RecordingFile, "_lock", lock)
+        early.open()
+        lock(file, fd, how)
+
+    monkeypatch.setattr(RecordingFile, "_lock", late_lock)
+    with pytest.raises(UsageError, match="being recorded"):
+        late.open()
+    put(early, 1, 1)
+    early.close()
+    assert open_trace(path).message_count == 1
     assert not part(path).exists()
 
 

@@ -102,10 +102,7 @@ class RecordingFile:
             return
         self._refuse_company(self._part)
         if existing is None:
-            self._fd = os.open(
-                self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
-            )
-            self._lock(self._fd, fcntl.LOCK_EX)
+            self._fd = self._create()
             return
         self._refuse_company(self._target)
         fd = self._open_beside()
@@ -129,6 +126,21 @@ class RecordingFile:
             os.close(fd)
             raise
         self._fd, self._hidden = fd, True
+
+    def _create(self) -> int:
+        """Create a file that is not there, and lock it."""
+        fd = os.open(self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            self._lock(fd, fcntl.LOCK_EX)
+            # before the lock another recorder may have begun to replace the new file: each locks
+            # its own file first and then examines the other's, so one of them gives way
+            self._refuse_company(self._part)
+        except BaseException:
+            if self._is_at(self._target, fd):
+                self._target.unlink()
+            os.close(fd)
+            raise
+        return fd
 
     def _open_device(self) -> int:
         """Open what is no file. A pipe that nobody reads is refused, not waited for."""
