@@ -28,6 +28,12 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     The constant is the one the SDK's users edit for slow adapters
     (docs/sources/mx64-ezgripper.md#c3).
     """
+    monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 10_000)
+
+
+@pytest.fixture
+def silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no answer may come, waiting longer shows nothing more."""
     monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 300)
 
 
@@ -66,6 +72,10 @@ def _come(port: sdk.PortHandler, count: int) -> None:
 
 def test_ping(port: sdk.PortHandler) -> None:
     assert PACKETS.ping(port, 1) == (mx64.MODEL, *OK)
+
+
+@pytest.mark.usefixtures("silence")
+def test_ping_of_a_missing_servo_times_out(port: sdk.PortHandler) -> None:
     assert PACKETS.ping(port, 3)[1] == sdk.COMM_RX_TIMEOUT
 
 
@@ -106,6 +116,7 @@ def test_register_and_act(port: sdk.PortHandler) -> None:
     assert PACKETS.read1ByteTxRx(port, 1, mx64.LED.address)[0] == 1
 
 
+@pytest.mark.usefixtures("silence")
 def test_clear_reboot_and_factory_reset(port: sdk.PortHandler) -> None:
     assert PACKETS.clearMultiTurn(port, 2) == OK
     assert PACKETS.write1ByteTxRx(port, 2, mx64.RETURN_DELAY_TIME.address, 5) == OK
@@ -164,6 +175,7 @@ def test_group_bulk_read_and_write(port: sdk.PortHandler) -> None:
     assert reader.getData(2, mx64.GOAL_POSITION.address, 4) == 2222
 
 
+@pytest.mark.usefixtures("silence")
 def test_group_read_of_a_missing_servo_fails(port: sdk.PortHandler) -> None:
     reader = sdk.GroupSyncRead(port, PACKETS, mx64.GOAL_POSITION.address, 4)
     for servo_id in (1, 9):

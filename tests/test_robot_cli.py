@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import threading
@@ -106,7 +107,8 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
             EmulatedRobot(G1, node=node).start()  # another robot, on the same topics
         forced = CliRunner().invoke(command, [*arguments, "--force"], standalone_mode=False)
         assert forced.exception is None
-        assert "stopped: states" in forced.output
+        # on a busy machine it counts pauses as well
+        assert re.search(r"^stopped: .*\bstates \d", forced.output, re.MULTILINE)
     finally:
         stop.set()
         thread.join()

@@ -363,7 +363,7 @@ def test_counters_are_one_line_of_json(caplog: pytest.LogCaptureFixture) -> None
     hand, node = ScriptedHand(), FakeNode()
     with caplog.at_level(logging.INFO, "dexkit.service"), serve(hand, node) as service:
         node.deliver(CMD, cmd(1.0))
-        wait_until(lambda: service.counters.received == 1)
+        wait_until(lambda: service.snapshot()["hands"]["left"]["accepted"] == 1)
         service.log_counters()
     line = next(m for m in caplog.messages if m.startswith("counters "))
     counters = json.loads(line.removeprefix("counters "))
