@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
-from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
+from dexkit.conformance.checks.motion import Step, not_driven, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
 from dexkit.conformance.motor_messages import Wire
 from dexkit.hand import Floats, JointMode
@@ -282,7 +282,7 @@ def plain_mode(ctx: Context) -> Outcome:
 @check("DEX3-MODE-03")
 def locked(ctx: Context) -> Outcome:
     """Motion towards q while the motors are locked."""
-    return not_pulled(ctx, "with status 0, which locks the motor")
+    return not_driven(ctx, "with status 0, which locks the motor")
 
 
 @check("DEX3-MODE-04")
@@ -304,7 +304,7 @@ def order(ctx: Context) -> Outcome:
     found = 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        told = phase.targets.get(ctx.side, {})
+        commanded = phase.targets.get(ctx.side, {})
         for step in steps_of(ctx, phase):
             rows = ctx.states.between(begin, end)
             before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
@@ -312,7 +312,7 @@ def order(ctx: Context) -> Outcome:
                 continue
             moved = np.abs(ctx.states.q[rows] - np.median(before, axis=0)).max(axis=0)
             strokes = np.array([j.stroke for j in ctx.joints])
-            others = [j for j in range(len(ctx.joints)) if j not in told]
+            others = [j for j in range(len(ctx.joints)) if j not in commanded]
             limit = ctx.tolerance("max_others_stroke", 0) / ctx.joints[0].stroke
             wrong = [j for j in others if not moved[j] <= limit * strokes[j]]
             own = float(moved[step.joint])
@@ -416,11 +416,11 @@ def units(ctx: Context) -> Outcome:
     if span is None:
         return ctx.skipped("no state while it squeezed")
     rows, given = ctx.states.between(*span), ctx.commands
-    told = (given.t >= span[0]) & (given.t <= span[1]) & np.isfinite(given.q).all(axis=1)
-    if not told.any():
+    commanded = (given.t >= span[0]) & (given.t <= span[1]) & np.isfinite(given.q).all(axis=1)
+    if not commanded.any():
         return ctx.skipped("no command while it squeezed")
     here, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
-    due = np.median(given.kp[told], axis=0) * (np.median(given.q[told], axis=0) - here)
+    due = np.median(given.kp[commanded], axis=0) * (np.median(given.q[commanded], axis=0) - here)
     joints = model(ctx.recording.dialect.model).joint_gains
     ratios = {}
     for name, mine in (("thumb", True), ("fingers", False)):
@@ -506,7 +506,7 @@ def brakes(ctx: Context) -> Outcome:
 
 
 @check("DEX3-GUARD-02")
-def tells(ctx: Context) -> Outcome:
+def reports_trip(ctx: Context) -> Outcome:
     """Bit 7 of the state's mode byte before and after the time-out."""
     last, late, end = _silence(ctx)
     before = _modes(ctx, ctx.states.between(last - 0.2, last + 0.5)) >> 7
@@ -530,7 +530,7 @@ def tells(ctx: Context) -> Outcome:
 @check("DEX3-GUARD-03")
 def latches(ctx: Context) -> Outcome:
     """Motion by commands that do not clear the protection."""
-    return not_pulled(ctx, "while the time-out protection was tripped and not cleared")
+    return not_driven(ctx, "while the time-out protection was tripped and not cleared")
 
 
 @check("DEX3-GUARD-04")

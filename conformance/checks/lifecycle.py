@@ -79,7 +79,7 @@ def restarted_service(ctx: Context) -> Outcome:
 
 
 @check("DEX1-LIFE-04", "DEX3-LIFE-04")
-def leaves(ctx: Context) -> Outcome:
+def shutdown(ctx: Context) -> Outcome:
     """How long the service takes to end, and its publisher to vanish."""
     phase = ctx.phases()[-1]
     begin, end = ctx.span(phase)
@@ -111,7 +111,7 @@ def leaves(ctx: Context) -> Outcome:
 
 
 @check("DEX1-LIFE-05", "DEX3-LIFE-05")
-def last_word(ctx: Context) -> Outcome:
+def last_state(ctx: Context) -> Outcome:
     """The mode of the last state before the service ended."""
     begin, end = ctx.span(ctx.phases()[-1])
     modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]

@@ -161,12 +161,12 @@ def acceleration(ctx: Context) -> Outcome:
         t, q = states.clock, states.q[:, joint]
         # integrated twice, so that it can be compared with q over the same window
         dq = _integral(t, states.ddq[:, joint])
-        told, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
+        reported, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
         busy = np.abs(seen) > ctx.tolerance("min_ddq_rad_s2")
         if busy.sum() < 20:
             continue
         judged = True
-        ratio = float(np.sum(told[busy] * seen[busy]) / np.sum(seen[busy] ** 2))
+        ratio = float(np.sum(reported[busy] * seen[busy]) / np.sum(seen[busy] ** 2))
         worst = max(worst, (ratio, joint), key=lambda w: abs(w[0] - 1.0))
     if not judged:
         return ctx.skipped("the hand hardly accelerates where its states come regularly")

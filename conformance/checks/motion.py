@@ -378,10 +378,10 @@ def independent(ctx: Context) -> Outcome:
 @check("DEX1-GAIN-01", "DEX3-GAIN-01")
 def zero_gains(ctx: Context) -> Outcome:
     """Motion towards q while all gains are zero."""
-    return not_pulled(ctx, "with kp = kd = 0")
+    return not_driven(ctx, "with kp = kd = 0")
 
 
-def not_pulled(ctx: Context, how: str) -> Outcome:
+def not_driven(ctx: Context, how: str) -> Outcome:
     """How far each joint moves towards a q that must not pull."""
     given = steps(ctx)
     if not given:

@@ -192,8 +192,8 @@ def speed_of_q(ctx: RobotContext) -> Outcome:
         later = later[first]
         change = (q[later] - q[first]) / np.maximum(t[later] - t[first], 1e-6)
         sums = np.concatenate(([0.0], np.cumsum(dq)))
-        told = (sums[later] - sums[first]) / (later - first)
-        off = float(np.abs(change - told).mean())
+        reported = (sums[later] - sums[first]) / (later - first)
+        off = float(np.abs(change - reported).mean())
         if not off <= worst:
             worst, which = off, joint
     name = ctx.joints[which].name if which >= 0 else ""
@@ -288,7 +288,7 @@ def same_attitude(ctx: RobotContext) -> Outcome:
 
 
 @check("H1-IMU-03")
-def feels_gravity(ctx: RobotContext) -> Outcome:
+def measured_gravity(ctx: RobotContext) -> Outcome:
     """Accelerometer and gyroscope before anything is commanded."""
     begin, end = ctx.span(ctx.phases()[0])
     rows = ctx.states.between(begin, end)
@@ -313,8 +313,8 @@ def frame_head(ctx: RobotContext) -> Outcome:
     if not bad.any():
         return ctx.passed("FE EF FF")
     row = int(np.argmax(bad))
-    told = " ".join(f"{int(v):02X}" for v in (*low["head"][row], low["level_flag"][row]))
-    return _wrong_rows(ctx, bad, told, f"head and level_flag are {told}")
+    reported = " ".join(f"{int(v):02X}" for v in (*low["head"][row], low["level_flag"][row]))
+    return _wrong_rows(ctx, bad, reported, f"head and level_flag are {reported}")
 
 
 @check("H1-BMS-01")
@@ -327,10 +327,10 @@ def battery(ctx: RobotContext) -> Outcome:
     bad |= ~((volts >= ctx.tolerance("min_v")) & (volts <= ctx.tolerance("max_v")))
     bad |= (cells > 0) & ~(np.abs(cells - volts) <= ctx.tolerance("max_part") * volts)
     row = int(np.argmax(bad))
-    told = f"{soc[row]:.0f} %, {volts[row]:.1f} V"
+    reported = f"{soc[row]:.0f} %, {volts[row]:.1f} V"
     if not bad.any():
-        return ctx.passed(told)
-    return _wrong_rows(ctx, bad, told, f"{told}, cells of {cells[row]:.1f} V together")
+        return ctx.passed(reported)
+    return _wrong_rows(ctx, bad, reported, f"{reported}, cells of {cells[row]:.1f} V together")
 
 
 @check("H1-FOOT-01")
@@ -356,23 +356,23 @@ def remote(ctx: RobotContext) -> Outcome:
     if not bad.any():
         return ctx.passed(f"{np.abs(sticks).max(initial=0.0):.2f}")
     worst = sticks[int(np.argmax(bad))]
-    told = ", ".join(f"{v:.3g}" for v in worst)
+    reported = ", ".join(f"{v:.3g}" for v in worst)
     wrong = np.broadcast_to(bad[which.reshape(-1)], len(low))
-    return _wrong_rows(ctx, wrong, "rubbish", f"sticks at {told}")
+    return _wrong_rows(ctx, wrong, "rubbish", f"sticks at {reported}")
 
 
 @check("G1-MACH-01")
-def machine_told(ctx: RobotContext) -> Outcome:
+def reported_machine(ctx: RobotContext) -> Outcome:
     """The machine's kind."""
     kinds = np.unique(ctx.low["mode_machine"][ctx.low.ok])
-    told = ", ".join(f"{k:.0f}" for k in kinds)
+    reported = ", ".join(f"{k:.0f}" for k in kinds)
     if len(kinds) == 1 and kinds[0] > 0:
-        return ctx.passed(told)
-    return ctx.failed(told, f"mode_machine is {told}")
+        return ctx.passed(reported)
+    return ctx.failed(reported, f"mode_machine is {reported}")
 
 
 @check("H1-MODE-01")
-def mode_told(ctx: RobotContext) -> Outcome:
+def reported_mode(ctx: RobotContext) -> Outcome:
     """The mode bytes while motors are held, and of the one that was turned off."""
     robot = ctx.recording.robot
     for phase in (*ctx.phases("hold"), *ctx.phases()):
@@ -386,10 +386,10 @@ def mode_told(ctx: RobotContext) -> Outcome:
         wrong = np.flatnonzero((modes != wanted).any(axis=0))
         if len(wrong):
             joint = int(wrong[0])
-            name, told = ctx.joints[joint].name, modes[-1, joint]
+            name, reported = ctx.joints[joint].name, modes[-1, joint]
             return ctx.failed(
-                f"{told:.0f}",
-                f"{name}: mode {told:.0f} in the state, {wanted[joint]} in the command"
+                f"{reported:.0f}",
+                f"{name}: mode {reported:.0f} in the state, {wanted[joint]} in the command"
                 + (f"; {len(wrong)} motors are so" if len(wrong) > 1 else ""),
                 ctx.at(ctx.states.topic, begin, end),
             ).about(joint)
@@ -550,7 +550,7 @@ def torque(ctx: RobotContext) -> Outcome:
 
 
 @check("H1-FORCE-01")
-def torque_told(ctx: RobotContext) -> Outcome:
+def reported_torque(ctx: RobotContext) -> Outcome:
     """tau_est while only tau is commanded."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -558,12 +558,12 @@ def torque_told(ctx: RobotContext) -> Outcome:
     tau = ctx.states.tau[rows, _index(ctx, phase)]
     if len(tau) < 3:
         return ctx.skipped("the joint was turned for too short a time")
-    wanted, told = float(phase.params["torque"]), float(np.median(tau))
-    text = f"tau_est is {told:.2f} N m, tau was {wanted:.2f} N m"
-    if ctx.tolerance("low_part") <= told / wanted <= ctx.tolerance("high_part"):
-        return ctx.passed(f"{told:.2f} N m", text)
+    wanted, reported = float(phase.params["torque"]), float(np.median(tau))
+    text = f"tau_est is {reported:.2f} N m, tau was {wanted:.2f} N m"
+    if ctx.tolerance("low_part") <= reported / wanted <= ctx.tolerance("high_part"):
+        return ctx.passed(f"{reported:.2f} N m", text)
     place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{told:.2f} N m", text, place).about(_index(ctx, phase))
+    return ctx.failed(f"{reported:.2f} N m", text, place).about(_index(ctx, phase))
 
 
 # ------------------------------------------------------------------------------------- watchdog

@@ -411,9 +411,9 @@ def two_writers(ctx: Context) -> Outcome:
         here = np.median(before, axis=0)
         for joint, there in phase.targets.get(ctx.side, {}).items():
             low, high = sorted((float(here[joint]), there))
-            room = margin("max_beyond_stroke", joint)
+            beyond = margin("max_beyond_stroke", joint)
             q = ctx.states.q[rows, joint]
-            outside = ~((q >= low - room) & (q <= high + room))
+            outside = ~((q >= low - beyond) & (q <= high + beyond))
             if outside.any():
                 i = int(np.argmax(outside))
                 return ctx.failed(

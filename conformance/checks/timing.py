@@ -235,12 +235,12 @@ def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float)
     A hand that rests where it is told to be repeats its position with good reason. ``begin`` where
     no command is known.
     """
-    t, told = ctx.commands.t, ctx.commands.q[:, joint]
-    known = np.isfinite(told)
-    t, told = t[known], told[known]
+    t, commanded = ctx.commands.t, ctx.commands.q[:, joint]
+    known = np.isfinite(commanded)
+    t, commanded = t[known], commanded[known]
     first, last = np.searchsorted(t, [begin, end], side="right")
     first = max(int(first) - 1, 0)  # the one in force when it began
-    elsewhere = np.abs(told[first:last] - q) > ctx.tolerance("min_jump_stroke", joint)
+    elsewhere = np.abs(commanded[first:last] - q) > ctx.tolerance("min_jump_stroke", joint)
     if not len(elsewhere):
         return begin
     if not elsewhere[-1]:

@@ -204,11 +204,11 @@ def _band_labels(bands: Sequence[Band], axes: _Axes) -> list[str]:
         free_from = 0.0
         for i, band in order:
             a, b = (axes.across(v) / 100 * width for v in (band.begin, band.end))
-            room = _LETTER * len(band.label)
+            label_width = _LETTER * len(band.label)
             at = max(a, free_from)
-            if band.label and at <= max(b, a + 12) and at + room <= width:
+            if band.label and at <= max(b, a + 12) and at + label_width <= width:
                 chosen[i] = 100 * at / width
-                free_from = at + room + 5
+                free_from = at + label_width + 5
         return chosen
 
     order = sorted(enumerate(bands), key=lambda item: (item[1].css == "band", item[1].begin))

@@ -141,10 +141,10 @@ def _unique(own: Sequence[str], names: Sequence[str] | None) -> list[str]:
 
 def _figure(group: Sequence[Result]) -> str:
     """The figures of a run for one requirement; once where the sides agree."""
-    told = {r.side: r.figure for r in group if r.figure}
-    if len(set(told.values())) == 1:
-        return next(iter(told.values()))
-    return ", ".join(f"{side} {figure}" for side, figure in told.items())
+    figures = {r.side: r.figure for r in group if r.figure}
+    if len(set(figures.values())) == 1:
+        return next(iter(figures.values()))
+    return ", ".join(f"{side} {figure}" for side, figure in figures.items())
 
 
 def _change_text(comparison: Comparison, change: Change) -> str:

@@ -211,13 +211,13 @@ def _areas(result: RunResult) -> str:
             f'<i class="{VERDICTS[v].css}" style="width:{100 * n / most:.1f}%"></i>'
             for v, n in counts
         )
-        told = ", ".join(
+        summary = ", ".join(
             f'<span class="{VERDICTS[v].css}">{n} {VERDICTS[v].text}</span>' for v, n in counts
         )
         rows.append(
             f'<tr><th scope="row"><a href="#{_anchor(area)}">{escape(area)}</a></th>'
             f'<td><div class="tally"><span class="bar" aria-hidden="true">{bar}</span>'
-            f"<span>{told}</span></div></td></tr>"
+            f"<span>{summary}</span></div></td></tr>"
         )
     return (
         '<h2>By area</h2><table class="areas"><thead class="hidden"><tr><th scope="col">area</th>'
@@ -409,13 +409,13 @@ def _cell(result: Result) -> str:
 
 
 def _seen(result: Result, link: str) -> str:
-    told = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
+    text = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
     )
     return (
-        f"<p><b>{escape(result.side)}:</b> {escape(told)}</p>"
+        f"<p><b>{escape(result.side)}:</b> {escape(text)}</p>"
         + (f'<p class="figures">{figures}</p>' if figures else "")
         + "".join(_place(e, link) for e in result.evidence)
     )

@@ -155,16 +155,16 @@ def nature(result: RunResult) -> str:
 
 def about_harness(result: RunResult) -> str:
     """How fair the kit's own machine was, or empty where the kit made no run."""
-    told = []
+    parts = []
     figures = result.harness
     if "jitter_p50_ms" in figures and "jitter_p99_ms" in figures:
-        told.append(
+        parts.append(
             f"itself late by {figures['jitter_p50_ms']:.2f} ms (median), "
             f"{figures['jitter_p99_ms']:.2f} ms (99 of 100)"
         )
     if "starved" in figures:
-        told.append(f"programs waited for a processor in {figures['starved']:.1%} of the run")
-    return "; ".join(told)
+        parts.append(f"programs waited for a processor in {figures['starved']:.1%} of the run")
+    return "; ".join(parts)
 
 
 def utc_date(time_ns: int) -> datetime:

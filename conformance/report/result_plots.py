@@ -665,14 +665,14 @@ def _usb_plots(result: Result, usb: UsbRecording) -> list[str]:
 
 
 def _descriptors(_: Result, hand: UsbSide) -> str:
-    told = hand.device
+    device = hand.device
     rows = {
-        "idVendor:idProduct": f"{told.vendor:04X}:{told.product:04X}",
-        "bcdDevice": f"{told.release >> 8:x}.{told.release & 0xFF:02x}",
-        "strings": f"{told.manufacturer!r}, {told.name!r}, serial {told.serial!r}",
+        "idVendor:idProduct": f"{device.vendor:04X}:{device.product:04X}",
+        "bcdDevice": f"{device.release >> 8:x}.{device.release & 0xFF:02x}",
+        "strings": f"{device.manufacturer!r}, {device.name!r}, serial {device.serial!r}",
         "endpoints of interface 0": ", ".join(
             f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'} {e.size} bytes"
-            for e in told.endpoints
+            for e in device.endpoints
         )
         or "none",
     }

@@ -256,7 +256,7 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
         raise UsageError(f"{origin}: requirements are [[requirement]] tables")
     found = []
     for entry in entries:
-        _look_at_types(entry, origin)
+        _check_types(entry, origin)
         if "like" not in entry:
             found.append(entry)
             continue
@@ -278,7 +278,7 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
     return found
 
 
-def _look_at_types(entry: Any, origin: str) -> None:
+def _check_types(entry: Any, origin: str) -> None:
     """Whether each value is what its key stands for.
 
     :raises UsageError: naming the one that is not.

@@ -77,10 +77,11 @@ def _describe(get: Control, speed: int) -> Descriptors:
     return Descriptors(device, get(0x0200, 0, total), strings, speed)
 
 
-def _first(candidates: list[Any], where: str, side: Side, told: str) -> Any:
+def _first(candidates: list[Any], where: str, side: Side, offers: str) -> Any:
     if not candidates:
         raise ConformanceError(
-            f"no {side} Dex3-1 at {where or 'this machine'}", hint=f"there is: {told or 'nothing'}"
+            f"no {side} Dex3-1 at {where or 'this machine'}",
+            hint=f"there is: {offers or 'nothing'}",
         )
     return candidates[0]
 
@@ -228,13 +229,13 @@ class _UsbIp:
             ]
             if self._serial or not mine:
                 mine = [e for e in offered if e.vendor == VENDOR_ID]
-            told = ", ".join(f"{e.vendor:04x}:{e.product:04x}" for e in offered)
+            offers = ", ".join(f"{e.vendor:04x}:{e.product:04x}" for e in offered)
             for exported in mine:
                 self._attach(exported)
                 if not self._serial or parse_device(self.descriptors).serial == self._serial:
                     return
                 self._socket.close()
-            _first([], self._url, self._side, told)
+            _first([], self._url, self._side, offers)
         except ConformanceError:
             self.close()
             raise

@@ -165,14 +165,14 @@ def pack_command(
     :param sizes: a bus's ``cmd_size`` that is not its true one.
     :param spoil: give the frame a wrong CRC.
     """
-    room = COMMAND_SIZES[size]
+    buffer = COMMAND_SIZES[size]
     data = {bus: b"".join(packets) for bus, packets in buses.items()}
-    told = [(sizes or {}).get(bus, len(data.get(bus, b""))) for bus in range(BUSES)]
+    declared = [(sizes or {}).get(bus, len(data.get(bus, b""))) for bus in range(BUSES)]
     body = b"".join(
         (
             bytes(4),
-            _SIZES.pack(*told),
-            *(data.get(bus, b"").ljust(room, b"\0") for bus in range(BUSES)),
+            _SIZES.pack(*declared),
+            *(data.get(bus, b"").ljust(buffer, b"\0") for bus in range(BUSES)),
             bytes(4),
         )
     )
@@ -319,15 +319,15 @@ def read_command(data: bytes) -> list[tuple[int, int, Motor]] | None:
     None when the frame is not one: wrong length, wrong CRC, or a size past its buffer. Packets
     with a wrong head or CRC are left out.
     """
-    room = COMMAND_SIZES.get(len(data))
-    if room is None or crc(data[2:-4]) != _U32.unpack_from(data, len(data) - 4)[0]:
+    buffer = COMMAND_SIZES.get(len(data))
+    if buffer is None or crc(data[2:-4]) != _U32.unpack_from(data, len(data) - 4)[0]:
         return None
     sizes = _SIZES.unpack_from(data, 6)
-    if max(sizes) > room:
+    if max(sizes) > buffer:
         return None
     found = []
     for bus, size in enumerate(sizes):
-        start = 26 + bus * room
+        start = 26 + bus * buffer
         for at in range(start, start + size - 19, 20):
             head, mode, _, tau, dq, q, kp, kd = _MOTOR_CMD.unpack_from(data, at)
             right = crc(data[at : at + 16]) == _U32.unpack_from(data, at + 16)[0]

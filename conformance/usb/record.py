@@ -151,12 +151,12 @@ class UsbRecord:
         record = {"version": str(VERSION)}
         for side, part in self.sides.items():
             plain = asdict(part)
-            told = part.descriptors
+            descriptors = part.descriptors
             plain["descriptors"] = {
-                "device": told.device.hex(),
-                "configuration": told.configuration.hex(),
-                "strings": {str(i): text for i, text in told.strings.items()},
-                "speed": told.speed,
+                "device": descriptors.device.hex(),
+                "configuration": descriptors.configuration.hex(),
+                "strings": {str(i): text for i, text in descriptors.strings.items()},
+                "speed": descriptors.speed,
             }
             record[str(side)] = json.dumps(plain)
         record["stalls"] = json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls])
@@ -188,13 +188,13 @@ class UsbRecord:
 
 
 def _side(plain: dict[str, Any]) -> SideRecord:
-    told = plain["descriptors"]
+    descriptors = plain["descriptors"]
     return SideRecord(
         descriptors=Descriptors(
-            device=bytes.fromhex(told["device"]),
-            configuration=bytes.fromhex(told["configuration"]),
-            strings={int(i): str(text) for i, text in told["strings"].items()},
-            speed=int(told["speed"]),
+            device=bytes.fromhex(descriptors["device"]),
+            configuration=bytes.fromhex(descriptors["configuration"]),
+            strings={int(i): str(text) for i, text in descriptors["strings"].items()},
+            speed=int(descriptors["speed"]),
         ),
         buses=[(int(bus), int(number)) for bus, number in plain["buses"]],
         phases=[

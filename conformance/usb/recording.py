@@ -81,13 +81,13 @@ class Device:
     endpoints: tuple[Endpoint, ...] = ()
 
 
-def parse_device(told: Descriptors) -> Device:
+def parse_device(raw: Descriptors) -> Device:
     """Read the raw descriptors (USB 2.0 specification 9.6)."""
-    if len(told.device) < 18:
+    if len(raw.device) < 18:
         return Device()
-    vendor, product, release, *indices = struct.unpack_from("<HHHBBB", told.device, 8)
-    maker, name, serial = (told.strings.get(i, "") for i in indices)
-    endpoints = _endpoints(told.configuration)
+    vendor, product, release, *indices = struct.unpack_from("<HHHBBB", raw.device, 8)
+    maker, name, serial = (raw.strings.get(i, "") for i in indices)
+    endpoints = _endpoints(raw.configuration)
     return Device(vendor, product, release, maker, name, serial, endpoints)
 
 

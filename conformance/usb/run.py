@@ -93,14 +93,16 @@ def _play(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> SideRecord:
-    told: Descriptors = host.descriptors
+    descriptors: Descriptors = host.descriptors
     plan = Plan(side)
-    pair = bulk_pair(told)
+    pair = bulk_pair(descriptors)
     for inward in (False, True):
         recorder.add_foreign_channel(topic(side, inward=inward), SCHEMA_NAME, SCHEMA)
     if pair is None:
         say("interface 0 has no pair of bulk endpoints: nothing more can be asked of it")
-        return SideRecord(told, list(plan.buses), trouble="there is no pair of bulk endpoints")
+        return SideRecord(
+            descriptors, list(plan.buses), trouble="there is no pair of bulk endpoints"
+        )
     script = UsbScript(plan, say)
     player = _Player(side, host, pair, recorder, turn)
     try:
@@ -112,7 +114,7 @@ def _play(
             player.carry_out(Out(script.lock_frame()))
             player.carry_out(In(_LAST_ANSWER))
     phases = [p for p in script.phases if p.end_ns]
-    return SideRecord(told, list(plan.buses), phases, script.trouble)
+    return SideRecord(descriptors, list(plan.buses), phases, script.trouble)
 
 
 class _Player:

@@ -73,7 +73,7 @@ class Service:
         """Change the recording of a run: a fault of the client shows only there."""
 
     @property
-    def hears(self) -> bool:
+    def matches_clients(self) -> bool:
         """Whether DDS would match its reader with an official client's writer."""
         matched = self.reader_durability == "Volatile"
         return matched and self.command_type == self.dialect.cmd_type

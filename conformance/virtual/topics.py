@@ -138,7 +138,7 @@ class _Player:
             log_ns = log_time_ns(self.now) + 50_000
             sent_ns = log_time_ns(self.now - action.age_s)
             self.trace.put(topic, self._plan.dialect.cmd_type, log_ns, sent_ns, payload)
-            if self._service.hears:
+            if self._service.matches_clients:
                 client = _RIVAL if action.by is Role.RIVAL else self._clients
                 self._service.receive(topic, payload, client)
 

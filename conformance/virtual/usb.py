@@ -143,17 +143,17 @@ class ReferenceDevice:
 
     def good_frame(self, data: bytes) -> bool:
         """Whether a command frame is intact."""
-        room = self.accepts.get(len(data))
-        if room is None or crc(data[2:-4]) != int.from_bytes(data[-4:], "little"):
+        buffer = self.accepts.get(len(data))
+        if buffer is None or crc(data[2:-4]) != int.from_bytes(data[-4:], "little"):
             return False
-        return all(size <= room for size in struct.unpack_from(f"<{BUSES}I", data, 6))
+        return all(size <= buffer for size in struct.unpack_from(f"<{BUSES}I", data, 6))
 
     def carry_out(self, data: bytes) -> None:
         """Carry out every packet of an intact frame."""
-        room = self.accepts[len(data)]
+        buffer = self.accepts[len(data)]
         for bus, size in enumerate(struct.unpack_from(f"<{BUSES}I", data, 6)):
-            start = 26 + bus * room
-            end = start + min(size, room)
+            start = 26 + bus * buffer
+            end = start + min(size, buffer)
             for at in range(start, end - 19, 20):
                 self.packet(bus, data[at : at + 20])
 
