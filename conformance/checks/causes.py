@@ -1,4 +1,4 @@
-"""Likely causes that can be told from the figures: wrong units, wrong sides, wrong types."""
+"""Determine likely causes from measured values: wrong units, wrong sides, wrong types."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["of_positions", "of_range", "of_scale", "of_type"]
 
 
 def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec]) -> str:
-    """Why positions leave their range, or nothing.
+    """The likely cause of positions outside their range, or an empty text.
 
     :param q: rad, shape (n, n_joints).
     :param other: the joints of the hand's other side.
@@ -49,7 +49,7 @@ def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSp
 
 
 def of_range(q: float) -> str:
-    """Why a joint stands at ``q``, far off its range, or nothing."""
+    """The likely cause of a joint at ``q``, far outside its range, or an empty text."""
     if abs(q - 100.0) < 5.0:
         unit = "percent"
     elif 120.0 < abs(q) <= 400.0:
@@ -60,7 +60,7 @@ def of_range(q: float) -> str:
 
 
 def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
-    """Why steps of one joint end elsewhere, or nothing.
+    """The likely cause of steps of one joint that miss their targets, or an empty text.
 
     :param targets: q that was commanded, rad; ``reached``: where each step ended.
     :param stroke: of a joint whose q counts from 0.
@@ -82,15 +82,15 @@ def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
 
 
 def of_type(found: Iterable[str], wanted: str, dialect: Dialect) -> str:
-    """Why a topic has these types and not the wanted one, or nothing."""
+    """The likely cause of a topic with other types than the expected one, or an empty text."""
     for name in sorted(found):
         if name in (dialect.cmd_type, dialect.state_type) and name != wanted:
             return "The types of state and command are swapped."
-        speak = [d.name for d in DIALECTS.values() if name in (d.cmd_type, d.state_type)]
-        if speak:
+        dialects = [d.name for d in DIALECTS.values() if name in (d.cmd_type, d.state_type)]
+        if dialects:
             return (
                 f"{_short(name)} is the type of another hand or generation "
-                f"(--dialect {' or '.join(speak)}); here it has to be {_short(wanted)}."
+                f"(--dialect {' or '.join(dialects)}); here it has to be {_short(wanted)}."
             )
         if _short(name) == _short(wanted):
             return f"The type has the right name in another package: {name}."

@@ -1,7 +1,7 @@
 """The USB checks: each judges one hand's transfers for one requirement.
 
-As those of :mod:`dexkit.conformance.checks`: a check never passes on missing evidence, and takes
-every figure from its requirement's tolerances.
+As in :mod:`dexkit.conformance.checks`, a check never passes on missing evidence, and takes
+every limit from its requirement's tolerances.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
 __all__ = ["UsbContext"]
 
 _ORDINARY = ("exchange", "burst", "move", "lock", "pause", "drive", "tripped", "clear")
-"""Phases in which every command is a good one, followed by a wait for its answer."""
+"""Phases in which every command is valid and is followed by a wait for its answer."""
 _COARSEST = 0.03
 """s between two answers over which a speed is integrated; most of a move takes 0.1 s."""
 _DAMAGED = ("malformed", "broadcast", "short")
-"""Phases that begin with something odd; good commands follow."""
+"""Phases that begin with an invalid frame; good commands follow."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class UsbContext(BaseContext[UsbRecording, UsbSide]):
     """One requirement to be judged for the USB transfers of one hand."""
 
     def tolerance(self, name: str) -> float:
-        """A figure of the requirement."""
+        """A tolerance of the requirement."""
         return self.requirement.tolerance(name)
 
     def phases(self) -> list[UsbPhase]:
@@ -49,7 +49,7 @@ class UsbContext(BaseContext[UsbRecording, UsbSide]):
         return self.place(topic(self.hand.side, inward=inward), seconds, end)
 
     def over(self, phase: UsbPhase) -> Evidence:
-        """A phase as a place."""
+        """The time of a phase, as a place in the recording."""
         return self.at(*self.hand.span(phase))
 
 
@@ -90,7 +90,7 @@ def _strings(c: UsbContext) -> Outcome:
 def _speed(c: UsbContext) -> Outcome:
     speed = c.hand.record.descriptors.speed
     if not speed:
-        return c.skipped("this host does not tell the speed")
+        return c.skipped("this host does not report the speed")
     name = {1: "low", 2: "full", 3: "high"}.get(speed, "super")
     return c.passed(name) if speed == 3 else c.failed(name, f"it runs at {name} speed")
 
@@ -171,7 +171,7 @@ def _two(c: UsbContext) -> Outcome:
 def _bursts(c: UsbContext) -> list[tuple[UsbPhase, list[float], float]]:
     """Each burst with its answer times and its rate, the fastest first.
 
-    What else the machine does slows a burst down and never makes one faster.
+    Other load of the machine can only slow a burst down.
     """
     found = []
     for phase in c.phases():
@@ -223,7 +223,7 @@ def _latency(c: UsbContext) -> Outcome:
 def _all(
     c: UsbContext, good: Callable[[Answer], bool], what: str, answers: list[Answer] | None = None
 ) -> Outcome:
-    """Every frame must be good; ``what`` says what the others have."""
+    """Fail unless every frame is good; ``what`` names the fault of the others."""
     answers = c.hand.answers if answers is None else answers
     if not answers:
         return c.skipped("no frame came")
@@ -368,14 +368,14 @@ def _errors(c: UsbContext) -> Outcome:
 
 
 def _part(hand: UsbSide, phase: UsbPhase, joint: int, begin: float, target: float) -> float:
-    """Part of the way from begin to target that a joint went in a phase; NaN if it is not told."""
+    """Part of the way to its target that a joint went in a phase; NaN if it is not reported."""
     _, q = hand.positions(phase)
     known = q[np.isfinite(q[:, joint]), joint]
     return float((known[-1] - begin) / (target - begin)) if len(known) else math.nan
 
 
 def _travel(hand: UsbSide, phase: UsbPhase, *, before: bool = True) -> Floats:
-    """How far each joint was at most from where it was at the beginning, rad; 0 if untold."""
+    """The largest distance of each joint from its first position, rad; 0 if not reported."""
     _, q = hand.positions(phase, before=before)
     if len(q) < 2:
         return np.zeros(len(hand.joints))
@@ -386,7 +386,7 @@ def _travel(hand: UsbSide, phase: UsbPhase, *, before: bool = True) -> Floats:
 def _quiet_motors(
     c: UsbContext, phases: list[UsbPhase], name: Callable[[UsbPhase], str]
 ) -> Outcome:
-    """No joint may have moved in any of the phases."""
+    """Fail if a joint moved in any of the phases."""
     limit = c.tolerance("max_q")
     most = 0.0
     for phase in phases:
@@ -416,7 +416,7 @@ def _mode(c: UsbContext) -> Outcome:
         last = answers[-1]
         odd = {f"{m.bus}.{m.id}": m.status for m in last.reading.motors if m.status != wanted}
         if odd:
-            figure = ", ".join(f"motor {who} says {status}" for who, status in odd.items())
+            figure = ", ".join(f"motor {who} reports {status}" for who, status in odd.items())
             observed = f"commanded status {wanted}, {figure}"
             return c.failed(f"not {wanted}", observed, c.at(last.t))
     return c.passed("0 and 1") if judged else c.skipped("no answer to judge by")
@@ -438,7 +438,7 @@ def _follows(c: UsbContext) -> Outcome:
     wrong = []
     for phase, joint, begin, target in _moves(c):
         parts[joint] = _part(c.hand, phase, joint, begin, target)
-        # to overshoot by as much again is no following either
+        # overshooting by the same distance is not following either
         if not c.tolerance("min_part") <= parts[joint] <= 2 - c.tolerance("min_part"):
             wrong.append((joint, phase))
     figure = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
@@ -455,14 +455,14 @@ def _others(c: UsbContext) -> Outcome:
     earlier: set[int] = set()
     for phase, joint, _, _ in _moves(c):
         travel = _travel(c.hand, phase)
-        # the one that moved before this one may still be arriving
+        # the joint that moved before may still be moving
         travel[[joint, *earlier]] = 0.0
         earlier.add(joint)
         most = max(most, float(travel.max()))
         if travel.max() > c.tolerance("max_q"):
             other = int(travel.argmax())
             moved, commanded = (_named(c, [i]) for i in (other, joint))
-            observed = f"{moved} moved by {travel.max():.2f} rad when {commanded} was told to"
+            observed = f"{moved} moved by {travel.max():.2f} rad when {commanded} was commanded to"
             outcome = c.failed(f"{travel.max():.2f} rad", observed, c.over(phase))
             return outcome.about(other, joint)
     return c.passed(f"{most:.3f} rad", moved=most)
@@ -475,7 +475,7 @@ def _limits(c: UsbContext) -> Outcome:
     for answer in c.hand.answers:
         for i, (joint, q) in enumerate(zip(c.hand.joints, c.hand.q(answer), strict=True)):
             over = max(joint.q_min - q, q - joint.q_max)
-            beyond = max(beyond, over)  # NaN is never beyond
+            beyond = max(beyond, over)  # a comparison with NaN is false
             if over > margin:
                 span = f"{joint.q_min:.2f} .. {joint.q_max:.2f}"
                 return c.failed(
@@ -495,7 +495,7 @@ def _speed_unit(c: UsbContext) -> Outcome:
         t = np.array([at for at, _ in points])
         q = np.array([m.position for _, m in points]) / scale.q
         dq = np.array([m.speed for _, m in points]) / scale.dq
-        # an integral over samples that are far apart says nothing, whoever was late
+        # an integral over samples that are far apart is meaningless, whatever caused the gap
         close = len(points) > 2 and np.diff(t).max() <= _COARSEST
         if close and abs(q[-1] - q[0]) > 0.05:
             way = float(np.sum((dq[1:] + dq[:-1]) / 2 * np.diff(t)))
@@ -509,7 +509,7 @@ def _torque_unit(c: UsbContext) -> Outcome:
     for phase, joint, _, _ in _moves(c):
         scale = Scale(c.hand.joints[joint].gear_ratio)
         law, reported = [], []
-        # the first answer may be the state of before the command
+        # the first answer may hold the state before the command
         for x in c.hand.exchanges(phase)[1:]:
             order = next(
                 (
@@ -571,9 +571,9 @@ def _trips(c: UsbContext) -> Outcome:
 
 
 def _driven(c: UsbContext, joint: int) -> float | None:
-    """Seconds for which a joint that was driven at a steady speed went on in the silence.
+    """Seconds for which a joint driven at a steady speed went on after the last command.
 
-    :returns: None when it had no such speed before, so that nothing can be told from it.
+    :returns: None when it had no such speed before, so that its stop cannot be detected.
     """
     silences, drives = c.hand.phases("silence"), c.hand.phases("drive")
     after = [a for s in silences for a in c.hand.answers if a.transfer.submitted_ns >= s.end_ns]
@@ -601,7 +601,7 @@ def _stops(c: UsbContext) -> Outcome:
     figure = f"{driven:.2f} s"
     if driven <= c.tolerance("max_s"):
         return c.passed(figure, driven_s=driven)
-    observed = f"in the silence it went as far as in {figure} of driving"
+    observed = f"without commands it went as far as in {figure} of driving"
     return c.failed(figure, observed, c.over(silence), driven_s=driven).about(DRIVEN)
 
 
@@ -661,7 +661,7 @@ def _disabled(c: UsbContext) -> Outcome:
     figure = f"{part:.0%} of the way"
     if part >= c.tolerance("min_part"):
         return c.passed(figure)
-    return c.failed(figure, f"after the silence it went {figure}", c.over(phase)).about(FREE)
+    return c.failed(figure, f"after the pause it went {figure}", c.over(phase)).about(FREE)
 
 
 @check("DEX3USB-PROT-06")
