@@ -1,4 +1,4 @@
-"""A Dex3-1 on USB that meets every requirement, in memory on a virtual clock.
+"""The reference Dex3-1 on USB, in memory on a virtual clock: it meets every requirement.
 
 It shares no code with the emulated device that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
@@ -316,7 +316,7 @@ class _Player:
         self.transfers: list[Transfer] = []
 
     def carry_out(self, action: Action) -> Observation:
-        """Do it at once; the device's clock goes on by as long as it takes."""
+        """Carry out an action; the device's clock goes on by its duration."""
         device = self._device
         begin, status, data = log_time_ns(device.now), 0, b""
         match action:
@@ -334,7 +334,7 @@ class _Player:
                 device.reopen()
                 device.advance(0.01)
             case Alone():
-                pass  # there is no other hand
+                pass  # there is only one hand
         return Observation(log_time_ns(device.now), status, data)
 
     def _put(self, begin: int, endpoint: int, status: int, requested: int, data: bytes) -> None:
