@@ -24,7 +24,7 @@ LEFT, RIGHT = (joints_of(dialect("dex3"), side) for side in Side)
     [
         ([0.0, 98.0], "percent"),
         ([0.0, 309.0], "degrees"),
-        ([-5.4, 0.0], "sign of q is turned"),
+        ([-5.4, 0.0], "sign of q is wrong"),
         ([0.0, 65535.0], "counts"),
         ([0.0, 7.0], ""),
         ([np.nan], ""),

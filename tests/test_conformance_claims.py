@@ -89,7 +89,7 @@ def test_claimed_units_are_must_and_others_not_claimed() -> None:
     nothing = judge(recording, claims=Claims.parse('[hand]\nname = "X"\nfirmware = "1"'))
     assert of(nothing, VELOCITY.id).verdict is Verdict.NOT_CLAIMED
     assert (nothing.subject["hand"], nothing.subject["firmware"]) == ("X", "1")
-    assert hand_name(nothing) == "X 1"  # and the reports call it so
+    assert hand_name(nothing) == "X 1"  # the reports show it under that name
 
 
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:

@@ -25,7 +25,7 @@ PHASES = frozenset(
 
 
 class JustFastEnough(ReferenceService):
-    """State at 200 Hz, and not a sample more."""
+    """Publishes state at exactly 200 Hz."""
 
     tick = period = 0.005
 
@@ -43,7 +43,7 @@ class FarTooSlow(ReferenceService):
 
 
 class Plain(ReferenceService):
-    """Measures its position, and nothing else; publishes best effort."""
+    """Reports only its position; publishes best effort."""
 
     writer_reliability = "best_effort"
 
@@ -151,11 +151,11 @@ def test_restart_of_the_service_by_the_kit_is_not_a_gap() -> None:
         (ReferenceService, 0.1, False, Verdict.PASS),
         (ReferenceService, 5.0, True, Verdict.PASS),
         (Slowish, 0.1, False, Verdict.FAIL),
-        (Slowish, 0.5, True, Verdict.FAIL),  # programs wait, and yet nothing is late
+        (Slowish, 0.5, True, Verdict.FAIL),  # programs wait, but nothing is late
         (Slowish, 2.0, True, Verdict.BLOCKED),
         (FarTooSlow, 0.1, False, Verdict.FAIL),
         (FarTooSlow, 2.0, True, Verdict.FAIL),
-        (FarTooSlow, 4.0, True, Verdict.FAIL),  # overloaded, and yet it is never fast
+        (FarTooSlow, 4.0, True, Verdict.FAIL),  # overloaded, but the rate is never high enough
         (FarTooSlow, 6.0, True, Verdict.BLOCKED),  # nothing is on time on such a machine
     ],
 )
@@ -202,7 +202,7 @@ def test_late_timestamps_do_not_fail_acceleration_check(part: float, late_ms: fl
 
 
 def stamped_late(service: type[Service], part: float, late_ms: float) -> MemoryTrace:
-    """A trace of a hand whose publisher is now and then held up, and then sends what waited."""
+    """A trace of a hand whose publisher is sometimes delayed, and then sends the waiting states."""
     trace, random, free = copy_of(listened(service)), Random(1), 0
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     rows = []

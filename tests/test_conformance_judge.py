@@ -198,7 +198,7 @@ def test_end_of_state_blocks_later_requirements() -> None:
     assert "DEX1-WDOG-02" in [r.requirement.id for r in found]
     assert all("fell silent for good" in r.cause for r in found), found
     early = copy_of(short_run())
-    del early.rows[STATE][1000:1100]  # a gap, and on it goes
+    del early.rows[STATE][1000:1100]  # a gap, then state goes on
     assert "silent for good" not in of(judged(early), "DEX1-RATE-03").cause
 
 
@@ -220,7 +220,7 @@ def test_exception_in_check_is_verdict_error(monkeypatch: pytest.MonkeyPatch) ->
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), share=st.sampled_from([0.001, 0.05, 1.0]))
 def test_damaged_samples_raise_no_exception_in_checks(seed: int, share: float) -> None:
-    """Whatever the bytes are, there is a verdict, and never the kit's own error."""
+    """Any bytes give a verdict, never an error of the kit."""
     random_ = random.Random(seed)
     trace = copy_of(short_run())
     for key, rows in trace.rows.items():

@@ -56,7 +56,7 @@ def seen(
         "report": page,
         "kinds": render(result_of_every_kind("averylongwordthatfindsnoplacetobreak" * 3)),
         "compare": render_comparison(Comparison([*runs, *runs])),
-        # what the measurement has to notice
+        # the measurement must detect this
         "wide": page.replace("<main>", '<main><p style="width:600px">wide</p>'),
         "loads": page.replace("<main>", '<main><img alt="" src="http://loads.invalid/x.png">'),
     }

@@ -121,7 +121,7 @@ def blamed(robot: type[ReferenceRobot], model: str, *phases: str) -> set[str]:
 
 
 def _one_of_each() -> list[Mutant]:
-    """A wrong robot for each check of a MUST, and what only a G1 has."""
+    """A wrong robot for each check of a MUST, and for the requirements of the G1 alone."""
     by_id = {r.id: r for r in catalogue(None, "robot")}
     found: dict[object, Mutant] = {}
     for mutant in mutants("robot"):
@@ -168,7 +168,7 @@ def test_robot_that_waits_for_commands_is_commanded() -> None:
 
 def test_script_ends_early_without_state() -> None:
     class Mute(ReferenceRobot):
-        """Nothing at all."""
+        """Publishes no state."""
 
         def publish(self) -> list[object]:  # type: ignore[override]
             return []
@@ -183,7 +183,7 @@ def test_script_ends_early_without_state() -> None:
 
 
 def test_failure_on_busy_machine_is_blocked() -> None:
-    """The gap of a tenth of a second is blocked where the kit's own timer stood still as long."""
+    """A gap of 0.1 s is blocked when the kit's timer was late by as much."""
     trace = listened("h1")
     ((key, rows),) = ((k, r) for k, r in trace.rows.items() if k[0] == "rt/lowstate")
     begin = rows[200][0]
@@ -217,7 +217,7 @@ class DiesOfNaN(ReferenceRobot):
 
 
 class Hiccup(ReferenceRobot):
-    """Is kept from publishing for a fifth of a second, when NaNs come."""
+    """Publishes nothing for 0.2 s after a NaN."""
 
     since = math.inf
 
@@ -239,7 +239,7 @@ def test_robot_that_stops_publishing_fails_and_late_one_is_not_judged() -> None:
 
 
 def write(trace: MemoryTrace, path: Path, *, bare: bool = False) -> Path:
-    """As a file; ``bare`` without what only the kit writes."""
+    """Write a trace to a file; with ``bare`` without the kit's metadata."""
     with Recorder(path) as recorder:
         for (topic, kind), rows in trace.rows.items():
             for log, sent, data in rows:

@@ -34,7 +34,7 @@ MOVE = BY_ID["DEX1-MOVE-02"]  # not of real time
 
 
 def blame(outcome: Outcome) -> Excuse:
-    """The machine has nothing to do with it."""
+    """No load of the machine: the failure is not excused."""
     return Excuse()
 
 
@@ -43,7 +43,7 @@ LATE = Lost(total=0.1, mean=0.001, p99=0.01)
 
 
 class Machine:
-    """A machine that lost so much, with programs that waited for so much of the time."""
+    """A machine with given lateness and given part of the time with waiting programs."""
 
     def __init__(self, lost: Lost | None, starved: float = 0.0) -> None:
         self._lost, self._starved = lost, starved
@@ -78,11 +78,11 @@ def gap(seconds: float) -> Outcome:
         # any failure on an idle machine is the hand's
         (RATE, rate(195.0), Machine(IDLE), False),
         (GAP, gap(0.101), Machine(IDLE), False),
-        # pressure without any delay explains nothing, however steady it is
+        # waiting programs without a delay excuse nothing
         (RATE, rate(50.0), PRESSED, False),
         (RATE, rate(180.0), PRESSED, False),
         (GAP, gap(0.2), PRESSED, False),
-        # a delay explains as much as there is of it
+        # a delay excuses a failure of its own size
         (RATE, rate(50.0), BUSY_ONE, False),
         (RATE, rate(125.0), BUSY_ONE, True),
         (RATE, rate(180.0), BUSY_ONE, True),
@@ -91,7 +91,7 @@ def gap(seconds: float) -> Outcome:
         # more of it where programs waited all the time
         (GAP, gap(0.45), Machine(LATE), False),
         (GAP, gap(0.25), Machine(LATE), True),
-        # what was late now and then does not move a mean
+        # occasional lateness does not change a mean
         (RATE, rate(150.0), Machine(Lost(0.06, 0.0006, 0.06), starved=0.2), False),
         # irregular, but the hand is never fast
         (RATE, rate(180.0, best=0.0), FITS, True),
@@ -101,7 +101,7 @@ def gap(seconds: float) -> Outcome:
         (RATE, rate(50.0, best=0.015), Machine(Lost(9.0, 0.009, 0.1, best=0.004), 1.0), True),
         # not known
         (GAP, gap(0.2), Machine(None, starved=1.0), False),
-        # too fast is never the machine's doing, and no more is what has nothing to do with time
+        # load excuses neither too high a rate nor failures without a relation to time
         (RATE, failure(2.0).if_late(math.inf, how="mean"), BUSY_ONE, False),
         (MOVE, gap(0.2), Machine(Lost(1.0, 1.0, 1.0), starved=1.0), False),
         # a failure without a size is as large as its place

@@ -135,7 +135,7 @@ def travel(gripper: EmulatedThread) -> int:
     return (gripper.servo.get(mx64.PRESENT_POSITION) - ZERO) % 4096
 
 
-# --- the packets themselves
+# --- packets
 
 
 class _FakePort(DevicePort):
@@ -793,7 +793,7 @@ def test_missing_answer_times_out_within_documented_time(
                     break
                 except HandTimeout:
                     assert time.monotonic() < deadline
-        # it is switched off in silence, too
+        # torque is also switched off when answers are missing
         hand.open()
         hand.exchange(BRAKE)
         gripper.inject("drop")
@@ -1025,7 +1025,7 @@ def test_the_baud_rate_is_changed(tmp_path: Path) -> None:
 
 @pytest.mark.realtime
 def test_exchange_is_not_faster_than_the_line(tmp_path: Path) -> None:
-    """On a real terminal and clock too. How fast it is, is a matter of the benchmark."""
+    """On a real terminal and clock too. The rate itself is measured by the benchmark."""
     count = 100
     busy = line_time(1_000_000)
     with (

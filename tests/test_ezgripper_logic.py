@@ -354,7 +354,7 @@ def test_no_torque_before_first_command() -> None:
             goal = control.plan(BRAKE, _sample(0.01 * i, ZERO + position, velocity=50))
             assert (goal.position, goal.current) == (ZERO + position, 0)
             assert control.phase is Phase.BRAKE
-        # a command, then silence: the service brakes, and the fingers are held
+        # no more commands: the service brakes, and the fingers are held
         assert control.plan(CLOSE, _sample(1.0, ZERO + 700)).current == 800
         assert control.plan(BRAKE, _sample(1.1, ZERO + 600)).current == 240
         # a restart of the servo: it begins anew

@@ -189,7 +189,7 @@ def test_finger_joints_have_their_finger_in_the_name() -> None:
 
 
 def test_left_and_right_drawings_are_mirrored() -> None:
-    """What closes the left hand stands on the other side of the sheet on the right hand."""
+    """Fingers of the right hand are on the other side of the sheet than the left hand's."""
     sheet = draw_hand(DEX3_1)
     for joint in DEX3_1.joints[Side.LEFT]:
         left, right = sorted((b.left + b.right) / 2 for b in sheet.texts if b.text == joint.name)

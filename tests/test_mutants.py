@@ -39,7 +39,7 @@ def test_reference_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
     assert not bad, "\n".join(bad)
     assert result.overall is Overall.PASS
     assert result.judged >= 30
-    # with both hands, and an object in one, there is an occasion for everything
+    # with both hands, and an object in one, every requirement can be judged
     if sides == BOTH and dialect != "unitree_hg":
         assert {r.requirement.id for r in result.results if r.verdict is Verdict.PASS} == {
             r.id for r in catalogue(plan.dialect.model) if dialect in r.dialects
@@ -48,7 +48,7 @@ def test_reference_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
 
 GOOD = (Verdict.PASS, Verdict.NOT_APPLICABLE)
 
-# one wrong hand of each MUST, no longer than it takes to show it
+# one wrong hand of each MUST, in a short run
 ESSENTIAL = essential(mutants())
 
 
@@ -56,7 +56,7 @@ def name_of(given: Mutant) -> str:
     return f"{given.layer}-{given.model}-{given.name}"
 
 
-# one of each check: what the models share is shown with the first
+# one of each check: shared checks are tried with the first model
 HAND = {r.id: r for r in catalogue()}
 OF_EACH_CHECK = {check_of(HAND[t.kills]): t for t in reversed(ESSENTIAL) if t.layer == "dds"}
 

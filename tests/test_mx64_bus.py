@@ -30,7 +30,7 @@ def three(**options: object) -> Host:
     return Host(servo(3), servo(1), servo(2), **options)
 
 
-# --- who answers, and when
+# --- order of answers
 
 
 def test_broadcast_ping_is_answered_in_order_of_ids() -> None:
@@ -242,7 +242,7 @@ def test_bad_crc_gives_no_answer_or_an_error() -> None:
     assert [p.error for p in answers.send_raw(bad)] == [ErrorNumber.CRC]
 
 
-# --- garbage never wedges it
+# --- recovery after invalid bytes
 
 
 @given(
@@ -265,7 +265,7 @@ def test_ping_after_any_bytes_is_answered(pieces: list[bytes]) -> None:
     for piece in pieces:
         host.exchange_raw(piece)
     for _ in range(2):
-        # the first may find the servo rebooting or renamed by a lucky broadcast write
+        # at the first ping the servo may reboot, or have a new id from a random broadcast write
         host.wait(0.5)
         packets = host.send(254, Instruction.PING)
     assert len(packets) == 1
@@ -327,7 +327,7 @@ def test_latency_timer_rounds_up_to_ticks() -> None:
     for timer, expected in ((1e-3, 1e-3), (16e-3, 16e-3)):
         host = Host(target, latency_timer=timer)
         for _ in range(5):
-            # a host that asks again at once is in step with the timer
+            # a host that sends again at once is synchronous with the timer
             assert transaction(host, PING) == pytest.approx(expected)
             host.now = host.at
 

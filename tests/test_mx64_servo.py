@@ -259,7 +259,7 @@ def test_reboot_folds_the_position_into_one_turn() -> None:
 def test_torque_on_in_mode_3_folds_but_not_in_mode_4() -> None:
     target = servo(closed_at=3010, start=100.0)
     write(target, mx64.OPERATING_MODE, OperatingMode.EXTENDED_POSITION)
-    target.drive.counter -= 4096  # as if it had come around
+    target.drive.counter -= 4096  # as after a full turn
     before = read(target, mx64.PRESENT_POSITION)
     write(target, mx64.TORQUE_ENABLE, 1)
     assert read(target, mx64.PRESENT_POSITION) == before > 4095
@@ -408,7 +408,7 @@ def test_clear_folds_position_only_at_rest() -> None:
     assert send(target, Instruction.CLEAR, dxl.CLEAR_POSITION_KEY).error == 0
     at = read(target, mx64.PRESENT_POSITION)
     assert 0 <= at <= 4095
-    run(target, 0.5)  # and it does not run away
+    run(target, 0.5)  # and it stays there
     assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at, abs=3)
 
 
@@ -744,7 +744,7 @@ def test_following_error_shows_when_blocked() -> None:
     assert read(target, mx64.MOVING_STATUS) & MovingStatus.FOLLOWING_ERROR
 
 
-# --- any history keeps the servo sane
+# --- any instructions keep registers within limits
 
 
 class_items = st.sampled_from([i for i in mx64.TABLE.values() if i.writable and i.address < 168])

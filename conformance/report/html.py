@@ -471,7 +471,7 @@ def _glossary(result: RunResult) -> str:
         ),
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
         ("tau_est, N m", "torque that the motor reports; the only sign of touch without sensors."),
-        ("not applicable", "the recording does not show it; the row says why."),
+        ("not applicable", "the recording does not show it; the row gives the reason."),
         ("docs/sources", "pages of dexkit with the facts, documents and measurements, by section."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]

@@ -6,7 +6,7 @@ with this model's prefix, unless it gives another; ids and topics of the other m
 are turned into this model's; tolerances are taken one by one. Where it names no source of its
 own, it is an inference from the other's.
 
-Everything else takes them from here: checks (which look up their tolerances), pytest ids,
+All other parts take them from here: checks (which read their tolerances), pytest ids,
 selection, reports and the catalogue in docs/conformance.md.
 """
 
