@@ -38,7 +38,7 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
         request.config.stash[WHY_KEY] = why
         raise Ended(f"{why}{more}", returncode)
 
-    # Whoever ends the run early must not leave a hand driven: services are ended in order.
+    # An early end must not leave a hand driven: services are ended in order.
     with stop_on_signals() as stop:
         try:
             result = run_suite(options, say, stop.event)

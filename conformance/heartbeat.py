@@ -1,4 +1,4 @@
-"""Whether the machine that the kit runs on had the processor time that a fair judgement needs."""
+"""Measure whether the kit's machine had enough processor time for a fair judgement."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _PSI = Path("/proc/pressure/cpu")
 
 
 class Heartbeat:
-    """Notes by how much the kit's own timer is late, and when programs wait for a processor.
+    """Record the lateness of the kit's timer, and when programs wait for a processor.
 
-    The first, :attr:`beats`, is what the machine demonstrably did to who runs on it. The second
-    comes from Linux' pressure stall information too: the time for which some task could have run
-    but had no processor. It says nothing of how long any of them waited, or which: two programs
-    in the background fill it, and leave the hand alone. What each of them excuses is said in
-    :mod:`~dexkit.conformance.verdicts`.
+    The first, :attr:`beats`, is a measured delay of a program on this machine. The second also uses
+    Linux' pressure stall information: the time for which some task could have run but had no
+    processor. It does not show which task waited, or for how long: two programs in the background
+    can fill it without delaying the hand. :mod:`~dexkit.conformance.verdicts` decides what each of
+    them excuses.
 
     :ivar stalls: when programs waited for most of the time, or this thread was woken late.
     """
@@ -47,7 +47,7 @@ class Heartbeat:
             clock.sleep_until(due)
             late = clock.now() - due
             end = time.time_ns()
-            # one append, so that whoever looks meanwhile never sees half a beat
+            # a single append, so that another thread never reads half a beat
             self._beats.append(((end - self._begin_ns) // 1000, round(late * 1e6)))
             before, waited = waited, _waited()
             short = (waited - before) * 1e9 > _PRESSURE * (end - begin)
@@ -60,7 +60,7 @@ class Heartbeat:
 
     @property
     def beats(self) -> Beats:
-        """By how much this thread was woken late, up to now: the jitter of the kit itself."""
+        """Lateness of each wake-up of this thread so far: the kit's jitter."""
         beats = self._beats.copy()
         return Beats(self._begin_ns, [t for t, _ in beats], [late for _, late in beats])
 
@@ -74,7 +74,7 @@ class Heartbeat:
 
 
 def _waited() -> float:
-    """Seconds, ever, for which some task waited for a processor; 0 where that is not told."""
+    """Total seconds for which some task waited for a processor; 0 where it is not available."""
     try:
         text = _PSI.read_text()
         return float(text.partition("total=")[2].split()[0]) / 1e6

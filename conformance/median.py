@@ -1,4 +1,4 @@
-"""Figures of many numbers that numpy has too, at a smaller price."""
+"""A faster median than numpy's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["median"]
 def median(values: Floats) -> float:
     """The median of one column; NaN if one of them is, or if there are none.
 
-    What ``np.median`` gives, without the masked arrays that it loads and asks after.
+    The result is that of ``np.median``, which is slower because it also handles masked arrays.
     """
     n = len(values)
     if not n:

@@ -2,7 +2,7 @@
 
 A script's :meth:`~PhasedScript.run` is a generator. It yields actions, a player carries each out
 and sends back what it observed. A live player does so on DDS or on USB, a virtual one with a hand
-in memory on a virtual clock; the script cannot tell them apart.
+in memory on a virtual clock; the script is the same for both.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Which plots show a result: named by a requirement in the catalogue, or by its check.
 
 :mod:`dexkit.conformance.report.result_plots` draws them. This module only names them, so that
-catalogue, checks and result files need not know how.
+catalogue, checks and result files do not depend on the drawing code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class PlotKind(str, Enum):
     """What a plot shows; "the place" is the first one in the recording that the check names."""
 
     ENDPOINTS = "endpoints"
-    """Table of what a client needs on the network, and what discovery saw."""
+    """Table of the endpoints that a client needs, and of those that discovery found."""
     POSITION = "position"
     """Command and state of the joints about the place."""
     BOTH_SIDES = "both-sides"

@@ -1,4 +1,4 @@
-"""Read a result file: hold it to its schema, and convert one of version 2."""
+"""Read a result file: validate it against its schema, and convert version 2."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ __all__ = ["read_json"]
 
 
 def read_json(path: Path) -> RunResult:
-    """Read a result file back.
+    """Read a result file.
 
-    :raises UsageError: it is not one, of a version that this dexkit does not know, or something
-        in it is not as ``result.schema.json`` says: the error names the place.
+    :raises UsageError: it is not a result file, its version is unknown, or it does not match
+        ``result.schema.json``: the error names the place.
     """
     data = documents.read_json(path)
     about = data if isinstance(data, dict) else {}
@@ -70,16 +70,16 @@ def _validator() -> Any:
 
 
 def _validate(data: Any, path: Path) -> None:
-    """Hold a document to the schema that is published with dexkit.
+    """Validate a document against the schema that is published with dexkit.
 
-    :raises UsageError: naming the first place that is not as it says.
+    :raises UsageError: naming the first place that does not match.
     """
     from jsonschema.exceptions import relevance
 
     error = min(_validator().iter_errors(data), key=relevance, default=None)
     if error is None:
         return
-    while error.context:  # of several alternatives: what is wrong with the nearest
+    while error.context:  # of several alternatives: the error of the nearest
         error = min(error.context, key=relevance)
     where = one_line(error.json_path.removeprefix("$").removeprefix(".") or "the document")
     raise UsageError(
@@ -110,7 +110,7 @@ _NAMES = {
 
 
 def _expected(rule: str, value: Any, found: Any) -> str:
-    """What a rule of the schema wants, and what is there instead."""
+    """The expected and the actual value for a rule of the schema."""
     is_there = _KINDS[type(found)]
     if isinstance(found, str | int | float | bool):
         is_there = one_line(json.dumps(found), 60)

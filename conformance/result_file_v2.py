@@ -1,8 +1,8 @@
 """Convert a result file of version 2 into version 3.
 
-Version 2 had prose where version 3 has data: the load of the machine stood at the beginning of
+Version 2 had text where version 3 has data: the load of the machine stood at the beginning of
 ``reason``, and joints were named in ``observed``. A robot's side and layer were called ``body``.
-Nothing is checked here: :mod:`~dexkit.conformance.result_file` holds what comes out to the schema.
+Nothing is checked here: :mod:`~dexkit.conformance.result_file` validates the result.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from dexkit.robots import ROBOTS
 __all__ = ["converted"]
 
 _LOADS = {"the machine was busy": "busy", "the machine was too busy": "too busy"}
-"""How a reason began, and the load that it stands for."""
+"""Beginnings of a reason, and the load that each of them means."""
 _ROBOT = {"body": "robot"}
 
 
 def converted(document: dict[str, Any]) -> dict[str, Any]:
-    """The document as version 3 has it; what is not of the form of version 2 stays as it is."""
+    """Return the document in version 3; parts that are not of version 2's form stay unchanged."""
     found = {**document, "version": 3}
     if isinstance(document.get("results"), list):
         found["results"] = [_result(e) if isinstance(e, dict) else e for e in document["results"]]

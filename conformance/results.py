@@ -1,4 +1,4 @@
-"""What a run found: one object, written as JSON, from which every report is rendered.
+"""The result of a run: one object, written as JSON, from which every report is rendered.
 
 :mod:`dexkit.conformance.result_file` reads the JSON back.
 
@@ -52,7 +52,7 @@ VERSION = 3
 
 
 class Verdict(str, Enum):
-    """What was found for one requirement; see the module."""
+    """The verdict on one requirement; see the module."""
 
     PASS = "pass"
     FAIL = "fail"
@@ -104,7 +104,7 @@ class Overall(str, Enum):
 
 
 class Stage(str, Enum):
-    """How far a hand got: the first question when it fails."""
+    """The stage that a hand reached."""
 
     NO_PARTICIPANT = "no participant"
     PARTICIPANT_SEEN = "participant seen"
@@ -121,7 +121,7 @@ class Stage(str, Enum):
 class Evidence:
     """A place in the recording.
 
-    :param topic: where to look.
+    :param topic: topic of the samples.
     :param time_s: seconds from the beginning of the recording.
     :param log_time_ns: the same as a log time of the recording.
     :param end_s: end of the stretch, if it is one.
@@ -148,13 +148,13 @@ class Load(str, Enum):
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What the machine that made the recording has to do with a failure.
+    """The load of the recording machine during a failure, and how much of it the load explains.
 
     :param late_s: by how much the kit's own timer was late at the failure's place, seconds; None
         if it was not measured.
-    :param explained_s: by how much a good hand may then have been late, seconds.
-    :param failure_s: by how much a good hand would have had to be late to look like this, seconds;
-        None if no delay does.
+    :param explained_s: delay of a conforming hand that this load can cause, seconds.
+    :param failure_s: delay of a conforming hand that would cause this failure, seconds; None if
+        no delay can.
     """
 
     load: Load
@@ -168,7 +168,7 @@ UNDISTURBED = Disturbance(Load.NONE)
 
 @dataclass(frozen=True)
 class Result:
-    """What was found for one requirement on one side.
+    """The result of one requirement on one side.
 
     :param figure: the measured figure in a few characters, for tables.
     :param observed: what was seen, in words.
@@ -200,7 +200,7 @@ class Result:
 
     @property
     def expected(self) -> str:
-        """What would have been right, in a few words."""
+        """The expected result, in a few words."""
         return self.requirement.expected or self.requirement.sentence
 
     def explain(self) -> str:
@@ -243,7 +243,7 @@ class RunResult:
     :param harness: how fair the kit's own machine was, where it made the run: ``jitter_p50_ms``
         and ``jitter_p99_ms``, by which it was late itself, and ``starved``, the part of the run,
         0 to 1, in which programs waited for a processor.
-    :param claims: by unit, whether the vendor claims it; None where nothing is said.
+    :param claims: by unit, whether the vendor claims it; None without claims.
     :param catalogue: how many requirements there are for such a run, selected or not; 0 if it is
         not known.
     """

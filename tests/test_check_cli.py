@@ -45,7 +45,7 @@ def test_recording_with_a_dropout_fails_with_an_explanation(
     suite = ElementTree.parse(files[1]).getroot()
     failures = suite.findall("./testcase/failure")
     assert (suite.get("failures"), len(failures)) == ("1", 1)
-    assert "never silent for more than 0.1 s" in (failures[0].text or "")
+    assert "never longer than 0.1 s" in (failures[0].text or "")
     assert "Fail" in files[2].read_text()
 
 

@@ -1,4 +1,4 @@
-"""A failure says why: from what the check saw, where that tells more than the rule."""
+"""Test the likely causes that checks determine from measured values."""
 
 from __future__ import annotations
 
@@ -13,35 +13,36 @@ from dexkit.conformance.results import Verdict
 from dexkit.hand import Side
 from dexkit.models import dialect
 from tests.conformance_helpers import of
+from tests.each import each
 
 GRIPPER = joints_of(dialect("unitree_go"), Side.LEFT)
 LEFT, RIGHT = (joints_of(dialect("dex3"), side) for side in Side)
 
 
-@pytest.mark.parametrize(
-    ("q", "says"),
+@each(
+    ("q", "expected"),
     [
         ([0.0, 98.0], "percent"),
         ([0.0, 309.0], "degrees"),
-        ([-5.4, 0.0], "sign of q is turned"),
+        ([-5.4, 0.0], "sign of q is wrong"),
         ([0.0, 65535.0], "counts"),
         ([0.0, 7.0], ""),
         ([np.nan], ""),
     ],
 )
-def test_units_are_told_from_the_positions_of_a_gripper(q: list[float], says: str) -> None:
+def test_cause_names_unit_of_gripper_positions(q: list[float], expected: str) -> None:
     found = of_positions(np.array(q)[:, None], GRIPPER, GRIPPER)
-    assert (says in found) if says else not found
+    assert (expected in found) if expected else not found
 
 
-def test_the_other_sides_signs_are_told() -> None:
+def test_cause_names_signs_of_other_side() -> None:
     ends = np.array([[j.q_min for j in RIGHT], [j.q_max for j in RIGHT]])
     assert "other side's positions" in of_positions(ends, LEFT, RIGHT)
     assert of_positions(np.full((3, 7), 2.9), LEFT, RIGHT) == ""
 
 
-@pytest.mark.parametrize(
-    ("reached", "says"),
+@each(
+    ("reached", "expected"),
     [
         ([4.86, 0.54, 2.7], "mirrored"),
         ([0.1, 0.9, 0.5], "0 to 1"),
@@ -50,17 +51,17 @@ def test_the_other_sides_signs_are_told() -> None:
         ([0.54, 3.0, 2.7], ""),
     ],
 )
-def test_a_scale_is_told_from_steps(reached: list[float], says: str) -> None:
+def test_cause_names_scale_from_steps(reached: list[float], expected: str) -> None:
     targets = np.array([0.54, 4.86, 2.7])
     found = of_scale(targets, np.array(reached), 5.4)
-    assert (says in found) if says else not found
+    assert (expected in found) if expected else not found
 
 
-def test_one_step_tells_no_scale() -> None:
+def test_one_step_gives_no_scale() -> None:
     assert of_scale(np.array([2.7]), np.array([2.7]), 5.4) == ""
 
 
-def test_types_of_another_hand_are_told() -> None:
+def test_cause_names_types_of_another_hand() -> None:
     go, dex3 = dialect("unitree_go"), dialect("dex3")
     assert "swapped" in of_type({go.cmd_type}, go.state_type, go)
     assert "--dialect unitree_hg or dex3" in of_type({dex3.state_type}, go.state_type, go)
@@ -69,7 +70,7 @@ def test_types_of_another_hand_are_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mutant", "requirement", "says"),
+    ("mutant", "requirement", "expected"),
     [
         ("OtherStateType", "DEX1-TOPIC-01", "is the type of another hand"),
         ("Percent", "DEX1-FIELD-03", "percent"),
@@ -77,17 +78,17 @@ def test_types_of_another_hand_are_told() -> None:
         ("Frozen", "DEX1-MOVE-01", "Nothing moves at all"),
     ],
 )
-def test_a_wrong_hand_is_told_its_own_mistake(mutant: str, requirement: str, says: str) -> None:
+def test_cause_names_mistake_of_wrong_hand(mutant: str, requirement: str, expected: str) -> None:
     wrong = next(m for m in mutants() if m.name == mutant and m.kills == requirement)
     result = run_mutant(wrong.made, HandTrial().plan(wrong))
     found = next(
         r for r in result.results if (r.requirement.id, r.verdict) == (requirement, Verdict.FAIL)
     )
-    assert says in found.cause
+    assert expected in found.cause
     assert f"cause:    {found.cause}" in found.explain()
 
 
-def test_what_passes_has_no_cause() -> None:
+def test_passed_result_has_no_cause() -> None:
     from dexkit.conformance.judge import judge
     from dexkit.conformance.recording import Recording
     from tests.conformance_helpers import short_run

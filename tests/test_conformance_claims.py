@@ -1,4 +1,4 @@
-"""What a vendor claims, and what becomes of it."""
+"""Test capability claims: reading the file, and their effect on verdicts."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from tests.conformance_helpers import of, short_run
+from tests.each import each
 
 DOCS = Path(__file__).parent.parent / "docs" / "capabilities.md"
 VELOCITY = next(r for r in catalogue("dex1-1") if r.id == "DEX1-FIELD-04")
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
+@each(
+    ("text", "expected"),
     [
         ("[claims]\nforse = true", "no unit 'forse'"),
         ("[claims]\nforce = 1", "force is true or false"),
@@ -38,12 +39,12 @@ VELOCITY = next(r for r in catalogue("dex1-1") if r.id == "DEX1-FIELD-04")
         ("[claims", "capabilities.toml is not valid TOML: "),
     ],
 )
-def test_a_file_that_is_not_understood_is_an_error(text: str, says: str) -> None:
-    with pytest.raises(UsageError, match=re.escape(says)):
+def test_invalid_claims_file_is_error(text: str, expected: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(expected)):
         Claims.parse(text)
 
 
-def test_a_file_about_another_model_is_an_error(tmp_path: Path) -> None:
+def test_claims_file_for_other_model_is_error(tmp_path: Path) -> None:
     path = tmp_path / "capabilities.toml"
     path.write_text("[hand]\nmodel = 'dex3-1'\n")
     assert Claims.load(path, "dex3-1").hand["model"] == "dex3-1"
@@ -53,7 +54,7 @@ def test_a_file_about_another_model_is_an_error(tmp_path: Path) -> None:
         Claims.load(tmp_path / "missing.toml", "dex1-1")
 
 
-def test_the_shipped_example_and_the_documentation_have_every_unit() -> None:
+def test_example_and_documentation_list_every_unit() -> None:
     assert dexkit.conformance.__file__ is not None
     example = Path(dexkit.conformance.__file__).parent / "capabilities.example.toml"
     claims = Claims.load(example, "dex1-1")
@@ -68,13 +69,13 @@ def test_every_unit_has_a_requirement() -> None:
     assert {r.capability for r in catalogue(None, None)} == {"", *CAPABILITIES}
 
 
-def test_without_a_file_nothing_changes() -> None:
+def test_without_claims_file_verdicts_are_unchanged() -> None:
     claims = Claims()
     assert claims.apply(catalogue()) == catalogue()
     assert claims.claimed(VELOCITY) is None
 
 
-def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
+def test_claimed_units_are_must_and_others_not_claimed() -> None:
     recording = Recording.of(short_run())
     silent = judge(recording)
     assert of(silent, VELOCITY.id).requirement.level is Level.SHOULD
@@ -88,7 +89,7 @@ def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
     nothing = judge(recording, claims=Claims.parse('[hand]\nname = "X"\nfirmware = "1"'))
     assert of(nothing, VELOCITY.id).verdict is Verdict.NOT_CLAIMED
     assert (nothing.subject["hand"], nothing.subject["firmware"]) == ("X", "1")
-    assert hand_name(nothing) == "X 1"  # and the reports call it so
+    assert hand_name(nothing) == "X 1"  # the reports show it under that name
 
 
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
@@ -97,8 +98,8 @@ def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
     return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: Excuse())
 
 
-@pytest.mark.parametrize("met", [None, True])
-def test_a_claimed_unit_of_which_nothing_is_seen_fails(met: bool | None) -> None:
+@each("met", [None, True])
+def test_claimed_unit_without_data_fails(met: bool | None) -> None:
     absent = Outcome(met, observed="all 0", reason="" if met else "dq is 0", absent=True)
     usual = Verdict.PASS if met else Verdict.NOT_APPLICABLE
     assert concluded(VELOCITY, "", absent).verdict is usual
@@ -107,12 +108,12 @@ def test_a_claimed_unit_of_which_nothing_is_seen_fails(met: bool | None) -> None
     assert "but the unit 'velocity' is claimed" in found.observed
 
 
-def test_a_claimed_should_fails_where_it_would_warn() -> None:
+def test_claimed_should_fails_instead_of_warning() -> None:
     bad = Outcome(False, "200 %", "dq is off")
     assert concluded(VELOCITY, "", bad).verdict is Verdict.WARN
     assert concluded(VELOCITY, "[claims]\nvelocity = true", bad).verdict is Verdict.FAIL
 
 
-def test_an_info_stays_an_info() -> None:
+def test_claimed_info_stays_info() -> None:
     info = replace(VELOCITY, level=Level.INFO)
     assert concluded(info, "[claims]\nvelocity = true", Outcome(False)).verdict is Verdict.WARN

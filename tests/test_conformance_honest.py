@@ -1,4 +1,4 @@
-"""No false alarm: hands that differ from the reference in what no source forbids."""
+"""Test that hands within the limits do not fail, also on a busy machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PHASES = frozenset(
 
 
 class JustFastEnough(ReferenceService):
-    """State at 200 Hz, and not a sample more."""
+    """Publishes state at exactly 200 Hz."""
 
     tick = period = 0.005
 
@@ -43,7 +43,7 @@ class FarTooSlow(ReferenceService):
 
 
 class Plain(ReferenceService):
-    """Measures its position, and nothing else; publishes best effort."""
+    """Reports only its position; publishes best effort."""
 
     writer_reliability = "best_effort"
 
@@ -109,40 +109,40 @@ def blamed(result: RunResult) -> set[str]:
         (JustFastEnough, {"DEX1-RATE-02"}),
         (Plain, {"DEX1-QOS-02"}),
         (Quick, set()),
-        # slow, and so it is told; but it arrives, opens, closes and obeys
+        # slow, which gives warnings; but it arrives, opens, closes and obeys
         (Unhurried, {"DEX1-MOVE-04", "DEX1-MOVE-07"}),
     ],
 )
-def test_an_honest_hand_is_warned_at_most(service: type[Service], warned: set[str]) -> None:
+def test_hand_within_the_limits_never_fails(service: type[Service], warned: set[str]) -> None:
     result = judged(service)
     assert blamed(result) == warned
     assert result.overall is Overall.PASS
 
 
-def test_a_hand_that_rests_where_it_is_told_to_be_is_not_frozen() -> None:
+def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
     fresh = of(judge(Recording.of(listened(Hesitates))), "DEX1-FRESH-02")
     assert fresh.verdict is Verdict.PASS
     assert 0.08 < fresh.values["frozen_s"] < 0.15  # and not the second of rest before it
 
 
-def test_a_gripper_that_is_quick_for_its_size_is_not_taken_for_percent() -> None:
+def test_fast_gripper_is_not_judged_as_percent() -> None:
     speed = of(judge(Recording.of(listened(Quick))), "DEX1-FIELD-14")
     assert speed.verdict is Verdict.PASS
     assert 30 < speed.values["speed_rad_s"] < 60
 
 
-def test_what_a_plain_hand_does_not_claim_is_not_held_against_it() -> None:
+def test_units_that_are_not_claimed_do_not_fail() -> None:
     result = judged(Plain, Claims.parse('[hand]\nmodel = "dex1-1"'))
     assert blamed(result) == {"DEX1-QOS-02"}
     assert of(result, "DEX1-FIELD-04").verdict is Verdict.NOT_CLAIMED
 
 
-def test_the_kits_own_restart_of_the_service_is_no_gap_of_the_hand() -> None:
+def test_restart_of_the_service_by_the_kit_is_not_a_gap() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"shutdown", "service-restart"}))
     found = judge(Recording.of(run_virtual(plan, ReferenceService)))
     gap = of(found, "DEX1-RATE-03")
     assert gap.verdict is Verdict.PASS
-    assert gap.values["max_gap_s"] < 0.1  # nor is it told as the longest
+    assert gap.values["max_gap_s"] < 0.1  # nor is it reported as the longest
 
 
 @pytest.mark.parametrize(
@@ -151,15 +151,15 @@ def test_the_kits_own_restart_of_the_service_is_no_gap_of_the_hand() -> None:
         (ReferenceService, 0.1, False, Verdict.PASS),
         (ReferenceService, 5.0, True, Verdict.PASS),
         (Slowish, 0.1, False, Verdict.FAIL),
-        (Slowish, 0.5, True, Verdict.FAIL),  # programs wait, and yet nothing is late
+        (Slowish, 0.5, True, Verdict.FAIL),  # programs wait, but nothing is late
         (Slowish, 2.0, True, Verdict.BLOCKED),
         (FarTooSlow, 0.1, False, Verdict.FAIL),
         (FarTooSlow, 2.0, True, Verdict.FAIL),
-        (FarTooSlow, 4.0, True, Verdict.FAIL),  # overloaded, and yet it is never fast
+        (FarTooSlow, 4.0, True, Verdict.FAIL),  # overloaded, but the rate is never high enough
         (FarTooSlow, 6.0, True, Verdict.BLOCKED),  # nothing is on time on such a machine
     ],
 )
-def test_a_busy_machine_explains_as_much_as_it_was_late_by(
+def test_busy_machine_explains_failures_up_to_its_lateness(
     service: type[Service], usual_ms: float, pressed: bool, verdict: Verdict
 ) -> None:
     recording = with_beats(
@@ -177,9 +177,7 @@ def test_a_busy_machine_explains_as_much_as_it_was_late_by(
 
 
 @pytest.mark.parametrize(("usual_ms", "verdict"), [(2.0, Verdict.FAIL), (6.0, Verdict.BLOCKED)])
-def test_nothing_is_told_of_motion_where_the_machine_was_overloaded(
-    usual_ms: float, verdict: Verdict
-) -> None:
+def test_motion_is_blocked_on_overloaded_machine(usual_ms: float, verdict: Verdict) -> None:
     trace = copy_of(listened(ReferenceService))
     topic = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     still = trace.rows[topic][0][2]
@@ -195,7 +193,7 @@ def test_nothing_is_told_of_motion_where_the_machine_was_overloaded(
 @pytest.mark.parametrize(
     ("part", "late_ms"), [(0.02, 10.0), (0.05, 10.0), (0.05, 30.0), (0.2, 10.0)]
 )
-def test_late_stamps_do_not_bend_a_good_hands_acceleration(part: float, late_ms: float) -> None:
+def test_late_timestamps_do_not_fail_acceleration_check(part: float, late_ms: float) -> None:
     ratio = of(judge(Recording.of(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06")
     assert ratio.verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE)
     turned = stamped_late(gripper.TurnedAcceleration, part, late_ms)
@@ -204,7 +202,7 @@ def test_late_stamps_do_not_bend_a_good_hands_acceleration(part: float, late_ms:
 
 
 def stamped_late(service: type[Service], part: float, late_ms: float) -> MemoryTrace:
-    """A trace of a hand whose publisher is now and then held up, and then sends what waited."""
+    """A trace of a hand whose publisher is sometimes delayed, and then sends the waiting states."""
     trace, random, free = copy_of(listened(service)), Random(1), 0
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     rows = []
@@ -223,7 +221,7 @@ def listened(service: type[Service]) -> MemoryTrace:
 
 
 @pytest.mark.parametrize("off_s", [-3600.0, 0.4, 86400.0])
-def test_the_hands_clock_need_not_be_right(off_s: float) -> None:
+def test_wrong_clock_of_the_hand_does_not_change_verdicts(off_s: float) -> None:
     right = judge(Recording.of(short_run()))
     trace = copy_of(short_run())
     topic = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")

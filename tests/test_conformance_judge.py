@@ -1,4 +1,4 @@
-"""Verdicts on recordings: the genuine ones, damaged ones, and those that hold too little."""
+"""Test verdicts on recordings: genuine, damaged and incomplete ones."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from dexkit.messages import message_type
 from dexkit.models import dialect
 from dexkit.traces import Recorder, open_trace, sample_labels, sample_path
 from tests.conformance_helpers import copy_of, failed, of, short_run
+from tests.each import each
 
 STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
 CMD = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
@@ -33,8 +34,8 @@ def judged(trace: MemoryTrace) -> RunResult:
     return judge(Recording.of(trace))
 
 
-@pytest.mark.parametrize("sent", [(Side.LEFT,), ()])
-def test_only_somebody_elses_second_type_is_worth_a_note(
+@each("sent", [(Side.LEFT,), ()])
+def test_second_type_on_command_topic_is_noted_unless_kit_sent_it(
     tmp_path: Path, sent: tuple[Side, ...]
 ) -> None:
     path = tmp_path / "two.mcap"
@@ -61,7 +62,7 @@ def test_genuine_recordings_pass(name: str) -> None:
             assert of(result, requirement, side).verdict is Verdict.PASS
 
 
-def test_the_dropout_is_found_where_it_was_made() -> None:
+def test_dropout_is_found_at_its_time() -> None:
     result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
     assert result.overall is Overall.FAIL
     assert failed(result) == {("DEX1-RATE-03", "left")}
@@ -74,7 +75,7 @@ def test_the_dropout_is_found_where_it_was_made() -> None:
     assert gap.end_s == pytest.approx(resumes, abs=0.01)
 
 
-def test_the_legacy_recording_is_judged_in_its_own_dialect() -> None:
+def test_legacy_recording_is_judged_in_legacy_dialect() -> None:
     trace = open_trace(sample_path("dex1_legacy_v1_1"))
     assert detect_dialect(trace).name == "unitree_actuator"
     recording = Recording.of(trace)
@@ -86,14 +87,14 @@ def test_the_legacy_recording_is_judged_in_its_own_dialect() -> None:
     assert of(result, "DEX1-FIELD-01", "right").figure == "2"
 
 
-def test_a_dex3_recording_is_no_dex1() -> None:
+def test_dex3_recording_is_not_judged_as_dex1() -> None:
     trace = open_trace(sample_path("dex3_pinch"))
     assert detect_dialect(trace).name == "dex3"
     with pytest.raises(ConformanceError, match="no Dex1-1 gripper topic"):
         Recording.of(trace, dialect_name="unitree_go")
 
 
-def test_the_wrong_dialect_fails_by_its_topics() -> None:
+def test_wrong_dialect_fails_topic_requirements() -> None:
     trace = open_trace(sample_path("dex1_pick_place"))
     result = judge(Recording.of(trace, dialect_name="unitree_hg"))
     assert failed(result) == {("DEX1-TOPIC-01", "left"), ("DEX1-TOPIC-01", "right")}
@@ -106,14 +107,14 @@ def test_the_wrong_dialect_fails_by_its_topics() -> None:
 # ----------------------------------------------------------------------------- too little
 
 
-def test_a_side_that_is_asked_for_and_absent_fails() -> None:
+def test_requested_side_without_data_fails() -> None:
     trace = copy_of(short_run())
     result = judge(Recording.of(trace, sides=(Side.LEFT, Side.RIGHT)))
     assert failed(result) == {("DEX1-TOPIC-01", "right"), ("DEX1-TOPIC-02", "right")}
     assert result.stage == {"left": "moving", "right": "participant seen"}
 
 
-def test_without_discovery_the_endpoints_are_not_judged() -> None:
+def test_endpoints_are_not_judged_without_discovery_data() -> None:
     trace = copy_of(short_run())
     trace.endpoints.clear()
     result = judged(trace)
@@ -122,7 +123,7 @@ def test_without_discovery_the_endpoints_are_not_judged() -> None:
     assert result.overall is Overall.PASS
 
 
-def test_states_alone_are_judged_as_far_as_they_go() -> None:
+def test_recording_without_commands_is_judged_by_its_states() -> None:
     trace = copy_of(short_run())
     trace.metadata.clear()
     del trace.rows[CMD]
@@ -132,7 +133,7 @@ def test_states_alone_are_judged_as_far_as_they_go() -> None:
     assert of(result, "DEX1-MOVE-01").reason.startswith("needs the stimulus 'step'")
 
 
-def test_an_empty_topic_is_no_pass() -> None:
+def test_empty_topic_does_not_pass() -> None:
     trace = copy_of(short_run())
     trace.metadata.clear()
     trace.rows.clear()
@@ -140,7 +141,7 @@ def test_an_empty_topic_is_no_pass() -> None:
     assert failed(result) == {("DEX1-TOPIC-01", "left")}
 
 
-def test_nothing_judged_is_inconclusive() -> None:
+def test_run_without_judged_requirement_is_inconclusive() -> None:
     recording = Recording.of(copy_of(short_run()))
     only = select(catalogue(), prefixes=["DEX1-LIFE-01"])
     result = judge(recording, requirements=only)
@@ -150,7 +151,7 @@ def test_nothing_judged_is_inconclusive() -> None:
     assert "nothing can be said" in result.sentence()
 
 
-def test_a_recording_that_begins_in_mid_session_says_nothing_about_the_start() -> None:
+def test_start_up_is_not_judged_in_recording_that_begins_late() -> None:
     trace = copy_of(short_run())
     trace.metadata.clear()
     first_command = trace.rows[CMD][0][0]
@@ -158,7 +159,7 @@ def test_a_recording_that_begins_in_mid_session_says_nothing_about_the_start() -
     assert of(judged(trace), "DEX1-START-01").verdict is Verdict.NOT_APPLICABLE
 
 
-def test_without_source_timestamps_reception_is_judged() -> None:
+def test_reception_times_are_judged_without_source_timestamps() -> None:
     trace = copy_of(short_run())
     trace.rows[STATE] = [(log, 0, data) for log, _, data in trace.rows[STATE]]
     result = judged(trace)
@@ -177,31 +178,31 @@ def with_gap(seconds: float, at: float = 2.5) -> MemoryTrace:
     return trace
 
 
-def test_a_gap_is_blamed_on_the_hand() -> None:
+def test_gap_in_state_fails_the_hand() -> None:
     assert ("DEX1-RATE-03", "left") in failed(judged(with_gap(0.2)))
     assert of(judged(with_gap(0.05)), "DEX1-RATE-03").verdict is Verdict.PASS
 
 
-def test_a_state_that_stops_for_good_is_a_gap() -> None:
+def test_state_that_never_returns_is_a_gap() -> None:
     trace = copy_of(short_run())
-    trace.metadata.clear()  # no silence that has its own requirement
+    trace.metadata.clear()  # no phase without commands that has a separate requirement
     rows = trace.rows[STATE]
     trace.rows[STATE] = rows[: len(rows) // 2]
     assert ("DEX1-RATE-03", "left") in failed(judged(trace))
 
 
-def test_a_hand_that_dies_is_the_cause_of_what_fails_afterwards() -> None:
+def test_end_of_state_blocks_later_requirements() -> None:
     trace = copy_of(short_run())
     trace.rows[STATE] = trace.rows[STATE][: len(trace.rows[STATE]) // 2]
     found = [r for r in judged(trace).results if r.verdict is Verdict.FAIL]
     assert "DEX1-WDOG-02" in [r.requirement.id for r in found]
     assert all("fell silent for good" in r.cause for r in found), found
     early = copy_of(short_run())
-    del early.rows[STATE][1000:1100]  # a gap, and on it goes
+    del early.rows[STATE][1000:1100]  # a gap, then state goes on
     assert "silent for good" not in of(judged(early), "DEX1-RATE-03").cause
 
 
-def test_a_check_that_breaks_is_the_kits_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_in_check_is_verdict_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(context: object) -> None:
         raise ZeroDivisionError("1/0")
 
@@ -218,8 +219,8 @@ def test_a_check_that_breaks_is_the_kits_error(monkeypatch: pytest.MonkeyPatch) 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), share=st.sampled_from([0.001, 0.05, 1.0]))
-def test_damaged_samples_never_break_a_check(seed: int, share: float) -> None:
-    """Whatever the bytes are, there is a verdict, and never the kit's own error."""
+def test_damaged_samples_raise_no_exception_in_checks(seed: int, share: float) -> None:
+    """Any bytes give a verdict, never an error of the kit."""
     random_ = random.Random(seed)
     trace = copy_of(short_run())
     for key, rows in trace.rows.items():
@@ -246,7 +247,7 @@ def damage(random_: random.Random, data: bytes) -> bytes:
 # ------------------------------------------------------------------------- result and record
 
 
-def test_a_result_file_reads_back(tmp_path: Path) -> None:
+def test_result_file_is_read_back_unchanged(tmp_path: Path) -> None:
     result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
     path = tmp_path / "r.json"
     result.write_json(path)
@@ -262,7 +263,7 @@ def test_a_result_file_reads_back(tmp_path: Path) -> None:
         read_json(path)
 
 
-def test_the_stimulus_record_reads_back_and_refuses_what_it_does_not_know() -> None:
+def test_stimulus_record_is_read_back_and_refuses_unknown_versions() -> None:
     record = short_run().metadata[RECORD]
     assert Stimulus.from_metadata(record).to_metadata() == record
     with pytest.raises(TraceUnsupported, match="version"):
@@ -271,7 +272,7 @@ def test_the_stimulus_record_reads_back_and_refuses_what_it_does_not_know() -> N
         Stimulus.from_metadata({**record, "phases": "[{}]"})
 
 
-def test_the_worst_verdict_counts_and_an_unjudged_side_does_not() -> None:
+def test_worst_verdict_of_judged_sides_counts() -> None:
     assert worst([Verdict.PASS, Verdict.FAIL]) is Verdict.FAIL
     assert worst([Verdict.NOT_APPLICABLE, Verdict.PASS]) is Verdict.PASS
     assert worst([]) is Verdict.NOT_APPLICABLE

@@ -1,4 +1,4 @@
-"""The report page: self-contained, complete, and safe with what is in a recording."""
+"""Test the HTML report: self-contained, complete, and external text is escaped."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
 from tests.conformance_helpers import copy_of, of, short_run
+from tests.each import each
 from tests.report_helpers import HOSTILE, result_of_every_kind
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
@@ -68,7 +69,7 @@ def failing() -> str:
     return render(judge(view, subject={"recording": "dex1_hand_dropout.mcap"}), view)
 
 
-def test_it_needs_nothing_but_itself(failing: str) -> None:
+def test_page_loads_no_other_files(failing: str) -> None:
     structure = parsed(failing)
     assert all(link.startswith("#") for link in structure.links)
     assert "script" not in structure.counts
@@ -76,24 +77,24 @@ def test_it_needs_nothing_but_itself(failing: str) -> None:
     assert len(failing) < 200_000
 
 
-def test_verdict_evidence_and_every_requirement_are_on_it(failing: str) -> None:
+def test_page_has_verdict_evidence_and_every_requirement(failing: str) -> None:
     assert '<header class="verdict bad">' in failing
     assert "<h1>Fail<small>" in failing
     assert "a gap from 9.49" in failing
     assert 'class="alarm"' in failing
     for requirement in catalogue("dex1-1"):
         assert requirement.id in failing
-    # per side: position, force, intervals twice; the gap has two of its own
+    # per side: position, force, intervals twice; the gap has two more
     assert parsed(failing).counts["svg"] == 8 + 2
 
 
-def test_it_knows_light_dark_phone_and_print(failing: str) -> None:
+def test_page_has_styles_for_light_dark_phone_and_print(failing: str) -> None:
     for query in ("prefers-color-scheme:dark", "max-width:640px", "@media print"):
         assert query in failing
     assert 'name="viewport"' in failing
 
 
-def test_a_live_run_shows_its_phases() -> None:
+def test_page_of_live_run_shows_phases() -> None:
     view = Recording.of(short_run())
     page = render(judge(view, subject={"backend": "x", "device": "emulated"}), view)
     parsed(page)
@@ -102,7 +103,7 @@ def test_a_live_run_shows_its_phases() -> None:
     assert ">silence</span>" in page
 
 
-def test_a_hand_that_was_never_heard_has_a_page_too() -> None:
+def test_page_of_hand_without_state_is_written() -> None:
     trace = copy_of(short_run())
     trace.rows = {k: v for k, v in trace.rows.items() if k[0].endswith("cmd")}
     view = Recording.of(trace)
@@ -111,7 +112,7 @@ def test_a_hand_that_was_never_heard_has_a_page_too() -> None:
     assert "No state of this hand was received" in page
 
 
-def test_nan_in_states_does_not_reach_the_drawing() -> None:
+def test_nan_in_states_is_not_drawn() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"}))
     view = Recording.of(run_virtual(plan, gripper.NanVelocity))
     assert "nan" not in "".join(re.findall(r' d="[^"]*"', render(judge(view), view)))
@@ -144,7 +145,7 @@ def test_every_verdict_is_rendered_from_the_result_alone() -> None:
         assert not link.startswith("#") or f'id="{link[1:]}"' in page
 
 
-def test_text_from_outside_is_escaped() -> None:
+def test_external_text_is_escaped() -> None:
     page = render(result_of_every_kind(HOSTILE), link="../a b/<script>.mcap")
     structure = parsed(page)
     assert "script" not in structure.counts
@@ -152,14 +153,14 @@ def test_text_from_outside_is_escaped() -> None:
     assert not re.search(r"https?://", re.sub(r"\(http://evil.example\)", "", page))
 
 
-def test_a_busy_testing_machine_is_not_passed_over() -> None:
+def test_page_reports_a_busy_machine() -> None:
     result = result_of_every_kind()
     assert "machine was busy" not in render(result).partition("</header>")[0]
     result.harness["starved"] = 0.5
     assert "waited for a processor in 50.0% of the run" in render(result).partition("</header>")[0]
 
 
-def test_a_page_does_not_grow_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_of_plots_on_page_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
     result = judge(view)
     monkeypatch.setattr("dexkit.conformance.report.html._PLOT_BUDGET", 1)
@@ -182,7 +183,7 @@ def luminance(colour: str) -> float:
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
+@each("theme", ["light", "dark"])
 def test_text_has_contrast(failing: str, theme: str) -> None:
     blocks = re.findall(r":root\{([^}]*)\}", failing)
     colours: dict[str, str] = {}
@@ -220,7 +221,7 @@ WRONG = {m.name: m.made for m in mutants() if m.model == "dex1-1"}
         ("OldTopic", {"step"}, "TOPIC-01", ["On the network"]),
     ],
 )
-def test_a_failure_shows_the_plots_of_its_requirement(
+def test_failure_shows_plots_of_its_requirement(
     name: str, phases: set[str], need: str, titles: list[str]
 ) -> None:
     view = Recording.of(
@@ -240,7 +241,7 @@ def test_a_failure_shows_the_plots_of_its_requirement(
         assert 'class="faint line"' in figures[0]
 
 
-def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
+def test_usb_failure_shows_bytes_joints_or_descriptors() -> None:
     kinds = {
         wrong_usb.StaleCrc: "transfer from the hand",
         wrong_usb.Backwards: "joint positions in the answers",
@@ -263,7 +264,7 @@ floats = st.floats(-1e6, 1e6)
 
 @settings(max_examples=60)
 @given(values=st.lists(floats, min_size=1, max_size=400), points=st.integers(10, 50))
-def test_thinning_keeps_the_extremes_and_the_order(values: list[float], points: int) -> None:
+def test_thinned_curve_keeps_extremes_and_order(values: list[float], points: int) -> None:
     x, y = np.arange(len(values), dtype=float), np.array(values)
     xs, ys = thin(x, y, points)
     assert len(xs) <= max(points, len(values) if len(values) <= points else 0)
@@ -280,12 +281,12 @@ def test_ticks_lie_within_and_are_few(low: float, width: float) -> None:
     assert all(low - slack <= t <= low + width + slack for t in ticks)
 
 
-def test_a_curve_is_cut_where_samples_are_missing() -> None:
+def test_curve_has_gaps_at_missing_samples() -> None:
     x = np.concatenate((np.arange(0, 1, 0.01), np.arange(3, 4, 0.01)))
     assert [len(p[0]) for p in pieces(x, x)] == [100, 100]
 
 
-def test_a_curve_of_nothing_but_gaps_stays_small() -> None:
+def test_curve_with_many_gaps_is_limited() -> None:
     x = (np.arange(3000) + np.repeat(np.arange(1000) * 100, 3)) * 0.001
     assert len(pieces(x, x)) == MAX_GAPS + 1
     figure = chart("t", [Line("a", "state", x, np.sin(x))], y_unit="", span=(0, float(x[-1])))

@@ -1,6 +1,6 @@
-"""The pages in a real browser: nothing sticks out on a phone, nothing is loaded, nothing fails.
+"""Test the HTML pages in a real browser: width on a phone, loaded files and console errors.
 
-A browser's window has a least width, so the page stands in a frame that is as wide as a phone.
+A browser's window has a minimum width, so the page is in a frame that is as wide as a phone.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ const innerWidthOf = frame => frame.contentWindow.innerWidth;
 def seen(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[dict[str, dict[str, object]], list[str]]:
-    """What the browser measured in each page, and what its console said."""
+    """What the browser measured in each page, and the lines of its console."""
     browser = chromium()
     if browser is None:
         pytest.skip("no chromium here")
@@ -56,7 +56,7 @@ def seen(
         "report": page,
         "kinds": render(result_of_every_kind("averylongwordthatfindsnoplacetobreak" * 3)),
         "compare": render_comparison(Comparison([*runs, *runs])),
-        # what the measurement has to notice
+        # the measurement must detect this
         "wide": page.replace("<main>", '<main><p style="width:600px">wide</p>'),
         "loads": page.replace("<main>", '<main><img alt="" src="http://loads.invalid/x.png">'),
     }
@@ -88,27 +88,27 @@ def seen(
         timeout=120,
         check=False,
     )
-    told = re.findall(r'<pre id="found">(.*?)</pre>', done.stdout)
-    assert told, done.stderr[-2000:]
+    reports = re.findall(r'<pre id="found">(.*?)</pre>', done.stdout)
+    assert reports, done.stderr[-2000:]
     console = [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
-    return json.loads(unescape(told[-1])), console
+    return json.loads(unescape(reports[-1])), console
 
 
 @pytest.mark.parametrize("name", ["report", "kinds", "compare"])
-def test_nothing_sticks_out_on_a_phone(
+def test_page_is_not_wider_than_a_phone(
     seen: tuple[dict[str, dict[str, object]], list[str]], name: str
 ) -> None:
     found, _ = seen
     assert found[name] == {"width": PHONE, "wide": []}
 
 
-def test_a_wide_page_would_be_noticed(
+def test_measurement_detects_a_wide_page(
     seen: tuple[dict[str, dict[str, object]], list[str]],
 ) -> None:
     assert seen[0]["wide"]["width"] != PHONE
 
 
-def test_nothing_is_loaded_and_nothing_fails(
+def test_page_loads_nothing_and_logs_no_errors(
     seen: tuple[dict[str, dict[str, object]], list[str]], tmp_path: Path
 ) -> None:
     _, console = seen

@@ -1,4 +1,4 @@
-"""Markdown, badge, JUnit, comparison, and the commands that write them."""
+"""Test Markdown, badge, JUnit and comparison, and the commands that write them."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
 from tests.conformance_helpers import short_run
+from tests.each import each
 from tests.report_helpers import HOSTILE, result_of_every_kind, run_named
 
 # ------------------------------------------------------------------------------- Markdown
 
 
-def test_markdown_tells_every_verdict_and_each_failure_wholly() -> None:
+def test_markdown_has_every_verdict_and_full_text_of_failures() -> None:
     result = result_of_every_kind()
     text = render_markdown(result)
     assert text.startswith("## ❌ Fail: plain words as Dex1-1")
@@ -53,7 +54,7 @@ def test_markdown_tells_every_verdict_and_each_failure_wholly() -> None:
     assert "itself late by 0.10 ms (median), 1.50 ms" in text
 
 
-def test_text_from_outside_stays_text() -> None:
+def test_external_text_stays_text_in_markdown() -> None:
     text = render_markdown(result_of_every_kind(HOSTILE))
     text = re.sub(r"`[^`\n]*`", "", text.replace("\\`", ""))  # code shows what it holds
     assert "<script" not in text
@@ -64,7 +65,7 @@ def test_text_from_outside_stays_text() -> None:
         assert len(re.findall(r"(?<!\\)\|", line)) in (len(Verdict) + 2, 6), line
 
 
-def test_a_comment_does_not_grow_without_end() -> None:
+def test_length_of_markdown_is_limited() -> None:
     result = result_of_every_kind()
     bad = next(r for r in result.results if r.verdict is Verdict.FAIL)
     many = [
@@ -77,13 +78,13 @@ def test_a_comment_does_not_grow_without_end() -> None:
     assert len(text) < 65536
 
 
-def test_a_run_without_results_says_so() -> None:
+def test_markdown_reports_a_run_without_results() -> None:
     text = render_markdown(replace(result_of_every_kind(), results=[]))
     assert "Inconclusive" in text
     assert "nothing was judged" in text
 
 
-def test_a_verdict_has_one_name_in_all_reports() -> None:
+def test_verdicts_have_same_name_in_all_reports() -> None:
     for verdict in Verdict:
         assert VERDICTS[verdict].text == str(verdict)
         assert MARKS[verdict][0].lower() == str(verdict)
@@ -92,7 +93,7 @@ def test_a_verdict_has_one_name_in_all_reports() -> None:
 # ---------------------------------------------------------------------------------- badge
 
 
-@pytest.mark.parametrize(
+@each(
     ("verdicts", "subject", "text"),
     [
         ((Verdict.PASS, Verdict.PASS), {}, "2/2 pass"),
@@ -107,7 +108,7 @@ def test_a_verdict_has_one_name_in_all_reports() -> None:
         ((), {}, "inconclusive, 0 of 0 pass"),
     ],
 )
-def test_a_badge_claims_no_more_than_was_shown(
+def test_badge_states_only_what_was_judged(
     verdicts: tuple[Verdict, ...], subject: dict[str, str], text: str
 ) -> None:
     run = run_named("h", "", **dict(zip(("TOPIC_01", "TOPIC_02"), verdicts, strict=False)))
@@ -142,7 +143,7 @@ def test_the_badge_is_an_image_with_its_text() -> None:
 # ---------------------------------------------------------------------------------- JUnit
 
 
-def test_junit_counts_every_verdict_and_stays_xml(tmp_path: Path) -> None:
+def test_junit_counts_every_verdict_and_is_valid_xml(tmp_path: Path) -> None:
     write_junit(result_of_every_kind(HOSTILE), tmp_path / "r.xml")
     suite = ElementTree.parse(tmp_path / "r.xml").getroot()
     counts = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
@@ -163,7 +164,7 @@ def three_runs() -> list[RunResult]:
     ]
 
 
-def test_regressions_are_named_between_runs_of_one_hand_by_their_time() -> None:
+def test_regressions_compare_runs_of_one_hand_in_order_of_time() -> None:
     found = Comparison(three_runs(), ["new", "old", "other"])
     assert [(c.requirement.id, c.before, c.after) for c in found.regressions] == [
         ("DEX1-RATE-01", 1, 0)
@@ -172,7 +173,7 @@ def test_regressions_are_named_between_runs_of_one_hand_by_their_time() -> None:
     assert better == {"DEX1-RATE-02", "DEX1-MOVE-01"}
 
 
-def test_what_says_nothing_of_the_hand_is_no_regression() -> None:
+def test_unjudged_result_is_not_a_regression() -> None:
     runs = [
         run_named("Grip", "1", TOPIC_01=Verdict.PASS),
         run_named("Grip", "2", TOPIC_01=Verdict.BLOCKED),
@@ -181,7 +182,7 @@ def test_what_says_nothing_of_the_hand_is_no_regression() -> None:
     assert Comparison(runs).changes == []
 
 
-def test_recordings_of_nobody_knows_what_are_not_the_same_hand() -> None:
+def test_unnamed_recordings_are_not_compared_as_one_hand() -> None:
     runs = [
         run_named("a", "1", TOPIC_01=Verdict.PASS),
         run_named("a", "2", TOPIC_01=Verdict.FAIL),
@@ -191,7 +192,7 @@ def test_recordings_of_nobody_knows_what_are_not_the_same_hand() -> None:
     assert Comparison(runs).regressions == []
 
 
-def test_the_comparison_shows_differences_first() -> None:
+def test_comparison_lists_differences_first() -> None:
     page = render_comparison(Comparison(three_runs(), ["new", "old", "other"]))
     differ, agree = page.index("Where they differ (3)"), page.index("Where they agree (1)")
     regress = page.index("Regressions (1)")
@@ -207,13 +208,13 @@ def test_the_comparison_shows_differences_first() -> None:
     assert "fail in Grip (new)" in text
 
 
-def test_hostile_names_stay_text_in_a_comparison() -> None:
+def test_external_names_are_escaped_in_comparison() -> None:
     runs = [result_of_every_kind(HOSTILE), result_of_every_kind("b")]
     assert "<script" not in render_comparison(Comparison(runs))
     assert "<script" not in render_comparison_markdown(Comparison(runs))
 
 
-def test_models_are_not_mixed() -> None:
+def test_comparison_refuses_different_models() -> None:
     other = replace(run_named("a", "1"), subject={"model": "dex3-1"})
     with pytest.raises(UsageError, match=r"different models: dex1-1, dex3-1"):
         Comparison([run_named("a", "1"), other])
@@ -224,7 +225,7 @@ def test_models_are_not_mixed() -> None:
 # ------------------------------------------------------------------------- from the suite
 
 
-def test_the_suite_writes_the_files_that_were_asked_for(tmp_path: Path) -> None:
+def test_suite_writes_requested_report_files(tmp_path: Path) -> None:
     options = SuiteOptions.make(
         backend="sim-dex1",
         side="left",
@@ -256,7 +257,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_reports_are_written_again_from_the_file(judged: Path, tmp_path: Path) -> None:
+def test_reports_are_rendered_again_from_result_file(judged: Path, tmp_path: Path) -> None:
     done = run(
         "report",
         judged / "result.json",
@@ -279,7 +280,7 @@ def test_reports_are_written_again_from_the_file(judged: Path, tmp_path: Path) -
     assert ElementTree.parse(tmp_path / "r.xml").getroot().tag == "testsuite"
 
 
-def test_without_a_recording_the_page_has_words_only(judged: Path, tmp_path: Path) -> None:
+def test_page_without_recording_has_no_plots(judged: Path, tmp_path: Path) -> None:
     alone = tmp_path / "result.json"
     alone.write_bytes((judged / "result.json").read_bytes())
     assert run("report", alone, "--html", tmp_path / "r.html").exit_code == 0
@@ -289,7 +290,7 @@ def test_without_a_recording_the_page_has_words_only(judged: Path, tmp_path: Pat
     assert "a gap from 9.49" in page
 
 
-def test_another_recording_is_refused(judged: Path, tmp_path: Path) -> None:
+def test_report_refuses_another_recording(judged: Path, tmp_path: Path) -> None:
     other = sample_path("dex1_pick_place")
     page = tmp_path / "r.html"
     done = run("report", judged / "result.json", "--recording", other, "--html", page)
@@ -304,7 +305,7 @@ def test_another_recording_is_refused(judged: Path, tmp_path: Path) -> None:
     assert "<svg" not in page.read_text()
 
 
-def test_the_table_and_the_summary_go_to_the_terminal(judged: Path) -> None:
+def test_terminal_shows_table_and_summary(judged: Path) -> None:
     table = run("report", judged / "result.json")
     assert "DEX1-RATE-03" in table.output
     assert "FAIL: a MUST is not met" in table.output
@@ -312,7 +313,7 @@ def test_the_table_and_the_summary_go_to_the_terminal(judged: Path) -> None:
     assert run("report", judged / "result.json", "--markdown", "-").output.startswith("## ❌ Fail")
 
 
-def test_a_terminal_tells_once_what_holds_for_both_hands() -> None:
+def test_terminal_prints_facts_of_both_hands_once() -> None:
     result = result_of_every_kind("a word " * 30)
     out = io.StringIO()
     print_result(result, Console(file=out, width=80), verbose=True)
@@ -350,7 +351,7 @@ def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) 
     assert "Nowhere: all verdicts agree" in same.output
 
 
-def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
+def test_invalid_result_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("{}")
     for args in (["report"], ["badge"], ["compare", tmp_path / "x.json"]):
         done = run(*args, tmp_path / "x.json")
@@ -359,7 +360,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     assert run("compare").exit_code == 2
 
 
-def test_a_part_of_the_catalogue_is_told_as_a_part(tmp_path: Path) -> None:
+def test_reports_state_that_only_a_part_was_selected(tmp_path: Path) -> None:
     result = replace(run_named("G", "2026-01-01", TOPIC_01=Verdict.PASS), catalogue=67)
     assert result.partial
     assert "(1 of 67 requirements: 1 pass)" in result.sentence()

@@ -1,4 +1,4 @@
-"""The catalogue: well formed, complete, documented."""
+"""Test that the catalogue is well formed, complete and documented."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import model
 from tests import hostile
+from tests.each import each
 
 GOOD = """
 model = "dex1-1"
@@ -44,8 +45,8 @@ def test_tolerances_come_from_the_model_and_fill_the_sentence() -> None:
     assert requirement.sentence == "At most 1."
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
+@each(
+    ("old", "new", "expected"),
     [
         ('id = "DEX1-X-01"', 'id = "x"', "an id is like"),
         ('level = "MUST"', 'level = "must"', "level is one of"),
@@ -62,8 +63,8 @@ def test_tolerances_come_from_the_model_and_fill_the_sentence() -> None:
         ('model = "dex1-1"', 'model = "dex1-1"\nretried = []', "unknown keys ['retried']"),
     ],
 )
-def test_what_is_wrong_in_a_requirement_is_said(old: str, new: str, says: str) -> None:
-    with pytest.raises(UsageError, match=says.replace("[", r"\[").replace("]", r"\]")):
+def test_error_names_the_mistake_in_a_requirement(old: str, new: str, expected: str) -> None:
+    with pytest.raises(UsageError, match=expected.replace("[", r"\[").replace("]", r"\]")):
         parse(GOOD.replace(old, new))
 
 
@@ -75,7 +76,7 @@ like = "DEX1-X-01"
 """
 
 
-def test_what_is_like_another_takes_what_it_does_not_say() -> None:
+def test_like_entry_inherits_missing_keys() -> None:
     theirs = {
         "id": "DEX1-X-01",
         "area": "A",
@@ -94,7 +95,7 @@ def test_what_is_like_another_takes_what_it_does_not_say() -> None:
     assert (alike.id, alike.like, alike.model) == ("DEX5-X-01", "DEX1-X-01", "dex5-1")
     assert alike.sentence == "From 1 to 2 on rt/dex5/SIDE/state."
     assert alike.rationale == "see DEX5-Y-01"
-    # somebody else's evidence is none for this hand
+    # evidence for another model is none for this hand
     assert (alike.source, alike.confidence) == ("as DEX1-X-01: s", "inferred")
     own = LIKE + 'level = "INFO"\nconfidence = "measured"\ntolerances = { high = 3 }\n'
     (other,) = parse(own, others=others)
@@ -104,7 +105,7 @@ def test_what_is_like_another_takes_what_it_does_not_say() -> None:
         parse(LIKE)
 
 
-def test_what_is_expected_is_the_sentence_unless_it_is_said_shorter() -> None:
+def test_expected_is_the_sentence_unless_given() -> None:
     (requirement,) = parse(GOOD)
     assert requirement.expected == requirement.sentence
     (short,) = parse(GOOD + 'expected = "{limit:g} s"\ncause = "c"\nrepeat = 3\n')
@@ -115,7 +116,7 @@ def test_every_must_and_should_has_a_likely_cause() -> None:
     assert [r.id for r in catalogue(None, None) if r.level is not Level.INFO and not r.cause] == []
 
 
-def test_an_id_occurs_once() -> None:
+def test_requirement_ids_are_unique() -> None:
     table = GOOD[GOOD.index("[[") :]
     with pytest.raises(UsageError, match="occurs once"):
         parse(GOOD + table)
@@ -127,12 +128,12 @@ def test_every_requirement_has_one_check_and_every_check_a_requirement() -> None
     assert set(REGISTRY) <= {r.id for r in every}
 
 
-def test_every_requirement_has_a_hand_that_breaks_it() -> None:
+def test_every_requirement_has_a_wrong_hand() -> None:
     assert {m.kills for m in mutants("dds")} == {r.id for r in catalogue()}
 
 
-@pytest.mark.parametrize("name", models())
-def test_every_stimulus_that_is_needed_exists(name: str) -> None:
+@each("name", models())
+def test_needed_stimuli_exist(name: str) -> None:
     needed = phases_for(catalogue(name))
     dialect = model(name).dialects[0]
     plan = Plan(dialect, tuple(Side), default_objects(dialect, tuple(Side)), phases=needed)
@@ -141,7 +142,7 @@ def test_every_stimulus_that_is_needed_exists(name: str) -> None:
     assert needed - {p.name for p in script.phases} == {"replay"}  # there is no session here
 
 
-def test_dependencies_bring_their_stimuli() -> None:
+def test_selection_includes_stimuli_of_dependencies() -> None:
     (only,) = select(catalogue(), prefixes=["DEX1-LIFE-02"])
     assert {"restart", "resume", "step"} <= phases_for([only])
 
@@ -159,7 +160,7 @@ def test_select() -> None:
         select(catalogue(), level="may")
 
 
-def test_what_is_quick_can_be_told_of_every_hand_at_once() -> None:
+def test_quick_requirements_are_known_for_all_models() -> None:
     everything = catalogue(layer=None)
     assert {r.layer for r in everything} == set(LAYERS)
     names = dict.fromkeys(r.model for r in everything)
@@ -168,7 +169,7 @@ def test_what_is_quick_can_be_told_of_every_hand_at_once() -> None:
     assert quick(everything) == tuple(r for found in each for r in found)
 
 
-def test_what_cannot_be_written_is_told_before_the_run(
+def test_unwritable_output_is_reported_before_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UsageError, match="it is a directory"):
@@ -178,7 +179,7 @@ def test_what_cannot_be_written_is_told_before_the_run(
         SuiteOptions.make(backend="sim-dex1", json=tmp_path / "r.json")
 
 
-def test_what_is_no_catalogue_is_refused_by_name() -> None:
+def test_invalid_catalogue_is_refused_by_name() -> None:
     rng = random.Random(1)
     document = parse_toml(GOOD, "good")
     good = 0

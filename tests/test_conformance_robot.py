@@ -1,4 +1,4 @@
-"""The conformance of robots: a good one passes, wrong ones are caught, and a run on DDS."""
+"""Test conformance of robots: the reference passes, wrong robots fail, and a run on DDS."""
 
 from __future__ import annotations
 
@@ -46,6 +46,7 @@ from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import crc_of, verify_payload
 from tests.conformance_helpers import copy_of, short_run
 from tests.dds_helpers import free_domain
+from tests.each import each
 from tests.test_conformance_schema import validate
 
 NAMES = list(ROBOTS)
@@ -61,7 +62,7 @@ def everything(name: str) -> frozenset[str]:
 
 @cache
 def listened(name: str, service: type[ReferenceRobot] = ReferenceRobot) -> MemoryTrace:
-    """A robot that is listened to, and told to hold."""
+    """Run a robot through the phases listen and hold."""
     return run_virtual(plan(name, ()), service)
 
 
@@ -72,24 +73,24 @@ def judged(trace: MemoryTrace, name: str) -> RunResult:
 # ----------------------------------------------------------------------------------- the wire
 
 
-@pytest.mark.parametrize("model", ROBOTS.values(), ids=NAMES)
-def test_commands_are_what_the_codec_reads(model: RobotModel) -> None:
+@each("model", ROBOTS.values(), ids=NAMES)
+def test_robot_commands_are_decoded_by_the_codec(model: RobotModel) -> None:
     wire = RobotWire(robot_dialect(model.name))
     motors = [Motor(0.1 * i, 0.2, 0.3, 4.0, 0.5, i % 3) for i in range(model.slots)]
     payload = wire.low_command(motors, 7)
     assert verify_payload(model.cmd_type, payload)
     message = decode(model.cmd_type, payload)
     read = [(m.mode, m.q, m.dq, m.tau, m.kp, m.kd) for m in message.motor_cmd]
-    told = [(m.mode, *np.float32((m.q, m.dq, m.tau, m.kp, m.kd)).tolist()) for m in motors]
-    assert read == told
+    sent = [(m.mode, *np.float32((m.q, m.dq, m.tau, m.kp, m.kd)).tolist()) for m in motors]
+    assert read == sent
     if model is G1:
         assert message.mode_machine == 7
     else:
         assert (*message.head, message.level_flag) == (0xFE, 0xEF, 0xFF)
 
 
-@pytest.mark.parametrize("kind", SPOILS)
-def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
+@each("kind", SPOILS)
+def test_damaged_commands_differ_only_in_crc(kind: str) -> None:
     wire = RobotWire(robot_dialect("h1"))
     motors = [Motor(q=0.5)] * 20
     good, bad = wire.low_command(motors, 0), wire.low_command(motors, 0, kind)
@@ -104,7 +105,7 @@ def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["h1", pytest.param("g1", marks=pytest.mark.soak)])
-def test_a_good_robot_passes_everything(name: str) -> None:
+def test_reference_robot_passes_every_requirement(name: str) -> None:
     result = judged(run_virtual(plan(name, everything(name)), ReferenceRobot), name)
     bad = [r.explain() for r in result.results if r.verdict is not Verdict.PASS]
     assert not bad, "\n".join(bad)
@@ -120,7 +121,7 @@ def blamed(robot: type[ReferenceRobot], model: str, *phases: str) -> set[str]:
 
 
 def _one_of_each() -> list[Mutant]:
-    """A wrong robot for each check of a MUST, and what only a G1 has."""
+    """A wrong robot for each check of a MUST, and for the requirements of the G1 alone."""
     by_id = {r.id: r for r in catalogue(None, "robot")}
     found: dict[object, Mutant] = {}
     for mutant in mutants("robot"):
@@ -131,19 +132,19 @@ def _one_of_each() -> list[Mutant]:
 
 
 @pytest.mark.parametrize("mutant", _one_of_each(), ids=lambda m: f"{m.model}-{m.name}")
-def test_a_wrong_robot_is_caught(mutant: Mutant) -> None:
+def test_wrong_robot_fails_its_requirement(mutant: Mutant) -> None:
     assert try_one(mutant, short=True) == Outcome(mutant), mutant.summary
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_requirement_has_a_check_and_a_robot_that_breaks_it(name: str) -> None:
+@each("name", NAMES)
+def test_every_requirement_has_a_check_and_a_wrong_robot(name: str) -> None:
     every = catalogue(name, "robot")
     assert {m.kills for m in mutants() if m.model == name} == {r.id for r in every}
     assert all(check_of(r) for r in every)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_stimulus_that_is_needed_exists(name: str) -> None:
+@each("name", NAMES)
+def test_needed_stimuli_exist(name: str) -> None:
     script = script_class(name)(plan(name, everything(name)))
     assert 15 < script.length() < 40
     assert everything(name) <= {p.name for p in script.phases}
@@ -152,7 +153,7 @@ def test_every_stimulus_that_is_needed_exists(name: str) -> None:
 # ------------------------------------------------------------------------------ single findings
 
 
-def test_a_crc_that_was_never_set_is_told_from_a_wrong_one() -> None:
+def test_cause_distinguishes_unset_crc_from_wrong_crc() -> None:
     def cause(service: type[ReferenceRobot]) -> str:
         results = judged(listened("h1", service), "h1").results
         return next(r.cause for r in results if r.requirement.id == "H1-CRC-01")
@@ -161,13 +162,13 @@ def test_a_crc_that_was_never_set_is_told_from_a_wrong_one() -> None:
     assert "CDR" in cause(CdrCrc)
 
 
-def test_a_robot_that_waits_is_woken() -> None:
+def test_robot_that_waits_for_commands_is_commanded() -> None:
     assert blamed(WaitsForCommands, "g1") == {"G1-START-01"}
 
 
-def test_a_robot_that_says_nothing_is_not_commanded_for_long() -> None:
+def test_script_ends_early_without_state() -> None:
     class Mute(ReferenceRobot):
-        """Nothing at all."""
+        """Publishes no state."""
 
         def publish(self) -> list[object]:  # type: ignore[override]
             return []
@@ -181,8 +182,8 @@ def test_a_robot_that_says_nothing_is_not_commanded_for_long() -> None:
     assert failed == {"H1-TOPIC-01"}
 
 
-def test_a_machine_that_was_busy_is_not_the_robots_fault() -> None:
-    """The gap of a tenth of a second is blocked where the kit's own timer stood still as long."""
+def test_failure_on_busy_machine_is_blocked() -> None:
+    """A gap of 0.1 s is blocked when the kit's timer was late by as much."""
     trace = listened("h1")
     ((key, rows),) = ((k, r) for k, r in trace.rows.items() if k[0] == "rt/lowstate")
     begin = rows[200][0]
@@ -216,7 +217,7 @@ class DiesOfNaN(ReferenceRobot):
 
 
 class Hiccup(ReferenceRobot):
-    """Is kept from publishing for a fifth of a second, when NaNs come."""
+    """Publishes nothing for 0.2 s after a NaN."""
 
     since = math.inf
 
@@ -229,7 +230,7 @@ class Hiccup(ReferenceRobot):
         return [] if self.since <= self.now < self.since + 0.25 else super().publish()
 
 
-def test_a_robot_that_dies_of_a_command_is_told_from_a_late_one() -> None:
+def test_robot_that_stops_publishing_fails_and_late_one_is_not_judged() -> None:
     assert "H1-SAFE-01" in blamed(DiesOfNaN, "h1", "nan")
     assert blamed(Hiccup, "h1", "nan") == set()
 
@@ -238,7 +239,7 @@ def test_a_robot_that_dies_of_a_command_is_told_from_a_late_one() -> None:
 
 
 def write(trace: MemoryTrace, path: Path, *, bare: bool = False) -> Path:
-    """As a file; ``bare`` without what only the kit writes."""
+    """Write a trace to a file; with ``bare`` without the kit's metadata."""
     with Recorder(path) as recorder:
         for (topic, kind), rows in trace.rows.items():
             for log, sent, data in rows:
@@ -250,7 +251,7 @@ def write(trace: MemoryTrace, path: Path, *, bare: bool = False) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
+def test_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
     path = write(listened(name), tmp_path / "run.mcap")
     files = [f"{option}={tmp_path / file}" for option, file in FILES.items()]
     result = CliRunner().invoke(command, [str(path), *files])
@@ -268,7 +269,7 @@ def test_a_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
 FILES = {"--json": "result.json", "--html": "report.html", "--junit": "junit.xml"}
 
 
-def test_somebody_elses_recording_shows_what_needs_no_stimulus(tmp_path: Path) -> None:
+def test_recording_without_stimulus_is_judged_in_part(tmp_path: Path) -> None:
     path = write(listened("g1", CdrCrc), tmp_path / "session.mcap", bare=True)
     result = CliRunner().invoke(command, [str(path)])
     assert result.exit_code == 1
@@ -289,7 +290,7 @@ def test_somebody_elses_recording_shows_what_needs_no_stimulus(tmp_path: Path) -
         robot_recording(MemoryTrace(), "h1")
 
 
-def test_hands_come_first_and_the_robot_is_mentioned(tmp_path: Path) -> None:
+def test_recording_with_hands_and_robot_judges_hands_and_mentions_robot(tmp_path: Path) -> None:
     whole = copy_of(short_run())
     whole.rows.update(listened("g1").rows)
     path = write(whole, tmp_path / "robot.mcap", bare=True)
@@ -304,14 +305,14 @@ def test_hands_come_first_and_the_robot_is_mentioned(tmp_path: Path) -> None:
         recording_of(open_trace(path), "g1", (Side.LEFT,))
 
 
-def test_a_stimulus_record_of_an_earlier_version_is_read() -> None:
+def test_earlier_stimulus_record_is_read() -> None:
     record = listened("h1").metadata["dexkit.stimulus"]
     earlier = {name: text.replace('"robot"', '"body"') for name, text in record.items()}
     assert earlier != record
     assert Stimulus.from_metadata(earlier).to_metadata() == record
 
 
-def test_the_requirements_are_listed_without_a_recording() -> None:
+def test_requirements_are_listed_without_recording() -> None:
     result = CliRunner().invoke(command, ["--list", "--dialect", "h1", "--level", "must"])
     assert result.exit_code == 0
     musts = [r for r in catalogue("h1", "robot") if r.level is Level.MUST]
@@ -321,7 +322,7 @@ def test_the_requirements_are_listed_without_a_recording() -> None:
 # ------------------------------------------------------------------------------------ live runs
 
 
-def test_what_is_about_hands_is_refused() -> None:
+def test_hand_options_are_refused_for_robots() -> None:
     options = SuiteOptions.make(backend="sim-g1")
     assert (options.sides, options.dialect.name) == ((ROBOT,), "g1")
     assert {r.layer for r in options.requirements} == {"robot"}
@@ -338,7 +339,7 @@ def test_what_is_about_hands_is_refused() -> None:
     assert SuiteOptions.make(backend="external", dialect_name="h1").domain == 0
 
 
-def test_an_emulated_robot_passes_on_dds(tmp_path: Path) -> None:
+def test_emulated_robot_passes_on_dds(tmp_path: Path) -> None:
     wanted = select(catalogue("g1", "robot"), prefixes=["G1-LIFE-01", "G1-CRC-01", "G1-TOPIC"])
     rig = RigOptions("sim-g1", (ROBOT,), robot_dialect("g1"), free_domain())
     path = tmp_path / "run.mcap"

@@ -1,4 +1,4 @@
-"""Result files are what their published schema says."""
+"""Test result files against their published schema."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def validate(data: object) -> None:
     jsonschema.Draft202012Validator(schema()).validate(data)
 
 
-def test_the_schema_is_one() -> None:
+def test_schema_is_valid() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
 
 
@@ -57,7 +57,7 @@ def test_a_result_with_claims_and_stimulus_validates() -> None:
         validate({**data, "surprise": 1})
 
 
-def test_the_schema_knows_every_value() -> None:
+def test_schema_lists_every_enumeration_value() -> None:
     known = schema()
     properties, defs = known["properties"], known["$defs"]
     assert properties["version"]["const"] == VERSION

@@ -1,4 +1,4 @@
-"""The suite as a user runs it: pytest options, and live runs on DDS."""
+"""Test the suite as users run it: pytest options, and live runs on DDS."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def suite(*arguments: object, timeout: float = 120) -> subprocess.CompletedProce
 # --------------------------------------------------------------------------------- options
 
 
-def test_without_a_backend_it_skips_says_how_and_is_no_success() -> None:
+def test_without_backend_tests_are_skipped_with_hint_and_exit_code() -> None:
     run = suite("conformance/", "-rs")
     assert run.returncode == 2
     assert "Nothing was judged, which is not a pass" in run.stdout
@@ -60,17 +60,17 @@ def test_without_a_backend_it_skips_says_how_and_is_no_success() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (("--side", "left"), "--side without --backend"),
         (("--backend", "sim-dex1", "--trace", "missing.mcap"), "no such file: missing.mcap"),
         (("--backend", "sim-dex1", "--json", "/no/such/r.json"), "cannot write /no/such/r.json"),
     ],
 )
-def test_what_makes_no_sense_is_a_usage_error(arguments: tuple[str, ...], says: str) -> None:
+def test_invalid_options_are_usage_errors(arguments: tuple[str, ...], expected: str) -> None:
     run = suite("conformance/", *arguments)
     assert run.returncode == 4
-    assert says in run.stderr
+    assert expected in run.stderr
 
 
 def test_requirements_are_the_test_ids() -> None:
@@ -82,30 +82,30 @@ def test_requirements_are_the_test_ids() -> None:
     assert ids == [f"test_requirement[DEX1-RATE-0{i}-left]" for i in range(1, 5)]
 
 
-def test_a_selection_that_leaves_nothing_is_no_success() -> None:
+def test_empty_selection_is_not_success() -> None:
     run = suite("conformance/", "--backend", "sim-dex1", "-k", "nothing-is-called-so")
     assert run.returncode == 2, run.stdout
     assert "Nothing was judged, which is not a pass. No requirement was left" in run.stdout
 
 
-def test_a_suite_that_a_vendors_pytest_settings_hide_is_said_to_be() -> None:
+def test_suite_hidden_by_pytest_settings_is_reported() -> None:
     run = suite("conformance/", "--backend", "sim-dex1", "-o", "python_files=check_*.py")
     assert run.returncode == 2, run.stdout
     assert "pytest found none of the suite's tests" in run.stdout
     assert "add -c /dev/null" in run.stdout
 
 
-def test_a_hand_that_cannot_be_reached_is_no_success() -> None:
+def test_unreachable_hand_is_not_success() -> None:
     run = suite(
         "conformance/", "-p", "tests.short_discovery", "--backend", "external", "--quick",
         "--domain", str(free_domain()), "--side", "left",
     )  # fmt: skip
     assert run.returncode == 2, run.stdout
-    assert "nobody publishes rt/dex1/left/state" in run.stdout
+    assert "publishes rt/dex1/left/state" in run.stdout
     assert "passed" not in run.stdout
 
 
-def test_one_hand_is_judged_by_one_run() -> None:
+def test_all_requirements_of_a_hand_use_one_run() -> None:
     run = suite("conformance/", "--backend", "sim-dex1", "-n", "2")
     assert run.returncode == 4
     assert "does not work with pytest-xdist's -n" in run.stderr
@@ -119,7 +119,7 @@ def listed(*arguments: object) -> list[list[str]]:
     return [line.split("  ") for line in rows]
 
 
-def test_the_selection_is_listed_without_a_hand(tmp_path: Path) -> None:
+def test_selection_is_listed_without_hand(tmp_path: Path) -> None:
     claims = tmp_path / "capabilities.toml"
     claims.write_text("[claims]\nvelocity = true\n")
     rows = listed("--require", "DEX1-FIELD", "--capabilities", claims)
@@ -138,14 +138,14 @@ def test_the_selection_is_listed_without_a_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["dex1-1", "dex3-1"])
-def test_what_is_quick_is_derived_from_the_stimuli(name: str) -> None:
+def test_quick_selection_follows_length_of_stimuli(name: str) -> None:
     every = requirements(name)
     chosen = quick(every)
     phases = phases_for(chosen)
     assert {r.level for r in chosen} == {Level.MUST}
     assert length(name, phases) <= model(name).quick_seconds
     assert "replay" not in phases
-    # it is about motion, and nothing that comes without a further stimulus is left out
+    # motion is included, and all that needs no further stimulus
     assert any(r.area == "Motion" for r in chosen)
     musts = [r for r in every if r.level is Level.MUST]
     assert {r.id for r in musts if phases_for([r]) <= phases} == {r.id for r in chosen}
@@ -153,7 +153,7 @@ def test_what_is_quick_is_derived_from_the_stimuli(name: str) -> None:
     assert quick([r for r in every if r.level is not Level.MUST]) == ()
 
 
-def test_the_length_of_a_stimulus_is_that_of_a_run() -> None:
+def test_length_of_stimulus_equals_length_of_run() -> None:
     plan = replace(plan_for(), phases=frozenset({"step", "nan", "squeeze"}), session=None)
     recording = Recording.of(run_virtual(plan, ReferenceService))
     assert length("dex1-1", plan.phases) == pytest.approx(recording.duration, rel=0.3)
@@ -172,7 +172,7 @@ def test_defaults() -> None:
     assert SuiteOptions.make(backend="sim-dex1", objects=["none"]).objects == {}
 
 
-def test_options_that_contradict_each_other() -> None:
+def test_contradictory_options_are_refused() -> None:
     with pytest.raises(UsageError, match="one --device for two hands"):
         SuiteOptions.make(backend="ezgripper", side="both", devices=["/dev/ttyUSB0"])
     with pytest.raises(UsageError, match="a device is needed for each side"):
@@ -188,7 +188,7 @@ def test_options_that_contradict_each_other() -> None:
     with pytest.raises(UsageError, match="no requirement begins with 'DEX9'"):
         SuiteOptions.make(backend="external", require=["DEX9"])
     with pytest.raises(UnknownBackend):
-        SuiteOptions.make(backend="nobody")
+        SuiteOptions.make(backend="unknown")
 
 
 # ------------------------------------------------------------------------------- live runs
@@ -197,7 +197,7 @@ def test_options_that_contradict_each_other() -> None:
 def run_live(
     service: type[ReferenceService], prefix: str, tmp_path: Path, *, sides: tuple[Side, ...]
 ) -> RunResult:
-    """A hand of the zoo, on DDS, judged by the live suite."""
+    """Judge a reference or wrong hand on DDS by the live suite."""
     domain, chosen = free_domain(), dialect("unitree_go")
     wanted = select(requirements(), prefixes=[prefix])
     path = tmp_path / "run.mcap"
@@ -207,12 +207,12 @@ def run_live(
     return judge(Recording.of(open_trace(path), sides=sides), requirements=wanted)
 
 
-def test_a_good_hand_passes_on_dds(tmp_path: Path) -> None:
+def test_reference_hand_passes_on_dds(tmp_path: Path) -> None:
     result = run_live(ReferenceService, "DEX1-LIFE-01", tmp_path, sides=(Side.LEFT,))
     assert str(result.overall) == "pass"
 
 
-def test_a_hand_that_waits_for_a_command_is_caught_on_dds(tmp_path: Path) -> None:
+def test_hand_that_waits_for_commands_fails_on_dds(tmp_path: Path) -> None:
     result = run_live(
         mix(any_model.SilentUntilCommanded, ReferenceService),
         "DEX1-START",
@@ -222,22 +222,22 @@ def test_a_hand_that_waits_for_a_command_is_caught_on_dds(tmp_path: Path) -> Non
     assert failed(result) == {("DEX1-START-01", "left")}
 
 
-def test_a_hand_that_asks_for_history_is_caught_on_dds(tmp_path: Path) -> None:
+def test_hand_that_requests_transient_local_fails_on_dds(tmp_path: Path) -> None:
     result = run_live(
         mix(any_model.DemandsHistory, ReferenceService), "DEX1-QOS", tmp_path, sides=(Side.LEFT,)
     )
     assert failed(result) == {("DEX1-QOS-01", "left")}
 
 
-def test_nobody_there_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dexkit.conformance.live.DISCOVERY_TIMEOUT", 0.3)  # there is nobody
+def test_missing_hand_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dexkit.conformance.live.DISCOVERY_TIMEOUT", 0.3)  # there is no hand
     rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
-    with pytest.raises(ConformanceError, match="nobody publishes rt/dex1/left/state") as caught:
+    with pytest.raises(ConformanceError, match="publishes rt/dex1/left/state") as caught:
         record_run(LiveOptions(rig, frozenset({"step"})), tmp_path / "run.mcap")
     assert "dexkit doctor" in caught.value.hint
 
 
-def test_a_hand_of_another_dialect_is_named(tmp_path: Path) -> None:
+def test_error_names_dialect_of_the_hand(tmp_path: Path) -> None:
     rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
     legacy = dialect("unitree_actuator")
     with DdsNode(rig.domain, "lo") as other:
@@ -247,7 +247,7 @@ def test_a_hand_of_another_dialect_is_named(tmp_path: Path) -> None:
     assert "--dialect unitree_actuator" in caught.value.hint
 
 
-def test_a_recording_of_nobody_is_a_failure_not_a_success(tmp_path: Path) -> None:
+def test_recording_without_hand_fails(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path):
         pass
@@ -257,7 +257,7 @@ def test_a_recording_of_nobody_is_a_failure_not_a_success(tmp_path: Path) -> Non
     assert result.stage == {"left": "no participant"}
 
 
-def test_it_refuses_to_start_beside_another_client(tmp_path: Path) -> None:
+def test_suite_refuses_to_start_beside_another_client(tmp_path: Path) -> None:
     domain, chosen = free_domain(), dialect("unitree_go")
     rig = RigOptions(EXTERNAL, (Side.LEFT,), chosen, domain)
     with DdsNode(domain, "lo") as other:
@@ -266,7 +266,7 @@ def test_it_refuses_to_start_beside_another_client(tmp_path: Path) -> None:
             record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap")
 
 
-def test_a_service_that_does_not_start_is_the_kits_error(tmp_path: Path) -> None:
+def test_service_that_does_not_start_is_an_error(tmp_path: Path) -> None:
     rig = RigOptions(
         "sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain(), settings=("colour=red",)
     )
@@ -275,7 +275,7 @@ def test_a_service_that_does_not_start_is_the_kits_error(tmp_path: Path) -> None
     assert "colour" in caught.value.hint
 
 
-def test_a_run_can_be_stopped_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_stopped_run_leaves_no_process(tmp_path: Path) -> None:
     rig = RigOptions("sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain())
     stop = threading.Event()
 
@@ -291,9 +291,7 @@ def test_a_run_can_be_stopped_and_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_whoever_ends_the_suite_early_ends_the_hand_in_order(
-    tmp_path: Path, signum: signal.Signals
-) -> None:
+def test_signal_to_suite_ends_the_service_cleanly(tmp_path: Path, signum: signal.Signals) -> None:
     recording = tmp_path / "run.mcap"
     run = subprocess.Popen(
         [
@@ -322,7 +320,7 @@ def test_whoever_ends_the_suite_early_ends_the_hand_in_order(
     assert '"exchanges"' in words[1], words  # its counters, when it has braked
 
 
-def test_the_emulated_ezgripper_passes_as_a_user_runs_it(tmp_path: Path) -> None:
+def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("r.json", "r.html", "r.mcap", "junit.xml")]
     run = suite(
         "conformance/", "--backend", "ezgripper", "--side", "right", "--require", "DEX1-FORCE",
@@ -343,6 +341,6 @@ def test_the_emulated_ezgripper_passes_as_a_user_runs_it(tmp_path: Path) -> None
     assert "DEX1-FORCE-01-right" in files[3].read_text()
     # the recording alone gives the same verdicts
     again = judge(Recording.of(open_trace(files[2])))
-    told = {r["id"]: r["verdict"] for r in result["results"]}
+    expected = {r["id"]: r["verdict"] for r in result["results"]}
     found = {r.requirement.id: str(r.verdict) for r in again.results}
-    assert {name: found[name] for name in told} == told
+    assert {name: found[name] for name in expected} == expected

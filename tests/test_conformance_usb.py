@@ -1,4 +1,4 @@
-"""The USB conformance: its own reading of the protocol, its teeth, and a run on a real socket."""
+"""Test USB conformance: frame codec, wrong devices, and a run over USB/IP."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ from dexkit.models import DEX3_1
 from dexkit.traces import open_trace
 from dexkit.traces.recorder import Recorder
 from dexkit.wire import crc32, dex3_usb
+from tests.each import each
 
 BY_NAME = {m.name: m for m in mutants("usb")}
 ACCEPTABLE = {Verdict.PASS, Verdict.NOT_APPLICABLE}
@@ -57,7 +58,7 @@ def usb() -> tuple[Requirement, ...]:
 # --------------------------------------------------------------------- its reading of the wire
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "crc"),
     [
         (bytes(4), 0xC704DD7B),
@@ -70,18 +71,18 @@ def usb() -> tuple[Requirement, ...]:
         (bytes(1264), 0x2768D24E),
     ],
 )
-def test_its_crc_is_the_fact_sheets(data: bytes, crc: int) -> None:
+def test_crc_matches_documented_vectors(data: bytes, crc: int) -> None:
     assert frames.crc(data) == crc
 
 
 @given(st.binary(max_size=400))
-def test_its_crc_is_the_codecs(data: bytes) -> None:
+def test_crc_equals_the_codecs(data: bytes) -> None:
     whole = data[: len(data) // 4 * 4]
     assert frames.crc(data) == crc32.crc32_words(whole)
 
 
-@pytest.mark.parametrize("size", [1234, 734])
-def test_its_commands_are_what_the_codec_reads(size: int) -> None:
+@each("size", [1234, 734])
+def test_usb_commands_are_decoded_by_the_codec(size: int) -> None:
     joints = DEX3_1.joints[Side.LEFT]
     buses: dict[int, list[bytes]] = {}
     for i, (joint, (bus, number)) in enumerate(zip(joints, BUSES, strict=True)):
@@ -104,14 +105,14 @@ def test_its_commands_are_what_the_codec_reads(size: int) -> None:
 
 @settings(max_examples=100)
 @given(st.binary(max_size=1400), st.booleans())
-def test_any_bytes_can_be_read(data: bytes, filled: bool) -> None:
+def test_reading_any_bytes_raises_no_exception(data: bytes, filled: bool) -> None:
     frame = ReferenceDevice(Side.LEFT).frame()
     reading = frames.read_state(data + frame[len(data) :] if filled else data)
     assert reading.length >= len(data)
     frames.read_command(data)
 
 
-def test_a_damaged_packet_is_seen_and_the_rest_read() -> None:
+def test_damaged_packet_is_reported_and_others_are_read() -> None:
     frame = bytearray(ReferenceDevice(Side.LEFT).frame())
     frame[26 + 10] ^= 1  # in the first motor's position
     frame[26 + 240] ^= 1  # in the head of bus 1's first motor
@@ -125,14 +126,14 @@ def test_a_damaged_packet_is_seen_and_the_rest_read() -> None:
 
 
 @given(st.binary(max_size=100), st.integers(-200, 0), st.integers(0, 2**63))
-def test_a_transfer_comes_back(data: bytes, status: int, when: int) -> None:
+def test_transfer_is_decoded_unchanged(data: bytes, status: int, when: int) -> None:
     transfer = Transfer(when, when + 5, 0x81, status, 4096, data)
     assert Transfer.of(transfer.payload(), when, when + 5) == transfer
     with pytest.raises(TraceUnsupported):
         Transfer.of(transfer.payload()[:-1] if data else b"", when, when)
 
 
-def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
+def test_recording_from_file_gives_same_verdicts(tmp_path: Path) -> None:
     live = run_virtual_usb(ReferenceDevice(Side.RIGHT))
     (hand,) = live.sides.values()
     with Recorder(tmp_path / "run.mcap") as recorder:
@@ -151,11 +152,11 @@ def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
     assert judge_layer(USB, read.since(live.origin_ns), usb()) == judge_layer(USB, live, usb())
 
 
-@pytest.mark.parametrize(
+@each(
     "record",
     [{}, {"version": "2"}, {"version": "1"}, {"version": "1", "stalls": "[]", "left": "{}"}],
 )
-def test_a_damaged_record_is_said(record: dict[str, str]) -> None:
+def test_damaged_record_raises_trace_unsupported(record: dict[str, str]) -> None:
     with pytest.raises(TraceUnsupported):
         UsbRecord.from_metadata(record)
 
@@ -163,7 +164,7 @@ def test_a_damaged_record_is_said(record: dict[str, str]) -> None:
 # ------------------------------------------------------------------------------------- teeth
 
 
-def test_every_requirement_has_a_check_and_a_device_that_breaks_it() -> None:
+def test_every_requirement_has_a_check_and_a_wrong_device() -> None:
     ids = {r.id for r in usb()}
     assert len(ids) >= 40
     assert all(check_of(r) for r in usb())
@@ -181,28 +182,28 @@ def test_the_documented_schema_is_the_current_one() -> None:
 
 
 @pytest.mark.parametrize("side", list(Side))
-def test_a_good_device_passes(side: Side) -> None:
+def test_reference_device_passes(side: Side) -> None:
     results = judge_layer(USB, run_virtual_usb(ReferenceDevice(side)), usb())
     assert [r.explain() for r in results if r.verdict is not Verdict.PASS] == []
     assert len(results) == len(usb())
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_a_wrong_device_is_caught_for_the_right_reason(name: str) -> None:
+def test_wrong_device_fails_only_its_requirements(name: str) -> None:
     mutant = BY_NAME[name]
     assert try_one(mutant) == Outcome(mutant), mutant.summary
 
 
-def test_a_deaf_device_is_not_asked_for_long() -> None:
+def test_script_ends_early_without_answers() -> None:
     results = run_usb_mutant(BY_NAME["Deaf"].made, usb())
     assert {r.verdict for r in results if r.requirement.needs != "nothing"} == {
         Verdict.FAIL,  # no answer
-        Verdict.PASS,  # and nothing unasked
+        Verdict.PASS,  # and no frame without a command
         Verdict.BLOCKED,
     }
 
 
-def test_what_failed_is_said_with_its_place() -> None:
+def test_failure_has_evidence_in_the_recording() -> None:
     results = run_usb_mutant(BY_NAME["SlowTrip"].made, usb())
     (failed,) = [r for r in results if r.verdict is Verdict.FAIL]
     assert failed.requirement.id == "DEX3USB-PROT-02"
@@ -213,7 +214,7 @@ def test_what_failed_is_said_with_its_place() -> None:
     assert 1.4 < place.end_s - place.time_s < 1.6
 
 
-def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
+def test_slow_rate_on_overloaded_machine_is_blocked() -> None:
     from dexkit.conformance.stimulus_record import Beats
 
     recording = run_virtual_usb(BY_NAME["Slow"].made(Side.LEFT))
@@ -227,7 +228,7 @@ def test_a_slow_rate_on_a_starved_machine_is_not_blamed_on_the_device() -> None:
         assert ("too busy" in rate.reason) is (verdict is Verdict.BLOCKED)
 
 
-def test_a_speed_is_not_judged_by_a_few_samples() -> None:
+def test_speed_is_not_judged_with_few_samples() -> None:
     recording = run_virtual_usb(ReferenceDevice(Side.LEFT))
     hand = recording.sides[Side.LEFT]
     gone = {
@@ -252,10 +253,8 @@ def hands() -> Iterator[str]:
         yield tool.place
 
 
-def test_an_emulated_hand_passes_and_a_faulty_one_beside_it_does_not(
-    hands: str, tmp_path: Path
-) -> None:
-    said: list[str] = []
+def test_emulated_hand_passes_and_faulty_hand_fails(hands: str, tmp_path: Path) -> None:
+    messages: list[str] = []
     fault = ("--fault", "silent:id=3")
     with (
         Tool("emulate", "dex3-usb", "--side", "right", "--port", "0", *fault) as faulty,
@@ -263,20 +262,20 @@ def test_an_emulated_hand_passes_and_a_faulty_one_beside_it_does_not(
     ):
         faulty.wait_ready(threading.Event())
         devices = {Side.LEFT: hands, Side.RIGHT: faulty.place}
-        assert run(devices, recorder, say=said.append)
+        assert run(devices, recorder, say=messages.append)
     recording = UsbRecording.of(open_trace(tmp_path / "run.mcap"))
     assert recording is not None
     assert set(recording.sides) == set(Side)
     results = judge_layer(USB, recording, usb())
-    # how fast it is on a test machine says nothing
+    # the rate on a test machine is not judged
     wrong = [r for r in results if r.verdict not in ACCEPTABLE and not r.requirement.realtime]
     assert [r.explain() for r in wrong if r.side == "left"] == []
     blamed = {r.requirement.id for r in wrong if r.verdict is not Verdict.BLOCKED}
     assert blamed == {"DEX3USB-PACK-02"}
-    assert said
+    assert messages
 
 
-def test_the_host_takes_a_timed_out_transfer_back(hands: str) -> None:
+def test_host_unlinks_transfer_after_timeout(hands: str) -> None:
     host = open_device(hands, Side.LEFT)
     try:
         for _ in range(3):
@@ -292,9 +291,7 @@ def test_the_host_takes_a_timed_out_transfer_back(hands: str) -> None:
         host.close()
 
 
-def test_the_systems_usb_is_used_as_pyusb_wants_it(
-    hands: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_libusb_host_calls_pyusb_correctly(hands: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import usb.core
     import usbip_backend
 
@@ -317,7 +314,7 @@ def test_the_systems_usb_is_used_as_pyusb_wants_it(
             connection.close()
 
 
-def test_a_run_can_be_stopped(hands: str, tmp_path: Path) -> None:
+def test_usb_run_can_be_stopped(hands: str, tmp_path: Path) -> None:
     stop = threading.Event()
     stop.set()
     with Recorder(tmp_path / "run.mcap") as recorder:
@@ -350,7 +347,7 @@ class _Watched:
 
 
 @pytest.mark.parametrize("why", ["stopped", "deaf", "broken"])
-def test_a_run_that_ends_early_leaves_no_motor_driven(
+def test_run_that_ends_early_leaves_no_motor_driven(
     why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop = threading.Event()
@@ -376,24 +373,24 @@ def test_a_run_that_ends_early_leaves_no_motor_driven(
     assert [(motor.status, motor.protect) for _, _, motor in last] == [(0, False)] * 7
 
 
-@pytest.mark.parametrize(
-    ("where", "says"),
+@each(
+    ("where", "expected"),
     [
         ("usbip://127.0.0.1:1", "127.0.0.1:1"),
         ("usbip://127.0.0.1:x", "127.0.0.1:x"),
     ],
 )
-def test_a_device_that_is_not_there_is_said(where: str, says: str) -> None:
-    with pytest.raises(ConformanceError, match=says):
+def test_missing_device_is_a_clear_error(where: str, expected: str) -> None:
+    with pytest.raises(ConformanceError, match=expected):
         open_device(where, Side.LEFT)
 
 
-def test_an_unknown_serial_number_is_said(hands: str) -> None:
+def test_unknown_serial_number_is_a_clear_error(hands: str) -> None:
     with pytest.raises(ConformanceError, match="no left Dex3-1"):
         open_device(f"{hands}/0000", Side.LEFT)
 
 
-def test_a_hand_that_somebody_has_is_said_and_nothing_stays_open(
+def test_device_in_use_is_an_error_and_connections_are_closed(
     hands: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     host = open_device(hands, Side.LEFT)

@@ -1,4 +1,4 @@
-"""From findings to verdicts: what blocks, whose fault it is, what the kit's own jitter excuses."""
+"""Test how outcomes become verdicts: blocking, errors of the kit, and load of the machine."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run, with_beats
+from tests.each import each
 
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]  # max_gap_s
@@ -33,7 +34,7 @@ MOVE = BY_ID["DEX1-MOVE-02"]  # not of real time
 
 
 def blame(outcome: Outcome) -> Excuse:
-    """The machine has nothing to do with it."""
+    """No load of the machine: the failure is not excused."""
     return Excuse()
 
 
@@ -42,7 +43,7 @@ LATE = Lost(total=0.1, mean=0.001, p99=0.01)
 
 
 class Machine:
-    """A machine that lost so much, with programs that waited for so much of the time."""
+    """A machine with given lateness and given part of the time with waiting programs."""
 
     def __init__(self, lost: Lost | None, starved: float = 0.0) -> None:
         self._lost, self._starved = lost, starved
@@ -71,17 +72,17 @@ def gap(seconds: float) -> Outcome:
     return failure(1.0 + seconds).if_late(seconds - 0.1)
 
 
-@pytest.mark.parametrize(
+@each(
     ("requirement", "outcome", "machine", "excused"),
     [
         # any failure on an idle machine is the hand's
         (RATE, rate(195.0), Machine(IDLE), False),
         (GAP, gap(0.101), Machine(IDLE), False),
-        # pressure without any delay explains nothing, however steady it is
+        # waiting programs without a delay excuse nothing
         (RATE, rate(50.0), PRESSED, False),
         (RATE, rate(180.0), PRESSED, False),
         (GAP, gap(0.2), PRESSED, False),
-        # a delay explains as much as there is of it
+        # a delay excuses a failure of its own size
         (RATE, rate(50.0), BUSY_ONE, False),
         (RATE, rate(125.0), BUSY_ONE, True),
         (RATE, rate(180.0), BUSY_ONE, True),
@@ -90,9 +91,9 @@ def gap(seconds: float) -> Outcome:
         # more of it where programs waited all the time
         (GAP, gap(0.45), Machine(LATE), False),
         (GAP, gap(0.25), Machine(LATE), True),
-        # what was late now and then does not move a mean
+        # occasional lateness does not change a mean
         (RATE, rate(150.0), Machine(Lost(0.06, 0.0006, 0.06), starved=0.2), False),
-        # by fits, and yet the hand is never fast
+        # irregular, but the hand is never fast
         (RATE, rate(180.0, best=0.0), FITS, True),
         (RATE, rate(50.0, best=0.0), FITS, True),
         (RATE, rate(50.0, best=0.015), FITS, False),
@@ -100,7 +101,7 @@ def gap(seconds: float) -> Outcome:
         (RATE, rate(50.0, best=0.015), Machine(Lost(9.0, 0.009, 0.1, best=0.004), 1.0), True),
         # not known
         (GAP, gap(0.2), Machine(None, starved=1.0), False),
-        # too fast is never the machine's doing, and no more is what has nothing to do with time
+        # load excuses neither too high a rate nor failures without a relation to time
         (RATE, failure(2.0).if_late(math.inf, how="mean"), BUSY_ONE, False),
         (MOVE, gap(0.2), Machine(Lost(1.0, 1.0, 1.0), starved=1.0), False),
         # a failure without a size is as large as its place
@@ -108,7 +109,7 @@ def gap(seconds: float) -> Outcome:
         (GAP, failure(2.0), BUSY_ONE, False),
     ],
 )
-def test_a_machine_excuses_what_it_can_have_caused(
+def test_machine_load_excuses_only_failures_it_can_cause(
     requirement: Requirement, outcome: Outcome, machine: Machine, excused: bool
 ) -> None:
     found = excuse(machine, requirement, outcome)
@@ -117,20 +118,20 @@ def test_a_machine_excuses_what_it_can_have_caused(
     assert (found.disturbance.load is Load.TOO_BUSY) is excused
 
 
-def test_a_failure_on_a_busy_machine_says_what_the_machine_does_not_explain() -> None:
+def test_failure_on_busy_machine_states_unexplained_part() -> None:
     found = excuse(BUSY_ONE, RATE, rate(50.0))
     assert found.text == (
         "the machine was busy, but the kit's own timer was late by 1 ms each time there, which "
         "explains at most 4 ms of 15 ms"
     )
-    told = found.disturbance
-    assert (told.load, told.late_s, told.explained_s) == (Load.BUSY, 0.001, 0.004)
-    assert told.failure_s == pytest.approx(0.015)
+    shown = found.disturbance
+    assert (shown.load, shown.late_s, shown.explained_s) == (Load.BUSY, 0.001, 0.004)
+    assert shown.failure_s == pytest.approx(0.015)
     assert not excuse(Machine(IDLE), RATE, rate(50.0)).text
 
 
 @given(lost=st.floats(0, 1), share=st.floats(0, 1), size=st.floats(0.001, 2), more=st.floats(0, 1))
-def test_a_larger_failure_is_never_excused_more_easily(
+def test_larger_failure_needs_more_lateness_to_be_excused(
     lost: float, share: float, size: float, more: float
 ) -> None:
     machine = Machine(Lost(lost, lost, lost), share)
@@ -139,7 +140,7 @@ def test_a_larger_failure_is_never_excused_more_easily(
     assert small.excused <= (lost > 0)
 
 
-def test_every_place_of_a_failure_has_to_be_excused() -> None:
+def test_failure_is_excused_only_at_all_its_places() -> None:
     class Once(Machine):
         def lost(self, begin: float, end: float) -> Lost | None:
             return LATE if end < 3 else IDLE
@@ -148,7 +149,7 @@ def test_every_place_of_a_failure_has_to_be_excused() -> None:
     assert not excuse(Once(None), GAP, failure(2.0, 4.0).if_late(0.1, 0.1)).excused
 
 
-def test_a_place_that_is_not_shown_counts_all_the_same() -> None:
+def test_places_beyond_the_shown_ones_count() -> None:
     """Six gaps: five while the machine was stalled, and one that is the hand's."""
     trace = copy_of(short_run())
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
@@ -165,13 +166,13 @@ def test_a_place_that_is_not_shown_counts_all_the_same() -> None:
     assert found.verdict is Verdict.BLOCKED
 
 
-def test_a_failure_without_a_place_is_excused_by_the_whole_run_if_at_all() -> None:
+def test_failure_without_place_needs_lateness_over_the_run() -> None:
     outcome = Outcome(False).if_late(0.01, how="p99")
     assert not excuse(BUSY_ONE, GAP, outcome).excused
     assert excuse(BUSY_ONE, GAP, outcome, (0.0, 10.0)).excused
 
 
-def test_a_gap_no_longer_than_the_kits_own_lateness_is_not_blamed_on_the_hand() -> None:
+def test_gap_within_the_kits_lateness_is_blocked() -> None:
     trace = copy_of(short_run())
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     begin = trace.rows[key][0][0] + round(2.5e9)
@@ -193,7 +194,7 @@ def test_a_gap_no_longer_than_the_kits_own_lateness_is_not_blamed_on_the_hand() 
     assert not judge(with_beats(trace)).disturbed
 
 
-def test_a_client_that_could_not_keep_its_rate_blames_no_hand() -> None:
+def test_slow_client_of_the_kit_does_not_fail_the_hand() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", OPERATOR}))
     trace = run_virtual(plan, LateState)
     lag = of(judge(Recording.of(trace)), "DEX1-OPER-02")
@@ -205,7 +206,7 @@ def test_a_client_that_could_not_keep_its_rate_blames_no_hand() -> None:
     assert "of 200 commands a second" in starved.reason
 
 
-def test_what_a_failure_blocks_names_it() -> None:
+def test_blocked_result_names_the_failed_requirement() -> None:
     trace = copy_of(short_run())
     result = judge(Recording.of(trace, dialect_name="unitree_hg"))
     blocked = [r for r in result.results if r.verdict is Verdict.BLOCKED]
@@ -216,7 +217,7 @@ def test_what_a_failure_blocks_names_it() -> None:
         assert entry.blocked_by in failing
 
 
-def test_a_check_that_breaks_is_the_kits_error_and_blocks() -> None:
+def test_exception_in_check_is_error_and_blocks() -> None:
     def broken() -> Outcome:
         raise ZeroDivisionError("1/0")
 
@@ -230,7 +231,7 @@ def test_a_check_that_breaks_is_the_kits_error_and_blocks() -> None:
     assert later.blocked_by == GAP.id
 
 
-def test_a_failure_is_explained_in_full() -> None:
+def test_failure_has_full_explanation() -> None:
     outcome = Outcome(False, "x", "seen", evidence=(Evidence("rt/x", 1.5, 0, 2.0),))
     result = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome, blame)
     assert result.verdict is Verdict.FAIL
@@ -238,14 +239,14 @@ def test_a_failure_is_explained_in_full() -> None:
     assert {k.strip() for k in lines} >= {"required", "observed", "cause", "try", "source"}
     assert "rt/x at 1.500 s to 2.000 s" in result.explain()
     assert GAP.cause in result.explain()
-    told = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome.because("the moon"), blame)
-    assert told.cause == "the moon"
+    result = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome.because("the moon"), blame)
+    assert result.cause == "the moon"
 
 
 # ------------------------------------------------------------------------------ the kit's jitter
 
 
-def test_the_heartbeat_measures_its_own_lateness() -> None:
+def test_heartbeat_measures_its_lateness() -> None:
     begin = time.time_ns()
     with Heartbeat() as heart:
         deadline = time.monotonic() + 60
@@ -262,7 +263,7 @@ def test_the_heartbeat_measures_its_own_lateness() -> None:
     gaps=st.lists(st.integers(1, 50_000), min_size=1, max_size=50),
     late=st.integers(0, 200_000),
 )
-def test_lateness_lies_between_the_least_and_the_most(gaps: list[int], late: int) -> None:
+def test_lateness_is_between_smallest_and_largest(gaps: list[int], late: int) -> None:
     times = [sum(gaps[: i + 1]) for i in range(len(gaps))]
     beats = Beats(1000, times, [late + i for i in range(len(times))])
     found = beats.lateness(1000, 1000 + 10**12)
@@ -270,12 +271,12 @@ def test_lateness_lies_between_the_least_and_the_most(gaps: list[int], late: int
     assert late / 1e6 <= found[0] <= found[1] <= (late + len(times)) / 1e6
 
 
-def test_a_beat_that_was_due_in_a_stretch_counts_for_it() -> None:
+def test_beat_due_in_an_interval_counts_for_it() -> None:
     beats = Beats(0, [100_000], [90_000])  # due at 10 ms, fired at 100 ms
     assert beats.lateness(20_000_000, 80_000_000) == (0.09, 0.09)
 
 
-def test_a_stimulus_that_was_not_applied_says_what_to_do() -> None:
+def test_missing_stimulus_has_a_hint() -> None:
     touch = of(judge(Recording.of(short_run())), "DEX1-FORCE-01")
     assert touch.verdict is Verdict.NOT_APPLICABLE
     assert touch.reason == (

@@ -1,4 +1,4 @@
-"""The Dex5-1: its joints, its dialect, its simulated hand, its client and its synthetic session.
+"""Test the Dex5-1: joints, dialect, simulated hand, client and synthetic session.
 
 ``python -m tests.test_dex5`` writes the session to traces/samples again.
 """
@@ -49,7 +49,7 @@ CLIENT_STARTS = 0.5  # seconds after the hands
 # --------------------------------------------------------------------------------------- the model
 
 
-def test_the_joints_are_the_urdfs_in_the_clients_order() -> None:
+def test_joints_match_urdf_in_client_order() -> None:
     names = [j.name for j in DEX5_1.joints[LEFT]]
     fingers = [f"{'Roll' if i == 1 else 'Pitch'}_{f}{i}" for f in (2, 3, 4, 5) for i in range(1, 5)]
     assert names == [*fingers, "Yaw_11", "Roll_12", "Pitch_13", "Pitch_14"]
@@ -72,21 +72,21 @@ def test_only_the_thumbs_roll_is_mirrored() -> None:
             )
 
 
-def test_the_thumb_has_gains_of_its_own_and_motors_are_shared() -> None:
+def test_thumb_has_other_gains_and_outer_joints_share_motors() -> None:
     assert KP.tolist() == [0.10] * 16 + [1.0] * 4
     assert KD.tolist() == [0.001] * 16 + [0.02] * 4
     assert len(DEX5_1.motors) == 16
     assert sorted(i for group in DEX5_1.motors for i in group) == list(range(N))
 
 
-def test_no_rest_is_zero_or_at_a_stop() -> None:
+def test_rest_positions_are_not_zero_or_at_a_stop() -> None:
     for side in Side:
         for q, joint in zip(DEX5_1.rest_q[side], DEX5_1.joints[side], strict=True):
             assert joint.q_min < q < joint.q_max
             assert q != 0.0
 
 
-def test_its_topics_are_known() -> None:
+def test_topics_belong_to_the_dialect() -> None:
     (state,) = roles("rt/dex5/left/state")
     assert (state.kind, state.dialect.name, state.sides) == ("state", "dex5", (LEFT,))
     assert [r.kind for r in roles("rt/dex5/right/cmd")] == ["cmd"]
@@ -110,7 +110,7 @@ def hold(hand: SimDex5, clock: ManualClock, command: HandCommand, seconds: float
     return state
 
 
-def test_is_a_hand() -> None:
+def test_simulated_hand_implements_hand() -> None:
     hand = SimDex5(RIGHT)
     assert isinstance(hand, Hand)
     assert (hand.spec.model, hand.spec.n_joints, hand.spec.n_sensors) == ("dex5-1", N, 0)
@@ -121,7 +121,7 @@ def test_is_a_hand() -> None:
 
 
 @pytest.mark.parametrize("side", Side)
-def test_every_joint_goes_where_the_clients_gains_bring_it(side: Side) -> None:
+def test_every_joint_reaches_its_target_with_client_gains(side: Side) -> None:
     hand, clock = opened(side)
     low, high = hand.spec.q_min, hand.spec.q_max
     state = hold(hand, clock, HandCommand.brake(N), 0.2)
@@ -137,7 +137,7 @@ def test_every_joint_goes_where_the_clients_gains_bring_it(side: Side) -> None:
     assert state.supply is None
 
 
-def test_fingers_and_thumb_press_on_an_object_towards_closing() -> None:
+def test_joints_press_on_object_towards_closing() -> None:
     hand, clock = opened(RIGHT, object_at=50.0)
     closed = np.where(CLOSING[RIGHT] > 0, hand.spec.q_max, hand.spec.q_min)
     goal = np.where(CLOSING[RIGHT] != 0, closed, 0.0)
@@ -149,7 +149,7 @@ def test_fingers_and_thumb_press_on_an_object_towards_closing() -> None:
     assert np.abs(state.q[presses] - 0.5 * closed[presses]).max() < 0.02
 
 
-def test_settings_are_those_of_a_hand_of_several_joints() -> None:
+def test_backend_takes_settings_of_hand_with_several_joints() -> None:
     hand = sim_dex5.make(BackendOptions(LEFT, settings={"start": "0", "object": "40"}))
     assert isinstance(hand, SimDex5)
     assert not hand.mechanics.q[CLOSING[LEFT] != 0].any()
@@ -181,7 +181,7 @@ def test_only_mode_1_drives(modes: list[int]) -> None:
     assert odd == (["unknown_status"] if any(m > 1 for m in modes) else [])
 
 
-def test_who_sends_a_dex3s_mode_byte_is_told() -> None:
+def test_dex3_mode_byte_is_reported() -> None:
     (remark,) = mapping().remarks(message([0x10 | i for i in range(16)] + [1] * 4), LEFT)
     assert "no RIS_Mode with ids, as a Dex3-1 has; send 1 to drive it" in remark.text
 
@@ -190,7 +190,7 @@ def test_seven_joints_of_a_default_message_hold_no_command() -> None:
     assert mapping().command(message([1] * 7), LEFT) is None
 
 
-def test_torques_come_in_two_units() -> None:
+def test_torques_are_in_two_units() -> None:
     command = mapping().command(message([1] * N, tau=500.0, kp=0.25), LEFT)
     assert command is not None
     assert command.tau.tolist() == pytest.approx([0.5] * 16 + [500.0] * 4)
@@ -199,9 +199,7 @@ def test_torques_come_in_two_units() -> None:
 
 @given(st.lists(st.floats(-0.93, 0.93), min_size=N, max_size=N), st.sampled_from(Fill))
 @settings(max_examples=60, deadline=None)
-def test_a_state_is_twenty_joints_and_nothing_that_is_not_known(
-    tau: list[float], fill: Fill
-) -> None:
+def test_state_has_twenty_joints_and_no_unknown_members(tau: list[float], fill: Fill) -> None:
     modes = [i % 2 for i in range(N)]
     state = HandState.from_values(DEX5_1.rest_q[LEFT], tau_est=tau, mode=modes, stamp=0.0)
     data = mapping(fill).encode({LEFT: StateView(state, (0,) * N)})
@@ -216,7 +214,7 @@ def test_a_state_is_twenty_joints_and_nothing_that_is_not_known(
     assert math.hypot(*sent.imu_state.quaternion) == 0.0
 
 
-def test_it_brakes_a_second_after_the_last_command() -> None:
+def test_hand_brakes_one_second_after_last_command() -> None:
     clock = ManualClock()
     core = HandCore(DEX5_1.spec(LEFT, io_rate=500.0, simulated=True), DEX5_1, clock)
     core.opened(core.spec)
@@ -235,13 +233,13 @@ def test_it_brakes_a_second_after_the_last_command() -> None:
 # --------------------------------------------------------------------------- client and recording
 
 
-def test_the_client_sends_what_the_genuine_one_does() -> None:
+def test_client_sends_same_commands_as_genuine_client() -> None:
     client = client_for("dex5")
     rest = {s: DEX5_1.rest_q[s] for s in Side}
     assert client.step(0.0, {LEFT: (0.0,) * N, RIGHT: rest[RIGHT]}, {}) == {}
     assert client.missing == {LEFT: "every q is exactly 0"}
-    told = client.step(0.01, rest, dict.fromkeys(Side, (0.2,) * N))
-    for motors in told.values():
+    commands = client.step(0.01, rest, dict.fromkeys(Side, (0.2,) * N))
+    for motors in commands.values():
         assert {m.mode for m in motors} == {1}
         assert [(m.q, m.kp, m.kd) for m in motors] == [(0.2, kp, kd) for kp, kd in DEX5_1.gains]
     assert {m.mode for m in client.parting(rest[LEFT])} == {0}
@@ -286,12 +284,12 @@ def write(path: Path, seconds: float = 6.0) -> None:
                 )
             now = clock.now() - CLIENT_STARTS
             if now >= 0.0 and step % CLIENT_STEPS == 0:
-                told = client.step(now, states, operator.inputs(now, Side))
-                for topic, payload in wire.encode(told):
+                sent = client.step(now, states, operator.inputs(now, Side))
+                for topic, payload in wire.encode(sent):
                     recorder.put(
                         topic, dialect.cmd_type, payload, now_ns + 500_000, now_ns + 300_000
                     )
-                for s, (_, payload) in zip(told, wire.encode(told), strict=True):
+                for s, (_, payload) in zip(sent, wire.encode(sent), strict=True):
                     command = maps[s].command(decode(payload), s)
                     assert command is not None
                     commands[s] = command
@@ -300,7 +298,7 @@ def write(path: Path, seconds: float = 6.0) -> None:
             hand.close()
 
 
-def test_the_synthetic_session_is_what_its_helper_writes(tmp_path: Path) -> None:
+def test_synthetic_session_matches_its_generator(tmp_path: Path) -> None:
     path = tmp_path / "again.mcap"
     write(path, 1.2)
     again = [(m.topic, m.log_time_ns, m.data) for m in open_trace(path).messages()]
@@ -311,7 +309,7 @@ def test_the_synthetic_session_is_what_its_helper_writes(tmp_path: Path) -> None
     assert "none" in shipped.metadata["provenance"]["controller_commit"]
 
 
-def test_the_synthetic_session_is_judged_as_a_dex5() -> None:
+def test_synthetic_session_is_judged_as_dex5() -> None:
     recording = Recording.of(open_trace(sample_path("dex5_synthetic")))
     assert recording.dialect is DEX5
     result = judge(recording)

@@ -1,4 +1,4 @@
-"""The EZGripper driver against the emulated servo, over a real pseudo-terminal.
+"""Test the EZGripper driver with the emulated servo over a pseudo-terminal.
 
 These run in real time, because a serial line does. Where a test waits, it waits for an event
 with a generous deadline; only the last group has the time itself as its subject.
@@ -61,6 +61,7 @@ from dexkit.errors import (
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
+from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
 ZERO = 1510
@@ -134,7 +135,7 @@ def travel(gripper: EmulatedThread) -> int:
     return (gripper.servo.get(mx64.PRESENT_POSITION) - ZERO) % 4096
 
 
-# --- the packets themselves
+# --- packets
 
 
 class _FakePort(DevicePort):
@@ -163,14 +164,14 @@ def _bus_on(port: _FakePort) -> ServoBus:
     return bus
 
 
-def test_stuffing_on_transmit_is_that_of_the_manual() -> None:
+def test_transmit_stuffing_follows_the_manual() -> None:
     # docs/sources/mx64-ezgripper.md#a6: write 116 = 0x00FDFFFF, correctly stuffed
     port = _FakePort(bytes.fromhex("FFFFFD00010400 5500 A10C"))
     assert not _bus_on(port).write(1, 116, bytes.fromhex("FFFFFD00"))
     assert port.sent.hex(" ").upper() == "FF FF FD 00 01 0A 00 03 74 00 FF FF FD FD 00 21 E7"
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         # current -1, velocity -3 (docs/sources/mx64-ezgripper.md#a3)
@@ -186,7 +187,7 @@ def test_stuffing_on_receive(payload: bytes) -> None:
     assert _bus_on(port).read(1, 126, 10) == (payload, False)
 
 
-def test_a_held_goal_leaves_with_the_next_request_and_only_once() -> None:
+def test_held_goal_is_sent_once_with_next_request() -> None:
     port = _FakePort(b"")
     bus = _bus_on(port)
     bus.retries = 1
@@ -202,7 +203,7 @@ def test_a_held_goal_leaves_with_the_next_request_and_only_once() -> None:
 # --- opening
 
 
-def test_opening_sets_the_registers_and_moves_nothing(tmp_path: Path) -> None:
+def test_open_sets_registers_without_motion(tmp_path: Path) -> None:
     with emulated() as gripper:
         before = travel(gripper)
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
@@ -223,7 +224,7 @@ def test_opening_sets_the_registers_and_moves_nothing(tmp_path: Path) -> None:
             assert settings.differences(hand._servo.bus, 1) == []
 
 
-def test_opening_refuses_without_a_calibration(tmp_path: Path) -> None:
+def test_open_without_calibration_is_refused(tmp_path: Path) -> None:
     with emulated() as gripper:
         hand = EZGripper(gripper.path, configuration=configured(tmp_path, zero=None))
         with pytest.raises(HandRefused, match="not been calibrated") as refused:
@@ -234,7 +235,7 @@ def test_opening_refuses_without_a_calibration(tmp_path: Path) -> None:
             pass
 
 
-def test_a_servo_at_the_factory_settings_is_found(tmp_path: Path) -> None:
+def test_servo_with_factory_settings_is_found(tmp_path: Path) -> None:
     with emulated(baudrate=57_600, servo_id=7) as gripper:
         configuration = configured(tmp_path, id=None, baudrate=57_600)
         with gripper_on(gripper.path, configuration) as hand:
@@ -248,7 +249,7 @@ def test_a_servo_at_the_factory_settings_is_found(tmp_path: Path) -> None:
         assert "id 7 (model 311) at 57600 baud" in missing.value.hint
 
 
-def test_protocol_1_firmware_is_refused_with_the_way_out(tmp_path: Path) -> None:
+def test_protocol_1_firmware_is_refused_with_hint(tmp_path: Path) -> None:
     with Port(Bus([], protocol_1=[Protocol1Servo(1)])) as port:
         port.start()
         hand = EZGripper(port.path, configuration=configured(tmp_path, timeout=0.05))
@@ -273,7 +274,7 @@ def test_two_servos_on_one_line(tmp_path: Path) -> None:
             bus.close()
 
 
-def test_what_is_no_gripper(tmp_path: Path) -> None:
+def test_other_devices_are_refused(tmp_path: Path) -> None:
     with pytest.raises(HandNotFound, match="no device"):
         EZGripper(str(tmp_path / "tty")).open()
     with pytest.raises(HandNotFound, match="serial number NOPE"):
@@ -285,7 +286,9 @@ def test_what_is_no_gripper(tmp_path: Path) -> None:
     assert find_device("/dev/null").serial_number is None
 
 
-def test_a_port_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_without_permission_is_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*args: object, **kwargs: object) -> int:
         raise PermissionError(13, "Permission denied")
 
@@ -309,7 +312,7 @@ def test_latency_timer_warning(tmp_path: Path) -> None:
     assert latency_warning("/dev/ttyACM0", tmp_path) == ""
 
 
-def test_the_backend_reads_its_settings(tmp_path: Path) -> None:
+def test_backend_reads_its_settings(tmp_path: Path) -> None:
     backend = find_backend("ezgripper")
     with pytest.raises(UsageError, match="needs a device"):
         backend.create(BackendOptions(Side.LEFT))
@@ -339,7 +342,7 @@ def test_the_backend_reads_its_settings(tmp_path: Path) -> None:
     assert hand.spec.side is Side.LEFT
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"id": "one"},
@@ -356,7 +359,7 @@ def test_the_backend_reads_its_settings(tmp_path: Path) -> None:
         {"colour": "red"},
     ],
 )
-def test_senseless_settings_are_refused(wrong: dict[str, str]) -> None:
+def test_invalid_settings_are_refused(wrong: dict[str, str]) -> None:
     with pytest.raises(UsageError):
         find_backend("ezgripper").create(BackendOptions(Side.LEFT, "/dev/null", wrong))
 
@@ -364,7 +367,7 @@ def test_senseless_settings_are_refused(wrong: dict[str, str]) -> None:
 # --- moving
 
 
-def test_it_follows_measures_and_switches_off(tmp_path: Path) -> None:
+def test_gripper_follows_reports_state_and_switches_torque_off(tmp_path: Path) -> None:
     with emulated(start=20.0) as gripper:
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
             start = hand.exchange(BRAKE)
@@ -388,7 +391,7 @@ def test_it_follows_measures_and_switches_off(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["write", "read"])
-def test_ctrl_c_in_an_exchange_switches_the_motor_off(
+def test_ctrl_c_during_exchange_switches_torque_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     def interrupt(*args: object) -> bytes:
@@ -423,7 +426,7 @@ def test_a_brake_before_any_command_exerts_no_torque(tmp_path: Path) -> None:
         assert not gripper.servo.torque
 
 
-def test_zero_gains_leave_it_alone_and_brake_holds(tmp_path: Path) -> None:
+def test_zero_gains_apply_no_torque_and_brake_holds(tmp_path: Path) -> None:
     with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
         before = travel(gripper)
         for _ in range(100):
@@ -444,7 +447,7 @@ def test_zero_gains_leave_it_alone_and_brake_holds(tmp_path: Path) -> None:
         assert hand.phase is Phase.BRAKE
 
 
-def test_an_object_is_felt_and_held_with_less_force(tmp_path: Path) -> None:
+def test_object_is_detected_and_held_with_hold_effort(tmp_path: Path) -> None:
     control = replace(QUICK, hold_after=0.2)
     with (
         emulated(object_pct=40.0, start=80.0) as gripper,
@@ -462,7 +465,7 @@ def test_an_object_is_felt_and_held_with_less_force(tmp_path: Path) -> None:
         assert float(drive(hand, OPEN, at(5.4)).tau_est[0]) == 0.0
 
 
-def test_closing_on_nothing_reports_no_force(tmp_path: Path) -> None:
+def test_closing_without_object_reports_no_force(tmp_path: Path) -> None:
     # the zero that calibration finds lies where the fingers press on each other
     configuration = configured(tmp_path, zero=ZERO - 25)
     with emulated(start=30.0) as gripper, gripper_on(gripper.path, configuration) as hand:
@@ -472,7 +475,7 @@ def test_closing_on_nothing_reports_no_force(tmp_path: Path) -> None:
         assert hand.phase is Phase.MOVING
 
 
-def test_the_position_is_right_whatever_turn_the_servo_counts_in(tmp_path: Path) -> None:
+def test_position_is_independent_of_the_servos_turn(tmp_path: Path) -> None:
     # closed at 3010: fully open is 5510, which a reboot folds to 1414
     # (docs/sources/mx64-ezgripper.md#d4)
     with emulated(start=10.0, closed_at=3010) as gripper:
@@ -522,7 +525,7 @@ def until_recovered(hand: EZGripper, command: HandCommand, timeout: float = LONG
             time.sleep(0.002)
 
 
-def test_overload_in_motion_is_recovered_without_a_new_motion(tmp_path: Path) -> None:
+def test_recovery_from_overload_starts_no_motion(tmp_path: Path) -> None:
     with (
         emulated(start=90.0) as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,
@@ -540,11 +543,11 @@ def test_overload_in_motion_is_recovered_without_a_new_motion(tmp_path: Path) ->
         for command in (CLOSE, BRAKE, CLOSE):
             drive_for(hand, command, 0.15)
         assert travel(gripper) == pytest.approx(stopped, abs=10)
-        assert not gripper.servo.torque, "nobody has asked for torque since"
+        assert not gripper.servo.torque, "no command has asked for torque since"
         drive(hand, OPEN, at(5.4))
 
 
-def test_a_hot_servo_is_left_to_cool(tmp_path: Path) -> None:
+def test_hot_servo_is_not_driven_until_cool(tmp_path: Path) -> None:
     with (
         emulated() as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,
@@ -573,7 +576,7 @@ def test_a_hot_servo_is_left_to_cool(tmp_path: Path) -> None:
         hand.exchange(BRAKE)
 
 
-def test_a_servo_found_in_shutdown_is_restarted(tmp_path: Path) -> None:
+def test_servo_in_shutdown_is_rebooted_at_open(tmp_path: Path) -> None:
     with emulated() as gripper:
         gripper.inject("shock")
         deadline = time.monotonic() + LONG
@@ -585,7 +588,7 @@ def test_a_servo_found_in_shutdown_is_restarted(tmp_path: Path) -> None:
             assert hand.exchange(BRAKE).fault[0] == 0
 
 
-def test_a_servo_that_has_cooled_down_is_restarted_by_whoever_comes_next(tmp_path: Path) -> None:
+def test_cooled_servo_is_rebooted_by_next_driver(tmp_path: Path) -> None:
     with emulated() as gripper:
         gripper.inject("overheat:c=85")
         deadline = time.monotonic() + LONG
@@ -604,7 +607,7 @@ def test_a_servo_that_has_cooled_down_is_restarted_by_whoever_comes_next(tmp_pat
             assert hand.exchange(BRAKE).fault[0] == 0
 
 
-def test_a_supply_dip_that_resets_the_servo(tmp_path: Path) -> None:
+def test_reset_by_supply_dip_is_recovered(tmp_path: Path) -> None:
     with (
         emulated(start=80.0) as gripper,
         gripper_on(gripper.path, configured(tmp_path, timeout=0.1)) as hand,
@@ -628,14 +631,14 @@ def test_a_supply_dip_that_resets_the_servo(tmp_path: Path) -> None:
         stopped = travel(gripper)
         for command in (BRAKE, CLOSE, BRAKE):
             drive_for(hand, command, 0.05)
-            assert not gripper.servo.torque, "nobody has asked for torque since"
+            assert not gripper.servo.torque, "no command has asked for torque since"
         assert float(state.q[0]) == pytest.approx(stopped * 5.4 / 2500, abs=0.05)
         drive_for(hand, CLOSE, 0.3)
         assert travel(gripper) == pytest.approx(stopped, abs=10)
         drive(hand, OPEN, at(5.4))
 
 
-def test_low_voltage_is_reported_while_work_goes_on(tmp_path: Path) -> None:
+def test_low_voltage_is_reported_and_exchange_goes_on(tmp_path: Path) -> None:
     with (
         emulated() as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,
@@ -649,7 +652,7 @@ def test_low_voltage_is_reported_while_work_goes_on(tmp_path: Path) -> None:
         drive(hand, HandCommand.position(3.5), at(3.5))
 
 
-def test_unplugged_in_motion_and_plugged_in_again(tmp_path: Path) -> None:
+def test_unplugged_in_motion_reconnects_without_motion(tmp_path: Path) -> None:
     with emulated(start=100.0) as gripper:
         hand = EZGripper(gripper.path, configuration=configured(tmp_path))
         hand.open()
@@ -663,7 +666,7 @@ def test_unplugged_in_motion_and_plugged_in_again(tmp_path: Path) -> None:
             hand.exchange(slow)
         hand.close()
         hand.close()
-        # nobody speaks to the servo any more: its watchdog stops it
+        # the servo gets no packets any more: its watchdog stops it
         while gripper.servo.get(mx64.BUS_WATCHDOG) != mx64.WATCHDOG_TRIPPED:
             assert time.monotonic() < deadline
             time.sleep(0.01)
@@ -683,6 +686,7 @@ import sys
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings
 from dexkit.drivers.ezgripper.control import ControlSettings
 from dexkit.hand import HandCommand
+from tests.each import each
 settings = GripperSettings(zero=int(sys.argv[2]), control=ControlSettings(startup_speed=20))
 with EZGripper(sys.argv[1], configuration=settings) as hand:
     while True:
@@ -690,7 +694,7 @@ with EZGripper(sys.argv[1], configuration=settings) as hand:
 """
 
 
-def test_a_killed_driver_leaves_nothing_moving(tmp_path: Path) -> None:
+def test_watchdog_stops_servo_after_driver_is_killed(tmp_path: Path) -> None:
     with emulated(start=100.0) as gripper:
         driver = subprocess.Popen([sys.executable, "-c", _DRIVER, gripper.path, str(ZERO)])
         try:
@@ -707,10 +711,10 @@ def test_a_killed_driver_leaves_nothing_moving(tmp_path: Path) -> None:
         while gripper.servo.get(mx64.PRESENT_VELOCITY) != 0:
             assert time.monotonic() < deadline
             time.sleep(0.01)
-        assert travel(gripper) > 1000, "far from where it was told to go"
+        assert travel(gripper) > 1000, "far from its goal"
 
 
-def test_a_pause_trips_the_watchdog_and_work_goes_on(tmp_path: Path) -> None:
+def test_driver_recovers_after_pause_trips_watchdog(tmp_path: Path) -> None:
     with (
         emulated(start=90.0) as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,
@@ -724,7 +728,7 @@ def test_a_pause_trips_the_watchdog_and_work_goes_on(tmp_path: Path) -> None:
         assert hand.servo_statistics.watchdog_trips == 1
 
 
-def test_a_servo_that_its_watchdog_stopped_is_taken_over_at_rest(tmp_path: Path) -> None:
+def test_servo_stopped_by_watchdog_is_opened_at_rest(tmp_path: Path) -> None:
     # the least kind reading of the manual: once cleared, it goes on to its old goal
     firmware = Firmware(watchdog_resumes=True)
     with emulated(start=100.0, latency_timer=16e-3, firmware=firmware) as gripper:
@@ -763,7 +767,7 @@ def test_damaged_and_lost_answers_are_retried_and_counted(tmp_path: Path) -> Non
             assert statistics.retries == statistics.corrupt + statistics.timeouts
 
 
-def test_silence_is_a_timeout_within_the_stated_time(
+def test_missing_answer_times_out_within_documented_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with emulated() as gripper:
@@ -788,14 +792,14 @@ def test_silence_is_a_timeout_within_the_stated_time(
                     break
                 except HandTimeout:
                     assert time.monotonic() < deadline
-        # it is switched off in silence, too
+        # torque is also switched off when answers are missing
         hand.open()
         hand.exchange(BRAKE)
         gripper.inject("drop")
         hand.close()
 
 
-def test_a_servo_that_refuses_a_register(tmp_path: Path) -> None:
+def test_refused_register_is_clear_error(tmp_path: Path) -> None:
     with emulated() as gripper:
         bus = ServoBus(gripper.path, 1_000_000, timeout=0.2)
         bus.open()
@@ -875,13 +879,13 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
             assert float(hand.exchange(BRAKE).q[0]) >= -0.05
 
 
-def test_without_a_measured_speed_the_estimator_gets_the_limit_that_the_servo_keeps() -> None:
+def test_estimator_uses_servo_limit_without_measured_speed() -> None:
     hand = EZGripper("/dev/nothing", Side.LEFT, GripperSettings())
     limit = 1.5 * DEX1_1.joints[Side.LEFT][0].stroke  # 150 % of the stroke a second
     assert hand.joint_speeds == ((pytest.approx(limit), pytest.approx(limit)),)
 
 
-def test_a_gripper_is_known_by_its_usb_serial_number_in_any_port(
+def test_calibration_follows_usb_serial_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def plug_in(path: str) -> None:
@@ -912,7 +916,7 @@ def test_a_gripper_is_known_by_its_usb_serial_number_in_any_port(
     assert "DA1Z9T40" in missing.value.hint
 
 
-def test_calibration_does_not_believe_an_object(tmp_path: Path) -> None:
+def test_calibration_refuses_an_object_between_the_fingers(tmp_path: Path) -> None:
     with emulated(start=90.0, object_pct=50.0) as gripper:
         hand = EZGripper(
             gripper.path, configuration=configured(tmp_path, zero=None, calibrate=Calibrate.AUTO)
@@ -922,7 +926,7 @@ def test_calibration_does_not_believe_an_object(tmp_path: Path) -> None:
         assert not gripper.servo.torque
 
 
-def test_a_lost_link_does_not_calibrate_again(
+def test_lost_link_does_not_repeat_calibration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
@@ -968,7 +972,7 @@ def test_calibration_without_fingers_on_the_tendon(tmp_path: Path) -> None:
             hand.open()
 
 
-def test_calibration_is_interrupted_and_lets_go(tmp_path: Path) -> None:
+def test_interrupted_calibration_switches_torque_off(tmp_path: Path) -> None:
     with emulated(start=90.0) as gripper:
         hand = EZGripper(gripper.path, configuration=configured(tmp_path))
         servo = hand.connect()
@@ -1019,8 +1023,8 @@ def test_the_baud_rate_is_changed(tmp_path: Path) -> None:
 
 
 @pytest.mark.realtime
-def test_no_exchange_is_faster_than_its_line(tmp_path: Path) -> None:
-    """On a real terminal and clock too. How fast it is, is a matter of the benchmark."""
+def test_exchange_is_not_faster_than_the_line(tmp_path: Path) -> None:
+    """On a real terminal and clock too. The rate itself is measured by the benchmark."""
     count = 100
     busy = line_time(1_000_000)
     with (
@@ -1036,7 +1040,7 @@ def test_no_exchange_is_faster_than_its_line(tmp_path: Path) -> None:
     assert took >= busy + (count - 1) * exchange_period(busy, 1e-3)
 
 
-def test_the_rate_follows_the_latency_timer_of_the_adapter(
+def test_rate_follows_latency_timer_of_adapter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gripper_module, "latency_timer", lambda path: 16)
@@ -1045,7 +1049,7 @@ def test_the_rate_follows_the_latency_timer_of_the_adapter(
 
 
 @pytest.mark.realtime
-def test_an_untuned_latency_timer_is_slow_but_works(tmp_path: Path) -> None:
+def test_default_latency_timer_is_slow_but_works(tmp_path: Path) -> None:
     with (
         emulated(latency_timer=16e-3) as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,
@@ -1058,7 +1062,7 @@ def test_an_untuned_latency_timer_is_slow_but_works(tmp_path: Path) -> None:
         drive(hand, HALF, at(2.7))
 
 
-def test_a_waiting_exchange_leaves_the_processor_to_others(tmp_path: Path) -> None:
+def test_waiting_exchange_uses_little_processor_time(tmp_path: Path) -> None:
     with (
         emulated_ezgripper(process=True, latency_timer=16e-3) as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,

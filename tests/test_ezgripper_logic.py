@@ -1,4 +1,4 @@
-"""The EZGripper driver's pure parts: no device, no clock but a number."""
+"""Test the EZGripper driver's control logic without device and with a simulated clock."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from dexkit.errors import TruncatedError, UsageError
 from dexkit.hand import HandCommand, MotorError
 from dexkit.wire import mx64
 from dexkit.wire.mx64 import HardwareError
+from tests.each import each
 
 fast = settings(max_examples=100, deadline=None)
 fewer = settings(max_examples=40, deadline=None)
@@ -42,7 +43,7 @@ def test_relative_position_does_not_depend_on_the_turn(
     assert scaling.relative_position(present, zero + 4096 * turns_then) == relative
 
 
-def test_fact_sheet_example_of_a_folded_position() -> None:
+def test_documented_example_of_folded_position() -> None:
     # zero 3010, fully open: 5510, reads 1414 after a reboot (docs/sources/mx64-ezgripper.md#d4)
     assert scaling.relative_position(5510, 3010) == 2500
     assert scaling.relative_position(1414, 3010) == 2500
@@ -59,14 +60,12 @@ def test_joint_and_ticks() -> None:
     assert scaling.joint_speed(1) == pytest.approx(0.229 / 60 * 4096 * 5.4 / 2500)
 
 
-@pytest.mark.parametrize(
-    ("effort", "units"), [(10, 160), (15, 240), (30, 480), (50, 800), (100, 1600), (150, 1600)]
-)
-def test_effort_is_the_current_of_the_fact_sheet(effort: float, units: int) -> None:
+@each(("effort", "units"), [(10, 160), (15, 240), (30, 480), (50, 800), (100, 1600), (150, 1600)])
+def test_effort_gives_documented_current(effort: float, units: int) -> None:
     assert scaling.current_of_effort(effort) == units
 
 
-def test_profile_velocity_is_never_the_value_that_means_unlimited() -> None:
+def test_profile_velocity_is_never_zero() -> None:
     assert scaling.profile_velocity(0.0) == 1
     assert scaling.profile_velocity(312.7) == 500
 
@@ -101,7 +100,7 @@ def test_force_never_falls_and_stays_within_the_table(
     assert ForceTable.from_mapping(force.to_mapping()) == force
 
 
-@pytest.mark.parametrize(
+@each(
     "table",
     [
         {},
@@ -116,7 +115,7 @@ def test_force_never_falls_and_stays_within_the_table(
         {"0": 0.0, "0.0": 1.0},
     ],
 )
-def test_what_is_no_force_table_is_refused(table: dict[str, object]) -> None:
+def test_invalid_force_table_is_refused(table: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         ForceTable.from_mapping(table)
 
@@ -256,7 +255,7 @@ def _in_contact(position: int = 1000, goal: int = 0) -> tuple[ContactDetector, f
     return detector, found
 
 
-def test_contact_ends_when_the_gripper_is_told_to_open() -> None:
+def test_contact_ends_at_command_to_open() -> None:
     detector, now = _in_contact()
     assert detector.update(now + 0.002, 1000, 2500) is None
 
@@ -266,7 +265,7 @@ def test_contact_ends_when_the_object_slips_out() -> None:
     assert detector.update(now + 0.002, 970, 0) is None
 
 
-def test_contact_survives_the_object_pushing_back() -> None:
+def test_contact_persists_when_object_pushes_back() -> None:
     detector, now = _in_contact()
     for i in range(300):
         # pushed out by 90 ticks, swinging by 40 at first
@@ -276,14 +275,14 @@ def test_contact_survives_the_object_pushing_back() -> None:
     assert detector.update(now + 0.7, 1090 - 30, 0) is None
 
 
-def test_contact_survives_slow_creep_for_an_hour() -> None:
+def test_contact_persists_during_slow_creep() -> None:
     detector, now = _in_contact()
     for i in range(3600 * 2):
         t = now + i * 0.5
         assert detector.update(t, round(1000 - i / 10), 0) is not None
 
 
-def test_a_new_motion_gets_a_whole_window_to_begin() -> None:
+def test_new_motion_starts_a_new_contact_window() -> None:
     detector = ContactDetector()
     for i in range(500):
         assert detector.update(i * 0.002, 1000, 1000) is None
@@ -328,7 +327,7 @@ def test_zero_gains_never_move() -> None:
         assert control.phase is Phase.LIMP
 
 
-def test_position_command_goes_to_q_in_the_servos_present_turn() -> None:
+def test_position_goal_is_in_servos_present_turn() -> None:
     # the same gripper before and after a reboot that folds 5510 to 1414
     for position in (5510, 1414):
         goal = Control(ZERO).plan(CLOSE, _sample(0.0, position))
@@ -341,7 +340,7 @@ def test_brake_holds_where_it_began_at_rest() -> None:
     control.plan(LIMP, _sample(-0.1, ZERO + 600))
     held = control.plan(BRAKE, _sample(0.0, ZERO + 600))
     assert (held.position, held.current) == (ZERO + 600, 240)
-    # it drifts, is pushed, is told to brake again: the goal stays
+    # it drifts, is pushed, gets another brake command: the goal stays
     for i, velocity in enumerate((0, 20, -20, 0)):
         sample = _sample(0.02 + i * 0.01, ZERO + 650, velocity=velocity)
         assert control.plan(BRAKE, sample).position == ZERO + 600
@@ -349,13 +348,13 @@ def test_brake_holds_where_it_began_at_rest() -> None:
     assert control.plan(BRAKE, _sample(0.12, ZERO + 800)).position == ZERO + 800
 
 
-def test_nobody_asked_for_torque_before_the_first_command() -> None:
+def test_no_torque_before_first_command() -> None:
     for control in (Control(ZERO), Control(ZERO)):
         for i, position in enumerate((600, 650, 700)):  # the springs open the fingers
             goal = control.plan(BRAKE, _sample(0.01 * i, ZERO + position, velocity=50))
             assert (goal.position, goal.current) == (ZERO + position, 0)
             assert control.phase is Phase.BRAKE
-        # a command, then silence: the service brakes, and the fingers are held
+        # no more commands: the service brakes, and the fingers are held
         assert control.plan(CLOSE, _sample(1.0, ZERO + 700)).current == 800
         assert control.plan(BRAKE, _sample(1.1, ZERO + 600)).current == 240
         # a restart of the servo: it begins anew
@@ -402,7 +401,7 @@ def _squeeze(control: Control, start: float, seconds: float, position: int) -> G
     return goal
 
 
-def test_contact_then_hold_at_less_effort_then_open_at_full() -> None:
+def test_contact_holds_with_less_effort_and_opens_with_full() -> None:
     control = Control(ZERO)
     assert _squeeze(control, 0.0, 0.3, ZERO + 1000).current == 800
     assert control.phase is Phase.CONTACT
@@ -506,7 +505,7 @@ def test_goals_stay_within_stroke_and_effort(
             assert 0 <= target <= 2500
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"effort": 0},
@@ -519,7 +518,7 @@ def test_goals_stay_within_stroke_and_effort(
         {"startup_time": math.inf},
     ],
 )
-def test_senseless_settings_are_refused(wrong: dict[str, float]) -> None:
+def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         ControlSettings(**wrong)
 
@@ -527,7 +526,7 @@ def test_senseless_settings_are_refused(wrong: dict[str, float]) -> None:
 # --- recovery
 
 
-def test_errors_in_words_and_in_the_common_vocabulary() -> None:
+def test_hardware_errors_map_to_text_and_motor_errors() -> None:
     assert describe(HardwareError(0x24)) == "overheating and overload"
 
     def bits(error: int, voltage: float = 12.0) -> MotorError:
@@ -542,7 +541,7 @@ def test_errors_in_words_and_in_the_common_vocabulary() -> None:
         assert (bits(bit, 9.0) != 0) == (bit != 0)
 
 
-def test_reboots_back_off_and_forget() -> None:
+def test_reboot_delay_grows_and_resets() -> None:
     policy = RebootPolicy(first=0.5, factor=2, longest=3, forget=60)
     now, delays = 0.0, []
     for _ in range(5):
@@ -567,7 +566,7 @@ def test_a_hot_servo_is_not_rebooted() -> None:
 # --- configuration
 
 
-def test_store_keeps_what_it_does_not_know(tmp_path: Path) -> None:
+def test_calibration_store_keeps_unknown_keys(tmp_path: Path) -> None:
     path = tmp_path / "new" / "file.json"
     store = config.Store(path)
     assert store.read("A") == config.GripperRecord()
@@ -602,7 +601,7 @@ def test_a_file_of_seed_003_reads(tmp_path: Path) -> None:
     assert record.force_table.force(4.5) == 0.5
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "",
@@ -629,7 +628,9 @@ def test_a_damaged_file_is_a_clear_error(tmp_path: Path, text: str) -> None:
         config.Store(path).read("A")
 
 
-def test_the_environment_names_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_environment_variable_sets_calibration_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv(config.ENVIRONMENT, str(tmp_path / "x.json"))
     assert config.Store().path == tmp_path / "x.json"
     monkeypatch.delenv(config.ENVIRONMENT)

@@ -1,4 +1,4 @@
-"""The picture of the family: ``dexkit models``, docs/models.md and its drawings."""
+"""Test ``dexkit models``, docs/models.md and its drawings."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from dexkit.hand import JointSpec, Side
 from dexkit.model_facts import describe, indices, names
 from dexkit.models import BUILT_IN, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
+from tests.each import each
 from tools.generate import DOCS
 from tools.generate.model_drawing import draw_hand, draw_robot
 from tools.generate.models_page import drawing
@@ -50,7 +51,7 @@ def gap(a: Box, b: Box) -> float:
 
 
 class TestCommandLine:
-    def test_overview_has_every_model_in_eighty_columns(self) -> None:
+    def test_overview_lists_every_model_in_eighty_columns(self) -> None:
         lines = run().splitlines()
         assert max(map(len, lines)) <= 80
         for name in names():
@@ -60,8 +61,8 @@ class TestCommandLine:
         for model in MODELS.values():
             assert f"{model.state_rate:g} Hz" in "\n".join(lines)
 
-    @pytest.mark.parametrize("name", names())
-    def test_a_model_in_eighty_columns(self, name: str) -> None:
+    @each("name", names())
+    def test_model_page_fits_eighty_columns(self, name: str) -> None:
         output = run(name)
         assert max(map(len, output.splitlines())) <= 80
         for i, joint in joints(name):
@@ -72,20 +73,20 @@ class TestCommandLine:
                 for text in (dialect.name, dialect.cmd_type, dialect.state_type):
                     assert text in output
 
-    def test_several_at_once(self) -> None:
+    def test_several_models_are_printed(self) -> None:
         assert run("dex1-1", "h1") == f"{run('dex1-1')}\n{run('h1')}"
 
-    def test_all_of_all(self) -> None:
+    def test_all_models_are_printed(self) -> None:
         assert run("--all") == "\n".join(run(name) for name in names())
 
-    def test_an_unknown_model(self) -> None:
+    def test_unknown_model_is_refused(self) -> None:
         result = CliRunner().invoke(cli, ["models", "dex9"])
         error = result.exception
         assert isinstance(error, UsageError)
         assert error.exit_code == 2
         assert error.hint == "known: dex1-1, dex3-1, dex5-1, h1, g1"
 
-    def test_json_holds_everything_and_its_shape_is_documented(self) -> None:
+    def test_json_is_complete_and_documented(self) -> None:
         models = {m["name"]: m for m in json.loads(run("--json"))["models"]}
         assert list(models) == names()
         for name in names():
@@ -104,7 +105,7 @@ class TestCommandLine:
 
         assert {*keys(models)} - set(names()) <= documented
 
-    def test_figures_are_those_of_the_models(self) -> None:
+    def test_printed_values_match_the_models(self) -> None:
         data = describe("dex3-1")
         for side in Side:
             rows = data["sides"][str(side)]["joints"]
@@ -115,7 +116,7 @@ class TestCommandLine:
         assert {b["name"] for b in data["backends"]} >= {"sim-dex3", "dex3-usb"}
         assert sum(len(s["slots"]) for s in data["pressure_sensors"]) == 33
 
-    def test_robots_name_a_command_that_exists(self) -> None:
+    def test_robot_pages_name_an_existing_command(self) -> None:
         listed = CliRunner().invoke(emulate, ["--help"]).output
         for name in ROBOTS:
             assert describe(name)["emulator"] == f"dexkit emulate {name}"
@@ -126,7 +127,7 @@ class TestCommandLine:
         assert indices([]) == ""
 
 
-def test_no_drawing_is_left_of_a_model_that_is_gone() -> None:
+def test_every_drawing_belongs_to_a_model() -> None:
     there = {path.name for path in (DOCS / "images").glob("model-*.svg")}
     assert there == {f"model-{name}.svg" for name in names()}
 
@@ -137,7 +138,7 @@ class TestDrawings:
     def sheet(self, name: str) -> Sheet:
         return draw_hand(MODELS[name]) if name in MODELS else draw_robot(ROBOTS[name])
 
-    def test_every_joint_once_with_its_index(self, name: str, sheet: Sheet) -> None:
+    def test_every_joint_is_labelled_once_with_its_index(self, name: str, sheet: Sheet) -> None:
         texts = Counter(box.text for box in sheet.texts)
         expected = Counter(joint.name for _, joint in joints(name))
         assert {text: texts[text] for text in expected} == expected
@@ -146,14 +147,14 @@ class TestDrawings:
             numbers = [b for b in sheet.texts if b.text == str(i)]
             assert any(gap(number, box) < 30 for number in numbers for box in boxes), joint.name
 
-    def test_no_label_lies_on_another_or_beyond_the_sheet(self, name: str, sheet: Sheet) -> None:
+    def test_labels_do_not_overlap_or_leave_the_sheet(self, name: str, sheet: Sheet) -> None:
         for k, box in enumerate(sheet.texts):
             assert box.left >= 0, box
             assert box.right <= sheet.width, box
             assert 0 <= box.top < box.bottom <= sheet.height, box
             assert not [other.text for other in sheet.texts[k + 1 :] if box.overlaps(other)], box
 
-    def test_it_is_one_file_for_light_and_dark(self, name: str, sheet: Sheet) -> None:
+    def test_drawing_has_light_and_dark_colours(self, name: str, sheet: Sheet) -> None:
         root = ElementTree.fromstring(drawing(name))
         assert root.tag == f"{SVG}svg"
         assert root.findtext(f"{SVG}title")
@@ -176,7 +177,7 @@ def test_sensors_are_drawn_where_the_model_has_them() -> None:
     assert Counter(e.text for e in badges) == Counter([*map(str, range(9))] * 2 + ["0"])
 
 
-def test_fingers_hold_the_joints_that_bear_their_names() -> None:
+def test_finger_joints_have_their_finger_in_the_name() -> None:
     assert DEX3_1.layout is not None
     for finger in DEX3_1.layout.fingers:
         for i in finger.joints:
@@ -187,8 +188,8 @@ def test_fingers_hold_the_joints_that_bear_their_names() -> None:
         assert covered == (list(range(len(hand.joints[Side.LEFT]))) if fingers else [])
 
 
-def test_sides_are_mirror_images() -> None:
-    """What closes the left hand stands on the other side of the sheet on the right hand."""
+def test_left_and_right_drawings_are_mirrored() -> None:
+    """Fingers of the right hand are on the other side of the sheet than the left hand's."""
     sheet = draw_hand(DEX3_1)
     for joint in DEX3_1.joints[Side.LEFT]:
         left, right = sorted((b.left + b.right) / 2 for b in sheet.texts if b.text == joint.name)

@@ -1,4 +1,4 @@
-"""The kit's teeth: good hands pass, each wrong hand is caught by its requirement alone."""
+"""Test that references pass and each wrong hand fails exactly its requirements."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dexkit.conformance.mutants.matrix import Outcome, Score, chosen, essential,
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.hand import Side
+from tests.each import each
 
 LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
 
@@ -31,14 +32,14 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         ("dex5", BOTH),
     ],
 )
-def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
+def test_reference_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
     plan = plan_for(dialect, sides=sides)
     result = run_mutant(layer("dds").reference(plan.dialect.model), plan)
     bad = [r.explain() for r in result.results if r.verdict not in GOOD]
     assert not bad, "\n".join(bad)
     assert result.overall is Overall.PASS
     assert result.judged >= 30
-    # with both hands, and an object in one, there is an occasion for everything
+    # with both hands, and an object in one, every requirement can be judged
     if sides == BOTH and dialect != "unitree_hg":
         assert {r.requirement.id for r in result.results if r.verdict is Verdict.PASS} == {
             r.id for r in catalogue(plan.dialect.model) if dialect in r.dialects
@@ -47,7 +48,7 @@ def test_a_good_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
 
 GOOD = (Verdict.PASS, Verdict.NOT_APPLICABLE)
 
-# one wrong hand of each MUST, no longer than it takes to show it
+# one wrong hand of each MUST, in a short run
 ESSENTIAL = essential(mutants())
 
 
@@ -55,19 +56,19 @@ def name_of(given: Mutant) -> str:
     return f"{given.layer}-{given.model}-{given.name}"
 
 
-# one of each check: what the models share is shown with the first
+# one of each check: shared checks are tried with the first model
 HAND = {r.id: r for r in catalogue()}
 OF_EACH_CHECK = {check_of(HAND[t.kills]): t for t in reversed(ESSENTIAL) if t.layer == "dds"}
 
 
 @pytest.mark.parametrize("given", OF_EACH_CHECK.values(), ids=name_of)
-def test_a_wrong_hand_is_caught(given: Mutant) -> None:
+def test_wrong_hand_fails_its_requirement(given: Mutant) -> None:
     assert try_one(given, short=True) == Outcome(given), given.summary
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("given", mutants(), ids=name_of)
-def test_a_wrong_hand_is_caught_for_the_right_reason(given: Mutant) -> None:
+def test_wrong_hand_fails_only_its_requirements(given: Mutant) -> None:
     assert try_one(given) == Outcome(given), given.summary
 
 
@@ -76,13 +77,13 @@ def test_every_must_has_a_wrong_hand() -> None:
     assert {t.kills for t in ESSENTIAL} == musts
 
 
-def test_every_mutant_says_what_it_does_wrong() -> None:
+def test_every_wrong_hand_has_a_summary() -> None:
     every = mutants()
     assert all(t.summary for t in every)
     assert len({(t.layer, t.model, t.name) for t in every}) == len(every)
 
 
-@pytest.mark.parametrize(
+@each(
     ("layer_name", "model"),
     [("dds", "dex1-1"), ("dds", "dex3-1"), ("dds", "dex5-1"), ("robot", "h1"), ("robot", "g1")],
 )
@@ -106,7 +107,7 @@ def test_a_requirement_without_a_wrong_hand_is_an_error() -> None:
     assert not score.perfect
 
 
-def test_a_survivor_and_a_stray_are_errors() -> None:
+def test_missed_and_extra_failures_are_errors() -> None:
     (nan,) = (t for t in mutants() if t.kills == "DEX1-FIELD-02")
     assert score_of(Outcome(nan)).perfect
     survivor = score_of(Outcome(nan, missed=("DEX1-FIELD-02",)))
@@ -115,13 +116,13 @@ def test_a_survivor_and_a_stray_are_errors() -> None:
     assert not score_of(Outcome(nan, wrongly=("DEX1-MOVE-01",))).perfect
 
 
-def test_usb_and_topics_are_chosen_together() -> None:
+def test_selection_by_model_includes_usb_and_topics() -> None:
     requirements, given = chosen("dex3-1", ["DEX3-IMU", "DEX3USB-DESC-01"])
     assert {r.id for r in requirements} == {"DEX3-IMU-01", "DEX3-IMU-02", "DEX3USB-DESC-01"}
     assert {t.layer for t in given} == {"dds", "usb"}
 
 
-def test_the_command_prints_the_score_and_writes_it(tmp_path: Path) -> None:
+def test_command_prints_and_writes_the_score(tmp_path: Path) -> None:
     path = tmp_path / "score.json"
     arguments = ["--require", "DEX3USB-DESC-0", "--json", str(path), "--jobs", "1", "-v"]
     run = CliRunner().invoke(command, arguments)

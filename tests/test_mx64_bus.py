@@ -1,4 +1,5 @@
-"""Several servos on a line: order, line time, garbage, faults (docs/sources/mx64-ezgripper.md#a5,
+"""Test several emulated servos on a line: order, line time, invalid bytes and faults
+(docs/sources/mx64-ezgripper.md#a5,
 docs/sources/mx64-ezgripper.md#c1, docs/sources/mx64-ezgripper.md#c2).
 """
 
@@ -18,6 +19,7 @@ from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import ErrorNumber, Instruction
 from dexkit.wire.mx64 import HardwareError
+from tests.each import each
 from tests.mx64_helpers import QUIET, Host, read, servo, write
 
 READ_POSITION = bytes([132, 0, 4, 0])
@@ -28,7 +30,7 @@ def three(**options: object) -> Host:
     return Host(servo(3), servo(1), servo(2), **options)
 
 
-# --- who answers, and when
+# --- order of answers
 
 
 def test_broadcast_ping_is_answered_in_order_of_ids() -> None:
@@ -52,7 +54,7 @@ def test_bulk_read_gives_each_its_own_block() -> None:
     assert [(p.id, len(p.data)) for p in packets] == [(3, 2), (1, 1)]
 
 
-def test_servos_behind_a_missing_one_wait_for_ever_or_not() -> None:
+def test_group_read_with_missing_servo_stops_or_goes_on() -> None:
     params = READ_POSITION + bytes([1, 9, 2])
     assert [p.id for p in three().send(254, Instruction.SYNC_READ, params)] == [1]
     skips = dataclasses.replace(QUIET, missing_id_stalls=False)
@@ -68,7 +70,7 @@ def test_an_error_in_a_sync_read_does_not_stop_the_others() -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("code", "params"),
     [
         (Instruction.READ, READ_POSITION),
@@ -86,16 +88,16 @@ def test_an_error_in_a_sync_read_does_not_stop_the_others() -> None:
         (Instruction.CONTROL_TABLE_BACKUP, b"\1CTRL"),
     ],
 )
-def test_broadcasts_that_nobody_answers(code: int, params: bytes) -> None:
+def test_broadcasts_without_answer(code: int, params: bytes) -> None:
     assert three().send(254, code, params) == []
 
 
-def test_group_read_to_one_id_is_no_instruction() -> None:
+def test_group_read_to_single_id_is_refused() -> None:
     (answer,) = three().send(1, Instruction.SYNC_READ, READ_POSITION + b"\1")
     assert answer.error == ErrorNumber.INSTRUCTION
 
 
-def test_status_packets_of_others_are_nobodys_instruction() -> None:
+def test_status_packets_are_not_executed() -> None:
     host = three()
     assert host.send_raw(dxl.status(1, 0, b"\1")) == []
     assert host.bus.counters.instructions == 0
@@ -116,7 +118,7 @@ def test_bulk_write_reaches_each_with_its_own_item() -> None:
     assert read(by_id[2], mx64.POSITION_P_GAIN) == 700
 
 
-@pytest.mark.parametrize(
+@each(
     ("code", "params"),
     [
         (Instruction.SYNC_WRITE, b"\x41\0\1"),
@@ -183,7 +185,7 @@ def test_a_fast_read_with_a_missing_servo_is_never_complete() -> None:
     assert dxl.PacketParser().feed(raw) == []
 
 
-def test_two_servos_with_one_id_talk_at_once() -> None:
+def test_two_servos_with_one_id_answer_at_the_same_time() -> None:
     host = Host(servo(1), servo(2, closed_at=1000))
     host.send(2, Instruction.WRITE, b"\x07\0\1")
     raw = host.exchange_raw(dxl.encode(1, Instruction.READ, READ_POSITION))
@@ -202,7 +204,7 @@ def test_one_bus_refuses_one_id_twice() -> None:
         Bus([servo(1)], latency_timer=-1.0)
 
 
-def test_servo_hears_only_its_own_baud_rate() -> None:
+def test_servo_receives_only_at_its_baud_rate() -> None:
     host = Host(servo(1, baudrate=57_600), servo(2))
     host.bus.host_baudrate = 1_000_000
     assert host.send(1, Instruction.PING) == []
@@ -214,7 +216,7 @@ def test_servo_hears_only_its_own_baud_rate() -> None:
     assert host.bus.counters.garbled == 10
 
 
-def test_a_new_baud_rate_counts_from_the_next_packet() -> None:
+def test_new_baud_rate_is_used_from_next_packet() -> None:
     host = Host(servo(1))
     host.bus.host_baudrate = 1_000_000
     assert [p.error for p in host.send(1, Instruction.WRITE, b"\x08\0\1")] == [0]
@@ -223,7 +225,7 @@ def test_a_new_baud_rate_counts_from_the_next_packet() -> None:
     assert [p.id for p in host.send(1, Instruction.PING)] == [1]
 
 
-def test_booting_servo_is_silent_and_then_back() -> None:
+def test_booting_servo_does_not_answer_until_started() -> None:
     host = Host(servo(1))
     assert [p.error for p in host.send(1, Instruction.REBOOT)] == [0]
     assert host.send(1, Instruction.PING) == []
@@ -231,7 +233,7 @@ def test_booting_servo_is_silent_and_then_back() -> None:
     assert [p.id for p in host.send(1, Instruction.PING)] == [1]
 
 
-def test_bad_crc_is_met_with_silence_or_an_error() -> None:
+def test_bad_crc_gives_no_answer_or_an_error() -> None:
     bad = PING[:-1] + bytes([PING[-1] ^ 1])
     host = Host(servo(1))
     assert host.send_raw(bad) == []
@@ -240,7 +242,7 @@ def test_bad_crc_is_met_with_silence_or_an_error() -> None:
     assert [p.error for p in answers.send_raw(bad)] == [ErrorNumber.CRC]
 
 
-# --- garbage never wedges it
+# --- recovery after invalid bytes
 
 
 @given(
@@ -257,13 +259,13 @@ def test_bad_crc_is_met_with_silence_or_an_error() -> None:
     )
 )
 @settings(max_examples=100, deadline=None)
-def test_a_ping_after_anything_is_answered(pieces: list[bytes]) -> None:
+def test_ping_after_any_bytes_is_answered(pieces: list[bytes]) -> None:
     """Given only a pause of more than 1.5 ms, in which a packet begun is dropped."""
     host = Host(servo(1))
     for piece in pieces:
         host.exchange_raw(piece)
     for _ in range(2):
-        # the first may find the servo rebooting or renamed by a lucky broadcast write
+        # at the first ping the servo may reboot, or have a new id from a random broadcast write
         host.wait(0.5)
         packets = host.send(254, Instruction.PING)
     assert len(packets) == 1
@@ -290,7 +292,7 @@ def transaction(host: Host, data: bytes) -> float:
     return host.at - begin
 
 
-@pytest.mark.parametrize(
+@each(
     ("what", "data", "wire_us"),
     [
         # the manual's table at 1 Mbaud without return delay (docs/sources/mx64-ezgripper.md#c1)
@@ -301,8 +303,8 @@ def transaction(host: Host, data: bytes) -> float:
         ("write 4", dxl.encode(1, 3, b"\x74\0" + bytes(4)), 270),
     ],
 )
-@pytest.mark.parametrize("delay", [0, 2, 250])
-def test_transactions_take_the_wires_time(what: str, data: bytes, wire_us: int, delay: int) -> None:
+@each("delay", [0, 2, 250])
+def test_transactions_take_line_time(what: str, data: bytes, wire_us: int, delay: int) -> None:
     target = servo()
     write(target, mx64.RETURN_DELAY_TIME, delay)
     host = Host(target, latency_timer=0.0)
@@ -319,13 +321,13 @@ def test_bytes_take_longer_at_57600() -> None:
     assert transaction(host, read_4) == pytest.approx(5.03e-3, abs=0.01e-3)
 
 
-def test_latency_timer_rounds_up_to_its_ticks() -> None:
+def test_latency_timer_rounds_up_to_ticks() -> None:
     target = servo()
     write(target, mx64.RETURN_DELAY_TIME, 0)
     for timer, expected in ((1e-3, 1e-3), (16e-3, 16e-3)):
         host = Host(target, latency_timer=timer)
         for _ in range(5):
-            # a host that asks again at once is in step with the timer
+            # a host that sends again at once is synchronous with the timer
             assert transaction(host, PING) == pytest.approx(expected)
             host.now = host.at
 
@@ -366,12 +368,12 @@ def test_an_untuned_adapter_gives_sixty_reads_a_second() -> None:
     assert n == 63  # one at each tick of the first second; docs/sources/mx64-ezgripper.md#c2
 
 
-def test_without_line_time_everything_is_there_at_once() -> None:
+def test_without_line_time_answers_are_immediate() -> None:
     host = Host(servo(), line_time=False)
     assert transaction(host, PING) == 0.0
 
 
-def test_answers_queue_behind_each_other_on_the_line() -> None:
+def test_answers_queue_on_the_line() -> None:
     host = three(latency_timer=0.0)
     for target in host.bus.servos:
         write(target, mx64.RETURN_DELAY_TIME, 0)
@@ -382,7 +384,7 @@ def test_answers_queue_behind_each_other_on_the_line() -> None:
 # --- faults
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "kind", "at", "duration", "params", "device"),
     [
         ("overload@3s", "overload", 3.0, None, {}, None),
@@ -412,7 +414,7 @@ def test_fault_grammar(
     assert (fault.params, fault.device) == (params, device)
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "",
@@ -435,7 +437,7 @@ def test_fault_grammar(
         "unplug@5s:for=ever",
     ],
 )
-def test_bad_faults_say_what_is_allowed(text: str) -> None:
+def test_invalid_fault_error_lists_allowed_faults(text: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse_fault(text)
     assert all(kind in caught.value.hint for kind in FAULT_KINDS)
@@ -459,7 +461,7 @@ def test_schedule_begins_and_ends_in_order() -> None:
     assert schedule.next_time is None
 
 
-@pytest.mark.parametrize(
+@each(
     ("spec", "error"),
     [
         ("overload", HardwareError.OVERLOAD),
@@ -469,7 +471,7 @@ def test_schedule_begins_and_ends_in_order() -> None:
         ("brown-out:volts=9", HardwareError.INPUT_VOLTAGE),
     ],
 )
-def test_fault_becomes_the_servos_error(spec: str, error: HardwareError) -> None:
+def test_fault_sets_hardware_error(spec: str, error: HardwareError) -> None:
     name, _, args = spec.partition(":")
     host = Host(servo(1), servo(2), faults=(f"{name}@1s:id=2" + ("," + args if args else ""),))
     host.wait(0.9)
@@ -481,14 +483,14 @@ def test_fault_becomes_the_servos_error(spec: str, error: HardwareError) -> None
     assert packet.alert
 
 
-def test_drop_loses_its_part_of_the_answers() -> None:
+def test_drop_loses_given_part_of_answers() -> None:
     host = Host(servo(), faults=("drop:p=0.3",), line_time=False)
     answered = sum(bool(host.exchange_raw(PING)) for _ in range(1000))
     assert 640 < answered < 760
     assert host.bus.counters.dropped == 1000 - answered
 
 
-def test_corrupt_spoils_its_part_of_the_answers() -> None:
+def test_corrupt_damages_given_part_of_answers() -> None:
     host = Host(servo(), faults=("corrupt:p=0.2",), line_time=False)
     good = Host(servo(), line_time=False).exchange_raw(PING)
     raws = [host.exchange_raw(PING) for _ in range(500)]
@@ -497,14 +499,14 @@ def test_corrupt_spoils_its_part_of_the_answers() -> None:
     assert all(not dxl.PacketParser().feed(raw) for raw in raws if raw != good)
 
 
-def test_delay_comes_late_and_ends() -> None:
+def test_delay_fault_delays_answers_until_it_ends() -> None:
     host = Host(servo(), faults=("delay:ms=30,for=1s",), latency_timer=0.0)
     assert transaction(host, PING) == pytest.approx(0.03, abs=0.002)
     host.wait(1.0)
     assert transaction(host, PING) < 0.002
 
 
-def test_chance_is_seeded() -> None:
+def test_random_faults_repeat_with_same_seed() -> None:
     def answers(seed: int) -> list[bytes]:
         host = Host(servo(), faults=("drop:p=0.5", "corrupt:p=0.5"), seed=seed)
         return [host.exchange_raw(PING) for _ in range(40)]
@@ -512,7 +514,7 @@ def test_chance_is_seeded() -> None:
     assert answers(1) == answers(1) != answers(2)
 
 
-def test_stuck_holds_for_its_time() -> None:
+def test_stuck_fault_holds_for_its_duration() -> None:
     target = servo()
     host = Host(target, faults=("stuck:for=1s",))
     write(target, mx64.OPERATING_MODE, 5)
@@ -535,7 +537,7 @@ def test_deep_brown_out_restarts_the_servo() -> None:
     assert read(target, mx64.LED) == 0
 
 
-def test_unplugged_bus_loses_what_was_on_its_way() -> None:
+def test_unplugged_bus_loses_pending_bytes() -> None:
     host = Host(servo(), faults=("unplug@1s:for=1s",))
     host.wait(0.9995)
     host.bus.receive(PING, host.now)
@@ -546,7 +548,7 @@ def test_unplugged_bus_loses_what_was_on_its_way() -> None:
     assert not host.bus.unplugged
 
 
-def test_counters_tell_the_story() -> None:
+def test_counters_count_packets_and_errors() -> None:
     host = Host(servo())
     host.send_raw(b"junk" + PING)
     counters = host.bus.counters
@@ -576,7 +578,7 @@ def test_protocol_1_servo_answers_its_own_protocol_only() -> None:
 
 @given(st.binary(max_size=200))
 @settings(deadline=None)
-def test_protocol_1_survives_anything(noise: bytes) -> None:
+def test_protocol_1_servo_accepts_any_bytes(noise: bytes) -> None:
     old = Protocol1Servo(1)
     old.feed(noise)
     for _ in range(3):
@@ -584,7 +586,7 @@ def test_protocol_1_survives_anything(noise: bytes) -> None:
     assert old.feed(bytes.fromhex("ffff010201fb")) == [bytes.fromhex("ffff010200fc")]
 
 
-def test_nothing_but_instructions_comes_back_unasked() -> None:
+def test_bus_sends_nothing_without_instruction() -> None:
     host = three()
     host.wait(5.0)
     assert host.bus.next_time is None

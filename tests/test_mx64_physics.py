@@ -1,4 +1,4 @@
-"""Motor, profiles, heat and supply of the emulated servo against the maker's figures."""
+"""Test motor, profiles, heat and supply of the emulated servo against data sheet values."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from dexkit.emulators.mx64 import Firmware, Physics, Servo
 from dexkit.emulators.mx64.drive import PERIOD, Drive, Profile
 from dexkit.wire import mx64
 from dexkit.wire.mx64 import HardwareError, MovingStatus, OperatingMode
+from tests.each import each
 from tests.mx64_helpers import QUIET, read, ready, run, servo, write
 
 EZ = OperatingMode.CURRENT_BASED_POSITION
@@ -30,14 +31,14 @@ def bare(mode: OperatingMode, **demand: float) -> Drive:
     return drive
 
 
-def test_no_load_speed_is_the_makers() -> None:
+def test_no_load_speed_matches_data_sheet() -> None:
     drive = bare(OperatingMode.PWM, pwm=mx64.PWM_MAX)
     for _ in range(1000):
         drive.step()
     assert drive.velocity * 60 / (2 * math.pi) == pytest.approx(63, rel=0.02)
 
 
-def test_stall_torque_and_current_are_the_makers() -> None:
+def test_stall_torque_and_current_match_data_sheet() -> None:
     drive = bare(OperatingMode.PWM, pwm=mx64.PWM_MAX)
     drive.physics = dataclasses.replace(drive.physics, supply_resistance=0.0)
     drive.joint.locked = True
@@ -49,7 +50,7 @@ def test_stall_torque_and_current_are_the_makers() -> None:
     assert torque == pytest.approx(6.0, rel=0.02)
 
 
-def test_full_stroke_takes_what_the_motor_can() -> None:
+def test_full_stroke_time_follows_motor_speed() -> None:
     """No faster than the no-load bound of 0.58 s (docs/sources/mx64-ezgripper.md#d1), no slower
     than 0.75 s.
     """
@@ -65,7 +66,7 @@ def test_full_stroke_takes_what_the_motor_can() -> None:
     assert 0.57 < target.now - begin < 0.75
 
 
-def test_free_motion_draws_what_logs_show() -> None:
+def test_free_motion_current_matches_logs() -> None:
     """8 to 106 units in free motion (docs/sources/mx64-ezgripper.md#b7)."""
     target = servo(start=0.0)
     ready(target, EZ)
@@ -156,7 +157,7 @@ def test_position_mode_reaches_its_goal() -> None:
         assert read(target, mx64.PRESENT_POSITION) == pytest.approx(goal, abs=25)
 
 
-def test_integral_gain_takes_the_rest_away() -> None:
+def test_integral_gain_removes_steady_error() -> None:
     target = servo()
     ready(target, OperatingMode.POSITION)
     write(target, mx64.POSITION_I_GAIN, 2000)
@@ -187,7 +188,7 @@ def test_velocity_mode_ramps_with_profile_acceleration() -> None:
     assert half == pytest.approx(10, abs=0.5)
 
 
-def test_current_mode_pulls_until_something_holds() -> None:
+def test_current_mode_moves_until_blocked() -> None:
     target = servo()
     ready(target, OperatingMode.CURRENT)
     write(target, mx64.GOAL_CURRENT, -200)
@@ -227,7 +228,7 @@ def test_goal_pwm_limits_the_current_mode_too() -> None:
     assert abs(read(target, mx64.PRESENT_CURRENT)) < 150
 
 
-def test_feedforward_leads() -> None:
+def test_feedforward_reduces_following_error() -> None:
     """With the profile's speed fed forward the servo lags its trajectory less."""
     lags = []
     for gain in (0, 800):
@@ -243,7 +244,7 @@ def test_feedforward_leads() -> None:
     assert lags[1] < lags[0] / 1.2
 
 
-def test_present_current_can_follow_the_goal() -> None:
+def test_present_current_option_follows_goal() -> None:
     follows = dataclasses.replace(QUIET, current_follows_goal=True)
     target = servo(object_pct=45.0, firmware=follows)
     ready(target, EZ)
@@ -295,12 +296,12 @@ def test_profile_arrives_exactly_and_keeps_its_limits(
     assert profile.position == goal
 
 
-@pytest.mark.parametrize(
+@each(
     ("velocity", "acceleration", "seconds"),
     # t = 64 dPos / V + 64 V / A ms (docs/sources/mx64-ezgripper.md#b5)
     [(100, 0, 0.64 * 1), (100, 100, 0.64 + 0.064), (50, 100, 1.28 + 0.032)],
 )
-def test_profile_takes_the_manuals_time(velocity: int, acceleration: int, seconds: float) -> None:
+def test_profile_time_matches_manual(velocity: int, acceleration: int, seconds: float) -> None:
     profile = Profile()
     profile.hold(0.0)
     profile.start(1000.0, velocity, acceleration)
@@ -312,8 +313,8 @@ def test_profile_takes_the_manuals_time(velocity: int, acceleration: int, second
     assert time == pytest.approx(seconds, rel=0.02)
 
 
-@pytest.mark.parametrize(("total", "ramp"), [(1000, 0), (1000, 250), (500, 400)])
-def test_timed_profile_takes_its_time(total: int, ramp: int) -> None:
+@each(("total", "ramp"), [(1000, 0), (1000, 250), (500, 400)])
+def test_time_based_profile_ends_on_time(total: int, ramp: int) -> None:
     profile = Profile()
     profile.hold(100.0)
     profile.start(900.0, total, ramp, timed=True)
@@ -338,7 +339,7 @@ def test_new_goal_keeps_the_speed() -> None:
     assert before - profile.velocity < 50 * mx64.ACCELERATION_UNIT / mx64.TICK * PERIOD * 1.01
 
 
-def test_shape_of_a_step_is_none() -> None:
+def test_step_without_profile_has_no_shape() -> None:
     profile = Profile()
     profile.start(100.0, 0, 10)
     assert (profile.shape, profile.position, profile.running) == (MovingStatus.NONE, 100.0, False)
@@ -374,7 +375,7 @@ def test_overheating_shuts_down() -> None:
     assert not target.torque
 
 
-def test_it_cools_down_towards_the_surroundings() -> None:
+def test_motor_cools_to_ambient_temperature() -> None:
     target = servo()
     target.drive.temperature = 75.0
     run(target, 20 * 60.0)
@@ -459,7 +460,7 @@ def test_two_runs_are_the_same_to_the_last_bit() -> None:
     assert traces[0] == traces[1]
 
 
-def test_how_time_is_cut_does_not_matter() -> None:
+def test_result_is_independent_of_step_length() -> None:
     ends = []
     for step in (0.001, 0.0037, 0.5):
         target = servo(object_pct=30.0)

@@ -1,7 +1,7 @@
-"""ROBOTIS' own SDK, unmodified, talks to the emulated servos over the pseudo-terminal.
+"""Test the emulated servos with ROBOTIS' unmodified SDK over a pseudo-terminal.
 
 Where the SDK has a defect (docs/sources/mx64-ezgripper.md#a3, docs/sources/mx64-ezgripper.md#c3)
-the emulator keeps to the manual, and the test says so.
+the emulator follows the manual, and the test notes it.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def test_reads_and_writes_of_every_size(port: sdk.PortHandler) -> None:
     assert (len(data), *rest) == (21, *OK)
 
 
-def test_tx_only_and_rx_apart(port: sdk.PortHandler) -> None:
+def test_separate_tx_only_and_rx(port: sdk.PortHandler) -> None:
     assert PACKETS.write1ByteTxOnly(port, 1, mx64.LED.address, 0) == sdk.COMM_SUCCESS
     port.is_using = False
     _come(port, 11)  # the status of the write, dropped by the next request
@@ -128,7 +128,7 @@ def test_clear_reboot_and_factory_reset(port: sdk.PortHandler) -> None:
     assert PACKETS.read1ByteTxRx(port, 2, mx64.RETURN_DELAY_TIME.address) == (250, *OK)
 
 
-def test_errors_are_understood(port: sdk.PortHandler) -> None:
+def test_sdk_decodes_status_errors(port: sdk.PortHandler) -> None:
     result, error = PACKETS.write1ByteTxRx(port, 1, mx64.HARDWARE_ERROR_STATUS.address, 0)
     assert (result, error) == (sdk.COMM_SUCCESS, 7)
     assert "not available to target address" in PACKETS.getRxPacketError(error)
@@ -136,7 +136,7 @@ def test_errors_are_understood(port: sdk.PortHandler) -> None:
     assert PACKETS.write1ByteTxRx(port, 1, mx64.ID.address, 1) == (sdk.COMM_SUCCESS, 7)
 
 
-def test_goals_that_the_sdk_forgets_to_stuff_are_still_understood(port: sdk.PortHandler) -> None:
+def test_unstuffed_goals_of_the_sdk_are_accepted(port: sdk.PortHandler) -> None:
     """The SDK does not stuff what it sends (docs/sources/mx64-ezgripper.md#a3), but its length and
     CRC agree.
     """
@@ -188,7 +188,7 @@ def test_fast_sync_and_bulk_read_when_switched_on(port: sdk.PortHandler) -> None
     bulk = sdk.GroupBulkRead(port, PACKETS)
     for servo_id in (1, 2):
         assert reader.addParam(servo_id)
-        # not a block of 2 bytes: the SDK looks an id up among addresses and lengths too
+        # not a block of 2 bytes: the SDK also searches an id among addresses and lengths
         assert bulk.addParam(servo_id, mx64.GOAL_POSITION.address, 4)
     assert reader.fastSyncRead() == sdk.COMM_SUCCESS
     slow = [PACKETS.read4ByteTxRx(port, i, mx64.PRESENT_POSITION.address)[0] for i in (1, 2)]
@@ -236,7 +236,7 @@ def test_gripper_closes_and_opens(port: sdk.PortHandler) -> None:
     eventually(lambda: abs(position() - zero - 1250) <= 25)
 
 
-def test_table_is_that_of_robotis() -> None:
+def test_table_matches_robotis_table() -> None:
     """Address and size of every item in the SDK's own model file."""
     text = resources.files("dynamixel_easy_sdk").joinpath("control_table/mx_64.model").read_text()
     rows = [line.split("\t") for line in text.split("[control table]")[1].splitlines()]
@@ -250,7 +250,7 @@ def test_table_is_that_of_robotis() -> None:
             assert renamed.get(address, ours[address][1]) == name
 
 
-def test_easy_sdk(pair: EmulatedProcess) -> None:
+def test_easy_sdk_example_runs(pair: EmulatedProcess) -> None:
     connector = easy.Connector(pair.path, 1_000_000)
     motors = connector.createAllMotors(0, 10)
     assert [m.id for m in motors] == [1, 2]
@@ -266,8 +266,8 @@ def test_easy_sdk(pair: EmulatedProcess) -> None:
 
 
 @pytest.mark.realtime
-def test_no_transaction_is_faster_than_the_line(port: sdk.PortHandler) -> None:
-    """A write and a read at 1 Mbaud with a 1 ms latency timer: each ends at a tick of its own."""
+def test_sdk_transaction_is_not_faster_than_the_line(port: sdk.PortHandler) -> None:
+    """A write and a read at 1 Mbaud with a 1 ms latency timer: each ends at a separate tick."""
     PACKETS.write1ByteTxRx(port, 1, mx64.RETURN_DELAY_TIME.address, 2)
     count = 50
     started = time.monotonic()

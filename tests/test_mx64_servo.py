@@ -1,4 +1,4 @@
-"""Registers and instructions of one emulated servo (docs/sources/mx64-ezgripper.md#a4,
+"""Test registers and instructions of one emulated servo (docs/sources/mx64-ezgripper.md#a4,
 docs/sources/mx64-ezgripper.md#a5, docs/sources/mx64-ezgripper.md#b).
 """
 
@@ -17,6 +17,7 @@ from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import ErrorNumber, Instruction, Packet
 from dexkit.wire.mx64 import HardwareError, Item, MovingStatus, OperatingMode
+from tests.each import each
 from tests.mx64_helpers import QUIET, error_of, read, ready, run, servo, write
 
 
@@ -51,7 +52,7 @@ def test_every_item_reads_with_its_initial_value() -> None:
 
 @given(st.integers(0, 700), st.integers(0, 700))
 @settings(max_examples=200, deadline=None)
-def test_reads_answer_everything_or_an_access_error(address: int, length: int) -> None:
+def test_read_answers_data_or_access_error(address: int, length: int) -> None:
     error, data = servo().read_block(address, length)
     covered = {a for i in mx64.TABLE.values() for a in range(i.address, i.end)}
     if length == 0:
@@ -81,9 +82,7 @@ def test_part_of_an_item_can_be_read_but_not_written() -> None:
 
 @given(st.integers(0, 700), st.binary(max_size=30), st.booleans())
 @settings(max_examples=200, deadline=None)
-def test_a_write_changes_all_of_what_it_says_or_nothing(
-    address: int, data: bytes, torque: bool
-) -> None:
+def test_write_changes_all_or_no_bytes(address: int, data: bytes, torque: bool) -> None:
     target = servo()
     if torque:
         assert write(target, mx64.TORQUE_ENABLE, 1) == 0
@@ -117,7 +116,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
         assert write(target, item, value) == 0, item.name
 
 
-def test_writing_nowhere_is_an_error_that_can_be_chosen() -> None:
+def test_error_of_write_to_unused_address_is_configurable() -> None:
     target = servo()
     other = servo(firmware=with_firmware(undefined_address_error=ErrorNumber.DATA_RANGE))
     for address in (14, 28, 56, 66, 71, 86, 92, 99, 147, 252, 662, 700):
@@ -125,7 +124,7 @@ def test_writing_nowhere_is_an_error_that_can_be_chosen() -> None:
         assert other.write_block(address, b"\0") == ErrorNumber.DATA_RANGE, address
 
 
-@pytest.mark.parametrize(
+@each(
     ("item", "value"),
     [
         (mx64.ID, 253),
@@ -152,7 +151,7 @@ def test_out_of_range(item: Item, value: int) -> None:
     assert write(servo(), item, value) == ErrorNumber.DATA_RANGE
 
 
-@pytest.mark.parametrize(
+@each(
     ("limit", "at", "goal", "most"),
     [
         (mx64.PWM_LIMIT, 500, mx64.GOAL_PWM, 500),
@@ -164,7 +163,7 @@ def test_out_of_range(item: Item, value: int) -> None:
     ],
     ids=lambda v: v.name if isinstance(v, Item) else "",
 )
-def test_goals_beyond_a_limit_item(limit: Item, at: int, goal: Item, most: int) -> None:
+def test_goal_beyond_limit_is_refused(limit: Item, at: int, goal: Item, most: int) -> None:
     target = servo()
     assert write(target, limit, at) == 0
     assert write(target, goal, most) == 0
@@ -218,7 +217,7 @@ def test_one_write_can_span_items() -> None:
 # --- mode changes, folding
 
 
-def test_mode_change_resets_what_the_manual_says() -> None:
+def test_mode_change_resets_documented_registers() -> None:
     target = servo()
     write(target, mx64.CURRENT_LIMIT, 1600)
     for item, value in (
@@ -260,7 +259,7 @@ def test_reboot_folds_the_position_into_one_turn() -> None:
 def test_torque_on_in_mode_3_folds_but_not_in_mode_4() -> None:
     target = servo(closed_at=3010, start=100.0)
     write(target, mx64.OPERATING_MODE, OperatingMode.EXTENDED_POSITION)
-    target.drive.counter -= 4096  # as if it had come around
+    target.drive.counter -= 4096  # as after a full turn
     before = read(target, mx64.PRESENT_POSITION)
     write(target, mx64.TORQUE_ENABLE, 1)
     assert read(target, mx64.PRESENT_POSITION) == before > 4095
@@ -316,7 +315,7 @@ def test_reverse_mode_mirrors_everything() -> None:
 # --- status policy
 
 
-@pytest.mark.parametrize(
+@each(
     ("level", "ping", "reads", "writes"),
     [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
 )
@@ -332,13 +331,13 @@ def test_status_return_level(level: int, ping: bool, reads: bool, writes: bool) 
     assert read(servo(), mx64.LED) == 0
 
 
-def test_broadcast_writes_act_in_silence() -> None:
+def test_broadcast_write_acts_without_answer() -> None:
     target = servo()
     assert target.handle(Packet(254, Instruction.WRITE, b"\x41\0\1")) is None
     assert read(target, mx64.LED) == 1
 
 
-def test_secondary_id_acts_in_silence_and_never_on_eeprom() -> None:
+def test_secondary_id_acts_without_answer_and_never_on_eeprom() -> None:
     target = servo()
     write(target, mx64.SECONDARY_ID, 9)
     assert target.secondary_id == 9
@@ -353,7 +352,7 @@ def test_secondary_id_acts_in_silence_and_never_on_eeprom() -> None:
     assert target.secondary_id is None
 
 
-def test_new_id_counts_from_the_next_packet() -> None:
+def test_new_id_is_used_from_next_packet() -> None:
     target = servo()
     status = target.handle(Packet(1, Instruction.WRITE, bytes([7, 0, 5])))
     assert status is not None
@@ -361,7 +360,7 @@ def test_new_id_counts_from_the_next_packet() -> None:
     assert target.id == 5
 
 
-@pytest.mark.parametrize(
+@each(
     ("code", "params", "error"),
     [
         (0x77, b"", ErrorNumber.INSTRUCTION),
@@ -375,7 +374,7 @@ def test_new_id_counts_from_the_next_packet() -> None:
         (Instruction.CLEAR, b"\x02\x45\x52\x43\x4c", ErrorNumber.DATA_RANGE),
     ],
 )
-def test_instructions_that_fail(code: int, params: bytes, error: int) -> None:
+def test_invalid_instructions_return_error(code: int, params: bytes, error: int) -> None:
     assert error_of(servo().handle(Packet(1, code, params))) == error
 
 
@@ -397,7 +396,7 @@ def test_reg_write_is_checked_at_once() -> None:
     assert read(target, mx64.REGISTERED_INSTRUCTION) == 0
 
 
-def test_clear_folds_only_when_standing() -> None:
+def test_clear_folds_position_only_at_rest() -> None:
     target = servo(closed_at=3010, start=90.0)
     ready(target, OperatingMode.CURRENT_BASED_POSITION)
     target.drive.counter -= 8192
@@ -409,13 +408,11 @@ def test_clear_folds_only_when_standing() -> None:
     assert send(target, Instruction.CLEAR, dxl.CLEAR_POSITION_KEY).error == 0
     at = read(target, mx64.PRESENT_POSITION)
     assert 0 <= at <= 4095
-    run(target, 0.5)  # and it does not run away
+    run(target, 0.5)  # and it stays there
     assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at, abs=3)
 
 
-@pytest.mark.parametrize(
-    ("option", "servo_id", "baud"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 2_000_000)]
-)
+@each(("option", "servo_id", "baud"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 2_000_000)])
 def test_factory_reset(option: int, servo_id: int, baud: int) -> None:
     target = servo(7, baudrate=2_000_000)
     write(target, mx64.CURRENT_LIMIT, 100)
@@ -498,7 +495,7 @@ def map_bytes(target: Servo, first: int, addresses: list[int]) -> None:
         assert write(target, mx64.indirect_address(first + k), address) == 0
 
 
-@pytest.mark.parametrize("first", [1, 20, 29, 51])
+@each("first", [1, 20, 29, 51])
 def test_indirect_data_read_and_write_their_targets(first: int) -> None:
     target = servo()
     ready(target, OperatingMode.CURRENT_BASED_POSITION)
@@ -571,8 +568,8 @@ def test_bus_watchdog_stops_and_locks_the_goals() -> None:
     assert write(target, mx64.GOAL_POSITION, at) == 0
 
 
-@pytest.mark.parametrize("resumes", [False, True])
-def test_a_cleared_watchdog_leaves_it_standing_or_lets_it_go_on(resumes: bool) -> None:
+@each("resumes", [False, True])
+def test_cleared_watchdog_stays_stopped_or_resumes(resumes: bool) -> None:
     target = servo(firmware=dataclasses.replace(QUIET, watchdog_resumes=resumes))
     ready(target, OperatingMode.CURRENT_BASED_POSITION)
     write(target, mx64.PROFILE_VELOCITY, 50)
@@ -587,7 +584,7 @@ def test_a_cleared_watchdog_leaves_it_standing_or_lets_it_go_on(resumes: bool) -
     assert read(target, mx64.PRESENT_POSITION) == pytest.approx(expected, abs=20)
 
 
-@pytest.mark.parametrize("mode", [OperatingMode.CURRENT, OperatingMode.VELOCITY, OperatingMode.PWM])
+@each("mode", [OperatingMode.CURRENT, OperatingMode.VELOCITY, OperatingMode.PWM])
 def test_bus_watchdog_stops_every_mode(mode: OperatingMode) -> None:
     target = servo()
     write(target, mx64.OPERATING_MODE, mode)
@@ -687,7 +684,7 @@ def test_eeprom_survives_into_another_run() -> None:
     assert read(again, mx64.LED) == 0
 
 
-@pytest.mark.parametrize("eeprom", [b"", bytes(64)])
+@each("eeprom", [b"", bytes(64)])
 def test_wrong_eeprom_is_refused(eeprom: bytes) -> None:
     with pytest.raises(UsageError):
         servo(eeprom=eeprom)
@@ -702,7 +699,7 @@ def test_wrong_values_in_eeprom_are_refused() -> None:
             servo(eeprom=bytes(bad))
 
 
-def test_impossible_servos_are_refused() -> None:
+def test_invalid_servo_options_are_refused() -> None:
     with pytest.raises(UsageError):
         Servo(253)
     with pytest.raises(UsageError):
@@ -712,7 +709,7 @@ def test_impossible_servos_are_refused() -> None:
 # --- moving status
 
 
-def test_moving_status_names_the_profile() -> None:
+def test_moving_status_reports_profile_type() -> None:
     target = servo(start=10.0)
     ready(target, OperatingMode.EXTENDED_POSITION)
     at = read(target, mx64.PRESENT_POSITION)
@@ -747,7 +744,7 @@ def test_following_error_shows_when_blocked() -> None:
     assert read(target, mx64.MOVING_STATUS) & MovingStatus.FOLLOWING_ERROR
 
 
-# --- any history keeps the servo sane
+# --- any instructions keep registers within limits
 
 
 class_items = st.sampled_from([i for i in mx64.TABLE.values() if i.writable and i.address < 168])
@@ -764,7 +761,7 @@ class_items = st.sampled_from([i for i in mx64.TABLE.values() if i.writable and 
     )
 )
 @settings(max_examples=60, deadline=None)
-def test_any_history_keeps_the_servo_within_its_table(
+def test_any_instructions_keep_registers_within_table_limits(
     steps: list[tuple[Item | None, int]],
 ) -> None:
     target = servo()

@@ -1,4 +1,4 @@
-"""The control table as data: no overlaps, the manual's gaps, units that agree with each other."""
+"""Test the control table: no overlaps, the manual's gaps, consistent units."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dexkit.wire import mx64
 from dexkit.wire.mx64 import Area
 
 
-def test_items_do_not_overlap_and_gaps_are_the_manuals() -> None:
+def test_items_do_not_overlap_and_gaps_match_manual() -> None:
     covered: set[int] = set()
     for item in mx64.TABLE.values():
         span = set(range(item.address, item.end))

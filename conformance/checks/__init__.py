@@ -1,11 +1,11 @@
 """The checks: each judges a recording for one requirement and one side.
 
 A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes on
-missing evidence, and takes every figure from its requirement's tolerances, so that several hand
-models share it. Modules, by what they look at: :mod:`~dexkit.conformance.checks.discovery`,
+missing evidence, and takes every limit from its requirement's tolerances, so that several hand
+models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.motion`, :mod:`~.force`,
-:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.fingers` for what only hands of
-several joints have.
+:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.fingers` for hands of several
+joints.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ CHECK_MODULES: Mapping[str, Sequence[str]] = {
 """The modules that register the checks of each layer."""
 
 STROKE_S = 1.0
-"""Seconds that a hand takes for a stroke, as Unitree's client leads it."""
+"""Seconds that a hand driven by Unitree's client takes for a stroke."""
 
 
 @dataclass(frozen=True)
 class Late:
-    """How late a good hand would have to be to look like a failure: the failure's size.
+    """The delay of a conforming hand that would cause the same failure: the failure's size.
 
     :param seconds: at each of the failure's places, or one for all of them; infinite where no
-        delay makes a good hand look so. Of a way that is missing, the seconds that a good hand
+        delay causes such a failure. For a missing motion, the seconds that a conforming hand
         takes for it: :data:`STROKE_S` for a stroke.
     :param how: ``total``: once, at that place; ``mean``: again and again, as a rate suffers;
         ``p99``: one time in a hundred.
-    :param best: the same of the best quarter of what happened again and again; 0 if not known.
+    :param best: the same for the best quarter of repeated events; 0 if not known.
     """
 
     seconds: tuple[float, ...]
@@ -73,15 +73,15 @@ class Outcome:
     """What a check found.
 
     :param met: whether the requirement is met; None when it could not be judged.
-    :param cause: the likely cause, where the check saw enough to tell; else the requirement's.
-    :param late: how late a good hand would have to be to look like this, where the check can
-        tell; else as late as the failure's place is long.
-    :param absent: the hand does not do this at all: a failure of who claims the unit, whatever
-        ``met`` is for others.
+    :param cause: the likely cause, where the check can determine it; else the requirement's.
+    :param late: the delay of a conforming hand that would cause this failure, where the check can
+        determine it; else the length of the failure's place.
+    :param absent: the hand lacks this unit: a failure if the vendor claims the unit, whatever
+        ``met`` is otherwise.
     :param joints: indices of the joints that it is about, the most important first; empty if it is
-        about none in particular.
-    :param plots: what shows it, where that is not what the requirement names.
-    :param retry: another run may come to another finding.
+        about no particular joint.
+    :param plots: the plots that show it, where they differ from the requirement's.
+    :param retry: another run may give another outcome.
     """
 
     met: bool | None
@@ -98,20 +98,20 @@ class Outcome:
     retry: bool = False
 
     def about(self, *joints: int) -> Outcome:
-        """The same, about these joints (indices)."""
+        """Return a copy that is about these joints (indices)."""
         return replace(self, joints=tuple(int(joint) for joint in joints))
 
     def shown_by(self, *plots: PlotKind | Plot) -> Outcome:
-        """The same, with plots of its own instead of the requirement's."""
+        """Return a copy with these plots instead of the requirement's."""
         chosen = tuple(Plot(p) if isinstance(p, PlotKind) else p for p in plots)
         return replace(self, plots=chosen)
 
     def because(self, cause: str) -> Outcome:
-        """The same, with a cause that the check could tell from what it saw."""
+        """Return a copy with a cause that the check has determined."""
         return replace(self, cause=cause)
 
     def if_late(self, *seconds: float, how: str = "total", best: float = 0.0) -> Outcome:
-        """The same, with its size; see :class:`Late`."""
+        """Return a copy with the size of the failure; see :class:`Late`."""
         sizes = tuple(max(0.0, float(s)) for s in seconds)
         return replace(self, late=Late(sizes, how, max(0.0, float(best))))
 
@@ -181,17 +181,17 @@ class Context(BaseContext[Recording, SideView]):
 
     @property
     def other(self) -> Side:
-        """The other one."""
+        """The other side."""
         return Side.RIGHT if self.side is Side.LEFT else Side.LEFT
 
     @property
     def states(self) -> States:
-        """Its states."""
+        """The states of this side."""
         return self.hand.states
 
     @property
     def commands(self) -> Commands:
-        """The commands to it."""
+        """The commands to this side."""
         return self.hand.commands
 
     @property
@@ -200,7 +200,7 @@ class Context(BaseContext[Recording, SideView]):
         return self.hand.joints
 
     def tolerance(self, name: str, joint: int = 0) -> float:
-        """A figure of the requirement; ``NAME_stroke`` comes in radians of that joint."""
+        """A tolerance of the requirement; ``NAME_stroke`` in radians of that joint."""
         value = self.requirement.tolerance(name)
         return value * self.joints[joint].stroke if name.endswith("_stroke") else value
 
@@ -218,7 +218,7 @@ class Context(BaseContext[Recording, SideView]):
 
     @property
     def object_at(self) -> float | None:
-        """Where this side touches its object, as far as is known."""
+        """The q at which this side touches its object, or None if not known."""
         return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
 
     def at(self, topic: str, seconds: float, end: float | None = None) -> Evidence:
@@ -227,15 +227,14 @@ class Context(BaseContext[Recording, SideView]):
 
 
 Check = Callable[[Any], Outcome]
-"""A function of its layer's context. The layer gives it that; see
-:mod:`dexkit.conformance.layers`."""
+"""A function of the context of its layer; see :mod:`dexkit.conformance.layers`."""
 CheckT = TypeVar("CheckT", bound=Check)
 REGISTRY: dict[str, Check] = {}
 """Checks by requirement id, of those modules that have been imported."""
 
 
 def check(*requirement_ids: str) -> Callable[[CheckT], CheckT]:
-    """Register the decorated function as the check of these requirements, of whichever layer."""
+    """Register the decorated function as the check of these requirements, of any layer."""
 
     def register(function: CheckT) -> CheckT:
         for name in requirement_ids:

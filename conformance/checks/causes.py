@@ -1,4 +1,4 @@
-"""Likely causes that can be told from the figures: wrong units, wrong sides, wrong types."""
+"""Determine likely causes from measured values: wrong units, wrong sides, wrong types."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["of_positions", "of_range", "of_scale", "of_type"]
 
 
 def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec]) -> str:
-    """Why positions leave their range, or nothing.
+    """The likely cause of positions outside their range, or an empty text.
 
     :param q: rad, shape (n, n_joints).
     :param other: the joints of the hand's other side.
@@ -36,31 +36,31 @@ def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSp
             "These are the other side's positions: its signs are used here, or sides are swapped."
         )
     if within([_mirrored(j) for j in joints]):
-        return "The sign of q is turned."
+        return "The sign of q is wrong."
     if low.min() >= -1.0 and 20.0 < high.max() <= 101.0:
-        return "q looks like percent, not radians."
+        return "q appears to be in percent, not radians."
     widest = max(max(-j.q_min, j.q_max) for j in joints)
     if np.abs(q).max() > 3 * widest and within(joints, 180 / np.pi):
         also = "percent or " if low.min() >= -1.0 and high.max() <= 20.0 else ""
-        return f"q looks like {also}degrees, not radians."
+        return f"q appears to be in {also}degrees, not radians."
     if np.abs(q).max() > 100.0:
-        return "q looks like the device's own counts, or the rotor's angle before the gear."
+        return "q appears to be in the device's counts, or to be the rotor's angle before the gear."
     return ""
 
 
 def of_range(q: float) -> str:
-    """Why a joint stands at ``q``, far off its range, or nothing."""
+    """The likely cause of a joint at ``q``, far outside its range, or an empty text."""
     if abs(q - 100.0) < 5.0:
         unit = "percent"
     elif 120.0 < abs(q) <= 400.0:
         unit = "degrees"
     else:
         return ""
-    return f"q looks like {unit}, in commands as in the state: of its range only a part was used."
+    return f"q appears to be in {unit}, in commands and state: only a part of its range was used."
 
 
 def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
-    """Why steps of one joint end elsewhere, or nothing.
+    """The likely cause of steps of one joint that miss their targets, or an empty text.
 
     :param targets: q that was commanded, rad; ``reached``: where each step ended.
     :param stroke: of a joint whose q counts from 0.
@@ -68,13 +68,13 @@ def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
     if len(targets) < 2 or np.ptp(targets) < 0.2 * stroke:
         return ""
     if np.allclose(reached, stroke - targets, atol=0.06 * stroke):
-        return "Travel is mirrored: what should open closes."
+        return "Travel is mirrored: commands to open close the hand."
     if reached.max() <= 0.06 * stroke and np.ptp(reached) >= 0.02 * stroke:
-        return "Commands look taken for percent or degrees: all that are radians close the hand."
+        return "Commands appear to be read as percent or degrees: radians always close the hand."
     if np.allclose(reached, stroke * np.clip(targets, 0.0, 1.0), atol=0.03 * stroke):
-        return "Commands look taken for 0 to 1: all that are above 1 rad open fully."
+        return "Commands appear to be read as 0 to 1: all commands above 1 rad open fully."
     if np.allclose(reached, np.clip(targets, 0.0, 1.0), atol=0.03):
-        return "q looks like 0 to 1 instead of radians, in commands as in the state."
+        return "q appears to be 0 to 1 instead of radians, in commands and state."
     for scale, what in ((1 / stroke, "0 to 1"), (100 / stroke, "0 to 100 (percent)")):
         if np.allclose(reached, scale * targets, atol=0.06 * scale * stroke):
             return f"q is published as {what} instead of radians."
@@ -82,15 +82,15 @@ def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
 
 
 def of_type(found: Iterable[str], wanted: str, dialect: Dialect) -> str:
-    """Why a topic has these types and not the wanted one, or nothing."""
+    """The likely cause of a topic with other types than the expected one, or an empty text."""
     for name in sorted(found):
         if name in (dialect.cmd_type, dialect.state_type) and name != wanted:
             return "The types of state and command are swapped."
-        speak = [d.name for d in DIALECTS.values() if name in (d.cmd_type, d.state_type)]
-        if speak:
+        dialects = [d.name for d in DIALECTS.values() if name in (d.cmd_type, d.state_type)]
+        if dialects:
             return (
                 f"{_short(name)} is the type of another hand or generation "
-                f"(--dialect {' or '.join(speak)}); here it has to be {_short(wanted)}."
+                f"(--dialect {' or '.join(dialects)}); here it has to be {_short(wanted)}."
             )
         if _short(name) == _short(wanted):
             return f"The type has the right name in another package: {name}."

@@ -40,11 +40,11 @@ def state_topic(ctx: Context) -> Outcome:
         {c.topic for c in ctx.recording.channels if c.topic.endswith("state")} - {topic}
     )
     seen = f"; other state topics: {', '.join(similar)}" if similar else ""
-    return ctx.failed("no topic", f"nobody publishes {topic}{seen}").because(_absent(ctx))
+    return ctx.failed("no topic", f"no process publishes {topic}{seen}").because(_absent(ctx))
 
 
 def _absent(ctx: Context) -> str:
-    """Why nobody publishes the state topic, as far as the others tell."""
+    """The likely cause of a missing publisher of the state topic, from the other topics."""
     recording, topic = ctx.recording, ctx.states.topic
     seen = {c.topic for c in recording.channels}
     seen |= {e.topic for e in recording.endpoints if e.kind == "writer"}
@@ -61,11 +61,11 @@ def _absent(ctx: Context) -> str:
 
 @check("DEX1-TOPIC-02", "DEX3-TOPIC-02", "H1-TOPIC-02")
 def command_topic(ctx: Context) -> Outcome:
-    """Somebody subscribes to the command topic with the right type."""
+    """The command topic has a reader of the right type."""
     topic, wanted = ctx.commands.topic, ctx.recording.dialect.cmd_type
     readers = _endpoints(ctx, topic, "reader")
     if not readers:
-        return ctx.failed("no reader", f"nobody subscribes to {topic}")
+        return ctx.failed("no reader", f"no process subscribes to {topic}")
     types = {r.type_name for r in readers}
     if wanted in types:
         return ctx.passed(wanted.rpartition("::")[2], f"a reader of {wanted}")

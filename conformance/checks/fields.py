@@ -1,4 +1,4 @@
-"""What is in the samples."""
+"""Values of the fields in each state."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
 
-_STAND_S = 0.1  # seconds without motion that are a stand
+_STAND_S = 0.1  # seconds without motion after which a joint counts as standing
 
 
 @check("DEX1-FIELD-01", "DEX3-FIELD-01", "H1-FIELD-01")
 def length(ctx: Context) -> Outcome:
-    """Samples decode and have one motor a hand."""
+    """Samples decode and have one motor per hand."""
     states, wanted = ctx.states, ctx.recording.dialect.length
     wrong = np.flatnonzero(states.length != wanted)
     if not len(wrong):
@@ -63,7 +63,7 @@ def finite(ctx: Context) -> Outcome:
 def in_stroke(ctx: Context) -> Outcome:
     """Smallest and largest q of each joint."""
     states, margin = ctx.states, ctx.tolerance("margin_rad")
-    # what a wild command does to q is SAFE-02's finding, unless it shows another scale
+    # q during out-of-range commands is judged by SAFE-02, unless it shows another scale
     excused = np.zeros(len(states), dtype=np.bool_)
     for phase in ctx.phases("out-of-range"):
         begin, end = ctx.span(phase)
@@ -111,10 +111,10 @@ def in_stroke(ctx: Context) -> Outcome:
 
 
 def _stands_far_off(ctx: Context) -> Outcome | None:
-    """The finding, if a wild command brings a joint to a stand more than a stroke off its range.
+    """Fail if an out-of-range command makes a joint stop more than a stroke outside its range.
 
-    No joint has its stop there: such a hand takes commands, and reports itself, in another unit,
-    of which the kit has used a small part only.
+    No joint has its stop there: such a hand takes commands and publishes states in another
+    unit, of which the kit has used only a small part.
     """
     for phase in ctx.phases("out-of-range"):
         begin, end = ctx.span(phase)
@@ -144,13 +144,13 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
 
 @check("DEX1-FIELD-14")
 def plausible_speed(ctx: Context) -> Outcome:
-    """The fastest motion of q, as a part of what the joint is good for."""
+    """The fastest motion of q, as a part of the joint's highest speed."""
     window = ctx.tolerance("window_s")
     t = ctx.states.clock
     ends = np.searchsorted(t, t + window)
     starts = np.flatnonzero(ends < len(t))
     ends = ends[starts]
-    near = t[ends] - t[starts] < 2 * window  # a gap in the state is RATE-03's finding
+    near = t[ends] - t[starts] < 2 * window  # a gap in the state is judged by RATE-03
     starts, ends = starts[near], ends[near]
     worst: tuple[float, float, int, float] = (-1.0, 0.0, 0, 0.0)
     for joint, spec in enumerate(ctx.joints):
@@ -204,7 +204,7 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     if not dq.any():
         return ctx.absent("dq is not filled (0 throughout)")
     window = ctx.tolerance("window_s")
-    which = good.tobytes()  # of all joints the same, unless states lack some
+    which = good.tobytes()  # the same for all joints, unless some states lack joints
     if which not in known:
         known[which] = _windows(t, window)
     starts, ends, span = known[which]

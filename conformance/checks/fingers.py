@@ -1,4 +1,4 @@
-"""What only hands of several joints have: an order, a mode byte, and of a Dex3-1 sensors and
+"""Checks for hands of several joints: order of joints, mode byte, and for a Dex3-1 sensors and
 time-out protection.
 """
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
-from dexkit.conformance.checks.motion import Step, not_pulled, steps, steps_of
+from dexkit.conformance.checks.motion import Step, not_driven, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
 from dexkit.conformance.motor_messages import Wire
 from dexkit.hand import Floats, JointMode
@@ -35,7 +35,7 @@ def low_rate_topic(ctx: Context) -> Outcome:
         if c.topic == topic and c.type_name == dialect.state_type and c.message_count
     ]
     if not found:
-        return ctx.failed("no topic", f"nobody publishes {topic} with {dialect.state_type}")
+        return ctx.failed("no topic", f"no process publishes {topic} with {dialect.state_type}")
     rate = found[0].message_count / max(ctx.recording.duration, 1e-9)
     text = f"{found[0].message_count} samples on {topic}, {rate:.1f} Hz"
     if rate <= ctx.tolerance("max_rate_hz"):
@@ -54,7 +54,7 @@ def rest_pose(ctx: Context) -> Outcome:
     if not len(q):
         return ctx.skipped("no state before the first command")
     most = np.abs(q).max(axis=1)
-    # zeros before the first measurement only let the client wait a little longer
+    # zeros before the first measurement only delay the client's start
     if not most[-1]:
         return ctx.failed(
             "all zero",
@@ -92,8 +92,8 @@ def packets(ctx: Context) -> Outcome:
         return ctx.passed(seen, f"{seen} sensor packets in each state")
     outcome = ctx.failed(seen, f"{seen} sensor packets, from state to state")
     if len(found) == 1:
-        return outcome.because("Each sensor element is published as a packet of its own.")
-    return outcome.because("A packet is published only when its sensor has news.")
+        return outcome.because("Each sensor element is published as a separate packet.")
+    return outcome.because("A packet is published only when its sensor has a new value.")
 
 
 @check("DEX3-SENS-02")
@@ -168,7 +168,7 @@ def touch(ctx: Context) -> Outcome:
 
 @check("DEX3-IMU-01")
 def attitude(ctx: Context) -> Outcome:
-    """Norm of the quaternion, or nothing in it."""
+    """Norm of the quaternion, which may also be all 0."""
     assert ctx.states.columns is not None
     columns = ctx.states.columns
     quaternion = columns["imu_state.quaternion"][columns.ok]
@@ -192,7 +192,7 @@ def attitude(ctx: Context) -> Outcome:
 def _roles(ctx: Context) -> JointRoles:
     """The joints that the stimulus uses."""
     hand = ctx.recording.model
-    # a profile of several joints has them
+    # every profile with several joints has roles
     assert isinstance(hand, HandModel)
     assert hand.roles is not None
     return hand.roles
@@ -224,7 +224,7 @@ def ids(ctx: Context) -> Outcome:
     return (
         ctx.failed(
             f"id {row[joint]}",
-            ctx.named(f"motor {joint} says id {row[joint]}, in {int(wrong.sum())} states", joint),
+            ctx.named(f"motor {joint} has id {row[joint]}, in {int(wrong.sum())} states", joint),
             ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmax(wrong))])),
         )
         .about(joint)
@@ -267,7 +267,7 @@ def plain_mode(ctx: Context) -> Outcome:
         q = q[np.isfinite(q).all(axis=1)]
         if len(q) and far and max(far) >= 0.05:
             asked += 1
-            # which joint it is that moves is DEX5-JOINT-01's question
+            # which joint moves is judged by DEX5-JOINT-01
             moved = float((np.ptp(q, axis=0) / strokes).max())
             obeyed += moved >= ctx.tolerance("min_progress") * max(far)
     if not asked:
@@ -282,12 +282,12 @@ def plain_mode(ctx: Context) -> Outcome:
 @check("DEX3-MODE-03")
 def locked(ctx: Context) -> Outcome:
     """Motion towards q while the motors are locked."""
-    return not_pulled(ctx, "with status 0, which locks the motor")
+    return not_driven(ctx, "with status 0, which locks the motor")
 
 
 @check("DEX3-MODE-04")
 def wrong_id(ctx: Context) -> Outcome:
-    """A motor whose place in the sequence says to hold, while another one bears its id."""
+    """A command with another motor's id at one index: the other motor must not move."""
     first, other = _roles(ctx).crossed
     names = [ctx.joints[i].name for i in (first, other)]
     quiet = [j for j in range(len(ctx.joints)) if j != first]
@@ -300,11 +300,11 @@ def wrong_id(ctx: Context) -> Outcome:
 
 @check("DEX3-JOINT-01")
 def order(ctx: Context) -> Outcome:
-    """Which joint moves when one is told to."""
+    """Which joint moves when one joint is commanded."""
     found = 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        told = phase.targets.get(ctx.side, {})
+        commanded = phase.targets.get(ctx.side, {})
         for step in steps_of(ctx, phase):
             rows = ctx.states.between(begin, end)
             before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
@@ -312,7 +312,7 @@ def order(ctx: Context) -> Outcome:
                 continue
             moved = np.abs(ctx.states.q[rows] - np.median(before, axis=0)).max(axis=0)
             strokes = np.array([j.stroke for j in ctx.joints])
-            others = [j for j in range(len(ctx.joints)) if j not in told]
+            others = [j for j in range(len(ctx.joints)) if j not in commanded]
             limit = ctx.tolerance("max_others_stroke", 0) / ctx.joints[0].stroke
             wrong = [j for j in others if not moved[j] <= limit * strokes[j]]
             own = float(moved[step.joint])
@@ -321,7 +321,7 @@ def order(ctx: Context) -> Outcome:
                 seen = ", ".join(f"{ctx.joints[j].name} moved {moved[j]:.2f} rad" for j in wrong)
                 outcome = ctx.failed(
                     ctx.joints[wrong[0]].name if wrong else "no motion",
-                    f"{name} was told to go {abs(step.size):.2f} rad and moved {own:.2f} rad; "
+                    f"{name} was commanded to go {abs(step.size):.2f} rad and moved {own:.2f} rad; "
                     + (seen or "no joint moved"),
                     ctx.at(ctx.states.topic, begin, end),
                 ).about(step.joint, *wrong)
@@ -330,11 +330,11 @@ def order(ctx: Context) -> Outcome:
             found += 1
     if not found:
         return ctx.failed("no step", "there is no state while the joints were moved")
-    return ctx.passed(f"{found} of {found}", f"{found} steps, each of the joint that was told")
+    return ctx.passed(f"{found} of {found}", f"{found} steps, each of the commanded joint")
 
 
 def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) -> str:
-    """Why another joint moved than the one that was told, where it shows."""
+    """The likely cause of motion in another joint than the commanded one, or an empty text."""
     name = ctx.joints[joint].name
     if still and not wrong:
         return f"{name} is not driven: its commands are lost, it is locked, or it has no power."
@@ -350,7 +350,7 @@ def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) ->
 
 @check("DEX3-GAIN-02")
 def stiffness(ctx: Context) -> Outcome:
-    """Time to half-way of a soft step, compared with a stiff one."""
+    """Time to half-way of a step with low gains, compared with one with the client's gains."""
     stiff = {s.joint: s for p in ctx.recording.phases("stiff", ctx.side) for s in steps_of(ctx, p)}
     worst: tuple[float, int] | None = None
     for step in steps(ctx):
@@ -360,7 +360,7 @@ def stiffness(ctx: Context) -> Outcome:
         quick, slow = (_half_way(s) for s in (reference, step))
         if quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
-        # one that never gets there took at least as long as it was given
+        # a step that never gets half-way took at least as long as its phase
         ratio = (slow if slow is not None else step.end - step.begin) / max(quick, 1e-3)
         if worst is None or ratio < worst[0]:
             worst = (ratio, step.joint)
@@ -409,18 +409,18 @@ def contact(ctx: Context) -> Outcome:
 
 @check("DEX5-FORCE-03")
 def units(ctx: Context) -> Outcome:
-    """tau_est compared with what the command's stiffness makes of the distance."""
+    """tau_est compared with the commanded stiffness times the position error."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     span = squeezes(ctx)
     if span is None:
         return ctx.skipped("no state while it squeezed")
     rows, given = ctx.states.between(*span), ctx.commands
-    told = (given.t >= span[0]) & (given.t <= span[1]) & np.isfinite(given.q).all(axis=1)
-    if not told.any():
+    commanded = (given.t >= span[0]) & (given.t <= span[1]) & np.isfinite(given.q).all(axis=1)
+    if not commanded.any():
         return ctx.skipped("no command while it squeezed")
     here, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
-    due = np.median(given.kp[told], axis=0) * (np.median(given.q[told], axis=0) - here)
+    due = np.median(given.kp[commanded], axis=0) * (np.median(given.q[commanded], axis=0) - here)
     joints = model(ctx.recording.dialect.model).joint_gains
     ratios = {}
     for name, mine in (("thumb", True), ("fingers", False)):
@@ -463,7 +463,7 @@ def _silence(ctx: Context) -> tuple[float, float, float]:
 
 
 def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
-    """Joints that move when commands end move no longer after the time-out."""
+    """Fail if joints that move when commands end still move after the time-out."""
     last, late, end = _silence(ctx)
     before = _moved(ctx, joints, last, last + ctx.tolerance("timeout_s"))
     after = _moved(ctx, joints, late, end)
@@ -486,14 +486,14 @@ def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
     if before.min() < ctx.requirement.tolerance("min_travel_stroke"):
         return ctx.skipped(
             "not every joint that was set in motion still moved when the commands stopped: "
-            "braking cannot be told from standing"
+            "a braked joint cannot be distinguished from one at rest"
         )
     return ctx.passed("stops", f"moving, then still ({rad:.3f} rad)", motion_rad=rad)
 
 
 @check("DEX3-WDOG-01")
 def nothing_left_moving(ctx: Context) -> Outcome:
-    """Joints that were driven by a velocity, without protection."""
+    """Motion after the time-out of joints driven by a velocity, without protection."""
     if ctx.object_at is not None:
         return ctx.skipped("this hand held an object when the commands stopped")
     return _stops(ctx, _roles(ctx).driven)
@@ -501,12 +501,12 @@ def nothing_left_moving(ctx: Context) -> Outcome:
 
 @check("DEX3-GUARD-01")
 def brakes(ctx: Context) -> Outcome:
-    """Joints on their way, by velocity or to a position, with protection."""
+    """Motion after the time-out of protected joints, driven by velocity or to a position."""
     return _stops(ctx, (*_roles(ctx).driven, *_roles(ctx).slow))
 
 
 @check("DEX3-GUARD-02")
-def tells(ctx: Context) -> Outcome:
+def reports_trip(ctx: Context) -> Outcome:
     """Bit 7 of the state's mode byte before and after the time-out."""
     last, late, end = _silence(ctx)
     before = _modes(ctx, ctx.states.between(last - 0.2, last + 0.5)) >> 7
@@ -515,7 +515,7 @@ def tells(ctx: Context) -> Outcome:
         return ctx.skipped("no state in the silence")
     if before.any():
         return ctx.failed(
-            "too early", "bit 7 is set while commands come", ctx.at(ctx.states.topic, last)
+            "too early", "bit 7 is set while commands arrive", ctx.at(ctx.states.topic, last)
         )
     if not after.all():
         joint = int(np.argmin(after.all(axis=0)))
@@ -530,7 +530,7 @@ def tells(ctx: Context) -> Outcome:
 @check("DEX3-GUARD-03")
 def latches(ctx: Context) -> Outcome:
     """Motion by commands that do not clear the protection."""
-    return not_pulled(ctx, "while the time-out protection was tripped and not cleared")
+    return not_driven(ctx, "while the time-out protection was tripped and not cleared")
 
 
 @check("DEX3-GUARD-04")
@@ -541,7 +541,7 @@ def clears(ctx: Context) -> Outcome:
 
 @check("DEX3-HOLD-01")
 def holds(ctx: Context) -> Outcome:
-    """Without protection a position stays in force: a grip presses on, a slow way is finished."""
+    """Grip force and motion to a position go on after commands end, without protection."""
     last, late, end = _silence(ctx)
     if ctx.object_at is not None:
         before = np.abs(ctx.states.tau[ctx.states.between(last - 0.2, last)])
@@ -584,11 +584,11 @@ def holds(ctx: Context) -> Outcome:
 
 @check("DEX3-SAFE-04")
 def short(ctx: Context) -> Outcome:
-    """A command with a motor too few."""
-    return stays(ctx, "commands for a motor too few")
+    """A command with one motor too few."""
+    return stays(ctx, "commands with one motor too few")
 
 
 @check("DEX3-SAFE-05")
 def long(ctx: Context) -> Outcome:
-    """A command with motors too many."""
+    """A command with too many motors."""
     return stays(ctx, "commands for more motors than there are")

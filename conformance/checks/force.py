@@ -51,16 +51,16 @@ def in_contact(ctx: Context) -> Outcome:
 
 
 def _ranges(t: Floats, begins: Floats, ends: Floats, side: Literal["left", "right"]) -> Ranges:
-    """Rows of t in each stretch: the first, and the first behind it, shape (n, 2)."""
+    """Rows of t in each interval: the first, and the first after it, shape (n, 2)."""
     return np.column_stack([np.searchsorted(t, begins), np.searchsorted(t, ends, side)])
 
 
 def _bounds(values: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """Lowest and highest value in each range, NaN if one of them is not a number.
 
-    Of an empty range, whatever stands at its beginning.
+    For an empty range, the value at its beginning.
     """
-    longer = np.append(values, np.nan)  # an end may lie behind the last row
+    longer = np.append(values, np.nan)  # an end may be one past the last row
     if not len(ranges):
         return np.empty(0), np.empty(0)
     low, high = (f.reduceat(longer, ranges.ravel())[::2] for f in (np.minimum, np.maximum))
@@ -68,7 +68,7 @@ def _bounds(values: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
 
 
 def _still(ctx: Context) -> Floats:
-    """Begins of the windows, one after the other while commands come, in which q stands."""
+    """Begins of the consecutive windows during the commands in which q does not change."""
     window, asked = ctx.tolerance("min_rest_s"), ctx.commands.t
     begins: Floats = np.asarray(np.arange(float(asked[0]), float(asked[-1]) - window, window))
     ranges = _ranges(ctx.states.t, begins, begins + window, "left")
@@ -79,7 +79,7 @@ def _still(ctx: Context) -> Floats:
 
 @check("DEX1-FORCE-02")
 def at_rest(ctx: Context) -> Outcome:
-    """tau_est where the gripper stands at its target, free."""
+    """tau_est while the gripper rests at its target without contact."""
     states, commands = ctx.states, ctx.commands
     if len(commands) < 2:
         return ctx.skipped("no commands to this hand")
@@ -91,7 +91,7 @@ def at_rest(ctx: Context) -> Outcome:
     low, high = _bounds(states.q[:, 0], rows)
     goal_low, goal_high = _bounds(commands.q[:, 0], asked)
     rests = (np.diff(rows)[:, 0] >= 5) & (np.diff(asked)[:, 0] >= 3)
-    with np.errstate(invalid="ignore"):  # what is not finite has no ripple at most anything
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         rests &= high - low <= ctx.tolerance("max_ripple_stroke")
         rests &= goal_high - goal_low <= ctx.tolerance("max_ripple_stroke")
     rests &= _bounds(commands.kp[:, 0], asked)[0] > 0
@@ -105,7 +105,7 @@ def at_rest(ctx: Context) -> Outcome:
             taus.append((median(np.abs(states.tau[here, 0])), float(begins[i])))
     if not taus:
         return ctx.skipped("the gripper never rests at its target in this recording")
-    # the middle of all rests: one of them may be a touch that nobody announced
+    # the median of all rests: one of them may be an unannounced contact
     level, begin = sorted(taus)[len(taus) // 2]
     text = f"tau_est {level:.3f} N m at rest (median of {len(taus)} rests)"
     if level <= ctx.tolerance("max_tau_nm"):
@@ -132,7 +132,7 @@ def sign(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-04", "DEX3-FORCE-02")
 def unit(ctx: Context) -> Outcome:
-    """The largest tau_est, as a part of what the joint can do."""
+    """The largest tau_est, as a part of the joint's torque limit."""
     worst: tuple[float, float, int, float] = (0.0, 0.0, 0, 0.0)
     for joint, spec in enumerate(ctx.joints):
         tau = np.abs(ctx.states.tau[:, joint])
@@ -151,7 +151,7 @@ def unit(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-05")
 def unsigned(ctx: Context) -> Outcome:
-    """The least tau_est in a dialect where it is a strength."""
+    """The smallest tau_est in a dialect where it is the strength of the grip."""
     tau = ctx.states.tau[:, 0]
     if not np.isfinite(tau).any():
         return ctx.skipped("no state with a tau_est")

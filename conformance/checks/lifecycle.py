@@ -12,13 +12,13 @@ from dexkit.hand import JointMode
 
 @check("DEX1-START-01", "DEX3-START-01", "H1-START-01")
 def state_first(ctx: Context) -> Outcome:
-    """State is there before the first command."""
+    """State is published before the first command."""
     first_state = float(ctx.states.t[0])
     first_command = float(ctx.commands.t[0])
     listening = ctx.phases("listen")
     begin = ctx.span(listening[0])[0] if listening else 0.0
     if first_command - begin < ctx.tolerance("min_lead_s"):
-        return ctx.skipped("the recording begins when commands already flow")
+        return ctx.skipped("the recording begins after the first commands")
     lead = first_command - first_state
     if lead > 0:
         return ctx.passed(
@@ -37,7 +37,7 @@ def state_first(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")
 def late_joiner(ctx: Context) -> Outcome:
-    """What a subscriber received that was created in mid-session."""
+    """Time until a subscriber created during a session receives state."""
     phase = ctx.phases()[-1]
     waited = phase.observed.get(f"first_state_s_{ctx.side}")
     limit = ctx.tolerance("max_wait_s")
@@ -58,13 +58,13 @@ def late_joiner(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
 def restarted_client(ctx: Context) -> Outcome:
-    """The step of the client that took over."""
+    """The step of a restarted client."""
     return arrival(ctx, "commanded by a restarted client")
 
 
 @check("DEX1-LIFE-03", "DEX3-LIFE-03")
 def restarted_service(ctx: Context) -> Outcome:
-    """State and the step after the service came up again, with a client that stayed."""
+    """State and the step after a restart of the service, with a client that kept running."""
     begin, end = ctx.span(ctx.phases()[-1])
     later = ctx.states.t[ctx.states.t > begin]
     waited = float(later[0]) - begin if len(later) else np.inf
@@ -79,22 +79,22 @@ def restarted_service(ctx: Context) -> Outcome:
 
 
 @check("DEX1-LIFE-04", "DEX3-LIFE-04")
-def leaves(ctx: Context) -> Outcome:
-    """How long the service takes to end, and its publisher to vanish."""
+def shutdown(ctx: Context) -> Outcome:
+    """Time from SIGTERM to the end of the service, and until its publisher disappears."""
     phase = ctx.phases()[-1]
     begin, end = ctx.span(phase)
     ended, gone = phase.observed.get("exit_s"), phase.observed.get("gone_s")
     place = ctx.at(ctx.states.topic, begin, end)
     if ended is None or ended > ctx.tolerance("max_exit_s"):
         seen = "had to be killed" if ended is None else f"took {ended:.1f} s to end"
-        outcome = ctx.failed("does not end", f"told to end (SIGTERM) the service {seen}", place)
+        outcome = ctx.failed("does not end", f"after SIGTERM the service {seen}", place)
         return outcome.if_late(
             (end - begin if ended is None else ended) - ctx.tolerance("max_exit_s")
         )
     if gone is None or gone > ctx.tolerance("max_gone_s"):
         seen = "is still announced" if gone is None else f"was announced for {gone:.1f} s"
         outcome = ctx.failed(
-            "leaves no word", f"the state's publisher {seen} after the service had ended", place
+            "still announced", f"the state's publisher {seen} after the service had ended", place
         )
         outcome = outcome.if_late(
             (end - begin if gone is None else gone) - ctx.tolerance("max_gone_s")
@@ -105,24 +105,24 @@ def leaves(ctx: Context) -> Outcome:
         )
     return ctx.passed(
         f"{ended:.2f} s",
-        f"ended after {ended:.2f} s, and vanished {gone:.2f} s later",
+        f"ended after {ended:.2f} s, and its publisher disappeared {gone:.2f} s later",
         exit_s=ended,
     )
 
 
 @check("DEX1-LIFE-05", "DEX3-LIFE-05")
-def last_word(ctx: Context) -> Outcome:
+def last_state(ctx: Context) -> Outcome:
     """The mode of the last state before the service ended."""
     begin, end = ctx.span(ctx.phases()[-1])
     modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]
     modes = modes[np.isfinite(modes).all(axis=1)]
     status = Wire(ctx.recording.dialect).status(modes.astype(np.intp))
     if len(status) < 2 or not (status[0] == JointMode.FOC).all():
-        return ctx.absent("the mode of this hand does not tell whether it is driven")
+        return ctx.absent("the mode of this hand does not show whether it is driven")
     if not status[-1].any():
-        return ctx.passed("brakes", "its last state says that it is not driven any more")
+        return ctx.passed("brakes", "its last state shows that it is not driven any more")
     return ctx.failed(
         "driven",
-        f"its last state says mode {int(status[-1].max())}: driven",
+        f"its last state has mode {int(status[-1].max())}: driven",
         ctx.at(ctx.states.topic, float(ctx.states.t[ctx.states.between(begin - 0.2, end)][-1])),
     )

@@ -1,7 +1,7 @@
-"""The members of a state that clients hardly look at: where filled, they must make sense.
+"""Members of a state that clients rarely use: where they are filled, they must be plausible.
 
-A maker may leave each of them 0. What is there must be what its name says: an uninitialised byte,
-another unit, or a counter in a reserved word is read by somebody some day.
+A vendor may leave each of them 0. Otherwise it must hold what its name means: some client may read
+an uninitialised byte, a value in another unit or a counter in a reserved word.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def _values(ctx: Context, path: str) -> Floats:
 
 
 def _distinct(ctx: Context, path: str) -> Floats:
-    """The same; a single row, shape (1, length), where it stands for all."""
+    """As :func:`_values`, but a single row, shape (1, length), for a constant member."""
     assert ctx.states.columns is not None
     row = ctx.states.columns.constant(path)
     return _values(ctx, path) if row is None else row.reshape(1, -1)
@@ -84,7 +84,7 @@ def _outside(
 
 
 def _span(ctx: Context, paths: Iterable[str]) -> str:
-    """What the values are, for a verdict that says so."""
+    """The range of the values, as text."""
     assert ctx.states.columns is not None
     low, high = np.inf, -np.inf
     for path in paths:
@@ -113,7 +113,7 @@ def mode(ctx: Context) -> Outcome:
             if (ctx.states.mode[late, 0] == ctx.tolerance("driven")).any():
                 return ctx.failed(
                     "driven in silence",
-                    "mode says that the motor is driven when no command is in force any more",
+                    "mode shows a driven motor when no command is in force any more",
                     ctx.at(ctx.states.topic, end - 0.3, end),
                 )
         return ctx.passed(seen, f"mode {seen}")
@@ -131,8 +131,8 @@ def _integral(t: Floats, x: Floats) -> Floats:
 def _bend(t: Floats, x: Floats, window: float) -> Floats:
     """Second difference of x over a window to both sides, per second squared.
 
-    0 where it cannot be told: at a gap, and where a sample was stamped late. Over a window as
-    short as this a stamp that is a tenth of it late bends a straight line as much as a hand does.
+    0 where it cannot be computed: at a gap, and at samples with late timestamps. In such a short
+    window a timestamp that is late by a tenth of the window has the effect of an acceleration.
     """
     middle = np.flatnonzero((t >= t[0] + window) & (t <= t[-1] - window))
     before = np.searchsorted(t, t[middle] - window)
@@ -150,7 +150,7 @@ def _bend(t: Floats, x: Floats, window: float) -> Floats:
 
 @check("DEX1-FIELD-06", "DEX3-FIELD-05")
 def acceleration(ctx: Context) -> Outcome:
-    """Ddq against the bend of q over a window."""
+    """Compare ddq with the second difference of q over a window."""
     states = ctx.states
     if not np.nan_to_num(states.ddq).any():
         return ctx.absent("ddq is not filled (0 throughout)")
@@ -161,23 +161,23 @@ def acceleration(ctx: Context) -> Outcome:
         t, q = states.clock, states.q[:, joint]
         # integrated twice, so that it can be compared with q over the same window
         dq = _integral(t, states.ddq[:, joint])
-        told, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
+        reported, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
         busy = np.abs(seen) > ctx.tolerance("min_ddq_rad_s2")
         if busy.sum() < 20:
             continue
         judged = True
-        ratio = float(np.sum(told[busy] * seen[busy]) / np.sum(seen[busy] ** 2))
+        ratio = float(np.sum(reported[busy] * seen[busy]) / np.sum(seen[busy] ** 2))
         worst = max(worst, (ratio, joint), key=lambda w: abs(w[0] - 1.0))
     if not judged:
-        return ctx.skipped("the hand hardly accelerates where its states come regularly")
+        return ctx.skipped("the hand hardly accelerates where its states arrive regularly")
     ratio, joint = worst
     text = ctx.named(f"ddq is {ratio:.2f} times what q shows", joint)
     if ctx.tolerance("min_ratio") <= ratio <= ctx.tolerance("max_ratio"):
         return ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
-    # stamps that are so late bend a straight line as much as the least acceleration that counts
+    # such late timestamps have the effect of the smallest acceleration that is judged
     size = 0.1 * window
     outcome = ctx.failed(f"x {ratio:.2f}", text, ratio=ratio).about(joint).if_late(size, how="p99")
-    return outcome.because("its sign is turned") if ratio < 0 else outcome
+    return outcome.because("its sign is wrong") if ratio < 0 else outcome
 
 
 @check("DEX1-FIELD-07")
@@ -199,7 +199,7 @@ def temperature(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-09")
 def lost(ctx: Context) -> Outcome:
-    """A count of what was lost, no larger than what there was to lose."""
+    """The count of lost messages."""
     path = _motors(ctx, "lost")
     figure = _span(ctx, path)
     return _outside(ctx, path, 0.0, ctx.tolerance("max_lost")) or ctx.passed(
@@ -241,7 +241,7 @@ def voltages(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-12", "DEX3-FIELD-08")
 def no_fault(ctx: Context) -> Outcome:
-    """Fault words while a hand moves freely, as it is told."""
+    """Fault words while a hand moves freely and obeys its commands."""
     spans = [ctx.span(p) for p in ctx.phases()]
     paths = [*_motors(ctx, "motorstate"), "error"]
     assert ctx.states.columns is not None
@@ -251,7 +251,7 @@ def no_fault(ctx: Context) -> Outcome:
         free |= (t >= begin) & (t <= end)
     if not free.any():
         return ctx.skipped("no state while it moved")
-    # the second word of error is a vendor's own
+    # the second word of error is vendor-specific
     for path in paths:
         values = _values(ctx, path)[free][:, :1]
         if values.any():
@@ -259,7 +259,7 @@ def no_fault(ctx: Context) -> Outcome:
             return ctx.failed(
                 f"{int(values[row, 0]):#x}",
                 f"{path} = {int(values[row, 0]):#x} in {int(values.any(axis=1).sum())} states of "
-                "a hand that moves as it is told",
+                "a hand that obeys its commands",
                 ctx.at(ctx.states.topic, float(t[free][row])),
             ).shown_by(Plot.of_member(path), PlotKind.POSITION)
     return ctx.passed("0", f"no fault in {int(free.sum())} states")
@@ -270,13 +270,13 @@ _IMU = [f"imu_state.{name}" for name in ("quaternion", "gyroscope", "acceleromet
 
 @check("DEX1-FIELD-13")
 def rest_of_the_hand(ctx: Context) -> Outcome:
-    """What a gripper does not have."""
+    """Attitude and sensors, which a gripper does not have."""
     return _finite(ctx, [*_IMU, *_packets(ctx, "pressure"), *_packets(ctx, "temperature")])
 
 
 @check("DEX3-IMU-02")
 def attitude_numbers(ctx: Context) -> Outcome:
-    """The rest of the attitude; the sensors have requirements of their own."""
+    """Values in the attitude; the sensors have separate requirements."""
     return _finite(ctx, _IMU)
 
 
@@ -302,7 +302,7 @@ def sensor_temperature(ctx: Context) -> Outcome:
 
 @check("DEX3-SENS-06")
 def sensor_lost(ctx: Context) -> Outcome:
-    """Sensor packets' counts of what was lost."""
+    """The sensor packets' counts of lost packets."""
     paths = _packets(ctx, "lost")
     if not paths:
         return ctx.absent("the states hold no sensor packets")

@@ -14,7 +14,7 @@ from dexkit.hand import Floats
 
 @dataclass(frozen=True)
 class Step:
-    """A step of one joint's target and what q did.
+    """A step of one joint's target, and the course of q.
 
     :param name: of the joint, where the hand has several.
     :param stroke: of the joint, rad.
@@ -35,12 +35,12 @@ class Step:
 
     @property
     def size(self) -> float:
-        """How far it was to go, with sign."""
+        """Target minus start, rad."""
         return self.target - self.start
 
     @property
     def error(self) -> float:
-        """How far from the target it ended."""
+        """Distance from the target at the end, rad."""
         return abs(self.final - self.target)
 
     def __str__(self) -> str:
@@ -51,7 +51,7 @@ class Step:
 
 
 def steps_of(ctx: Context, phase: Phase) -> list[Step]:
-    """A phase with targets as steps of this side's joints; those without states are left out."""
+    """A phase's targets as steps of this side's joints; joints without state are left out."""
     begin, end = ctx.span(phase)
     states = ctx.states
     rows, before = states.between(begin, end), states.between(begin - 0.1, begin)
@@ -102,14 +102,14 @@ def direction(ctx: Context) -> Outcome:
     if progress[worst] >= ctx.tolerance("min_progress"):
         return ctx.passed(
             f"{len(found)} of {len(found)}",
-            f"{len(found)} steps, all the right way",
+            f"{len(found)} steps, all in the right direction",
             steps=len(found),
         )
     step = found[worst]
     moved = float(np.ptp(step.q))
-    verdict = "it did not move" if moved < 0.02 * step.stroke else "that is the wrong way"
+    verdict = "it did not move" if moved < 0.02 * step.stroke else "that is the wrong direction"
     if progress[worst] > -0.05 and moved >= 0.02 * step.stroke:
-        verdict = "it did not get there"
+        verdict = "it did not reach its target"
     return (
         ctx.failed(
             f"{progress[worst]:+.0%}",
@@ -148,7 +148,7 @@ def arrives(ctx: Context) -> Outcome:
 
 
 def _cause(found: Sequence[Step]) -> str:
-    """Why steps end elsewhere, where they show it."""
+    """The likely cause of steps that miss their targets, or an empty text."""
     still = all(float(np.ptp(s.q)) < 0.02 * s.stroke for s in found)
     scale = ""
     if len({s.joint for s in found}) == 1:
@@ -347,8 +347,8 @@ def independent(ctx: Context) -> Outcome:
         before = ctx.states.q[ctx.states.between(begin - 0.25, begin)]
         if len(t) < 2 or not len(before):
             continue
-        # the mean of each quarter of a second: a hand that hunts about its target is
-        # MOVE-03's finding
+        # the mean of each quarter of a second: a hand that oscillates about its target is
+        # judged by MOVE-03
         bins = ((t - begin) / 0.25).astype(np.intp)
         counts = np.bincount(bins)
         for joint, spec in enumerate(ctx.joints):
@@ -378,20 +378,20 @@ def independent(ctx: Context) -> Outcome:
 @check("DEX1-GAIN-01", "DEX3-GAIN-01")
 def zero_gains(ctx: Context) -> Outcome:
     """Motion towards q while all gains are zero."""
-    return not_pulled(ctx, "with kp = kd = 0")
+    return not_driven(ctx, "with kp = kd = 0")
 
 
-def not_pulled(ctx: Context, how: str) -> Outcome:
-    """How far each joint moves towards a q that must not pull."""
+def not_driven(ctx: Context, how: str) -> Outcome:
+    """How far each joint moves towards a q that must have no effect."""
     given = steps(ctx)
     if not given:
         return ctx.skipped("no state during this stimulus")
-    # one that is there already cannot be pulled there
+    # joints that are at q already show nothing
     limit = [2 * ctx.tolerance("max_motion_stroke", s.joint) for s in given]
     away = [s for s, least in zip(given, limit, strict=True) if abs(s.size) > least]
     found = [(float(np.max((s.q - s.start) * np.sign(s.size))), s) for s in away]
     if not found:
-        return ctx.skipped("the hand already was where it must not be pulled to")
+        return ctx.skipped("the hand was already at the q that must have no effect")
     towards, step = max(found, key=lambda f: f[0] / f[1].stroke)
     towards = max(0.0, towards)
     if towards <= ctx.tolerance("max_motion_stroke", step.joint):

@@ -1,4 +1,4 @@
-"""What an operator would feel, through the model of Unitree's client (phase ``operator``)."""
+"""Response to an operator through the model of Unitree's client (phase ``operator``)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dexkit.teleop import client_for
 from dexkit.teleop.feel import Feel, Step, feel
 
 _PART = 0.75
-"""Part of its rate that the modelled client must have kept for a failure to be the hand's."""
+"""Part of its rate that the modelled client must have reached; below it the hand is not blamed."""
 
 
 @dataclass(frozen=True)
 class _Felt:
-    """The figures of a side.
+    """Measured figures of one side.
 
     :param client_hz: commands a second of the client in the phase.
     :param joints: those of the joints that the operator moves, by index.
@@ -127,7 +127,7 @@ def stroke(ctx: Context) -> Outcome:
 
 @check("DEX1-OPER-02", "DEX3-OPER-02")
 def lag(ctx: Context) -> Outcome:
-    """Seconds behind a slowly moving operator."""
+    """Seconds by which the joint lags behind a slowly moving operator."""
     return _judge(
         ctx,
         "lag_s",
@@ -141,7 +141,7 @@ def lag(ctx: Context) -> Outcome:
 
 @check("DEX1-OPER-03", "DEX3-OPER-03")
 def overshoot(ctx: Context) -> Outcome:
-    """How far it goes past where it is wanted."""
+    """How far the joint goes past the operator's target."""
     return _judge(
         ctx,
         "overshoot_rad",
@@ -155,7 +155,7 @@ def overshoot(ctx: Context) -> Outcome:
 
 @check("DEX1-OPER-04", "DEX3-OPER-04")
 def stuck(ctx: Context) -> Outcome:
-    """How far from where it is wanted it rests."""
+    """Distance of the joint from the operator's target at rest."""
     return _judge(
         ctx,
         "stuck_rad",
@@ -169,7 +169,7 @@ def stuck(ctx: Context) -> Outcome:
 
 @check("DEX1-OPER-05", "DEX3-OPER-05")
 def reaction(ctx: Context) -> Outcome:
-    """Seconds until it moves at all."""
+    """Seconds until the joint begins to move."""
     return _judge(
         ctx,
         "reaction_s",

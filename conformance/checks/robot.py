@@ -1,4 +1,4 @@
-"""The checks of a robot; what it has in common with a hand is judged by the hands'."""
+"""Checks for robots; requirements that hands have as well use the hands' checks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from dexkit.messages import Columns
 
 __all__ = ["RobotContext"]
 
-_SOME = 20  # states at the end of a phase, or before it, over which is averaged
+_SOME = 20  # states before a phase or at its end that are averaged
 _END = 0.06  # s after a phase in which its last command may still have an effect
 _LATE = 1.0  # s by which a state may be late on a busy machine
-_STICKS = struct.Struct("<4x5f")  # in wireless_remote: behind head and keys
+_STICKS = struct.Struct("<4x5f")  # in wireless_remote, after head and keys
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def state_crc(ctx: RobotContext) -> Outcome:
 
 @check("H1-CLIENT-01")
 def client_crc(ctx: RobotContext) -> Outcome:
-    """The CRC of the commands that the kit has not spoilt."""
+    """The CRC of the commands that the kit has not damaged on purpose."""
     intact, t = ctx.recording.commands_intact, ctx.commands.t
     counts = np.ones(len(t), dtype=np.bool_)
     for phase in ctx.phases("wrong-crc"):
@@ -109,7 +109,7 @@ def client_rate(ctx: RobotContext) -> Outcome:
     if float(steady.sum()) < ctx.tolerance("min_observed_s"):
         return ctx.skipped("hardly any steady commands in the recording")
     rate = len(steady) / float(steady.sum())
-    text = f"{len(ctx.commands)} commands, {rate:.0f} Hz while they flow"
+    text = f"{len(ctx.commands)} commands, {rate:.0f} Hz while they are sent"
     if rate >= ctx.tolerance("min_rate_hz"):
         return ctx.passed(f"{rate:.0f} Hz", text)
     return ctx.failed(f"{rate:.0f} Hz", text)
@@ -117,7 +117,7 @@ def client_rate(ctx: RobotContext) -> Outcome:
 
 @check("H1-TICK-01")
 def tick_goes_on(ctx: RobotContext) -> Outcome:
-    """Steps of tick, and for how long it stands still."""
+    """Steps of tick, and the longest time without a change."""
     tick, clock = ctx.low["tick"], ctx.states.clock
     if len(tick) < 2:
         return ctx.skipped("fewer than two states")
@@ -126,7 +126,7 @@ def tick_goes_on(ctx: RobotContext) -> Outcome:
     if back.any():
         return _wrong_rows(ctx, back, "goes back", "tick goes back")
     changes = np.concatenate(([0], np.flatnonzero(steps) + 1, [len(tick)]))
-    held = clock[changes[1:] - 1] - clock[changes[:-1]]  # a gap in the state is RATE-03's
+    held = clock[changes[1:] - 1] - clock[changes[:-1]]  # a gap in the state is judged by RATE-03
     longest, i = float(held.max()), int(np.argmax(held))
     if longest <= ctx.tolerance("max_hold_s"):
         return ctx.passed(f"{longest * 1e3:.0f} ms", f"stood still for {longest:.3f} s at most")
@@ -179,7 +179,7 @@ def within_limits(ctx: RobotContext) -> Outcome:
 
 @check("H1-FIELD-04")
 def speed_of_q(ctx: RobotContext) -> Outcome:
-    """Speeds against the change of q, of each joint while it is moved."""
+    """Compare dq with the change of q of each joint while it moves."""
     window, worst, which = ctx.tolerance("window_s"), 0.0, -1
     for phase in ctx.phases():
         joint = _index(ctx, phase)
@@ -192,12 +192,12 @@ def speed_of_q(ctx: RobotContext) -> Outcome:
         later = later[first]
         change = (q[later] - q[first]) / np.maximum(t[later] - t[first], 1e-6)
         sums = np.concatenate(([0.0], np.cumsum(dq)))
-        told = (sums[later] - sums[first]) / (later - first)
-        off = float(np.abs(change - told).mean())
+        reported = (sums[later] - sums[first]) / (later - first)
+        off = float(np.abs(change - reported).mean())
         if not off <= worst:
             worst, which = off, joint
     name = ctx.joints[which].name if which >= 0 else ""
-    text = f"{name}: dq is off the change of q by {worst:.2f} rad/s in the mean"
+    text = f"{name}: dq is off the change of q by {worst:.2f} rad/s on average"
     if worst <= ctx.tolerance("tolerance_rad_s"):
         return ctx.passed(f"{worst:.2f} rad/s", text)
     return ctx.failed(f"{worst:.2f} rad/s", text).about(which)
@@ -271,7 +271,7 @@ def unit_quaternion(ctx: RobotContext) -> Outcome:
 
 @check("H1-IMU-02")
 def same_attitude(ctx: RobotContext) -> Outcome:
-    """Angles against the quaternion."""
+    """Compare rpy with the quaternion."""
     low = ctx.low
     w, x, y, z = low["imu_state.quaternion"].T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -288,8 +288,8 @@ def same_attitude(ctx: RobotContext) -> Outcome:
 
 
 @check("H1-IMU-03")
-def feels_gravity(ctx: RobotContext) -> Outcome:
-    """Accelerometer and gyroscope before anything is commanded."""
+def measured_gravity(ctx: RobotContext) -> Outcome:
+    """Accelerometer and gyroscope before the first command."""
     begin, end = ctx.span(ctx.phases()[0])
     rows = ctx.states.between(begin, end)
     low = ctx.low
@@ -298,7 +298,7 @@ def feels_gravity(ctx: RobotContext) -> Outcome:
     if not len(force):
         return ctx.skipped("no state before the first command")
     g, rate = float(force.mean()), float(turning.mean())
-    text = f"{g:.2f} m/s^2 and {rate:.3f} rad/s in the mean"
+    text = f"{g:.2f} m/s^2 and {rate:.3f} rad/s on average"
     good = ctx.tolerance("low") <= g <= ctx.tolerance("high")
     if good and rate <= ctx.tolerance("max_rad_s"):
         return ctx.passed(f"{g:.2f} m/s^2", text)
@@ -313,8 +313,8 @@ def frame_head(ctx: RobotContext) -> Outcome:
     if not bad.any():
         return ctx.passed("FE EF FF")
     row = int(np.argmax(bad))
-    told = " ".join(f"{int(v):02X}" for v in (*low["head"][row], low["level_flag"][row]))
-    return _wrong_rows(ctx, bad, told, f"head and level_flag are {told}")
+    reported = " ".join(f"{int(v):02X}" for v in (*low["head"][row], low["level_flag"][row]))
+    return _wrong_rows(ctx, bad, reported, f"head and level_flag are {reported}")
 
 
 @check("H1-BMS-01")
@@ -327,10 +327,10 @@ def battery(ctx: RobotContext) -> Outcome:
     bad |= ~((volts >= ctx.tolerance("min_v")) & (volts <= ctx.tolerance("max_v")))
     bad |= (cells > 0) & ~(np.abs(cells - volts) <= ctx.tolerance("max_part") * volts)
     row = int(np.argmax(bad))
-    told = f"{soc[row]:.0f} %, {volts[row]:.1f} V"
+    reported = f"{soc[row]:.0f} %, {volts[row]:.1f} V"
     if not bad.any():
-        return ctx.passed(told)
-    return _wrong_rows(ctx, bad, told, f"{told}, cells of {cells[row]:.1f} V together")
+        return ctx.passed(reported)
+    return _wrong_rows(ctx, bad, reported, f"{reported}, cells of {cells[row]:.1f} V together")
 
 
 @check("H1-FOOT-01")
@@ -347,7 +347,7 @@ def foot_forces(ctx: RobotContext) -> Outcome:
 def remote(ctx: RobotContext) -> Outcome:
     """The remote's sticks."""
     low = ctx.low
-    same = low.constant("wireless_remote")  # nobody touches it in most recordings
+    same = low.constant("wireless_remote")  # constant in most recordings
     values = low["wireless_remote"] if same is None else same
     rows = np.ascontiguousarray(np.nan_to_num(values)).astype(np.uint8)
     kinds, which = np.unique(rows.view(f"V{rows.shape[1]}"), return_inverse=True)
@@ -356,24 +356,24 @@ def remote(ctx: RobotContext) -> Outcome:
     if not bad.any():
         return ctx.passed(f"{np.abs(sticks).max(initial=0.0):.2f}")
     worst = sticks[int(np.argmax(bad))]
-    told = ", ".join(f"{v:.3g}" for v in worst)
+    reported = ", ".join(f"{v:.3g}" for v in worst)
     wrong = np.broadcast_to(bad[which.reshape(-1)], len(low))
-    return _wrong_rows(ctx, wrong, "rubbish", f"sticks at {told}")
+    return _wrong_rows(ctx, wrong, "out of range", f"sticks at {reported}")
 
 
 @check("G1-MACH-01")
-def machine_told(ctx: RobotContext) -> Outcome:
-    """The machine's kind."""
+def reported_machine(ctx: RobotContext) -> Outcome:
+    """The values of mode_machine."""
     kinds = np.unique(ctx.low["mode_machine"][ctx.low.ok])
-    told = ", ".join(f"{k:.0f}" for k in kinds)
+    reported = ", ".join(f"{k:.0f}" for k in kinds)
     if len(kinds) == 1 and kinds[0] > 0:
-        return ctx.passed(told)
-    return ctx.failed(told, f"mode_machine is {told}")
+        return ctx.passed(reported)
+    return ctx.failed(reported, f"mode_machine is {reported}")
 
 
 @check("H1-MODE-01")
-def mode_told(ctx: RobotContext) -> Outcome:
-    """The mode bytes while motors are held, and of the one that was turned off."""
+def reported_mode(ctx: RobotContext) -> Outcome:
+    """Mode bytes of motors that are held, and of one that was turned off."""
     robot = ctx.recording.robot
     for phase in (*ctx.phases("hold"), *ctx.phases()):
         begin, end = ctx.span(phase)
@@ -386,14 +386,14 @@ def mode_told(ctx: RobotContext) -> Outcome:
         wrong = np.flatnonzero((modes != wanted).any(axis=0))
         if len(wrong):
             joint = int(wrong[0])
-            name, told = ctx.joints[joint].name, modes[-1, joint]
+            name, reported = ctx.joints[joint].name, modes[-1, joint]
             return ctx.failed(
-                f"{told:.0f}",
-                f"{name}: mode {told:.0f} in the state, {wanted[joint]} in the command"
-                + (f"; {len(wrong)} motors are so" if len(wrong) > 1 else ""),
+                f"{reported:.0f}",
+                f"{name}: mode {reported:.0f} in the state, {wanted[joint]} in the command"
+                + (f"; {len(wrong)} motors differ" if len(wrong) > 1 else ""),
                 ctx.at(ctx.states.topic, begin, end),
             ).about(joint)
-    return ctx.passed("told")
+    return ctx.passed("reported")
 
 
 # --------------------------------------------------------------------------------------- motion
@@ -405,10 +405,10 @@ def _index(ctx: RobotContext, phase: Phase) -> int:
 
 
 def _silent(ctx: RobotContext, phase: Phase) -> Outcome:
-    """No state where one is needed: a robot that has died of it, or one that was late."""
+    """The outcome without a state in the phase: failed, or not judged if states come later."""
     begin, end = ctx.span(phase)
     if len(_q(ctx, end, end + _LATE)):
-        return ctx.skipped(f"no state came at the right moment of '{phase.name}', only later")
+        return ctx.skipped(f"no state in '{phase.name}', only later")
     place = ctx.at(ctx.states.topic, begin, end)
     return ctx.failed("no state", f"no state during '{phase.name}', nor after it", place)
 
@@ -436,7 +436,7 @@ def follows(ctx: RobotContext) -> Outcome:
             worst, where, which = error, (begin, end), joint
     if where is None:
         return ctx.skipped("no step was made")
-    text = f"{ctx.joints[which].name} ends {worst:.3f} rad from where it was told to go"
+    text = f"{ctx.joints[which].name} ends {worst:.3f} rad from its target"
     if worst <= ctx.tolerance("max_error_rad"):
         return ctx.passed(f"{worst:.3f} rad", text, error_rad=worst)
     outcome = ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
@@ -445,7 +445,7 @@ def follows(ctx: RobotContext) -> Outcome:
 
 @check("H1-MOVE-02")
 def independent(ctx: RobotContext) -> Outcome:
-    """How far other joints move along."""
+    """How far other joints move while one is commanded."""
     worst, text, where = -1.0, "", (0.0, 0.0)
     about: tuple[int, ...] = ()
     for phase in ctx.phases():
@@ -468,7 +468,7 @@ def independent(ctx: RobotContext) -> Outcome:
 @check("H1-CRC-02", "H1-MODE-02", "H1-GAIN-04")
 @check("H1-SAFE-01", "H1-SAFE-02", "H1-SAFE-03", "G1-SAFE-05")
 def stays(ctx: RobotContext) -> Outcome:
-    """How far joints move during commands that are to have no effect."""
+    """How far joints move during commands that must have no effect."""
     worst, text, where, which = -1.0, "", (0.0, 0.0), 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -490,7 +490,7 @@ def stays(ctx: RobotContext) -> Outcome:
 
 @check("H1-GAIN-01")
 def stiffness(ctx: RobotContext) -> Outcome:
-    """How far a soft joint gives way."""
+    """Displacement of a joint with low kp under a torque."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
     joint, wanted = _index(ctx, phase), float(phase.params["way"])
@@ -501,7 +501,7 @@ def stiffness(ctx: RobotContext) -> Outcome:
     if not len(before) or not len(after):
         return _silent(ctx, phase)
     way = float(after.mean() - before.mean())
-    text = f"it gives way by {way:.3f} rad; tau / kp is {wanted:.3f} rad"
+    text = f"it is displaced by {way:.3f} rad; tau / kp is {wanted:.3f} rad"
     if abs(way / wanted - 1.0) <= ctx.tolerance("tolerance_part"):
         return ctx.passed(f"{way:.3f} rad", text)
     place = ctx.at(ctx.states.topic, begin, end)
@@ -517,7 +517,7 @@ def _speed(ctx: RobotContext, phase: Phase, begin: float, end: float) -> float |
 
 @check("H1-GAIN-02")
 def velocity(ctx: RobotContext) -> Outcome:
-    """The speed of a joint that is commanded one."""
+    """The speed of a joint with a commanded velocity."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
     wanted = float(phase.params["speed"])
@@ -550,7 +550,7 @@ def torque(ctx: RobotContext) -> Outcome:
 
 
 @check("H1-FORCE-01")
-def torque_told(ctx: RobotContext) -> Outcome:
+def reported_torque(ctx: RobotContext) -> Outcome:
     """tau_est while only tau is commanded."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
@@ -558,12 +558,12 @@ def torque_told(ctx: RobotContext) -> Outcome:
     tau = ctx.states.tau[rows, _index(ctx, phase)]
     if len(tau) < 3:
         return ctx.skipped("the joint was turned for too short a time")
-    wanted, told = float(phase.params["torque"]), float(np.median(tau))
-    text = f"tau_est is {told:.2f} N m, tau was {wanted:.2f} N m"
-    if ctx.tolerance("low_part") <= told / wanted <= ctx.tolerance("high_part"):
-        return ctx.passed(f"{told:.2f} N m", text)
+    wanted, reported = float(phase.params["torque"]), float(np.median(tau))
+    text = f"tau_est is {reported:.2f} N m, tau was {wanted:.2f} N m"
+    if ctx.tolerance("low_part") <= reported / wanted <= ctx.tolerance("high_part"):
+        return ctx.passed(f"{reported:.2f} N m", text)
     place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{told:.2f} N m", text, place).about(_index(ctx, phase))
+    return ctx.failed(f"{reported:.2f} N m", text, place).about(_index(ctx, phase))
 
 
 # ------------------------------------------------------------------------------------- watchdog
@@ -571,7 +571,7 @@ def torque_told(ctx: RobotContext) -> Outcome:
 
 @check("H1-WDOG-01")
 def damps(ctx: RobotContext) -> Outcome:
-    """When a driven joint stands still after the last command."""
+    """Speed of a driven joint some time after the last command."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
     after = begin + ctx.tolerance("max_s")
@@ -587,7 +587,7 @@ def damps(ctx: RobotContext) -> Outcome:
 
 @check("H1-WDOG-02")
 def state_in_silence(ctx: RobotContext) -> Outcome:
-    """Gaps of the state while nothing is commanded."""
+    """Gaps in the state while no command is sent."""
     limit, longest = ctx.tolerance("max_gap_s"), 0.0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -604,7 +604,7 @@ def state_in_silence(ctx: RobotContext) -> Outcome:
 
 @check("H1-WDOG-03")
 def resumes(ctx: RobotContext) -> Outcome:
-    """The jump when commands come again, and the step after that."""
+    """The jump when commands arrive again, and the step after it."""
     hold = next(p for p in ctx.phases() if not p.targets)
     begin, end = ctx.span(hold)
     q = _q(ctx, begin - 0.02, end)
@@ -613,7 +613,9 @@ def resumes(ctx: RobotContext) -> Outcome:
     moved = np.abs(q - q[0]).max(axis=0)
     joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
     if not moved[joint] <= ctx.tolerance("max_jump_rad"):
-        text = f"{ctx.joints[joint].name} moves by {moved[joint]:.3f} rad when commands come again"
+        text = (
+            f"{ctx.joints[joint].name} moves by {moved[joint]:.3f} rad when commands arrive again"
+        )
         place = ctx.at(ctx.states.topic, begin, end)
         return ctx.failed(f"{moved[joint]:.2f} rad", text, place).about(joint)
     return follows(ctx)

@@ -1,4 +1,4 @@
-"""Bad commands and no commands."""
+"""Invalid commands, missing commands, several clients and load."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dexkit.hand import Floats
 
 
 def _recovery(ctx: Context, phase: Phase) -> Step | None:
-    """The step that follows a bad command, of the joint that did worst in it."""
+    """The step after a bad command, of the joint with the largest error."""
     for after in ctx.phases("recover"):
         if after.params.get("after") == phase.name and after.begin_ns >= phase.end_ns:
             found = steps_of(ctx, after)
@@ -24,7 +24,7 @@ def _recovery(ctx: Context, phase: Phase) -> Step | None:
 
 
 def unharmed(ctx: Context, what: str) -> Outcome:
-    """State goes on, and the hand obeys afterwards. ``met`` None: nothing wrong so far."""
+    """Fail if state stops or the hand disobeys afterwards; else an outcome with ``met`` None."""
     topic = ctx.states.topic
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -39,7 +39,9 @@ def unharmed(ctx: Context, what: str) -> Outcome:
         step = _recovery(ctx, phase)
         if step is None:
             return ctx.failed(
-                "no state", f"no state after {what}, when a good command came", ctx.at(topic, end)
+                "no state",
+                f"no state after {what}, when a good command was sent",
+                ctx.at(topic, end),
             )
         if step.error > ctx.tolerance("max_error_stroke", step.joint):
             return (
@@ -102,7 +104,7 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
 
 
 def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
-    """Nothing :func:`moves`, then :func:`unharmed`."""
+    """Check that no joint :func:`moves`, then that the hand is :func:`unharmed`."""
     still = moves(ctx, what, joints)
     if still.met is False:
         return still
@@ -114,13 +116,13 @@ def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
 
 @check("DEX1-SAFE-01", "DEX3-SAFE-01")
 def not_finite(ctx: Context) -> Outcome:
-    """NaN and infinity in every field."""
+    """Commands with NaN and infinity in every field."""
     return stays(ctx, "commands with NaN and infinity")
 
 
 @check("DEX1-SAFE-02", "DEX3-SAFE-02")
 def out_of_range(ctx: Context) -> Outcome:
-    """Positions far outside the stroke."""
+    """Commands to positions far outside the stroke."""
     margin = ctx.tolerance("margin_rad")
     reached: list[str] = []
     values: dict[str, float] = {}
@@ -167,7 +169,7 @@ def empty(ctx: Context) -> Outcome:
 
 
 def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
-    """(last command, end) of each silence: the requirement's own phases, and those of ``names``."""
+    """(last command, end) of each phase without commands: the requirement's, and ``names``."""
     found = []
     for phase in (*ctx.phases(), *(p for name in names for p in ctx.phases(name))):
         begin, end = ctx.span(phase)
@@ -181,9 +183,9 @@ def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
 def brakes(ctx: Context) -> Outcome:
     """Motion and force after the time-out, of a hand that moved or pressed when silence began.
 
-    A hand that merely stands at its target looks the same with and without a brake; so the
-    silence begins while it is driven by a velocity, or presses on an object. Of a hand that does
-    neither, its own word is taken: ``mode`` that goes from driven to 0.
+    A hand that rests at its target shows no difference between braking and holding. So commands
+    end while it is driven by a velocity, or presses on an object. If it does neither, its
+    ``mode`` counts: it must change from driven to 0.
     """
     timeout = ctx.tolerance("timeout_s")
     states = ctx.states
@@ -208,11 +210,11 @@ def brakes(ctx: Context) -> Outcome:
         if jump > allowed:
             return ctx.failed(
                 f"{jump:.2f} rad",
-                f"went {jump:.2f} rad elsewhere as it braked",
+                f"moved by {jump:.2f} rad while it braked",
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=jump,
             ).if_late(STROKE_S * (jump - allowed) / ctx.joints[0].stroke)
-        # at its stop it would stand still without a brake, too
+        # at its stop it stands still without a brake as well
         stroke = ctx.joints[0].stroke
         at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
         if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
@@ -237,17 +239,18 @@ def brakes(ctx: Context) -> Outcome:
     if not proofs:
         return ctx.skipped(
             "this hand neither moved (it does not follow velocity commands) nor pressed on an "
-            "object when the commands stopped, and its mode does not tell: braking cannot be "
-            "told from holding"
+            "object when the commands stopped, and its mode does not show it: braking cannot be "
+            "distinguished from holding"
         )
     figure = "stops" if "motion_rad" in values else "lets go" if values else "says so"
     return ctx.passed(figure, "; ".join(proofs), **values)
 
 
 def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
-    """How far the hand went while it braked, and how far it may: rad.
+    """Distance that the hand moved while it braked, and the distance that is allowed, rad.
 
-    What it runs on at the speed that it had; and an object that was pressed pushes it back.
+    The allowed distance is the run-out at its last speed, and the motion when a squeezed object
+    pushes it back.
     """
     states = ctx.states
     before = states.between(at - 0.15, at - 0.05)
@@ -262,13 +265,13 @@ def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
 
 @check("DEX1-WDOG-02", "DEX3-WDOG-02")
 def state_in_silence(ctx: Context) -> Outcome:
-    """Gaps of the state while no command comes."""
+    """Gaps in the state while no command is sent."""
     limit = ctx.tolerance("max_gap_s")
-    # a hand that has tripped has to tell of it
+    # a tripped hand must go on publishing as well
     silences = _silences(ctx, "guard")
     spans = [(a, b) for a, b in silences if b - a >= ctx.tolerance("min_silence_s")]
     if not spans:
-        return ctx.skipped("no silence that was long enough")
+        return ctx.skipped("no pause of commands that was long enough")
     longest = 0.0
     for begin, end in spans:
         found = gaps(ctx, limit, begin, end)
@@ -276,7 +279,7 @@ def state_in_silence(ctx: Context) -> Outcome:
             a, b = found[0]
             return ctx.failed(
                 f"{b - a:.2f} s",
-                f"no state from {a:.3f} s to {b:.3f} s, in the silence that began at {begin:.3f} s",
+                f"no state from {a:.3f} s to {b:.3f} s, in the pause that began at {begin:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 max_gap_s=b - a,
             ).if_late(b - a - limit)
@@ -290,7 +293,7 @@ def state_in_silence(ctx: Context) -> Outcome:
 
 @check("DEX1-WDOG-03", "DEX3-WDOG-03")
 def resumes(ctx: Context) -> Outcome:
-    """The step after a silence."""
+    """The step after a pause of commands."""
     limit = ctx.tolerance("max_reaction_s")
     slowest: tuple[float, Step] | None = None
     for step in steps(ctx):
@@ -304,18 +307,18 @@ def resumes(ctx: Context) -> Outcome:
         return (
             ctx.failed(
                 f"after {after:.2f} s",
-                f"after a silence: {step}, but was not under way before {after:.2f} s",
+                f"after a pause: {step}, but it began to move only after {after:.2f} s",
                 ctx.at(ctx.states.topic, step.begin, step.begin + after),
                 reaction_s=after,
             )
             .about(step.joint)
             .if_late(after - limit)
         )
-    return arrival(ctx, "after a silence")
+    return arrival(ctx, "after a pause of commands")
 
 
 def arrival(ctx: Context, when: str) -> Outcome:
-    """Whether the phase's step arrives."""
+    """Whether the phase's step reaches its target."""
     found = steps(ctx)
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
@@ -339,25 +342,25 @@ def arrival(ctx: Context, when: str) -> Outcome:
 
 @check("DEX1-SAFE-04")
 def long(ctx: Context) -> Outcome:
-    """A command with motors too many."""
+    """A command with too many motors."""
     return stays(ctx, "commands for more motors than there are")
 
 
 @check("DEX1-SAFE-05", "DEX3-SAFE-06")
 def negative_gains(ctx: Context) -> Outcome:
-    """A spring and a damper that push away."""
+    """Commands with negative kp and kd."""
     return stays(ctx, "commands with negative gains")
 
 
 @check("DEX1-SAFE-06", "DEX3-SAFE-07")
 def foreign_type(ctx: Context) -> Outcome:
-    """Somebody else's type on the command topic."""
+    """Messages of another type on the command topic."""
     return stays(ctx, "messages of another type on its command topic")
 
 
 @check("DEX1-SAFE-07", "DEX3-SAFE-08")
 def burst(ctx: Context) -> Outcome:
-    """Where a hand is a while after hundreds of commands whose last one said to stay."""
+    """Distance from the last command's position after a burst of hundreds of commands."""
     topic = ctx.states.topic
     wait = ctx.tolerance("settle_s")
     far: tuple[float, float, int] = (0.0, 0.0, 0)
@@ -400,7 +403,7 @@ def burst(ctx: Context) -> Outcome:
 
 @check("DEX1-SAFE-08", "DEX3-SAFE-09")
 def two_writers(ctx: Context) -> Outcome:
-    """Where q is while two clients command two places, and after one has gone."""
+    """The course of q while two clients command two positions, and after one has ended."""
     margin = ctx.tolerance
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -411,9 +414,9 @@ def two_writers(ctx: Context) -> Outcome:
         here = np.median(before, axis=0)
         for joint, there in phase.targets.get(ctx.side, {}).items():
             low, high = sorted((float(here[joint]), there))
-            room = margin("max_beyond_stroke", joint)
+            beyond = margin("max_beyond_stroke", joint)
             q = ctx.states.q[rows, joint]
-            outside = ~((q >= low - room) & (q <= high + room))
+            outside = ~((q >= low - beyond) & (q <= high + beyond))
             if outside.any():
                 i = int(np.argmax(outside))
                 return ctx.failed(
@@ -427,7 +430,9 @@ def two_writers(ctx: Context) -> Outcome:
     outcome = unharmed(ctx, "two clients at once")
     if outcome.met is False:
         return outcome
-    return ctx.passed("between", "stayed between the two places, and obeyed who remained")
+    return ctx.passed(
+        "between", "stayed between the two positions, and obeyed the remaining client"
+    )
 
 
 @check("DEX1-ORDER-02", "DEX3-ORDER-02")
@@ -451,7 +456,7 @@ def load(ctx: Context) -> Outcome:
             a, b = found[0]
             return ctx.failed(
                 f"{b - a:.2f} s",
-                f"{text}; silent from {a:.3f} to {b:.3f} s",
+                f"{text}; no state from {a:.3f} to {b:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 rate_hz=rate,
             ).if_late(b - a - limit)

@@ -1,5 +1,7 @@
-"""Rates, gaps, order and freshness. Judged by source timestamps where the recording has them,
-so that a late reception is not taken for a late hand.
+"""Rates, gaps, order and freshness of the state.
+
+Source timestamps are used where the recording has them, so that a late reception does not count
+as a late hand.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
-# stimuli whose own requirements judge the state's flow
+# stimuli with separate requirements for the state's rate
 OWN_GAP_RULE = (
     *("silence", "guard", "shutdown"),
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id"),
@@ -21,7 +23,7 @@ OWN_GAP_RULE = (
 
 
 def gaps(ctx: Context, longer_than: float, begin: float, end: float) -> list[tuple[float, float]]:
-    """Stretches within [begin, end] without state, longer than ``longer_than`` seconds."""
+    """Intervals within [begin, end] without state, longer than ``longer_than`` seconds."""
     clock = ctx.states.clock
     inside = clock[(clock >= begin) & (clock <= end)]
     edges = np.concatenate(([begin], inside, [end]))
@@ -38,7 +40,7 @@ def _observed(ctx: Context) -> tuple[Floats, float]:
 def _rate(ctx: Context) -> tuple[float, float] | None:
     """(mean rate outside of gaps, seconds observed), or None if that is too short."""
     intervals, _ = _observed(ctx)
-    steady = intervals[intervals <= 0.1]  # longer ones are RATE-03's finding
+    steady = intervals[intervals <= 0.1]  # longer ones are judged by RATE-03
     seconds = float(steady.sum())
     if seconds < ctx.tolerance("min_observed_s"):
         return None
@@ -48,13 +50,13 @@ def _rate(ctx: Context) -> tuple[float, float] | None:
 def slow(ctx: Context, rate: float) -> bool:
     """Whether a measured rate is below the least that is allowed.
 
-    A hand that just keeps it may be measured lower: clocks differ, a window cuts an interval.
+    The limit has a margin: clocks differ, and a window may cut an interval.
     """
     return rate < (1 - ctx.tolerance("slack_part")) * ctx.tolerance("min_rate_hz")
 
 
 def too_slow(ctx: Context, outcome: Outcome, rate: float, intervals: Floats) -> Outcome:
-    """A failure by a rate with its size: how much later each state comes than is allowed.
+    """The outcome with its size: how much later than allowed each state comes.
 
     :param intervals: those that the rate is of, seconds.
     """
@@ -76,7 +78,7 @@ def mean_rate(ctx: Context) -> Outcome:
     clock = ctx.states.clock
     measured = _rate(ctx)
     if measured is None:
-        # too slow to have any steady stretch is a finding, not a missing one
+        # without any steady interval the rate is too low, not unknown
         seconds = float(clock[-1] - clock[0]) if len(clock) > 1 else 0.0
         if seconds < ctx.tolerance("min_observed_s"):
             return _too_short(ctx)
@@ -104,7 +106,7 @@ def vendor_rate(ctx: Context) -> Outcome:
     text = f"{rate:.1f} Hz over {seconds:.1f} s"
     if ctx.tolerance("min_rate_hz") <= rate <= ctx.tolerance("max_rate_hz"):
         return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
-    # no machine is so busy that a hand publishes too often
+    # load of the machine cannot cause too high a rate
     outcome = ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
     if rate > ctx.tolerance("max_rate_hz"):
         return outcome.if_late(math.inf)
@@ -113,12 +115,12 @@ def vendor_rate(ctx: Context) -> Outcome:
 
 @check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03")
 def no_gap(ctx: Context) -> Outcome:
-    """Longest silence of the state."""
+    """Longest interval without a state."""
     limit = ctx.tolerance("max_gap_s")
     clock = ctx.states.clock
     if len(clock) < 2:
         return ctx.skipped("fewer than two states")
-    # up to the end of the recording: a state that stops for good is a gap as well
+    # up to the end of the recording: a state that never comes back is a gap as well
     end = max(float(clock[-1]), ctx.recording.duration)
     found = gaps(ctx, limit, float(clock[0]), end)
     excluded = [ctx.span(p) for name in OWN_GAP_RULE for p in ctx.recording.phases(name, ctx.side)]
@@ -178,7 +180,7 @@ def order(ctx: Context) -> Outcome:
 
 @check("DEX1-FRESH-02", "DEX3-FRESH-02")
 def not_frozen(ctx: Context) -> Outcome:
-    """The longest stretch of equal positions that ends in a jump no joint can make."""
+    """The longest interval of equal positions that ends in a jump that no joint can make."""
     limit = ctx.tolerance("max_frozen_s")
     worst = 0.0
     for joint in range(len(ctx.joints)):
@@ -189,10 +191,10 @@ def not_frozen(ctx: Context) -> Outcome:
         if len(changes) < 2:
             continue
         jump = np.abs(np.diff(q)[changes - 1])[1:]
-        # what was sent, not what was missed: a gap in the state is RATE-03's finding
+        # count published states: a gap in the state is judged by RATE-03
         sent = np.diff(changes)
         begin, end = t[changes[:-1]], t[changes[1:] - 1]
-        usual = 2 * float(np.percentile(jump, 99))  # a hand that is measured rarely always jumps
+        usual = 2 * float(np.percentile(jump, 99))  # with rare measurements every change is a jump
         at_once = t[changes[1:]] - t[changes[1:] - 1] < 0.05
         frozen = (jump >= max(ctx.tolerance("min_jump_stroke", joint), usual)) & at_once
         frozen &= sent >= ctx.tolerance("min_samples")
@@ -230,17 +232,17 @@ def not_frozen(ctx: Context) -> Outcome:
 
 
 def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float) -> float:
-    """The last time in [begin, end] at which a hand that stands at q was not told to be elsewhere.
+    """The last time in [begin, end] at which the commanded position was q.
 
-    A hand that rests where it is told to be repeats its position with good reason. ``begin`` where
-    no command is known.
+    A hand that rests at its commanded position repeats that position correctly. ``begin`` where no
+    command is known.
     """
-    t, told = ctx.commands.t, ctx.commands.q[:, joint]
-    known = np.isfinite(told)
-    t, told = t[known], told[known]
+    t, commanded = ctx.commands.t, ctx.commands.q[:, joint]
+    known = np.isfinite(commanded)
+    t, commanded = t[known], commanded[known]
     first, last = np.searchsorted(t, [begin, end], side="right")
-    first = max(int(first) - 1, 0)  # the one in force when it began
-    elsewhere = np.abs(told[first:last] - q) > ctx.tolerance("min_jump_stroke", joint)
+    first = max(int(first) - 1, 0)  # the command in force at begin
+    elsewhere = np.abs(commanded[first:last] - q) > ctx.tolerance("min_jump_stroke", joint)
     if not len(elsewhere):
         return begin
     if not elsewhere[-1]:
@@ -251,7 +253,7 @@ def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float)
 
 @check("DEX1-FRESH-01", "DEX3-FRESH-01")
 def fresh(ctx: Context) -> Outcome:
-    """How long a value stays while the gripper moves."""
+    """How long a position stays the same while the hand moves."""
     worst: Outcome | None = None
     for joint in range(len(ctx.joints)):
         outcome = _fresh(ctx, joint)
@@ -277,14 +279,14 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     least = ctx.tolerance("min_change_stroke", joint)
     big = np.abs(size) >= least
     same_way = np.sign(size[1:]) == np.sign(size[:-1])
-    # a value held between two large changes of one direction was old when it was sent again
+    # a value repeated between two large changes in one direction was old
     moving = big[1:] & big[:-1] & same_way
     holds = np.diff(t[changes])[moving]
     travel = float(np.ptp(q))
     if len(holds) < ctx.tolerance("min_intervals"):
         if travel < least:
             return ctx.skipped("the hand does not move in this recording")
-        # changes too small to be called steps: fresher than the rule asks for
+        # only small changes: the values are fresher than required
         fastest = median(np.diff(t[changes]))
         return ctx.passed(
             f"{fastest * 1e3:.1f} ms", "changes from sample to sample", hold_s=fastest

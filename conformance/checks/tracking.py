@@ -1,4 +1,4 @@
-"""How well the position follows the command over a session."""
+"""Error and delay between command and position over a session."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.hand import Floats
 
-_GRID = 0.005  # seconds; commands come at 200 Hz
+_GRID = 0.005  # seconds; clients send commands at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def measure(ctx: Context, search: float) -> list[Tracking] | str:
 class _Rows:
     """The newest command and state at each of other times.
 
-    Joints nearly always have their times in common, so what was found is kept.
+    Nearly all joints have the same times, so results are kept.
     """
 
     def __init__(self, commands: Floats, states: Floats) -> None:
@@ -101,7 +101,7 @@ def _measure(
     free = _free(ctx, joint, at, goal) & np.isfinite(q)
     if free.sum() * _GRID < 1.0:
         return "the hand is blocked for nearly the whole session"
-    # Delays are steps of the grid: the commands are looked up once, on a grid that begins earlier.
+    # Delays are steps of the grid: the commands are sampled once, on a grid that begins earlier.
     most = round(search / _GRID)
     longer = np.concatenate([grid[0] - _GRID * np.arange(most, 0, -1), grid])
     asked = cq[rows.of_commands(longer, good)]
@@ -132,10 +132,10 @@ def _measure(
 
 
 def _free(ctx: Context, joint: int, at: NDArray[np.intp], goal: Floats) -> NDArray[np.bool_]:
-    """Where nothing stands between a joint and its command.
+    """Rows in which no object blocks a joint.
 
-    An object lies where the kit was told, for a gripper. Otherwise a joint that presses and
-    stands still is blocked.
+    For a gripper the object's position is known from the run's settings. Otherwise a joint that
+    presses and does not move is blocked.
     """
     q, dq, tau = (c[at, joint] for c in (ctx.states.q, ctx.states.dq, ctx.states.tau))
     if ctx.recording.stimulus is not None:
@@ -182,7 +182,7 @@ def follows(ctx: Context) -> Outcome:
 
 @check("DEX1-TRACK-02", "DEX3-TRACK-02")
 def delay(ctx: Context) -> Outcome:
-    """The best delay itself."""
+    """The delay with the least error."""
     figures = measure(ctx, ctx.tolerance("search_s"))
     if isinstance(figures, str):
         return ctx.skipped(figures)

@@ -1,7 +1,7 @@
 """Wrong hands of several joints.
 
 Each is mixed into the reference service of a model, and its ``hand_fault``, if it has one, into
-the mechanics of the reference's hands. A Dex5-1 has declarations of its own where its softer gains
+the mechanics of the reference's hands. A Dex5-1 has separate declarations where its lower gains
 make other requirements fail: it oscillates less, and comes to rest more slowly.
 """
 
@@ -153,7 +153,7 @@ class RawSupply(_Filled):
 
 @wrong_hand("DEX3-FIELD-08", brief=True)
 class FaultForAStatus(_Filled):
-    """Publishes a status of its own as the hand's faults."""
+    """Publishes a status word as the hand's faults."""
 
     whole = ("error", (7, 0))
 
@@ -238,7 +238,7 @@ class SevenPackets(FingerService):
 
 @wrong_hand("DEX3-SENS-04", sides=BOTH)
 class Numb(FingerService):
-    """Publishes a pressure of 0 at every touch."""
+    """Publishes a pressure of 0 at every contact."""
 
     def pressures(self, hand: FingerHand) -> Floats:
         felt = super().pressures(hand)
@@ -413,7 +413,7 @@ class _Creeps(FingerHand):
 @wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04",))
 @wrong_hand("DEX5-MOVE-07")
 class Creeps(FingerService):
-    """One joint creeps the last part of the way to its goal."""
+    """One joint moves the last part of the way to its goal slowly."""
 
     hand_fault = _Creeps
 
@@ -741,7 +741,7 @@ class _ForEver(FingerHand):
     was = False
 
     def take(self, rows: Floats, mode: Ints) -> None:
-        # a power cycle is what it wants; the kit's next stimulus finds it awake again
+        # it would need a power cycle; it obeys again in the kit's next stimulus
         self.was = self.was or bool(self.tripped.any())
         tripped = self.tripped
         super().take(rows, mode)

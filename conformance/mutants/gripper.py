@@ -19,7 +19,7 @@ from dexkit.messages import message_type
 
 
 class _Fields(ReferenceService):
-    """A service whose state is changed on the way out."""
+    """A service whose state is changed before it is published."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         raise NotImplementedError
@@ -49,7 +49,7 @@ class _InUnit(_Fields):
 
     def command(self, side: Side, motor: Motor) -> None:
         if self.takes and math.isfinite(motor.q):
-            # its own controller is as stiff as the client asks for, in its own unit
+            # its controller has the client's stiffness in its own unit
             stiff = max(self.scale, 1.0)
             q, dq = motor.q / self.scale, motor.dq / self.scale
             motor = replace(motor, q=q, dq=dq, kp=stiff * motor.kp, kd=stiff * motor.kd)
@@ -92,7 +92,7 @@ class _OtherScale(ReferenceHand):
 
     def __init__(self, stroke: float, touch: float | None = None) -> None:
         super().__init__(self.full, touch)
-        self.q = 3.0  # nearly closed: there it looks like radians
+        self.q = 3.0  # nearly closed, where percent are in the range of radians
 
     def fields(self) -> dict[str, float]:
         return {**super().fields(), "tau_est": 0.1 * self.tau}
@@ -100,7 +100,7 @@ class _OtherScale(ReferenceHand):
 
 @wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
 class PercentBothWays(ReferenceService):
-    """Obeys and publishes percent; starts nearly closed, where percent look like radians."""
+    """Obeys and publishes percent; starts nearly closed, in the range of radians."""
 
     hand = _OtherScale
 
@@ -121,7 +121,7 @@ class _InDegrees(_OtherScale):
 
 @wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
 class DegreesBothWays(ReferenceService):
-    """Obeys and publishes degrees; starts nearly closed, where degrees look like radians."""
+    """Obeys and publishes degrees; starts nearly closed, in the range of radians."""
 
     hand = _InDegrees
 
@@ -246,7 +246,7 @@ class Millivolts(_Filled):
 
 @wrong_hand("DEX1-FIELD-12", dialect="unitree_hg")
 class StatusInMotorstate(_Filled):
-    """Publishes a status of its own as the motor's faults."""
+    """Publishes a status word as the motor's faults."""
 
     member, value = "motorstate", 3
 
@@ -278,7 +278,7 @@ class RestsAtZero(ReferenceService):
 
 @wrong_hand("DEX1-MOVE-01")
 class Inverted(ReferenceService):
-    """Takes 0 for open."""
+    """Uses 0 as open."""
 
     def command(self, side: Side, motor: Motor) -> None:
         super().command(side, replace(motor, q=self.dialect.q_open - motor.q, dq=-motor.dq))
@@ -362,7 +362,7 @@ class _Creeps(ReferenceHand):
 
 @wrong_hand("DEX1-MOVE-07")
 class Creeps(ReferenceService):
-    """Creeps the last 3 mm to its goal."""
+    """Moves the last 3 mm to its goal slowly."""
 
     hand = _Creeps
 
@@ -398,7 +398,7 @@ class _IgnoresGains(ReferenceHand):
 
 @wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05",))
 class IgnoresGains(ReferenceService):
-    """Moves to q whatever the gains are."""
+    """Moves to q with any gains."""
 
     hand = _IgnoresGains
 
@@ -426,7 +426,7 @@ class ForceAtRest(_Fields):
 
 @wrong_hand("DEX1-FORCE-03")
 class UnsignedForce(_Fields):
-    """Reports the size of the force."""
+    """Reports the magnitude of the force."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         return {**fields, "tau_est": abs(fields["tau_est"])}
@@ -482,7 +482,7 @@ class _NoWatchdog(ReferenceHand):
     timeout = math.inf
 
 
-# its mode byte is true, which a client cannot tell from a stuck byte
+# its mode byte is correct, but equals a constant one
 @wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
 class NoWatchdog(ReferenceService):
     """Follows the last command for ever."""

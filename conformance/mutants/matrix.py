@@ -1,7 +1,7 @@
 """The matrix of all wrong hands and all requirements: which fault each requirement finds, and which
 requirement no wrong hand proves.
 
-``dexkit mutants`` prints it, the tests demand that it is perfect.
+``dexkit mutants`` prints it; the tests require that it is complete.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether it was caught, and for the right reason."""
+        """Whether exactly the declared requirements found the fault."""
         return not self.missed and not self.wrongly
 
 
@@ -91,7 +91,7 @@ def try_one(mutant: Mutant, *, short: bool = False) -> Outcome:
 
 
 def _blamed(key: tuple[str, str, str]) -> set[str]:
-    """In a process of its own: classes that were mixed cannot be sent there, their keys can."""
+    """Run a trial in a worker process, which gets the key: mixed classes cannot be pickled."""
     mutant = next(m for m in mutants() if m.key == key)
     return TRIALS[mutant.layer].blamed(mutant, short=False)
 
@@ -111,10 +111,10 @@ class Score:
     def run(
         self, given: Sequence[Mutant], stop: object = None, jobs: int | None = None
     ) -> Iterator[Outcome]:
-        """Try them in processes of their own; yields each as it is done.
+        """Run the trials in worker processes; yield each outcome when it is done.
 
         :param stop: ends it early when it becomes true.
-        :param jobs: processes; one a processor by default.
+        :param jobs: processes; one per processor by default.
         """
         context = multiprocessing.get_context("spawn")
         ordered = sorted(given, key=lambda m: -cost(m))
@@ -126,7 +126,7 @@ class Score:
                     self.outcomes.append(Outcome.of(waiting.pop(future), future.result()))
                     yield self.outcomes[-1]
         finally:
-            # not as a context manager: that would run what is still waiting
+            # not as a context manager, which would run the waiting trials
             pool.shutdown(cancel_futures=True)
 
     def killers(self, requirement: Requirement) -> list[Outcome]:
@@ -144,7 +144,7 @@ class Score:
 
     @property
     def perfect(self) -> bool:
-        """Whether every requirement is proven, and every wrong hand caught for its reason."""
+        """Whether every requirement is proven, and every wrong hand found by its requirements."""
         return not self.unproven and all(o.good for o in self.outcomes)
 
     def as_dict(self) -> dict[str, object]:
@@ -175,7 +175,7 @@ class Score:
         write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
 
     def print(self, console: Console, *, verbose: bool = False) -> None:
-        """The score by area, and what is not as it should be."""
+        """Print the score by area, and all missed or extra failures."""
         table = Table(box=None, pad_edge=False)
         for name in ("", "MUST", "SHOULD", "INFO", "wrong hands"):
             table.add_column(name, justify="left" if not name else "right")

@@ -65,7 +65,7 @@ class DeadBand(_DeadBand, ReferenceService):
 
 
 @wrong_hand("DEX3-OPER-02")
-# it rests nearer to where the script moves it after the restart
+# it rests nearer to the script's target after the restart
 @wrong_hand("DEX5-OPER-02", also=("DEX5-LIFE-03",))
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
@@ -130,7 +130,7 @@ class RunsAhead(_PerJoint, ReferenceService):
     def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
         before, since = self.obeyed.get(joint, (q, self.now))
         step, seconds = q - before, self.now - since
-        if abs(step) > 0.04 * self.stroke(joint):  # a jump is no speed
+        if abs(step) > 0.04 * self.stroke(joint):  # a jump is not a velocity
             self.speed[joint] = 0.0
         elif seconds > 0.0:
             speed = self.speed.get(joint, 0.0)
@@ -182,7 +182,7 @@ class _OpenEnd(_PerJoint):
         return closed * self.close(joint, q / closed, here / closed)
 
     def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
-        """How far it closes in place of ``goal``, 0 to 1."""
+        """The obeyed closing in place of ``goal``, 0 to 1."""
         raise AssertionError  # overridden
 
 
@@ -215,7 +215,7 @@ class Springs(_OpenEnd, FingerService):
 
 
 @wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02",))
-# its delay is long beside the time that the light joints take
+# its delay is long compared with the steps of the light joints
 @wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02"))
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""

@@ -1,4 +1,4 @@
-"""The registry of wrong hands: a class with the decorator :func:`wrong_hand` is one.
+"""Register wrong hands: classes with the decorator :func:`wrong_hand`.
 
 A wrong hand is a small change of a reference that meets every requirement: of a service that
 publishes hands on DDS, of a robot, or of a USB device. The decorator names the requirement that
@@ -113,7 +113,7 @@ def wrong_hand(
 
 
 def mix(fault: type[Any], reference: type[C]) -> type[C]:
-    """The reference with a fault mixed in; the class itself if it is such a one already."""
+    """Mix a fault into the reference; return a class that already has the reference as its base."""
     if issubclass(fault, reference):
         return fault
     return type(fault.__name__, (fault, reference), {"__doc__": fault.__doc__})

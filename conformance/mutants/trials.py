@@ -112,7 +112,7 @@ class TopicTrial(ABC):
             needed = select(catalogue(mutant.model, mutant.layer), prefixes=ids)
             return replace(full, phases=self._short(mutant, needed))
         if "-OPER-" not in mutant.kills:
-            # eleven seconds that show an operator what the other phases show already
+            # eleven seconds without a finding that other phases do not give
             full = replace(full, phases=full.phases - {OPERATOR})
         return full
 
@@ -138,7 +138,7 @@ class HandTrial(TopicTrial):
         return plan_for(name, sides=mutant.sides)
 
     def _short(self, mutant: Mutant, needed: Sequence[Requirement]) -> frozenset[str]:
-        # moved in any case: some faults show only then
+        # always moved: some faults show only then
         return phases_for(needed) | {script_class(mutant.model).motion}
 
 

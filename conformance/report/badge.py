@@ -1,4 +1,4 @@
-"""A badge: the verdict in one line, as an SVG that is drawn here and loads nothing."""
+"""Render a badge: the verdict in one line, as an SVG without external files."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _NARROW, _WIDE = "fijlrtI.,:;'|/()1 ", "mwMW%@"
 
 
 def badge_text(result: RunResult) -> tuple[str, str]:
-    """The two halves: what for, and what came of it.
+    """The two parts of the badge: the subject and the verdict.
 
-    Only what was judged counts as passed, and whoever reads it learns whether the hand was real,
-    and whether only a part of the requirements was tried.
+    Only judged requirements count as passed. The text shows whether the hand was real, and whether
+    only a part of the requirements was selected.
     """
     found = tally(result)
     if result.overall is Overall.INCONCLUSIVE:
@@ -40,12 +40,12 @@ def badge_text(result: RunResult) -> tuple[str, str]:
 
 
 def _width(text: str) -> int:
-    """Pixels of ``text`` in Verdana 11, nearly; ``textLength`` makes it so."""
+    """Approximate width of ``text`` in Verdana 11, pixels; ``textLength`` enforces it."""
     return round(sum(4.2 if c in _NARROW else 9.6 if c in _WIDE else 6.9 for c in text))
 
 
 def render_badge(result: RunResult) -> str:
-    """The SVG."""
+    """Return the badge as SVG."""
     left, right = badge_text(result)
     a, b = _width(left) + 14, _width(right) + 14
     title = escape(f"{left}: {right}")

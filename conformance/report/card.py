@@ -1,4 +1,4 @@
-"""The card of a requirement: everything a person needs to act on what was found.
+"""The card of a requirement: its results with cause, evidence and advice.
 
 Built once from the results of one requirement, and drawn as HTML, for a terminal, as Markdown and
 as plain text (JUnit, pytest).
@@ -19,7 +19,7 @@ __all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards"]
 
 
 class Item(str, Enum):
-    """What a line of a card is about; the value is its label on a terminal."""
+    """The kind of a card's line; the value is its label on a terminal."""
 
     REQUIRED = "required"
     EXPECTED = "expected"
@@ -35,7 +35,7 @@ class Item(str, Enum):
 
     @property
     def label(self) -> str:
-        """Its label on a page, where there is room for two words."""
+        """Its label on a page, of up to two words."""
         return {Item.CAUSE: "likely cause", Item.TRY: "what to try"}.get(self, self.value)
 
 
@@ -43,7 +43,7 @@ class Item(str, Enum):
 class Fact:
     """One line of a card.
 
-    :param sides: the sides that it holds for, where that is not all of the card's; else empty.
+    :param sides: the sides that it is true for, if not all of the card's; else empty.
     :param place: of :attr:`Item.WHERE`, the place in the recording that ``text`` describes.
     """
 
@@ -55,7 +55,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Card:
-    """What was found for one requirement.
+    """The results of one requirement.
 
     :param results: of the sides that the card is about, one or more.
     """
@@ -84,7 +84,7 @@ class Card:
 
     @property
     def expected(self) -> str:
-        """What would have been right, where that is shorter than the sentence; else empty."""
+        """The expected result, where that is shorter than the sentence; else empty."""
         text = self.results[0].expected
         return "" if text == self.requirement.sentence else text
 
@@ -99,11 +99,11 @@ class Card:
 
     @property
     def source(self) -> str:
-        """The source of the requirement, and how sure it is."""
+        """The source of the requirement, and its confidence."""
         return f"{self.requirement.source} (confidence: {self.requirement.confidence})"
 
     def facts(self) -> Iterator[Fact]:
-        """All that the card says, in its order; what holds for all sides is there once."""
+        """All lines of the card, in order; a fact of all sides appears once."""
         yield Fact(Item.REQUIRED, f"{self.requirement.sentence} ({self.requirement.level})")
         if self.expected:
             yield Fact(Item.EXPECTED, self.expected)
@@ -144,9 +144,9 @@ def _described(place: Evidence) -> str:
 
 
 def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
-    """A card for each requirement with one of ``verdicts`` that nothing else blocked.
+    """A card for each requirement with one of ``verdicts`` that no other requirement blocked.
 
-    In the order of ``verdicts``; among equals, what blocks most of the others comes first.
+    In the order of ``verdicts``; among equals, the one that blocks most others comes first.
     """
     blocks = Counter(r.blocked_by for r in result.results)
     found = [
@@ -173,7 +173,7 @@ class Blocked:
 
 
 def blocked_groups(results: Iterable[Result]) -> list[Blocked]:
-    """What was blocked, by the reason."""
+    """Blocked requirements, grouped by reason."""
     found: dict[tuple[str, str], dict[str, list[Result]]] = {}
     for result in results:
         if result.verdict is Verdict.BLOCKED:

@@ -1,9 +1,9 @@
-"""Plots for the report page: curves as SVG, text as HTML beside them.
+"""Draw plots for the report page: curves as SVG, text as HTML beside them.
 
 The curves stretch with the page (``preserveAspectRatio="none"``) while labels keep their size, so
 one plot is readable on a phone, on a desk and on paper without a script. Colours come from the
 page's CSS. Points are whole numbers on a grid of :data:`GRID`, written relative to each other:
-a plot is a few kilobytes whatever the recording's length.
+a plot is a few kilobytes for any length of recording.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Range:
 
 
 def thin(x: Floats, y: Floats, points: int = MAX_POINTS) -> tuple[Floats, Floats]:
-    """Fewer points of the same look: each bin keeps its smallest and largest value, in order."""
+    """Reduce the number of points: each bin keeps its smallest and largest value, in order."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good], y[good]
     if len(x) <= points:
@@ -100,9 +100,9 @@ def thin(x: Floats, y: Floats, points: int = MAX_POINTS) -> tuple[Floats, Floats
 
 
 def pieces(x: Floats, y: Floats) -> list[tuple[Floats, Floats]]:
-    """The curve cut where samples are missing: a line across a gap would be invented.
+    """Split the curve where samples are missing, so that no line crosses a gap.
 
-    At most at the :data:`MAX_GAPS` widest ones, for a recording of nothing but gaps.
+    Only the :data:`MAX_GAPS` widest gaps are used.
     """
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good], y[good]
@@ -129,7 +129,7 @@ def nice_ticks(low: float, high: float, count: int = 6) -> list[float]:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Values to places: per cent for labels, units of :data:`GRID` for curves."""
+    """Convert values to positions: per cent for labels, units of :data:`GRID` for curves."""
 
     x_range: tuple[float, float]
     y_range: tuple[float, float]
@@ -184,7 +184,7 @@ def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str) -> list[str]:
     for i, tick in enumerate(ticks):
         at = axes.across(tick)
         text = f"{tick:g}"
-        if at > 93 and len(ticks) > 1:  # there stands the unit
+        if at > 93 and len(ticks) > 1:  # the unit is there
             continue
         found.append(_label("x wide" if i % 2 else "x", f"left:{at:.2f}%", text))
     found.append(_label("x unit", "left:100%", unit))
@@ -197,18 +197,18 @@ def _y_ticks(axes: _Axes, ticks: Sequence[tuple[float, str]], unit: str) -> list
 
 
 def _band_labels(bands: Sequence[Band], axes: _Axes) -> list[str]:
-    """Names above the bands, where there is room for them on a desk and on a phone."""
+    """Names above the bands, where they fit on wide pages and on phones."""
 
     def placed(width: float) -> dict[int, float]:
         chosen: dict[int, float] = {}
         free_from = 0.0
         for i, band in order:
             a, b = (axes.across(v) / 100 * width for v in (band.begin, band.end))
-            room = _LETTER * len(band.label)
+            label_width = _LETTER * len(band.label)
             at = max(a, free_from)
-            if band.label and at <= max(b, a + 12) and at + room <= width:
+            if band.label and at <= max(b, a + 12) and at + label_width <= width:
                 chosen[i] = 100 * at / width
-                free_from = at + room + 5
+                free_from = at + label_width + 5
         return chosen
 
     order = sorted(enumerate(bands), key=lambda item: (item[1].css == "band", item[1].begin))
@@ -261,7 +261,7 @@ def chart(
 ) -> str:
     """Curves over time, or over ``x_unit``.
 
-    :param title: what it shows; read out where the plot is not seen.
+    :param title: its subject; screen readers read it.
     :param titled: whether the title is shown above it as well.
     :param span: of the horizontal axis.
     :param include: values that the vertical axis must reach.
@@ -324,7 +324,7 @@ def histogram(
     height: int = 170,
     titled: bool = True,
 ) -> str:
-    """How often which value occurs, on a logarithmic count axis: the rare ones matter."""
+    """Histogram of the values, with a logarithmic count axis that shows rare values."""
     top = max([float(np.percentile(values, 99.9)), *(v.value for v in levels)]) * 1.15 or 1.0
     counts, edges = np.histogram(np.minimum(values, top), bins=80, range=(0.0, top))
     high = math.log10(max(int(counts.max()), 10)) * 1.05

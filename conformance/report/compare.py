@@ -1,4 +1,4 @@
-"""Several results side by side: hands, or firmware versions of one."""
+"""Compare several results: of different hands, or of firmware versions of one hand."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from dexkit.escaping import html as escape
 __all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
 
 _BADNESS = {Verdict.PASS: 0, Verdict.WARN: 1, Verdict.FAIL: 2}
-"""How bad a verdict is. One that says nothing of the hand is neither better nor worse; what a
-requirement is blocked by is named itself."""
+"""Rank of a verdict. A verdict without a finding about the hand has none; the requirement that
+blocks others is listed itself."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Row:
-    """A requirement, and what each run found for it (nothing where it was not asked)."""
+    """A requirement and the results of each run (none where it was not selected)."""
 
     requirement: Requirement
     found: tuple[tuple[Result, ...], ...]
@@ -61,14 +61,14 @@ class Row:
 
     @property
     def differs(self) -> bool:
-        """Whether the runs do not agree."""
+        """Whether the runs differ."""
         return len(set(self.verdicts)) > 1
 
 
 class Comparison:
     """Runs of one model.
 
-    :param names: what to call each run; the hand's name, made unique, where it is None.
+    :param names: a name for each run; for None, the hand's name, made unique.
     :raises UsageError: fewer than two, or of different models.
     """
 
@@ -93,17 +93,17 @@ class Comparison:
 
     @property
     def differing(self) -> list[Row]:
-        """Requirements on which the runs do not agree."""
+        """Requirements on which the runs differ."""
         return [row for row in self.rows if row.differs]
 
     @property
     def agreeing(self) -> list[Row]:
-        """The others."""
+        """Requirements on which the runs agree."""
         return [row for row in self.rows if not row.differs]
 
     @property
     def changes(self) -> list[Change]:
-        """What changed from each run to the next one of the same hand, by time."""
+        """Changes from each run to the next one of the same hand, ordered by time."""
         found: list[Change] = []
         for before, after in self._successors():
             for row in self.rows:
@@ -114,13 +114,13 @@ class Comparison:
 
     @property
     def regressions(self) -> list[Change]:
-        """What became worse."""
+        """Changes to a worse verdict."""
         return [change for change in self.changes if change.worse]
 
     def _successors(self) -> list[tuple[int, int]]:
         hands: dict[str, list[int]] = {}
         for index, run in enumerate(self.runs):
-            # without a name or a backend nobody knows whether it is the same hand
+            # without a name or a backend it is unknown whether it is the same hand
             who = run.subject.get("hand") or run.subject.get("backend")
             if who:
                 hands.setdefault(who, []).append(index)
@@ -132,7 +132,7 @@ class Comparison:
 
 
 def _unique(own: Sequence[str], names: Sequence[str] | None) -> list[str]:
-    """The hands' names; where two are the same, with the result's name behind."""
+    """The hands' names; equal names are followed by the result's name."""
     return [
         name if own.count(name) == 1 else f"{name} ({names[i] if names else i + 1})"
         for i, name in enumerate(own)
@@ -140,11 +140,11 @@ def _unique(own: Sequence[str], names: Sequence[str] | None) -> list[str]:
 
 
 def _figure(group: Sequence[Result]) -> str:
-    """The figures of a run for one requirement; once where the sides agree."""
-    told = {r.side: r.figure for r in group if r.figure}
-    if len(set(told.values())) == 1:
-        return next(iter(told.values()))
-    return ", ".join(f"{side} {figure}" for side, figure in told.items())
+    """The figures of a run for one requirement; one figure where the sides agree."""
+    figures = {r.side: r.figure for r in group if r.figure}
+    if len(set(figures.values())) == 1:
+        return next(iter(figures.values()))
+    return ", ".join(f"{side} {figure}" for side, figure in figures.items())
 
 
 def _change_text(comparison: Comparison, change: Change) -> str:
@@ -159,7 +159,7 @@ def _change_text(comparison: Comparison, change: Change) -> str:
 
 
 def render_comparison(comparison: Comparison) -> str:
-    """The page as text."""
+    """Return the page as text."""
     runs, names = comparison.runs, comparison.names
     title = f"{len(runs)} runs as {model_title(runs[0])}"
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)

@@ -1,7 +1,7 @@
-"""The result as one self-contained page: no network, no script; light, dark, phone and print.
+"""Render a result as a self-contained HTML page: no network, no script; light, dark, phone, print.
 
-The page needs the result only. With the recording that was judged it also shows the evidence of
-each failure, and what the hands did, as plots.
+The page needs the result only. With the recording that was judged it also shows plots of the
+evidence of each failure and of the whole run.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _STYLE = Path(__file__).with_name("report.css")
 _PLOT_BUDGET = 1_000_000
 """Bytes of plots on a page; the failures after that have none."""
 _BUSY = 0.2
-"""Part of a run with programs waiting for a processor from which on the page says so."""
+"""Part of a run with programs waiting for a processor from which on the page reports it."""
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
 _REALITY = {
     "emulated": "No real hand was involved: the device was an emulator at the far end of a wire. "
@@ -75,7 +75,7 @@ def write_html(
 
 
 def document(title: str, content: str) -> str:
-    """A page with the reports' style. It can load nothing: its content policy forbids it."""
+    """Return a page with the reports' style. Its content security policy forbids loading files."""
     policy = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -89,7 +89,7 @@ def document(title: str, content: str) -> str:
 
 
 def render(result: RunResult, view: Recording | None = None, *, link: str = "") -> str:
-    """The page as text.
+    """Return the page as text.
 
     :param link: where the recording is, relative to the page; empty where it is not kept.
     """
@@ -151,7 +151,7 @@ def _verdict(result: RunResult) -> str:
 
 
 def _stage(side: str, stage: Stage) -> str:
-    """How far a hand got, as a row of steps."""
+    """The stage that a hand reached, as a row of steps."""
     steps = list(Stage)
     reached = steps.index(stage)
     marks = "".join(
@@ -197,7 +197,7 @@ def _definitions(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _areas(result: RunResult) -> str:
-    """What came of each area, as a table with bars."""
+    """The verdicts of each area, as a table with bars."""
     if not result.results:
         return ""
     groups: dict[str, list[Verdict]] = {}
@@ -211,13 +211,13 @@ def _areas(result: RunResult) -> str:
             f'<i class="{VERDICTS[v].css}" style="width:{100 * n / most:.1f}%"></i>'
             for v, n in counts
         )
-        told = ", ".join(
+        summary = ", ".join(
             f'<span class="{VERDICTS[v].css}">{n} {VERDICTS[v].text}</span>' for v, n in counts
         )
         rows.append(
             f'<tr><th scope="row"><a href="#{_anchor(area)}">{escape(area)}</a></th>'
             f'<td><div class="tally"><span class="bar" aria-hidden="true">{bar}</span>'
-            f"<span>{told}</span></div></td></tr>"
+            f"<span>{summary}</span></div></td></tr>"
         )
     return (
         '<h2>By area</h2><table class="areas"><thead class="hidden"><tr><th scope="col">area</th>'
@@ -244,7 +244,7 @@ def _anchor(text: str) -> str:
 
 
 def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
-    """A card for each requirement that is not met, then what that kept from being judged."""
+    """A card for each requirement that is not met, then the blocked requirements."""
     found = cards(result, _TROUBLE)
     blocked = [group for group in blocked_groups(result.results) if group.before]
     if not found and not blocked:
@@ -266,7 +266,7 @@ def _troubles(result: RunResult, view: Recording | None, link: str) -> str:
 
 
 class _Plots:
-    """Draws evidence until the page is as large as a page should be."""
+    """Draws plots of evidence up to a maximum size of the page."""
 
     def __init__(self, view: Recording | None) -> None:
         self._view = view
@@ -306,7 +306,7 @@ def _label(fact: Fact) -> str:
 
 
 def _place(place: Evidence, link: str) -> str:
-    """Where in the recording, in a form that can be copied."""
+    """The place in the recording, as text that can be copied."""
     until = f" to {place.end_s:.3f} s" if place.end_s is not None else ""
     when = utc_date(place.log_time_ns).isoformat(timespec="milliseconds")
     file = f' in <a href="{escape(quote(link))}">{escape(Path(link).name)}</a>' if link else ""
@@ -334,7 +334,7 @@ def _blocked(blocked: Blocked) -> str:
 
 
 def _operator(result: RunResult) -> str:
-    """What an operator would notice, where one was modelled."""
+    """The figures of the modelled operator, if there was one."""
     rows = [
         (need.title, " · ".join(f"{r.side} {r.figure or VERDICTS[r.verdict].text}" for r in group))
         for need, group in result.by_requirement()
@@ -366,7 +366,7 @@ def _requirements(result: RunResult, link: str) -> str:
     )
     parts = [
         "<h2>Every requirement</h2><p class='dim'>MUST decides the verdict; SHOULD only warns. "
-        "Open a row for what was seen, the reason behind it, and who says so.</p>"
+        "Open a row for the observation, the rationale and the source.</p>"
         f'<div class="filter" role="radiogroup" aria-label="requirements to show">{radios}</div>'
     ]
     area = ""
@@ -409,13 +409,13 @@ def _cell(result: Result) -> str:
 
 
 def _seen(result: Result, link: str) -> str:
-    told = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
+    text = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
     )
     return (
-        f"<p><b>{escape(result.side)}:</b> {escape(told)}</p>"
+        f"<p><b>{escape(result.side)}:</b> {escape(text)}</p>"
         + (f'<p class="figures">{figures}</p>' if figures else "")
         + "".join(_place(e, link) for e in result.evidence)
     )
@@ -467,16 +467,16 @@ def _glossary(result: RunResult) -> str:
     terms = [
         (
             "topic",
-            "a named channel on the network (DDS); nobody receives what is sent on another.",
+            "a named channel on the network (DDS); a program with another name gets nothing.",
         ),
         ("q, rad", "position of a joint as the angle of its motor, in radians."),
         ("tau_est, N m", "torque that the motor reports; the only sign of touch without sensors."),
-        ("not applicable", "the recording does not show it; the row says why."),
+        ("not applicable", "the recording does not show it; the row gives the reason."),
         ("docs/sources", "pages of dexkit with the facts, documents and measurements, by section."),
         ("blocked", "something more basic failed first, or the testing machine itself was late."),
     ]
     if result.claims is not None:
-        terms.append(("not claimed", "the vendor does not say that the hand has this unit."))
+        terms.append(("not claimed", "the vendor does not claim that the hand has this unit."))
     return f"<h2>Words</h2>{_definitions(terms)}"
 
 

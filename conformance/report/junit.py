@@ -1,4 +1,4 @@
-"""The result as JUnit XML: one test case for each requirement and side."""
+"""Render a result as JUnit XML: one test case per requirement and side."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SKIPPED = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
 
 
 def write_junit(result: RunResult, path: Path) -> None:
-    """Write the file. A warning passes; what was not judged is skipped; the rest fails."""
+    """Write the file. A warning passes; an unjudged requirement is skipped; all others fail."""
     verdicts = [r.verdict for r in result.results]
     suite = ElementTree.Element(
         "testsuite",

@@ -1,4 +1,4 @@
-"""Names that all reports share: of verdicts, hands, quantities, and how real a hand was."""
+"""Names that all reports share: verdicts, hands, quantities, real or emulated hand."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ _UNITS = {
 class Tally:
     """Requirements by verdict, sides together, those of other dialects left out.
 
-    :param applicable: all that are about a hand that speaks and claims what this one does.
+    :param applicable: all that apply to this hand's dialect and claims.
     """
 
     passed: int
@@ -83,7 +83,7 @@ class Tally:
 
     @property
     def applicable(self) -> int:
-        """Requirements that the hand has to answer for."""
+        """Requirements that apply to the hand."""
         return self.passed + self.failed + self.warned + self.open + self.not_judged
 
 
@@ -113,7 +113,7 @@ def model_title(result: RunResult) -> str:
 
 
 def subject(result: RunResult, *, many: bool = False) -> str:
-    """``hand`` or ``robot``: what was judged; with ``many``, ``hands`` where there may be two."""
+    """``hand`` or ``robot``: the subject; with ``many``, ``hands`` where there may be two."""
     if result.subject.get("model") in ROBOTS:
         return "robot"
     return "hands" if many else "hand"
@@ -125,7 +125,7 @@ def whose(side: str) -> str:
 
 
 def hand_name(result: RunResult) -> str:
-    """What the hand is called: its vendor's name for it, the backend, or the recording."""
+    """The hand's name: from its vendor, the backend, or the recording."""
     about = result.subject
     name = about.get("hand") or about.get("backend") or about.get("recording") or "unnamed hand"
     if about.get("hand") and about.get("firmware"):
@@ -134,7 +134,7 @@ def hand_name(result: RunResult) -> str:
 
 
 def part(result: RunResult) -> str:
-    """What to say of a run for which only a part of the catalogue was selected, or nothing."""
+    """A note for a run with only a part of the catalogue selected, else an empty text."""
     if not result.partial:
         return ""
     n = len(result.by_requirement())
@@ -142,7 +142,7 @@ def part(result: RunResult) -> str:
 
 
 def nature(result: RunResult) -> str:
-    """``emulated``, ``simulated``, ``recorded``, or empty: how real the hand was."""
+    """``emulated``, ``simulated``, ``recorded``, or empty for a real hand."""
     from dexkit.conformance.backend_processes import BODY_EMULATORS, SIMULATED
 
     name = result.subject.get("backend", "")
@@ -154,17 +154,17 @@ def nature(result: RunResult) -> str:
 
 
 def about_harness(result: RunResult) -> str:
-    """How fair the kit's own machine was, or empty where the kit made no run."""
-    told = []
+    """The load of the kit's machine, or empty where the kit made no run."""
+    parts = []
     figures = result.harness
     if "jitter_p50_ms" in figures and "jitter_p99_ms" in figures:
-        told.append(
+        parts.append(
             f"itself late by {figures['jitter_p50_ms']:.2f} ms (median), "
             f"{figures['jitter_p99_ms']:.2f} ms (99 of 100)"
         )
     if "starved" in figures:
-        told.append(f"programs waited for a processor in {figures['starved']:.1%} of the run")
-    return "; ".join(told)
+        parts.append(f"programs waited for a processor in {figures['starved']:.1%} of the run")
+    return "; ".join(parts)
 
 
 def utc_date(time_ns: int) -> datetime:

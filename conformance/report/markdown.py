@@ -1,7 +1,6 @@
-"""The result as Markdown: a step summary or a comment on GitHub, a page of a wiki.
+"""Render a result as Markdown: a step summary or comment on GitHub, or a wiki page.
 
-Text from outside is written so that it stays text: no HTML, no table cell, no mention of a person
-comes out of a hostile name.
+External text is escaped: a hostile name cannot make HTML, table cells or mentions of a person.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN)
 
 
 def plain(text: str) -> str:
-    """``text`` as Markdown that shows just that, in one line."""
+    """Escape ``text`` for Markdown, in one line."""
     text = one_line(" ".join(text.split()), REMARK)
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    # a space of no width keeps a name behind @ from being called, and an address from being a link
+    # a zero-width space prevents mentions by @ and links from addresses
     return _SPECIAL.sub(r"\\\1", text).replace("@", f"@{_NOTHING}").replace("://", f":{_NOTHING}//")
 
 
@@ -55,7 +54,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def render_markdown(result: RunResult) -> str:
-    """The summary: verdict, areas, what is wrong, all requirements folded away."""
+    """The summary: verdict, areas, failures, and all requirements folded."""
     answer = ANSWERS[result.overall]
     real = nature(result)
     counts = ", ".join(f"{n} {VERDICTS[v].text}" for v, n in result.counts().items() if n)

@@ -1,4 +1,4 @@
-"""The plots that a result names (:mod:`dexkit.conformance.plots`), drawn from its recording."""
+"""Draw the plots that a result names (:mod:`dexkit.conformance.plots`) from its recording."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ PHASES = {
     "guard-latch": "latched",
     "guard-clear": "cleared",
 }
-"""What reports call the phases of the stimulus; any other is called by its own name."""
+"""Names of phases in reports; other phases appear under their own name."""
 _LONGEST = 8.0
 """Seconds of a plot about a place in the recording."""
 _MOST_ROWS = 24
@@ -60,9 +60,9 @@ _FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m"}
 
 
 def plots_of(result: Result, view: Recording) -> list[str]:
-    """The plots that the result names, as HTML; those that show nothing of it are left out.
+    """The plots that the result names, as HTML; plots without data are left out.
 
-    A hand without any state has nothing to plot: what discovery saw is shown instead.
+    For a hand without any state the endpoints from discovery are shown instead.
     """
     if result.requirement.layer == "usb":
         return _usb_plots(result, view.usb) if view.usb is not None else []
@@ -155,9 +155,9 @@ def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band
 
 
 def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
-    """When the kit's own machine was short of processor time; lateness then proves little.
+    """Intervals in which the kit's machine was short of processor time.
 
-    Stretches that a plot of ``span`` could not show apart are taken together.
+    Intervals that a plot of ``span`` cannot show separately are joined.
     """
     least = max(0.02, (span[1] - span[0]) / 300)
     merged: list[Band] = []
@@ -173,7 +173,7 @@ def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
 
 
 def wish(view: Recording, hand: SideView, joint: int) -> Line | None:
-    """Where the modelled operator wanted a joint, or None without such a phase."""
+    """The modelled operator's target of a joint, or None without such a phase."""
     phases = view.phases(OPERATOR, hand.side)
     if not phases:
         return None
@@ -186,7 +186,7 @@ def wish(view: Recording, hand: SideView, joint: int) -> Line | None:
 
 
 def operated(view: Recording, hand: SideView, joint: int, span: tuple[float, float]) -> str:
-    """What the operator wants, what the client commands of it, and what the hand does."""
+    """The operator's target, the client's commands, and the hand's position."""
     wanted = wish(view, hand, joint)
     return chart(
         f"{whose(hand.side)}, {_called(hand, joint)}: driven by Unitree's teleoperation client",
@@ -248,7 +248,7 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
 
 
 def _room(hand: SideView, joint: int, span: tuple[float, float]) -> list[float]:
-    """Values that make a plot a tenth of the stroke high or more: noise is not to fill it."""
+    """Values that make a plot at least a tenth of the stroke high, so noise does not fill it."""
     q = hand.states.q[hand.states.between(*span), joint]
     q = q[np.isfinite(q)]
     middle = float(np.median(q)) if len(q) else 0.0
@@ -286,7 +286,7 @@ def _both_sides(scene: _Scene) -> str:
 
 
 def _steps(scene: _Scene) -> str:
-    """Every step on top of each other, as what is left of the way to its target."""
+    """All steps laid over each other, as the distance to their targets."""
     hand, limits = scene.hand, scene.need.tolerances
     pairs = []
     longest = 0.1
@@ -306,7 +306,7 @@ def _steps(scene: _Scene) -> str:
             if not abs(target - start) > 0.02 * stroke:
                 continue
             left = 100 * (q - target) * np.sign(target - start) / stroke
-            if "max_ripple_stroke" in limits:  # small beside the way: only its end is shown
+            if "max_ripple_stroke" in limits:  # small compared with the step: only its end is shown
                 left = np.where(left < -1500 * limits["max_ripple_stroke"] / 2, np.nan, left)
             pairs.append((guilty and joint == named, Line("", "", t - begin, left)))
     if not pairs:
@@ -421,7 +421,7 @@ def _interval_histogram(scene: _Scene) -> str:
 
 
 def _rates(scene: _Scene) -> str:
-    """Rate in windows of half a second, with what is asked for."""
+    """Rate in windows of half a second, with the required rate."""
     clock, limits = scene.hand.states.clock, scene.need.tolerances
     if len(clock) < 2 or "max_p99_s" in limits:
         return ""
@@ -447,7 +447,7 @@ def _rates(scene: _Scene) -> str:
 
 
 def _samples(scene: _Scene) -> str:
-    """The single samples: a value that is sent again stands beside the one before."""
+    """Single samples, which show values that are sent again."""
     hand = scene.hand
     middle = scene.places[0] if scene.places else (_fastest(hand),) * 2
     span = (max(0.0, middle[0] - 0.05), middle[1] + 0.25)
@@ -462,7 +462,7 @@ def _samples(scene: _Scene) -> str:
 
 
 def _fastest(hand: SideView) -> float:
-    """When the first joint is fastest."""
+    """The time at which the first joint is fastest."""
     dq = hand.states.dq[:, 0]
     return float(hand.states.t[int(np.argmax(np.abs(np.where(np.isfinite(dq), dq, 0.0))))])
 
@@ -547,7 +547,7 @@ def _member(scene: _Scene, member: str) -> str:
 
 
 def _pressure(scene: _Scene) -> str:
-    """What each sensor packet feels: the sum over its elements."""
+    """Pressure of each sensor packet: the sum over its elements."""
     hand, span = scene.hand, scene.window()
     if hand.states.columns is None:
         return ""
@@ -606,7 +606,7 @@ def _endpoints(scene: _Scene) -> str:
         for topic, name, kind in wanted
     ]
     other = {t for s in Side if s is not side for t in dialect.topics(s)}
-    other -= set(dialect.topics(side))  # of both, where a dialect has one for both
+    other -= set(dialect.topics(side))  # one topic for both sides in some dialects
     seen = dict.fromkeys(
         (e.kind, e.topic, e.type_name, f"{e.reliability} {e.durability}".strip())
         for e in scene.view.endpoints
@@ -665,14 +665,14 @@ def _usb_plots(result: Result, usb: UsbRecording) -> list[str]:
 
 
 def _descriptors(_: Result, hand: UsbSide) -> str:
-    told = hand.device
+    device = hand.device
     rows = {
-        "idVendor:idProduct": f"{told.vendor:04X}:{told.product:04X}",
-        "bcdDevice": f"{told.release >> 8:x}.{told.release & 0xFF:02x}",
-        "strings": f"{told.manufacturer!r}, {told.name!r}, serial {told.serial!r}",
+        "idVendor:idProduct": f"{device.vendor:04X}:{device.product:04X}",
+        "bcdDevice": f"{device.release >> 8:x}.{device.release & 0xFF:02x}",
+        "strings": f"{device.manufacturer!r}, {device.name!r}, serial {device.serial!r}",
         "endpoints of interface 0": ", ".join(
             f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'} {e.size} bytes"
-            for e in told.endpoints
+            for e in device.endpoints
         )
         or "none",
     }

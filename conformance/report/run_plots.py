@@ -79,7 +79,7 @@ def _way(joint: JointSpec) -> str:
 
 
 def _felt(view: Recording, hand: SideView) -> list[Level]:
-    """Where a gripper's object is; of other hands it is at no one angle."""
+    """Position of a gripper's object; for other hands it is not a single angle."""
     touch = _touch(view, hand)
     return [Level(touch, "object")] if touch is not None and len(hand.joints) == 1 else []
 
@@ -175,7 +175,7 @@ def _timing(view: Recording, hand: SideView) -> str:
 
 
 def _alarms(result: RunResult, hand: SideView) -> list[Band]:
-    """Where something went wrong, in red."""
+    """Places of failures, in red."""
     return [
         Band("", e.time_s, e.end_s, "alarm")
         for r in result.results

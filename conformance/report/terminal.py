@@ -1,4 +1,4 @@
-"""The result as a table for a terminal."""
+"""Print a result as a table on a terminal."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _STYLE = {Overall.PASS: "green", Overall.FAIL: "red", Overall.INCONCLUSIVE: "mag
 def print_result(
     result: RunResult, console: Console, *, verbose: bool = False, more: str = ""
 ) -> None:
-    """Print the table, then what is wrong and what to try.
+    """Print the table, then the failures with advice.
 
     :param verbose: also list what could not be judged here, and why.
-    :param more: where else the reader finds why.
+    :param more: where else the reasons are written.
     """
     sides = list(dict.fromkeys(r.side for r in result.results))
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
@@ -56,7 +56,7 @@ def print_result(
         mark, style = MARKS[verdict]
         cells = {r.side: _cell(r) for r in group}
         table.add_row(
-            # texts, for rich would read a string as markup each time that it measures it
+            # Text objects, because rich parses a string as markup each time it measures it
             Text(one_line(requirement.id)),
             Text(str(requirement.level)),
             Text(one_line(requirement.title)),
@@ -92,7 +92,7 @@ def print_result(
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
-    # one line at any width, for logs are searched for it
+    # one line at any width, so that logs can be searched for it
     console.print(
         f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]",
         highlight=False,
@@ -113,7 +113,7 @@ def _print_card(card: Card, console: Console) -> None:
 
 
 def _hung(console: Console, head: str, text: str) -> str:
-    """``text`` after ``head``, its further lines below its first one, as markup."""
+    """``text`` after ``head``, further lines indented below the first one, as markup."""
     filled = textwrap.fill(
         one_line(" ".join(text.split()), REMARK),
         console.width,
@@ -126,7 +126,7 @@ def _hung(console: Console, head: str, text: str) -> str:
 
 
 def _print_blocked(result: RunResult, console: Console) -> None:
-    """What was not judged: something else failed first, or the machine was too busy."""
+    """Print the blocked requirements: another one failed first, or the machine was too busy."""
     groups = blocked_groups(result.results)
     if groups:
         console.print()

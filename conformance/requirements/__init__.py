@@ -1,12 +1,12 @@
 """The requirements as data: TOML files in this folder, read into :class:`Requirement`.
 
 What one model has in common with another is written once: an entry with ``like = "DEX3-RATE-01"``
-takes everything from that requirement of another file but what it says itself. Its id is the same
+inherits all keys that it does not give from that requirement of another file. Its id is the same
 with this model's prefix, unless it gives another; ids and topics of the other model in the texts
 are turned into this model's; tolerances are taken one by one. Where it names no source of its
 own, it is an inference from the other's.
 
-Everything else takes them from here: checks (which look up their tolerances), pytest ids,
+All other parts take them from here: checks (which read their tolerances), pytest ids,
 selection, reports and the catalogue in docs/conformance.md.
 """
 
@@ -41,10 +41,10 @@ __all__ = [
 ]
 
 CONFIDENCE = ("vendor document", "vendor code", "measured", "inferred")
-"""How sure the source of a requirement is, from best to least."""
+"""Confidence of a requirement's source, from best to least."""
 
 CAPABILITIES: Mapping[str, str] = {
-    "force": "tau_est tells what the hand presses with",
+    "force": "tau_est shows the force that the hand applies",
     "velocity": "dq is measured",
     "acceleration": "ddq is measured",
     "temperature": "temperatures are measured",
@@ -54,7 +54,7 @@ CAPABILITIES: Mapping[str, str] = {
     "low_rate": "a second, slow topic with the state",
     "timeout": "motors that ask for it brake when commands end (bit 7 of the mode byte)",
 }
-"""Units that a hand may have or not, and what who claims them says; see
+"""Optional units of a hand, and what a claim of each means; see
 :mod:`dexkit.conformance.claims`."""
 
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
@@ -151,13 +151,13 @@ class Requirement:
     :param after: requirements that must not have failed, or this one is blocked.
     :param dialects: the dialects that it applies to.
     :param tolerances: the figures that the check compares with.
-    :param layer: one of :data:`LAYERS`; a file's ``layer``, ``dds`` where it says nothing.
+    :param layer: one of :data:`LAYERS`; a file's ``layer``, ``dds`` by default.
     :param realtime: a machine that is short of processor time can make a good hand fail it; a
         failure is then not blamed on the hand.
-    :param cause: likely cause of a failure: the mistake that makers make.
-    :param advice: what to try then.
+    :param cause: likely cause of a failure: the usual mistake of vendors.
+    :param advice: what to try after a failure.
     :param expected: the norm in a few words for reports, tolerances filled in; the sentence
-        where nothing shorter says it.
+        where no shorter text is given.
     :param capability: one of :data:`CAPABILITIES`, where it is about a unit that a hand may lack.
     :param negative: whether it is about what a hand must not do, or about its reaction to bad
         input or another participant.
@@ -256,7 +256,7 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
         raise UsageError(f"{origin}: requirements are [[requirement]] tables")
     found = []
     for entry in entries:
-        _look_at_types(entry, origin)
+        _check_types(entry, origin)
         if "like" not in entry:
             found.append(entry)
             continue
@@ -278,8 +278,8 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
     return found
 
 
-def _look_at_types(entry: Any, origin: str) -> None:
-    """Whether each value is what its key stands for.
+def _check_types(entry: Any, origin: str) -> None:
+    """Check that each value has the type of its key.
 
     :raises UsageError: naming the one that is not.
     """

@@ -1,8 +1,9 @@
-"""A USB host as thin as can be: what the kit needs of it, and nothing of the driver.
+"""A minimal USB host for the kit, independent of the driver.
 
-Two ways lead to a device: the system's libusb through PyUSB, for a serial number, and USB/IP
-(``usbip://host:port[/serial]``), spoken here, because a transfer that times out must be taken
-back (CMD_UNLINK) as a kernel does it, and the connection must live on.
+It opens a device by serial number through PyUSB and the system's libusb, or by
+``usbip://host:port[/serial]`` over USB/IP. The USB/IP client is implemented here, because a
+transfer that times out must be unlinked (CMD_UNLINK) as a kernel does it, without losing the
+connection.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class UsbHost(Protocol):
         """A bulk OUT transfer; 0 or a negative errno."""
 
     def read(self, endpoint: int, length: int, timeout: float) -> tuple[int, bytes]:
-        """A bulk IN transfer: 0 or a negative errno, and what came."""
+        """A bulk IN transfer: 0 or a negative errno, and the data."""
 
     def reopen(self) -> None:
         """Release the interface, close the device, open and claim it again.
@@ -77,10 +78,11 @@ def _describe(get: Control, speed: int) -> Descriptors:
     return Descriptors(device, get(0x0200, 0, total), strings, speed)
 
 
-def _first(candidates: list[Any], where: str, side: Side, told: str) -> Any:
+def _first(candidates: list[Any], where: str, side: Side, offers: str) -> Any:
     if not candidates:
         raise ConformanceError(
-            f"no {side} Dex3-1 at {where or 'this machine'}", hint=f"there is: {told or 'nothing'}"
+            f"no {side} Dex3-1 at {where or 'this machine'}",
+            hint=f"there is: {offers or 'nothing'}",
         )
     return candidates[0]
 
@@ -129,7 +131,7 @@ class _LibUsb:
         try:
             if device.is_kernel_driver_active(0):
                 device.detach_kernel_driver(0)
-        except NotImplementedError:  # a system without kernel drivers in the way
+        except NotImplementedError:  # a system without kernel drivers for it
             pass
         try:
             device.get_active_configuration()
@@ -197,7 +199,7 @@ class _Exported:
 
     @classmethod
     def of(cls, raw: bytes) -> tuple[_Exported, int]:
-        """The device, and how many interface descriptions follow."""
+        """Decode a device and the number of interface descriptions that follow."""
         v = _DEVICE.unpack(raw)
         return cls(v[1], v[2] << 16 | v[3], v[4], v[5], v[6]), v[13]
 
@@ -217,7 +219,7 @@ class _UsbIp:
             raise ConformanceError(f"{url}: {error}") from error
         self._url, self._side = url, side
         self._serial = parts.path.strip("/")
-        self._socket = socket.socket()  # until there is a connection
+        self._socket = socket.socket()  # until it is connected
         self._open()
 
     def _open(self) -> None:
@@ -228,13 +230,13 @@ class _UsbIp:
             ]
             if self._serial or not mine:
                 mine = [e for e in offered if e.vendor == VENDOR_ID]
-            told = ", ".join(f"{e.vendor:04x}:{e.product:04x}" for e in offered)
+            offers = ", ".join(f"{e.vendor:04x}:{e.product:04x}" for e in offered)
             for exported in mine:
                 self._attach(exported)
                 if not self._serial or parse_device(self.descriptors).serial == self._serial:
                     return
                 self._socket.close()
-            _first([], self._url, self._side, told)
+            _first([], self._url, self._side, offers)
         except ConformanceError:
             self.close()
             raise
@@ -254,7 +256,7 @@ class _UsbIp:
         if code != reply or status:
             raise ConformanceError(
                 f"{self._url}: refused (status {status})",
-                hint="somebody else may have attached it",
+                hint="another program may have attached it",
             )
 
     def _offered(self) -> Iterator[_Exported]:
@@ -280,7 +282,7 @@ class _UsbIp:
         self.descriptors = _describe(get, self._device.speed)
 
     def _take(self, size: int, end: float | None) -> bytes:
-        """So many bytes; ``TimeoutError`` leaves what has come for the next call.
+        """Receive a number of bytes; after ``TimeoutError`` the next call goes on from there.
 
         :param end: monotonic time to wait until, None for the usual time-out.
         """
@@ -324,7 +326,7 @@ class _UsbIp:
             return -errno.ENODEV, b""
 
     def _take_back(self, mine: int, endpoint: int) -> tuple[int, bytes]:
-        """Unlink a transfer that has timed out; it may just have been done."""
+        """Unlink a transfer that has timed out; it may have ended meanwhile."""
         self._sequence += 1
         number = self._sequence
         self._socket.settimeout(_TIMEOUT)
@@ -346,7 +348,7 @@ class _UsbIp:
     def reopen(self) -> None:
         self.close()
         end = time.monotonic() + _TIMEOUT
-        while True:  # a server may need a moment to see that the connection is gone
+        while True:  # a server may need some time to detect that the connection is closed
             try:
                 return self._open()
             except ConformanceError:

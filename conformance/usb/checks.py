@@ -1,7 +1,7 @@
 """The USB checks: each judges one hand's transfers for one requirement.
 
-As those of :mod:`dexkit.conformance.checks`: a check never passes on missing evidence, and takes
-every figure from its requirement's tolerances.
+As in :mod:`dexkit.conformance.checks`, a check never passes on missing evidence, and takes
+every limit from its requirement's tolerances.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
 __all__ = ["UsbContext"]
 
 _ORDINARY = ("exchange", "burst", "move", "lock", "pause", "drive", "tripped", "clear")
-"""Phases in which every command is a good one, followed by a wait for its answer."""
+"""Phases in which every command is valid and is followed by a wait for its answer."""
 _COARSEST = 0.03
 """s between two answers over which a speed is integrated; most of a move takes 0.1 s."""
 _DAMAGED = ("malformed", "broadcast", "short")
-"""Phases that begin with something odd; good commands follow."""
+"""Phases that begin with an invalid frame; good commands follow."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class UsbContext(BaseContext[UsbRecording, UsbSide]):
     """One requirement to be judged for the USB transfers of one hand."""
 
     def tolerance(self, name: str) -> float:
-        """A figure of the requirement."""
+        """A tolerance of the requirement."""
         return self.requirement.tolerance(name)
 
     def phases(self) -> list[UsbPhase]:
@@ -49,7 +49,7 @@ class UsbContext(BaseContext[UsbRecording, UsbSide]):
         return self.place(topic(self.hand.side, inward=inward), seconds, end)
 
     def over(self, phase: UsbPhase) -> Evidence:
-        """A phase as a place."""
+        """The time of a phase, as a place in the recording."""
         return self.at(*self.hand.span(phase))
 
 
@@ -59,38 +59,38 @@ class UsbContext(BaseContext[UsbRecording, UsbSide]):
 @check("DEX3USB-DESC-01")
 def _ids(c: UsbContext) -> Outcome:
     device, wanted = c.hand.device, (VENDOR_ID, PRODUCT_ID[c.hand.side])
-    told = f"{device.vendor:04X}:{device.product:04X}"
+    figure = f"{device.vendor:04X}:{device.product:04X}"
     if (device.vendor, device.product) == wanted:
-        return c.passed(told)
+        return c.passed(figure)
     other = next(
         (s for s in Side if (device.vendor, device.product) == (VENDOR_ID, PRODUCT_ID[s])), None
     )
     what = f", which is a {other} hand" if other else ""
-    return c.failed(told, f"the {c.hand.side} hand's device is {told}{what}")
+    return c.failed(figure, f"the {c.hand.side} hand's device is {figure}{what}")
 
 
 @check("DEX3USB-DESC-02")
 def _release(c: UsbContext) -> Outcome:
     release = c.hand.device.release
-    told = f"{release >> 8:x}.{release & 0xFF:02x}"
-    return c.passed(told) if release == 0x0100 else c.failed(told, f"bcdDevice is {told}")
+    figure = f"{release >> 8:x}.{release & 0xFF:02x}"
+    return c.passed(figure) if release == 0x0100 else c.failed(figure, f"bcdDevice is {figure}")
 
 
 @check("DEX3USB-DESC-03")
 def _strings(c: UsbContext) -> Outcome:
     device = c.hand.device
     wanted = (MANUFACTURER, PRODUCT[c.hand.side])
-    told = f"{device.manufacturer!r}, {device.name!r}, serial {device.serial!r}"
+    figure = f"{device.manufacturer!r}, {device.name!r}, serial {device.serial!r}"
     if (device.manufacturer, device.name) == wanted and device.serial:
-        return c.passed(device.serial, told)
-    return c.failed(device.name or "none", f"the strings are {told}")
+        return c.passed(device.serial, figure)
+    return c.failed(device.name or "none", f"the strings are {figure}")
 
 
 @check("DEX3USB-DESC-04")
 def _speed(c: UsbContext) -> Outcome:
     speed = c.hand.record.descriptors.speed
     if not speed:
-        return c.skipped("this host does not tell the speed")
+        return c.skipped("this host does not report the speed")
     name = {1: "low", 2: "full", 3: "high"}.get(speed, "super")
     return c.passed(name) if speed == 3 else c.failed(name, f"it runs at {name} speed")
 
@@ -99,19 +99,19 @@ def _speed(c: UsbContext) -> Outcome:
 def _endpoints(c: UsbContext) -> Outcome:
     endpoints = c.hand.device.endpoints
     bulk = Counter(e.inward for e in endpoints if e.bulk)
-    told = ", ".join(f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'}" for e in endpoints)
+    figure = ", ".join(f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'}" for e in endpoints)
     if bulk == {True: 1, False: 1}:
-        return c.passed(" ".join(f"{e.address:#04x}" for e in endpoints if e.bulk), told)
-    return c.failed(f"{bulk.total()} bulk", f"interface 0 has {told or 'no endpoints'}")
+        return c.passed(" ".join(f"{e.address:#04x}" for e in endpoints if e.bulk), figure)
+    return c.failed(f"{bulk.total()} bulk", f"interface 0 has {figure or 'no endpoints'}")
 
 
 @check("DEX3USB-DESC-06")
 def _packet_size(c: UsbContext) -> Outcome:
     sizes = sorted({e.size for e in c.hand.device.endpoints if e.bulk})
-    told = ", ".join(map(str, sizes))
+    figure = ", ".join(map(str, sizes))
     if sizes == [c.tolerance("size")]:
-        return c.passed(told)
-    return c.failed(told, f"wMaxPacketSize is {told}")
+        return c.passed(figure)
+    return c.failed(figure, f"wMaxPacketSize is {figure}")
 
 
 # ---------------------------------------------------------------------------------- exchange
@@ -127,11 +127,11 @@ def _ordinary(c: UsbContext) -> Iterator[Exchange]:
 def _answered(c: UsbContext) -> Outcome:
     exchanges = list(_ordinary(c))
     silent = [x for x in exchanges if x.answer is None]
-    told = f"{len(exchanges) - len(silent)} of {len(exchanges)}"
+    figure = f"{len(exchanges) - len(silent)} of {len(exchanges)}"
     if not silent:
-        return c.passed(told)
+        return c.passed(figure)
     places = [c.at(x.t, inward=False) for x in silent]
-    return c.failed(told, f"{len(silent)} of {len(exchanges)} commands got no answer", *places)
+    return c.failed(figure, f"{len(silent)} of {len(exchanges)} commands got no answer", *places)
 
 
 @check("DEX3USB-XCHG-02")
@@ -139,11 +139,11 @@ def _once(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     sent = sum(not t.inward for t in c.hand.during(phase))
     answers = c.hand.answers_in(phase)
-    told = f"{len(answers)} to {sent}"
+    figure = f"{len(answers)} to {sent}"
     if len(answers) <= sent:
-        return c.passed(told)
+        return c.passed(figure)
     observed = f"{len(answers)} frames came to {sent} commands"
-    return c.failed(told, observed, *(c.at(a.t) for a in answers[sent:]))
+    return c.failed(figure, observed, *(c.at(a.t) for a in answers[sent:]))
 
 
 @check("DEX3USB-XCHG-03")
@@ -171,7 +171,7 @@ def _two(c: UsbContext) -> Outcome:
 def _bursts(c: UsbContext) -> list[tuple[UsbPhase, list[float], float]]:
     """Each burst with its answer times and its rate, the fastest first.
 
-    What else the machine does slows a burst down and never makes one faster.
+    Other load of the machine can only slow a burst down.
     """
     found = []
     for phase in c.phases():
@@ -192,11 +192,11 @@ def _rate(c: UsbContext) -> Outcome:
     if not bursts:
         return c.skipped("no exchange in a burst")
     _, times, rate = bursts[0]
-    told = f"{rate:.0f} Hz"
+    figure = f"{rate:.0f} Hz"
     if rate >= c.tolerance("min_rate_hz"):
-        return c.passed(told, rate_hz=rate)
-    observed = f"{told} in the fastest of {len(bursts)} bursts of {len(times)} exchanges"
-    outcome = c.failed(told, observed, *(c.over(phase) for phase, _, _ in bursts), rate_hz=rate)
+        return c.passed(figure, rate_hz=rate)
+    observed = f"{figure} in the fastest of {len(bursts)} bursts of {len(times)} exchanges"
+    outcome = c.failed(figure, observed, *(c.over(phase) for phase, _, _ in bursts), rate_hz=rate)
     return outcome.if_late(1 / rate - 1 / c.tolerance("min_rate_hz"), how="mean")
 
 
@@ -209,11 +209,11 @@ def _latency(c: UsbContext) -> Outcome:
         ((tuple(np.percentile(times, [50, 99])), phase) for phase, times, _ in bursts),
         key=lambda found: found[0][1],
     )
-    told = f"{p99 * 1e3:.2f} ms"
+    figure = f"{p99 * 1e3:.2f} ms"
     if p99 <= c.tolerance("max_s"):
-        return c.passed(told, p50_s=p50, p99_s=p99)
-    observed = f"99 of 100 within {told}, the median is {p50 * 1e3:.2f} ms"
-    outcome = c.failed(told, observed, c.over(phase), p50_s=p50, p99_s=p99)
+        return c.passed(figure, p50_s=p50, p99_s=p99)
+    observed = f"99 of 100 within {figure}, the median is {p50 * 1e3:.2f} ms"
+    outcome = c.failed(figure, observed, c.over(phase), p50_s=p50, p99_s=p99)
     return outcome.if_late(p99 - c.tolerance("max_s"), how="p99")
 
 
@@ -223,22 +223,22 @@ def _latency(c: UsbContext) -> Outcome:
 def _all(
     c: UsbContext, good: Callable[[Answer], bool], what: str, answers: list[Answer] | None = None
 ) -> Outcome:
-    """Every frame must be good; ``what`` says what the others have."""
+    """Fail unless every frame is good; ``what`` names the fault of the others."""
     answers = c.hand.answers if answers is None else answers
     if not answers:
         return c.skipped("no frame came")
     wrong = [a for a in answers if not good(a)]
     if not wrong:
         return c.passed(f"{len(answers)} frames")
-    told = f"{len(wrong)} of {len(answers)}"
-    return c.failed(told, f"{told} frames have {what}", *(c.at(a.t) for a in wrong))
+    figure = f"{len(wrong)} of {len(answers)}"
+    return c.failed(figure, f"{figure} frames have {what}", *(c.at(a.t) for a in wrong))
 
 
 @check("DEX3USB-SIZE-01")
 def _size(c: UsbContext) -> Outcome:
     sizes = Counter(a.reading.length for a in c.hand.answers)
-    told = ", ".join(f"{n} bytes ({times})" for n, times in sizes.most_common(4))
-    return _all(c, lambda a: a.reading.length == STATE_SIZE, f"another size: {told}")
+    figure = ", ".join(f"{n} bytes ({times})" for n, times in sizes.most_common(4))
+    return _all(c, lambda a: a.reading.length == STATE_SIZE, f"another size: {figure}")
 
 
 @check("DEX3USB-SIZE-02")
@@ -247,10 +247,10 @@ def _both_sizes(c: UsbContext) -> Outcome:
     joint = phase.params["joint"]
     part = _part(c.hand, phase, joint, phase.params["begin"], phase.params["target"])
     size = phase.params["size"]
-    told = f"{size} bytes: {part:.0%} of the way"
+    figure = f"{size} bytes: {part:.0%} of the way"
     if part >= c.tolerance("min_part"):
-        return c.passed("both", told)
-    observed = f"a frame of {size} bytes got {phase.params['answers']} answers; {told}"
+        return c.passed("both", figure)
+    observed = f"a frame of {size} bytes got {phase.params['answers']} answers; {figure}"
     return c.failed(f"not {size}", observed, c.over(phase)).about(joint)
 
 
@@ -303,17 +303,17 @@ def _seven(c: UsbContext) -> Outcome:
 
     answers = _to_all(c)
     odd = next((_places(a) for a in answers if not good(a)), [])
-    told = " ".join(f"{b}.{i}" for b, i in odd) or "none"
-    return _all(c, good, f"{len(odd)} motors (bus.id): {told}", answers)
+    figure = " ".join(f"{b}.{i}" for b, i in odd) or "none"
+    return _all(c, good, f"{len(odd)} motors (bus.id): {figure}", answers)
 
 
 @check("DEX3USB-PACK-03")
 def _map(c: UsbContext) -> Outcome:
     answers = _to_all(c)
     odd = next((_places(a) for a in answers if _places(a) != sorted(BUSES)), [])
-    told = " ".join(f"{b}.{i}" for b, i in odd)
+    figure = " ".join(f"{b}.{i}" for b, i in odd)
     good = sorted(BUSES)
-    return _all(c, lambda a: _places(a) == good, f"motors at (bus.id) {told}", answers)
+    return _all(c, lambda a: _places(a) == good, f"motors at (bus.id) {figure}", answers)
 
 
 @check("DEX3USB-PACK-04")
@@ -332,8 +332,8 @@ def _elements(c: UsbContext) -> Outcome:
         return sum(p != NO_VALUE for s in answer.reading.sensors for p in s.pressure)
 
     counts = sorted({elements(a) for a in c.hand.answers})
-    told = ", ".join(map(str, counts))
-    return _all(c, lambda a: elements(a) == 33, f"{told} values that are not {NO_VALUE}")
+    figure = ", ".join(map(str, counts))
+    return _all(c, lambda a: elements(a) == 33, f"{figure} values that are not {NO_VALUE}")
 
 
 @check("DEX3USB-VALUE-01")
@@ -359,8 +359,8 @@ def _errors(c: UsbContext) -> Outcome:
         if answer.reading.error:
             faulty["hand"] = answer.reading.error
         if faulty:
-            told = ", ".join(f"{who} {bits:#x}" for who, bits in faulty.items())
-            return c.failed(f"{len(faulty)} faulty", f"error bits: {told}", c.at(answer.t))
+            figure = ", ".join(f"{who} {bits:#x}" for who, bits in faulty.items())
+            return c.failed(f"{len(faulty)} faulty", f"error bits: {figure}", c.at(answer.t))
     return c.passed("none")
 
 
@@ -368,14 +368,14 @@ def _errors(c: UsbContext) -> Outcome:
 
 
 def _part(hand: UsbSide, phase: UsbPhase, joint: int, begin: float, target: float) -> float:
-    """Part of the way from begin to target that a joint went in a phase; NaN if it is not told."""
+    """Part of the way to its target that a joint went in a phase; NaN if it is not reported."""
     _, q = hand.positions(phase)
     known = q[np.isfinite(q[:, joint]), joint]
     return float((known[-1] - begin) / (target - begin)) if len(known) else math.nan
 
 
 def _travel(hand: UsbSide, phase: UsbPhase, *, before: bool = True) -> Floats:
-    """How far each joint was at most from where it was at the beginning, rad; 0 if untold."""
+    """The largest distance of each joint from its first position, rad; 0 if not reported."""
     _, q = hand.positions(phase, before=before)
     if len(q) < 2:
         return np.zeros(len(hand.joints))
@@ -386,7 +386,7 @@ def _travel(hand: UsbSide, phase: UsbPhase, *, before: bool = True) -> Floats:
 def _quiet_motors(
     c: UsbContext, phases: list[UsbPhase], name: Callable[[UsbPhase], str]
 ) -> Outcome:
-    """No joint may have moved in any of the phases."""
+    """Fail if a joint moved in any of the phases."""
     limit = c.tolerance("max_q")
     most = 0.0
     for phase in phases:
@@ -416,8 +416,8 @@ def _mode(c: UsbContext) -> Outcome:
         last = answers[-1]
         odd = {f"{m.bus}.{m.id}": m.status for m in last.reading.motors if m.status != wanted}
         if odd:
-            told = ", ".join(f"motor {who} says {status}" for who, status in odd.items())
-            observed = f"commanded status {wanted}, {told}"
+            figure = ", ".join(f"motor {who} reports {status}" for who, status in odd.items())
+            observed = f"commanded status {wanted}, {figure}"
             return c.failed(f"not {wanted}", observed, c.at(last.t))
     return c.passed("0 and 1") if judged else c.skipped("no answer to judge by")
 
@@ -438,14 +438,14 @@ def _follows(c: UsbContext) -> Outcome:
     wrong = []
     for phase, joint, begin, target in _moves(c):
         parts[joint] = _part(c.hand, phase, joint, begin, target)
-        # to overshoot by as much again is no following either
+        # overshooting by the same distance is not following either
         if not c.tolerance("min_part") <= parts[joint] <= 2 - c.tolerance("min_part"):
             wrong.append((joint, phase))
-    told = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
+    figure = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
     if not wrong:
-        return c.passed(told, f"of the way in 0.2 s: {told}")
+        return c.passed(figure, f"of the way in 0.2 s: {figure}")
     text = ", ".join(f"{_named(c, [joint])} {parts[joint]:.0%}" for joint, _ in wrong)
-    outcome = c.failed(told, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
+    outcome = c.failed(figure, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
     return outcome.about(*(joint for joint, _ in wrong))
 
 
@@ -455,14 +455,14 @@ def _others(c: UsbContext) -> Outcome:
     earlier: set[int] = set()
     for phase, joint, _, _ in _moves(c):
         travel = _travel(c.hand, phase)
-        # the one that moved before this one may still be arriving
+        # the joint that moved before may still be moving
         travel[[joint, *earlier]] = 0.0
         earlier.add(joint)
         most = max(most, float(travel.max()))
         if travel.max() > c.tolerance("max_q"):
             other = int(travel.argmax())
-            moved, told = (_named(c, [i]) for i in (other, joint))
-            observed = f"{moved} moved by {travel.max():.2f} rad when {told} was told to"
+            moved, commanded = (_named(c, [i]) for i in (other, joint))
+            observed = f"{moved} moved by {travel.max():.2f} rad when {commanded} was commanded to"
             outcome = c.failed(f"{travel.max():.2f} rad", observed, c.over(phase))
             return outcome.about(other, joint)
     return c.passed(f"{most:.3f} rad", moved=most)
@@ -475,7 +475,7 @@ def _limits(c: UsbContext) -> Outcome:
     for answer in c.hand.answers:
         for i, (joint, q) in enumerate(zip(c.hand.joints, c.hand.q(answer), strict=True)):
             over = max(joint.q_min - q, q - joint.q_max)
-            beyond = max(beyond, over)  # NaN is never beyond
+            beyond = max(beyond, over)  # a comparison with NaN is false
             if over > margin:
                 span = f"{joint.q_min:.2f} .. {joint.q_max:.2f}"
                 return c.failed(
@@ -495,7 +495,7 @@ def _speed_unit(c: UsbContext) -> Outcome:
         t = np.array([at for at, _ in points])
         q = np.array([m.position for _, m in points]) / scale.q
         dq = np.array([m.speed for _, m in points]) / scale.dq
-        # an integral over samples that are far apart says nothing, whoever was late
+        # an integral over samples that are far apart is meaningless, whatever caused the gap
         close = len(points) > 2 and np.diff(t).max() <= _COARSEST
         if close and abs(q[-1] - q[0]) > 0.05:
             way = float(np.sum((dq[1:] + dq[:-1]) / 2 * np.diff(t)))
@@ -508,8 +508,8 @@ def _torque_unit(c: UsbContext) -> Outcome:
     ratios: dict[int, float] = {}
     for phase, joint, _, _ in _moves(c):
         scale = Scale(c.hand.joints[joint].gear_ratio)
-        law, told = [], []
-        # the first answer may be the state of before the command
+        law, reported = [], []
+        # the first answer may hold the state before the command
         for x in c.hand.exchanges(phase)[1:]:
             order = next(
                 (
@@ -525,8 +525,8 @@ def _torque_unit(c: UsbContext) -> Outcome:
             error = (order.q - motor.position) / scale.q
             slip = (order.dq - motor.speed) / scale.dq
             law.append(order.kp / scale.kp * error + order.kd / scale.kd * slip)
-            told.append(motor.torque / scale.tau)
-        both = np.array([law, told])
+            reported.append(motor.torque / scale.tau)
+        both = np.array([law, reported])
         if both.size and np.abs(both[0]).max() > c.tolerance("min_tau"):
             ratios[joint] = float(both[0] @ both[1] / (both[0] @ both[0]))
     return _ratio(c, ratios, "the reported torque is {:.2f} of what the gains demand of {}")
@@ -535,12 +535,12 @@ def _torque_unit(c: UsbContext) -> Outcome:
 def _ratio(c: UsbContext, ratios: Mapping[int, float], text: str) -> Outcome:
     if not ratios:
         return c.skipped("no motion to judge by")
-    told = f"{min(ratios.values()):.2f} .. {max(ratios.values()):.2f}"
+    figure = f"{min(ratios.values()):.2f} .. {max(ratios.values()):.2f}"
     for joint, ratio in ratios.items():
         if not c.tolerance("min_ratio") <= ratio <= c.tolerance("max_ratio"):
             observed = text.format(ratio, _named(c, [joint]))
-            return c.failed(told, observed, *map(c.over, c.phases())).about(joint)
-    return c.passed(told)
+            return c.failed(figure, observed, *map(c.over, c.phases())).about(joint)
+    return c.passed(figure)
 
 
 # -------------------------------------------------------------------------------- protection
@@ -571,9 +571,9 @@ def _trips(c: UsbContext) -> Outcome:
 
 
 def _driven(c: UsbContext, joint: int) -> float | None:
-    """Seconds for which a joint that was driven at a steady speed went on in the silence.
+    """Seconds for which a joint driven at a steady speed went on after the last command.
 
-    :returns: None when it had no such speed before, so that nothing can be told from it.
+    :returns: None when it had no such speed before, so that its stop cannot be detected.
     """
     silences, drives = c.hand.phases("silence"), c.hand.phases("drive")
     after = [a for s in silences for a in c.hand.answers if a.transfer.submitted_ns >= s.end_ns]
@@ -598,11 +598,11 @@ def _stops(c: UsbContext) -> Outcome:
     driven = _driven(c, DRIVEN)
     if driven is None:
         return c.skipped(_NO_SPEED)
-    told = f"{driven:.2f} s"
+    figure = f"{driven:.2f} s"
     if driven <= c.tolerance("max_s"):
-        return c.passed(told, driven_s=driven)
-    observed = f"in the silence it went as far as in {told} of driving"
-    return c.failed(told, observed, c.over(silence), driven_s=driven).about(DRIVEN)
+        return c.passed(figure, driven_s=driven)
+    observed = f"without commands it went as far as in {figure} of driving"
+    return c.failed(figure, observed, c.over(silence), driven_s=driven).about(DRIVEN)
 
 
 @check("DEX3USB-PROT-03")
@@ -635,10 +635,10 @@ def _cleared(c: UsbContext) -> Outcome:
         observed = f"{_named(c, tripped)} still tripped after 0.25 s of commands with bit 7 = 0"
         return c.failed(f"{len(tripped)} tripped", observed, c.over(phase)).about(*tripped)
     part = _part(c.hand, phase, DRIVEN, phase.params["begin"], phase.params["target"])
-    told = f"{part:.0%} of the way"
+    figure = f"{part:.0%} of the way"
     if part >= c.tolerance("min_part"):
-        return c.passed(told)
-    return c.failed(told, f"after clearing it went {told}", c.over(phase)).about(DRIVEN)
+        return c.passed(figure)
+    return c.failed(figure, f"after clearing it went {figure}", c.over(phase)).about(DRIVEN)
 
 
 @check("DEX3USB-PROT-05")
@@ -658,10 +658,10 @@ def _disabled(c: UsbContext) -> Outcome:
         return c.failed(f"{driven:.2f} s", observed, c.over(phase), driven_s=driven).about(FREE)
     begin, target = (phase.params[name][FREE] for name in ("begin", "targets"))
     part = _part(c.hand, phase, FREE, begin, target)
-    told = f"{part:.0%} of the way"
+    figure = f"{part:.0%} of the way"
     if part >= c.tolerance("min_part"):
-        return c.passed(told)
-    return c.failed(told, f"after the silence it went {told}", c.over(phase)).about(FREE)
+        return c.passed(figure)
+    return c.failed(figure, f"after the pause it went {figure}", c.over(phase)).about(FREE)
 
 
 @check("DEX3USB-PROT-06")
@@ -721,10 +721,10 @@ def _broadcast(c: UsbContext) -> Outcome:
         for i, (bus, _) in enumerate(c.hand.record.buses)
         if bus == phase.params["bus"] and abs(target - begin[i]) >= c.tolerance("min_way")
     }
-    told = ", ".join(f"{_named(c, [i])} {part:.0%}" for i, part in parts.items())
+    figure = ", ".join(f"{_named(c, [i])} {part:.0%}" for i, part in parts.items())
     if min(parts.values()) >= c.tolerance("min_part"):
-        return c.passed("followed", told)
-    return c.failed("ignored", f"part of the way: {told}", c.over(phase)).about(*parts)
+        return c.passed("followed", figure)
+    return c.failed("ignored", f"part of the way: {figure}", c.over(phase)).about(*parts)
 
 
 # -------------------------------------------------------------------------------- connection

@@ -1,9 +1,11 @@
-"""The kit's own reading of the Dex3-1's frames, from the manual alone.
+"""Read and write the Dex3-1's USB frames, independently of the drivers' codec.
 
-Written apart from :mod:`dexkit.wire.dex3_usb`, which drivers and emulators share: a mistake there
-would be made on both ends of the wire and never be seen. The two are compared by the tests, and
-with the vectors of docs/sources/unitree-dex.md#c8. This one is lenient: it reads what can be read
-in any bytes and leaves it to the checks to find fault.
+This code follows the manual alone.
+
+It is separate from :mod:`dexkit.wire.dex3_usb`, which drivers and emulators share: a mistake there
+would be on both ends of the wire and would never show. The two are compared by the tests, and
+with the vectors of docs/sources/unitree-dex.md#c8. This one is lenient: it reads as much as
+possible of any bytes, and the checks judge the result.
 
 Layouts and units: the Dex3-1 manual "Introduction to Send and Receive Structures",
 docs/sources/unitree-dex.md#c. All little endian, one-byte alignment.
@@ -40,7 +42,7 @@ __all__ = [
 
 BUSES = 5
 COMMAND_SIZES = {1234: 240, 734: 140}
-"""Bytes of a command frame, and of each bus buffer in it: the manual's two readings."""
+"""Bytes of a command frame, and of each bus buffer in it: the manual's two versions."""
 STATE_SIZE = 1270
 STATE_BUS = 240
 NO_VALUE = 30000
@@ -72,7 +74,7 @@ def crc(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Scale:
-    """Counts on the wire for one joint's SI figures (docs/sources/unitree-dex.md#c9).
+    """Counts on the wire per SI unit of one joint (docs/sources/unitree-dex.md#c9).
 
     The rotor turns ``ratio`` times as fast as the joint. 32768/2pi counts are a radian, 256/2pi
     are 100 rad/s, 256 are 1 mN·m, 1280 are 1 mN·m/rad and 1 mN·m per 100 rad/s.
@@ -129,7 +131,7 @@ def motor_packet(
     """``MotorCmd_t``, 20 bytes.
 
     :param number: motor id on its bus, 0 to 15.
-    :param spoil: give it a wrong CRC.
+    :param spoil: write a wrong CRC.
     """
     scale = Scale(joint.gear_ratio)
 
@@ -163,16 +165,16 @@ def pack_command(
 
     :param buses: packets by bus.
     :param sizes: a bus's ``cmd_size`` that is not its true one.
-    :param spoil: give the frame a wrong CRC.
+    :param spoil: write a wrong CRC into the frame.
     """
-    room = COMMAND_SIZES[size]
+    buffer = COMMAND_SIZES[size]
     data = {bus: b"".join(packets) for bus, packets in buses.items()}
-    told = [(sizes or {}).get(bus, len(data.get(bus, b""))) for bus in range(BUSES)]
+    declared = [(sizes or {}).get(bus, len(data.get(bus, b""))) for bus in range(BUSES)]
     body = b"".join(
         (
             bytes(4),
-            _SIZES.pack(*told),
-            *(data.get(bus, b"").ljust(room, b"\0") for bus in range(BUSES)),
+            _SIZES.pack(*declared),
+            *(data.get(bus, b"").ljust(buffer, b"\0") for bus in range(BUSES)),
             bytes(4),
         )
     )
@@ -181,7 +183,7 @@ def pack_command(
 
 @dataclass(frozen=True)
 class MotorReading:
-    """One ``MotorState_t``, as it came: raw counts.
+    """One received ``MotorState_t`` in raw counts.
 
     :param intact: head and CRC are right.
     """
@@ -213,10 +215,10 @@ class SensorReading:
 
 @dataclass(frozen=True)
 class StateReading:
-    """What could be read in the bytes that the device sent.
+    """A state frame as far as it could be read.
 
     :param crc_right: the frame's CRC.
-    :param strange: what on a bus is neither a motor's nor a sensor's packet, in words.
+    :param strange: description of bytes on a bus that are neither a motor's nor a sensor's packet.
     :param pin_v: supply, V; pin_a: supply current, A.
     """
 
@@ -236,7 +238,7 @@ _MOTOR_SIZE, _SENSOR_SIZE = 26, 44
 
 @lru_cache(maxsize=2048)
 def read_state(data: bytes) -> StateReading:
-    """Read ``McuToLinuxState_t``, or as much of it as there is."""
+    """Read ``McuToLinuxState_t``, or the part of it that is present."""
     if len(data) < STATE_SIZE:
         return StateReading(len(data), data[:2])
     frame = data[:STATE_SIZE]
@@ -266,12 +268,12 @@ def read_state(data: bytes) -> StateReading:
 def _read_bus(
     motors: list[MotorReading], sensors: list[SensorReading], bus: int, data: bytes
 ) -> list[str]:
-    """Add what is on a bus; says what is strange there."""
+    """Add a bus's packets to the reading; return a description of unknown bytes."""
     at = 0
     while at < len(data):
         rest = len(data) - at
         head = data[at : at + 2]
-        # a packet whose head alone is wrong is known by its length and CRC
+        # a packet with only a wrong head is recognised by its length and CRC
         if head != b"\x7e\xe7" and rest >= _MOTOR_SIZE:
             right = crc(data[at + 2 : at + 22]) == _U32.unpack_from(data, at + 22)[0]
             if head == b"\xfc\xee" or right:
@@ -316,18 +318,18 @@ def _read_bus(
 def read_command(data: bytes) -> list[tuple[int, int, Motor]] | None:
     """The motors' commands in a good command frame as (bus, id, command in raw counts).
 
-    None when the frame is not one: wrong length, wrong CRC, or a size past its buffer. Packets
+    None for an invalid frame: wrong length, wrong CRC, or a size larger than the buffer. Packets
     with a wrong head or CRC are left out.
     """
-    room = COMMAND_SIZES.get(len(data))
-    if room is None or crc(data[2:-4]) != _U32.unpack_from(data, len(data) - 4)[0]:
+    buffer = COMMAND_SIZES.get(len(data))
+    if buffer is None or crc(data[2:-4]) != _U32.unpack_from(data, len(data) - 4)[0]:
         return None
     sizes = _SIZES.unpack_from(data, 6)
-    if max(sizes) > room:
+    if max(sizes) > buffer:
         return None
     found = []
     for bus, size in enumerate(sizes):
-        start = 26 + bus * room
+        start = 26 + bus * buffer
         for at in range(start, start + size - 19, 20):
             head, mode, _, tau, dq, q, kp, kd = _MOTOR_CMD.unpack_from(data, at)
             right = crc(data[at : at + 16]) == _U32.unpack_from(data, at + 16)[0]

@@ -1,9 +1,10 @@
-"""How USB transfers stand in a recording.
+"""Store USB transfers in a recording.
 
 Each endpoint of each hand is a channel, ``usb/dex3/left/out`` and ``usb/dex3/left/in``; each
-transfer is a message: log time when it was done, publish time when it was submitted. The payload
-is the CDR form of :data:`SCHEMA`, so that common viewers show it. Descriptors, and what the kit
-did when, are in the metadata record :data:`RECORD`, so that the recording alone can be judged.
+transfer is a message: log time is its end, publish time its submission. The payload
+is the CDR form of :data:`SCHEMA`, so that common viewers show it. Descriptors and
+the phases of the stimulus are in the metadata record :data:`RECORD`, so that the recording alone
+can be judged.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Transfer:
     """One bulk transfer.
 
     :param status: 0, or a negative errno.
-    :param requested: bytes offered or asked for.
+    :param requested: bytes offered or requested.
     """
 
     submitted_ns: int
@@ -70,17 +71,17 @@ class Transfer:
 
     @property
     def inward(self) -> bool:
-        """Whether it came from the device."""
+        """Whether it is an IN transfer, from the device."""
         return bool(self.endpoint & 0x80)
 
     def payload(self) -> bytes:
-        """As a message of the recording."""
+        """Encode it as a message of the recording."""
         head = _HEAD.pack(_CDR, self.endpoint, self.status, self.requested, len(self.data))
         return head + self.data
 
     @classmethod
     def of(cls, payload: bytes, submitted_ns: int, done_ns: int) -> Transfer:
-        """Read it back.
+        """Decode a message of the recording.
 
         :raises TraceUnsupported: the payload is damaged.
         """
@@ -94,11 +95,11 @@ class Transfer:
 
 @dataclass(frozen=True)
 class Descriptors:
-    """What the device said of itself.
+    """The descriptors of a device.
 
     :param device: device descriptor, 18 bytes; ``configuration`` with all that belongs to it.
     :param strings: by index.
-    :param speed: 1 low, 2 full, 3 high, 4 and more super; 0 where the host does not tell.
+    :param speed: 1 low, 2 full, 3 high, 4 and more super; 0 where the host does not report it.
     """
 
     device: bytes
@@ -109,9 +110,9 @@ class Descriptors:
 
 @dataclass
 class UsbPhase:
-    """One stretch of the stimulus.
+    """One phase of the stimulus.
 
-    :param params: what was commanded, in the checks' terms.
+    :param params: what was commanded, as the checks read it.
     """
 
     name: str
@@ -125,7 +126,7 @@ class SideRecord:
     """One hand's part of the record.
 
     :param buses: bus and id of each joint's motor that the script assumed.
-    :param trouble: why the script ended early, or empty.
+    :param trouble: the reason why the script ended early, or empty.
     """
 
     descriptors: Descriptors
@@ -147,16 +148,16 @@ class UsbRecord:
     beats: Beats = field(default_factory=Beats)
 
     def to_metadata(self) -> dict[str, str]:
-        """The record's content: JSON by side."""
+        """Encode it for the metadata: JSON by side."""
         record = {"version": str(VERSION)}
         for side, part in self.sides.items():
             plain = asdict(part)
-            told = part.descriptors
+            descriptors = part.descriptors
             plain["descriptors"] = {
-                "device": told.device.hex(),
-                "configuration": told.configuration.hex(),
-                "strings": {str(i): text for i, text in told.strings.items()},
-                "speed": told.speed,
+                "device": descriptors.device.hex(),
+                "configuration": descriptors.configuration.hex(),
+                "strings": {str(i): text for i, text in descriptors.strings.items()},
+                "speed": descriptors.speed,
             }
             record[str(side)] = json.dumps(plain)
         record["stalls"] = json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls])
@@ -188,13 +189,13 @@ class UsbRecord:
 
 
 def _side(plain: dict[str, Any]) -> SideRecord:
-    told = plain["descriptors"]
+    descriptors = plain["descriptors"]
     return SideRecord(
         descriptors=Descriptors(
-            device=bytes.fromhex(told["device"]),
-            configuration=bytes.fromhex(told["configuration"]),
-            strings={int(i): str(text) for i, text in told["strings"].items()},
-            speed=int(told["speed"]),
+            device=bytes.fromhex(descriptors["device"]),
+            configuration=bytes.fromhex(descriptors["configuration"]),
+            strings={int(i): str(text) for i, text in descriptors["strings"].items()},
+            speed=int(descriptors["speed"]),
         ),
         buses=[(int(bus), int(number)) for bus, number in plain["buses"]],
         phases=[
@@ -208,5 +209,5 @@ def _side(plain: dict[str, Any]) -> SideRecord:
 
 
 def _json(text: str) -> Any:
-    # what was measured may be NaN
+    # measured values may be NaN
     return parse_json(text, "the USB record", error=TraceUnsupported, finite=False)

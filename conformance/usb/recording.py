@@ -1,4 +1,4 @@
-"""A USB recording, decoded into what checks ask for."""
+"""Decode a USB recording for the checks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 
 class TraceLike(Protocol):
-    """What is needed of a recording."""
+    """The methods of a recording that are used here."""
 
     @property
     def metadata(self) -> Mapping[str, Mapping[str, str]]:
@@ -81,13 +81,13 @@ class Device:
     endpoints: tuple[Endpoint, ...] = ()
 
 
-def parse_device(told: Descriptors) -> Device:
+def parse_device(raw: Descriptors) -> Device:
     """Read the raw descriptors (USB 2.0 specification 9.6)."""
-    if len(told.device) < 18:
+    if len(raw.device) < 18:
         return Device()
-    vendor, product, release, *indices = struct.unpack_from("<HHHBBB", told.device, 8)
-    maker, name, serial = (told.strings.get(i, "") for i in indices)
-    endpoints = _endpoints(told.configuration)
+    vendor, product, release, *indices = struct.unpack_from("<HHHBBB", raw.device, 8)
+    maker, name, serial = (raw.strings.get(i, "") for i in indices)
+    endpoints = _endpoints(raw.configuration)
     return Device(vendor, product, release, maker, name, serial, endpoints)
 
 
@@ -106,9 +106,9 @@ def _endpoints(raw: bytes) -> tuple[Endpoint, ...]:
 
 @dataclass(frozen=True)
 class Answer:
-    """One frame that came from the device.
+    """One frame from the device.
 
-    :param t: seconds of the recording at which it was there.
+    :param t: seconds of the recording at which it was received.
     """
 
     t: float
@@ -118,7 +118,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Exchange:
-    """A command, and what came next; ``answer`` is None when nothing did."""
+    """A command and its answer, None if there was no answer."""
 
     t: float
     command: Transfer
@@ -127,7 +127,7 @@ class Exchange:
 
 @dataclass(eq=False)
 class UsbSide:
-    """One hand's transfers and what was done to it."""
+    """One hand's transfers and the phases of its stimulus."""
 
     side: Side
     record: SideRecord
@@ -162,11 +162,11 @@ class UsbSide:
 
     @cached_property
     def answers(self) -> list[Answer]:
-        """Every frame that came."""
+        """Every frame from the device."""
         return list(self._answers_in(self.transfers))
 
     def answers_in(self, phase: UsbPhase) -> list[Answer]:
-        """The frames that came in a phase."""
+        """The frames from the device in a phase."""
         return [a for a in self.answers if phase.begin_ns <= a.transfer.submitted_ns < phase.end_ns]
 
     def _answers_in(self, transfers: Sequence[Transfer]) -> Iterator[Answer]:
@@ -176,7 +176,7 @@ class UsbSide:
                 yield Answer(self.seconds(transfer.done_ns), transfer, reading)
 
     def exchanges(self, phase: UsbPhase) -> list[Exchange]:
-        """Commands of a phase, each with the answer that came before the next."""
+        """Commands of a phase, each with the answer before the next command."""
         known = {a.transfer.done_ns: a for a in self.answers}
         found: list[Exchange] = []
         for transfer in self.during(phase):
@@ -207,7 +207,7 @@ class UsbSide:
     def positions(self, phase: UsbPhase, *, before: bool = False) -> tuple[Floats, Floats]:
         """Times and joint positions of a phase's answers, shapes (n,) and (n, 7).
 
-        :param before: with the last answer before it, where everybody was then.
+        :param before: include the last answer before it, which has the positions at its begin.
         """
         answers = self.answers_in(phase)
         if before:
@@ -266,7 +266,7 @@ class UsbRecording:
         )
 
     def since(self, origin_ns: int) -> UsbRecording:
-        """The same with another second 0."""
+        """Return a copy with another second 0."""
         sides = {s: replace(side, origin_ns=origin_ns) for s, side in self.sides.items()}
         return UsbRecording(origin_ns, sides, self.stalls, self.beats)
 

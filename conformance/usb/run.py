@@ -1,4 +1,4 @@
-"""A live USB run: the script on real devices, every transfer into the recording."""
+"""Run the USB stimulus on real devices and record every transfer."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from dexkit.traces.recorder import Recorder
 
 __all__ = ["run"]
 
-_LAST_ANSWER = 0.1  # s that a run which ends early waits for the answer to its last command
+_LAST_ANSWER = 0.1  # s to wait for the answer to the last command when a run ends early
 
 
 def run(
@@ -49,12 +49,12 @@ def run(
     say: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
 ) -> bool:
-    """Play the script to every hand, both at once, and record what was transferred.
+    """Play the script to all hands at the same time, and record their transfers.
 
     :param devices: where each hand is: ``usbip://host:port``, the same with ``/serial``, a serial
         number, or empty for the only one of its side on this machine.
-    :param say: told what happens, in plain words.
-    :param stop: ends the run early when set; what was recorded is kept.
+    :param say: called with progress messages for the user.
+    :param stop: ends the run early when set; the recording so far is kept.
     :returns: False when it was ended early.
     :raises ConformanceError: a hand is not there, or cannot be opened.
     """
@@ -75,7 +75,7 @@ def run(
             try:
                 record.sides = {side: future.result() for side, future in runs.items()}
             except BaseException:
-                stop.set()  # the other hand's script is not to go on alone
+                stop.set()  # end the other hand's script as well
                 raise
         record.stalls, record.beats = heart.stalls, heart.beats
         recorder.add_metadata(RECORD, record.to_metadata())
@@ -93,14 +93,16 @@ def _play(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> SideRecord:
-    told: Descriptors = host.descriptors
+    descriptors: Descriptors = host.descriptors
     plan = Plan(side)
-    pair = bulk_pair(told)
+    pair = bulk_pair(descriptors)
     for inward in (False, True):
         recorder.add_foreign_channel(topic(side, inward=inward), SCHEMA_NAME, SCHEMA)
     if pair is None:
-        say("interface 0 has no pair of bulk endpoints: nothing more can be asked of it")
-        return SideRecord(told, list(plan.buses), trouble="there is no pair of bulk endpoints")
+        say("interface 0 has no pair of bulk endpoints: the device cannot be tested further")
+        return SideRecord(
+            descriptors, list(plan.buses), trouble="there is no pair of bulk endpoints"
+        )
     script = UsbScript(plan, say)
     player = _Player(side, host, pair, recorder, turn)
     try:
@@ -108,11 +110,11 @@ def _play(
             script.trouble = "it was stopped"
     finally:
         player.end_turn()
-        if not script.finished:  # stopped, deaf or broken: leave no motor driven
+        if not script.finished:  # stopped, or the device failed: leave no motor driven
             player.carry_out(Out(script.lock_frame()))
             player.carry_out(In(_LAST_ANSWER))
     phases = [p for p in script.phases if p.end_ns]
-    return SideRecord(told, list(plan.buses), phases, script.trouble)
+    return SideRecord(descriptors, list(plan.buses), phases, script.trouble)
 
 
 class _Player:
@@ -132,14 +134,14 @@ class _Player:
         self._recorder = recorder
         self._turn, self._has_turn = turn, False
         self._clock = RealClock()
-        # wall clock, as recordings have it, on a monotonic footing
+        # wall clock, as in recordings, advanced by the monotonic clock
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def _now_ns(self) -> int:
         return time.monotonic_ns() + self._offset_ns
 
     def carry_out(self, action: Action) -> Observation:
-        """Do it; what came of it."""
+        """Carry out an action and return its result."""
         status, data = 0, b""
         begin = self._now_ns()
         match action:
@@ -160,11 +162,11 @@ class _Player:
                 try:
                     self._host.reopen()
                 except ConformanceError:
-                    status = -1  # the next commands get no answer, which is the finding
+                    status = -1  # the next commands get no answer, which the checks report
         return Observation(self._now_ns(), status, data)
 
     def end_turn(self) -> None:
-        """Let another hand be alone."""
+        """Let the other hand have its turn."""
         if self._has_turn:
             self._has_turn = False
             self._turn.release()

@@ -1,7 +1,7 @@
 """Conformance runs without DDS, devices or waiting: hands in memory on a virtual clock.
 
 The same script drives them and the same checks judge them as in a live run; half a minute of hand
-takes a fraction of a second. They exist to prove the checks: the references
+takes a fraction of a second. They prove the checks: the references
 (:mod:`~dexkit.conformance.virtual.gripper`, :mod:`~dexkit.conformance.virtual.fingers`,
 :mod:`~dexkit.conformance.virtual.robot`, :mod:`~dexkit.conformance.virtual.usb`) meet every
 requirement, and each wrong hand in :mod:`dexkit.conformance.mutants` changes one thing.

@@ -15,7 +15,7 @@ class Dex5Hand(FingerHand):
     """Twenty joints; mode 1 drives them (docs/sources/unitree-dex.md#b5)."""
 
     model = DEX5_1
-    # light enough for the fingers' gains
+    # low inertia, for the fingers' gains
     inertia = 3e-4
     viscous = 0.012
     coulomb = 0.0005
@@ -23,7 +23,7 @@ class Dex5Hand(FingerHand):
     stiffness = 20.0
 
     def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        """Only 1 drives; nothing is protected in another way than all are."""
+        """Mode 1 drives; all joints have the same time-out protection."""
         return np.where(mode == JointMode.FOC, mode, 0), np.zeros_like(self.tripped)
 
     def mode_bytes(self) -> Ints:

@@ -1,4 +1,4 @@
-"""Hands of several joints that meet every requirement: what they share, and the Dex3-1."""
+"""Reference hands of several joints: common parts, and the Dex3-1."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class FingerHand:
         self.low: Floats = np.array([j.q_min for j in specs])
         self.high: Floats = np.array([j.q_max for j in specs])
         self.most: Floats = np.array([j.tau_max for j in specs])
-        # an object is a stop that is met earlier; beyond the limits there is a little room
+        # an object is an earlier stop; the stops are a little beyond the limits
         self.floor, self.ceiling = self.low - 0.03, self.high + 0.03
         if touch is not None:
             for i, j in enumerate(specs):
@@ -87,14 +87,14 @@ class FingerHand:
         self.heard = math.inf
         self.newest: tuple[Motor, ...] = ()
         self.version = 0
-        """Counts what has changed in what can be seen."""
+        """Counts the changes of the visible state."""
         self.changed()
 
     def command(self, motors: tuple[Motor, ...]) -> None:
         """Take a command; one field that is not finite rejects all of it."""
         if motors is self.newest and self.heard != math.inf:
             self.heard = self.now
-            return  # the same once more changes nothing
+            return  # an equal command changes nothing
         rows: Floats = np.array([(m.q, m.dq, m.tau, m.kp, m.kd) for m in motors]).T
         if not np.isfinite(rows).all():
             return
@@ -119,7 +119,7 @@ class FingerHand:
         raise AssertionError  # overridden
 
     def expire(self) -> None:
-        """The time-out has passed without a command: nothing is left driven by a velocity."""
+        """The time-out has passed without a command: no joint is driven by a velocity any more."""
         self.speed = np.zeros_like(self.speed)
         self.push = np.zeros_like(self.push)
 
@@ -149,7 +149,7 @@ class FingerHand:
             self.expire()
             self.changed()
         if self.rests:
-            return  # nothing has changed since a step that changed nothing
+            return  # at rest: the state does not change
         self.version += 1
         before = self.dq
         self.gained = before, dt
@@ -246,7 +246,7 @@ _UNTOUCHED = _untouched()
 
 
 class FingerService(Service):
-    """Such hands on their topics."""
+    """The hands on their topics."""
 
     fault_sides = (Side.LEFT,)  # several joints take long
     tick = 0.002
@@ -328,7 +328,7 @@ class FingerService(Service):
         return self.attitude
 
     def message(self, count: int) -> Any:
-        """A state with all that never changes: number of motors, sensor packets, attitude."""
+        """A state with its constant members: number of motors, sensor packets, attitude."""
         motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
         packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
         message = self.wire.state.cls()

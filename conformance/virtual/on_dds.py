@@ -56,7 +56,7 @@ class ServiceOnDds:
                 for sample in reader.take():
                     client = self._clients.setdefault(sample.writer, len(self._clients))
                     self.service.receive(topic, sample.data, client)
-            # late ticks are made up for, so that the hand does not slow down with the machine
+            # late ticks are caught up, so that a busy machine does not slow the hand
             now = time.monotonic()
             while last + tick <= now:
                 last += tick

@@ -1,4 +1,4 @@
-"""A robot in memory that meets every requirement.
+"""The reference robot, in memory: it meets every requirement.
 
 It shares no code with the emulated robots that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
@@ -79,7 +79,7 @@ class ReferenceRobot(Service):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         """Take a command message."""
-        if payload != self._last[0]:  # most are held for long, and read once
+        if payload != self._last[0]:  # most commands repeat, so they are decoded once
             self._last = (payload, self.read(payload))
         orders = self._last[1]
         if orders is not None and self.accepts(orders):

@@ -1,4 +1,4 @@
-"""A service in memory: what publishes hands on DDS topics, on a virtual clock."""
+"""A service in memory that publishes hands on DDS topics on a virtual clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sample:
 class Service:
     """Publishes and subscribes as a service that meets every requirement.
 
-    Its own hands never move; each model's reference service simulates some.
+    Its hands never move; each model's reference service simulates moving ones.
 
     :param touch: where each side touches an object, in the plan's terms.
     """
@@ -48,7 +48,7 @@ class Service:
     exit_s: float | None = 0.2
     """Seconds from SIGTERM to its end; None is never."""
     gone_s: float | None = 0.05
-    """Seconds from there until its publishers have vanished from the domain; None is never."""
+    """Seconds from there until its publishers have disappeared from the domain; None is never."""
     restarted = False
     """Whether there was a service before this one."""
     loaded = False
@@ -73,7 +73,7 @@ class Service:
         """Change the recording of a run: a fault of the client shows only there."""
 
     @property
-    def hears(self) -> bool:
+    def matches_clients(self) -> bool:
         """Whether DDS would match its reader with an official client's writer."""
         matched = self.reader_durability == "Volatile"
         return matched and self.command_type == self.dialect.cmd_type

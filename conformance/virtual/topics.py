@@ -84,7 +84,7 @@ class _Player:
         self._clients = 0
 
     def carry_out(self, action: Action) -> Observation:
-        """Do it at once; the clock goes on by as long as it takes."""
+        """Carry out an action; the clock goes on by its duration."""
         if isinstance(action, Send):
             self._send(action)
             self._advance((action.until_ns - ORIGIN_NS) / 1e9)
@@ -116,7 +116,7 @@ class _Player:
             self._take(service.advance(service.tick))
 
     def _take(self, samples: Iterable[Sample]) -> None:
-        """Record what was published, and pass it to whoever listens."""
+        """Record published states, and note the first one for a late reader."""
         for sample in samples:
             log_ns = log_time_ns(self.now) + 100_000
             sent_ns = log_time_ns(sample.sent)
@@ -138,7 +138,7 @@ class _Player:
             log_ns = log_time_ns(self.now) + 50_000
             sent_ns = log_time_ns(self.now - action.age_s)
             self.trace.put(topic, self._plan.dialect.cmd_type, log_ns, sent_ns, payload)
-            if self._service.hears:
+            if self._service.matches_clients:
                 client = _RIVAL if action.by is Role.RIVAL else self._clients
                 self._service.receive(topic, payload, client)
 

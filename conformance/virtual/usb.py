@@ -1,4 +1,4 @@
-"""A Dex3-1 on USB that meets every requirement, in memory on a virtual clock.
+"""The reference Dex3-1 on USB, in memory on a virtual clock: it meets every requirement.
 
 It shares no code with the emulated device that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
@@ -143,17 +143,17 @@ class ReferenceDevice:
 
     def good_frame(self, data: bytes) -> bool:
         """Whether a command frame is intact."""
-        room = self.accepts.get(len(data))
-        if room is None or crc(data[2:-4]) != int.from_bytes(data[-4:], "little"):
+        buffer = self.accepts.get(len(data))
+        if buffer is None or crc(data[2:-4]) != int.from_bytes(data[-4:], "little"):
             return False
-        return all(size <= room for size in struct.unpack_from(f"<{BUSES}I", data, 6))
+        return all(size <= buffer for size in struct.unpack_from(f"<{BUSES}I", data, 6))
 
     def carry_out(self, data: bytes) -> None:
         """Carry out every packet of an intact frame."""
-        room = self.accepts[len(data)]
+        buffer = self.accepts[len(data)]
         for bus, size in enumerate(struct.unpack_from(f"<{BUSES}I", data, 6)):
-            start = 26 + bus * room
-            end = start + min(size, room)
+            start = 26 + bus * buffer
+            end = start + min(size, buffer)
             for at in range(start, end - 19, 20):
                 self.packet(bus, data[at : at + 20])
 
@@ -316,7 +316,7 @@ class _Player:
         self.transfers: list[Transfer] = []
 
     def carry_out(self, action: Action) -> Observation:
-        """Do it at once; the device's clock goes on by as long as it takes."""
+        """Carry out an action; the device's clock goes on by its duration."""
         device = self._device
         begin, status, data = log_time_ns(device.now), 0, b""
         match action:
@@ -334,7 +334,7 @@ class _Player:
                 device.reopen()
                 device.advance(0.01)
             case Alone():
-                pass  # there is no other hand
+                pass  # there is only one hand
         return Observation(log_time_ns(device.now), status, data)
 
     def _put(self, begin: int, endpoint: int, status: int, requested: int, data: bytes) -> None:
