@@ -14,16 +14,16 @@ from pathlib import Path
 
 from dexkit import child_processes
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from dexkit.models import MODELS, Dialect
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = [
-    "BODY_EMULATORS",
     "EMULATED",
     "EXTERNAL",
     "ON_USB",
+    "ROBOT_EMULATORS",
     "SIMULATED",
     "Emulation",
     "Rig",
@@ -71,7 +71,7 @@ SIMULATED = tuple(m.simulator for m in MODELS.values() if m.simulator)
 """Backends without a device, which have a setting ``object``."""
 
 
-BODY_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
+ROBOT_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
 """Backends that are emulated robots: the names of their emulators."""
 
 
@@ -97,13 +97,18 @@ class RigOptions:
     """
 
     backend: str
-    sides: tuple[Side, ...]
+    sides: tuple[Subject, ...]
     dialect: Dialect
     domain: int
     interface: str = "lo"
     devices: Mapping[Side, str] = field(default_factory=dict)
     objects: Mapping[Side, float] = field(default_factory=dict)
     settings: tuple[str, ...] = ()
+
+    @property
+    def hands(self) -> tuple[Side, ...]:
+        """The hands among the subjects: none where a robot is judged."""
+        return tuple(s for s in self.sides if isinstance(s, Side))
 
     @property
     def emulated(self) -> bool:
@@ -177,7 +182,7 @@ class Rig:
         folder = self._stack.enter_context(TemporaryFolder("hands"))
         emulation = EMULATED[options.backend]
         emulators = {}
-        for s in options.sides:
+        for s in options.hands:
             command = emulation.command(s, folder / f"hand-{s}")
             emulators[s] = self._tool(*command, *_object(options, s))
         for s, tool in emulators.items():
@@ -192,14 +197,24 @@ class Rig:
         options = self.options
         if options.backend == EXTERNAL or self._stop.is_set():
             return
+        if options.backend in ROBOT_EMULATORS:
+            self._services = [self._start_robot(ROBOT_EMULATORS[options.backend])]
+        else:
+            self._services = self._start_hands()
+        for tool in self._services:
+            tool.wait_ready(self._stop)
+
+    def _start_robot(self, emulator: str) -> Tool:
+        return self._tool("emulate", emulator, "--quiet", *self._place_on_dds)
+
+    def _start_hands(self) -> list[Tool]:
+        options = self.options
         settings = list(options.settings)
         if options.emulated:
             given = {s.partition("=")[0] for s in settings}
             needed = EMULATED[options.backend].settings
             settings += [f"{k}={v}" for k, v in needed.items() if k not in given]
-        self._services = [self._serve(group, settings) for group in self._groups()]
-        for tool in self._services:
-            tool.wait_ready(self._stop)
+        return [self._serve(group, settings) for group in self._groups()]
 
     def end_services(self) -> bool | None:
         """Ask all services to end, at once.
@@ -214,16 +229,17 @@ class Rig:
 
     def _groups(self) -> list[tuple[Side, ...]]:
         """The sides that one service serves: one each, unless they share their topics."""
-        topics = {self.options.dialect.topics(s) for s in self.options.sides}
-        if len(topics) == len(self.options.sides):
-            return [(s,) for s in self.options.sides]
-        return [self.options.sides]
+        hands = self.options.hands
+        topics = {self.options.dialect.topics(s) for s in hands}
+        return [(s,) for s in hands] if len(topics) == len(hands) else [hands]
+
+    @property
+    def _place_on_dds(self) -> tuple[str, ...]:
+        """The options of a program that say where it is on DDS."""
+        return "--domain", str(self.options.domain), "--interface", self.options.interface
 
     def _serve(self, sides: Sequence[Side], settings: Sequence[str]) -> Tool:
         options = self.options
-        place_on_dds = ("--domain", str(options.domain), "--interface", options.interface)
-        if options.backend in BODY_EMULATORS:
-            return self._tool("emulate", BODY_EMULATORS[options.backend], "--quiet", *place_on_dds)
         arguments = ["serve", options.backend, "--side"]
         arguments.append(str(sides[0]) if len(sides) == 1 else "both")
         for side in sides:
@@ -241,7 +257,7 @@ class Rig:
         return self._tool(
             *arguments,
             *("--dialect", options.dialect.name),
-            *place_on_dds,
+            *self._place_on_dds,
         )
 
     def _tool(self, *arguments: str) -> Tool:

@@ -19,7 +19,7 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.verdicts import Judgement, excuse
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 
 __all__ = ["judge", "judge_layer"]
 
@@ -82,7 +82,7 @@ def judge_layer(
     claims = claims or Claims()
     whole = layer.whole(recording)
     results: list[Result] = []
-    for subject, view in layer.subjects(recording).items():
+    for subject, view in layer.subjects(recording):
         found: dict[str, Result] = {}
         for requirement in requirements:
             judgement = Judgement(requirement, subject, claims, found)
@@ -121,7 +121,7 @@ def _harness(recording: Recording) -> dict[str, float]:
     return figures
 
 
-def _stage(recording: Recording, side: Side) -> Stage:
+def _stage(recording: Recording, side: Subject) -> Stage:
     """How far a hand got."""
     hand = recording.sides[side]
     for q, joint in zip(hand.states.q.T, hand.joints, strict=True):

@@ -39,7 +39,7 @@ from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from dexkit.models import DIALECTS
 from dexkit.single_publisher import Place, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
@@ -69,7 +69,7 @@ class LiveOptions:
     force: bool = False
     usb: bool = False
 
-    def plan(self) -> Plan:
+    def plan(self) -> Plan[Subject]:
         """What the script is to do."""
         dialect = self.rig.dialect
         return Plan(
@@ -193,7 +193,7 @@ def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
     )
 
 
-def _meet(node: DdsNode, plan: Plan) -> None:
+def _meet(node: DdsNode, plan: Plan[Subject]) -> None:
     """Wait until the hands' endpoints are known; a hand without any is the checks' finding."""
     wanted = {t for s in plan.sides for t in plan.dialect.topics(s)}
     node.discovery.wait(
@@ -207,7 +207,7 @@ class _Driver:
     """Carries out the script's actions on DDS."""
 
     rig: Rig
-    plan: Plan
+    plan: Plan[Subject]
     sole: SolePublisher
     _newest: dict[str, bytes] = field(default_factory=dict)
     _others: dict[Role, _Client | _Monitor] = field(default_factory=dict)
@@ -238,7 +238,7 @@ class _Driver:
         """Now, on the recording's clock."""
         return round(self._clock.now() * 1e9) + self._offset
 
-    def go_through(self, script: Script, stop: threading.Event) -> bool:
+    def go_through(self, script: Script[Subject], stop: threading.Event) -> bool:
         """Run the script; False when it was stopped."""
         return play(script, self._carry_out, stop.is_set)
 
@@ -308,8 +308,8 @@ class _Driver:
         }
 
     def _observe(self) -> Observation:
-        q: dict[Side, Pose] = {}
-        dq: dict[Side, Pose] = {}
+        q: dict[Subject, Pose] = {}
+        dq: dict[Subject, Pose] = {}
         if self._client is not None:
             self._newest.update(self._client.newest())
         for side in self.plan.sides:
@@ -320,7 +320,7 @@ class _Driver:
                 state = self._wire.read_state(payload, side)
                 if state is not None:
                     q[side], dq[side] = state
-        joined: dict[Side, float] = {}
+        joined: dict[Subject, float] = {}
         for role, other in self._others.items():
             if isinstance(other, _Monitor):
                 if role is Role.MONITOR:
@@ -343,7 +343,7 @@ class _Client:
         self,
         rig: RigOptions,
         wire: Wire,
-        sides: tuple[Side, ...],
+        sides: tuple[Subject, ...],
         claim: bytes,
         type_name: str | None = None,
     ) -> None:
@@ -396,7 +396,7 @@ class _Client:
 class _Monitor:
     """Another listener: the late joiner, or a slow reader."""
 
-    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...], qos: Qos) -> None:
+    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Subject, ...], qos: Qos) -> None:
         self._node = _node(rig)
         self._sides = sides
         self._wire = wire
@@ -416,7 +416,7 @@ class _Monitor:
             for reader in self._readers.values():
                 reader.take()
 
-    def first_states(self) -> dict[Side, float]:
+    def first_states(self) -> dict[Subject, float]:
         """Seconds from being matched to the first state, for the sides that have sent one."""
         now = time.monotonic()
         for topic, reader in self._readers.items():

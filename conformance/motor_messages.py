@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.hand import JointMode, Side
+from dexkit.hand import JointMode, Side, Subject
 from dexkit.messages import MessageType, message_type
 from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
@@ -78,7 +78,7 @@ class Wire:
         *,
         joints: int | None = None,
         foreign: str | None = None,
-        subjects: Sequence[Side] = tuple(Side),
+        subjects: Sequence[Subject] = tuple(Side),
     ) -> None:
         self.dialect = dialect
         self.joints = joints or len(model(dialect.model).joints[Side.LEFT])
@@ -93,8 +93,8 @@ class Wire:
         self._states: dict[int, Any] = {}
         self._ids = dialect.mode_byte is ModeByte.RIS
         self._modes = dialect.mode_byte is not ModeByte.UNUSED
-        self.command_topics = {s: dialect.topics(s)[0] for s in subjects}
-        self.state_topics = {s: dialect.topics(s)[1] for s in subjects}
+        self.command_topics: Mapping[Subject, str] = {s: dialect.topics(s)[0] for s in subjects}
+        self.state_topics: Mapping[Subject, str] = {s: dialect.topics(s)[1] for s in subjects}
         self.shared = len(set(self.command_topics.values())) < len(subjects)
 
     def mode(self, index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
@@ -152,7 +152,7 @@ class Wire:
             places[self.dialect.index[side]] = motors[0]
         return {self.dialect.cmd_topic: places}
 
-    def encode_empty(self, sides: tuple[Side, ...]) -> list[tuple[str, bytes]]:
+    def encode_empty(self, sides: Sequence[Side]) -> list[tuple[str, bytes]]:
         """The same with no motor in the sequence."""
         topics = dict.fromkeys(self.command_topics[side] for side in sides)
         return [(topic, self._payload([])) for topic in topics]
@@ -167,7 +167,7 @@ class Wire:
         return self.command.encode(message)
 
     def read_state(
-        self, data: bytes, side: Side
+        self, data: bytes, side: Subject
     ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """(q, dq) of a side's joints in a state payload, or None if they are not all there.
 
@@ -178,7 +178,7 @@ class Wire:
             return None
         return tuple(m.q for m in motors), tuple(m.dq for m in motors)
 
-    def read_command(self, data: bytes, side: Side) -> tuple[Motor, ...] | None:
+    def read_command(self, data: bytes, side: Subject) -> tuple[Motor, ...] | None:
         """A side's motors in a command payload, or None if they are not all there.
 
         :raises WireError: the payload is not of the dialect's command type.
@@ -190,7 +190,7 @@ class Wire:
             Motor(q=m.q, dq=m.dq, tau=m.tau, kp=m.kp, kd=m.kd, mode=m.mode) for m in motors
         )
 
-    def _mine(self, motors: Sequence[Any], side: Side) -> Sequence[Any] | None:
+    def _mine(self, motors: Sequence[Any], side: Subject) -> Sequence[Any] | None:
         first = self.dialect.index[side]
         mine = motors[first : first + self.joints]
         return mine if len(mine) == self.joints else None

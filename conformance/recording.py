@@ -20,7 +20,7 @@ from dexkit.conformance.motor_messages import Wire
 from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
 from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Floats, JointSpec, Side
+from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.robots import RobotModel
@@ -131,9 +131,9 @@ class Commands:
 
 @dataclass(frozen=True, eq=False)
 class SideView:
-    """One hand in the recording."""
+    """One hand, or a robot, in the recording."""
 
-    side: Side
+    side: Subject
     states: States
     commands: Commands
     joints: tuple[JointSpec, ...]
@@ -153,11 +153,11 @@ class Recording:
     dialect: Dialect
     origin_ns: int
     duration: float
-    sides: Mapping[Side, SideView]
+    sides: Mapping[Subject, SideView]
     channels: Sequence[ChannelInfo]
     endpoints: Sequence[TraceEndpoint]
     stimulus: Stimulus | None
-    judged: tuple[Side, ...]
+    judged: tuple[Subject, ...]
     notes: Sequence[str] = ()
     usb: UsbRecording | None = None
 
@@ -206,7 +206,7 @@ class Recording:
         end = max([int(t[-1]) for t in times] + marks, default=0)
         wire = Wire(chosen)
         with np.errstate(invalid="ignore"):  # any NaN is a finding, not a surprise
-            views = {
+            views: dict[Subject, SideView] = {
                 s: SideView(
                     s,
                     _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
@@ -258,7 +258,7 @@ class Recording:
         """The other way round."""
         return self.origin_ns + round(seconds * 1e9)
 
-    def phases(self, name: str, side: Side | None = None) -> list[Phase]:
+    def phases(self, name: str, side: Subject | None = None) -> list[Phase]:
         """The phases of that name, about that side."""
         if self.stimulus is None:
             return []

@@ -1,7 +1,7 @@
 """Robots in the conformance kit: their dialect, messages with a CRC, and decoded recordings.
 
 A robot has no sides: where a hand has a side, it has
-:data:`~dexkit.conformance.stimulus_record.ROBOT`. Its joints are those of the used motor slots, in
+:data:`dexkit.hand.ROBOT`. Its joints are those of the used motor slots, in
 their order. What hands do not have: a CRC in each message, and slots that are not used.
 """
 
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.motor_messages import Motor, Motors, Wire
 from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
-from dexkit.conformance.stimulus_record import RECORD, ROBOT, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.errors import ConformanceError, WireError
-from dexkit.hand import Floats, Side
+from dexkit.hand import ROBOT, Floats, Subject
 from dexkit.messages import Columns, message_type
 from dexkit.models import Dialect
 from dexkit.robots import H1, ROBOTS, RobotModel, robot
@@ -85,7 +85,7 @@ class RobotWire(Wire):
         self.machine = 0
 
     def read_state(
-        self, data: bytes, side: Side
+        self, data: bytes, side: Subject
     ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """(q, dq) of the used slots.
 

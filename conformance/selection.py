@@ -8,8 +8,7 @@ from functools import cache
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side
 from dexkit.models import model
 from dexkit.robots import ROBOTS
 

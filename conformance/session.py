@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.backend_processes import (
-    BODY_EMULATORS,
     EMULATED,
     EXTERNAL,
     ON_USB,
+    ROBOT_EMULATORS,
     SIMULATED,
     RigOptions,
 )
@@ -28,10 +28,9 @@ from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import DEX1_1, Dialect, dialect, model
 from dexkit.open_file_limit import require_open_files
 from dexkit.robots import ROBOTS
@@ -56,7 +55,7 @@ class SuiteOptions:
     """
 
     backend: str
-    sides: tuple[Side, ...]
+    sides: tuple[Subject, ...]
     dialect: Dialect
     domain: int | None
     interface: str
@@ -137,18 +136,19 @@ class SuiteOptions:
         if of_robot:
             _refuse_for_robots(side=side, device=devices, object=objects, set=settings, trace=trace)
         one_device = len(devices) == 1 and "=" not in devices[0]
-        sides = sides_of(side or ("left" if one_device else "both"))
-        if one_device and len(sides) > 1:
+        hands = sides_of(side or ("left" if one_device else "both"))
+        if one_device and len(hands) > 1:
             raise UsageError(
                 "one --device for two hands", hint="--device left=PATH --device right=PATH"
             )
-        named = _by_side(devices, sides, str, "--device")
+        named = _by_side(devices, hands, str, "--device")
+        sides: tuple[Subject, ...] = hands
         if of_robot:
             sides, chosen = (ROBOT,), robot_dialect(of_robot)
         else:
-            chosen = _dialect(backend, dialect_name, sides[0], named, settings)
+            chosen = _dialect(backend, dialect_name, hands[0], named, settings)
         touch = [o for o in objects if o != "none"]
-        by_side = _by_side(touch, sides, float, "--object")
+        by_side = _by_side(touch, hands, float, "--object")
         low, high, of_what = (5, 60, "opening") if chosen.q_open > 0 else (55, 75, "closing")
         for pct in by_side.values():
             if not low <= pct <= high:
@@ -252,14 +252,14 @@ def _robot_of(backend: str, dialect_name: str | None) -> str:
 
     :raises UsageError: a backend and a dialect of two of them.
     """
-    started = BODY_EMULATORS.get(backend, "")
+    started = ROBOT_EMULATORS.get(backend, "")
     wanted = dialect_name if dialect_name in ROBOTS else ""
     if (started and dialect_name and wanted != started) or (
         wanted and not started and backend != EXTERNAL
     ):
         raise UsageError(
             f"{backend} does not speak {dialect_name}",
-            hint=f"robots: --backend {' or '.join(BODY_EMULATORS)}, or external with --dialect "
+            hint=f"robots: --backend {' or '.join(ROBOT_EMULATORS)}, or external with --dialect "
             f"{' or '.join(ROBOTS)}",
         )
     return started or wanted or ""

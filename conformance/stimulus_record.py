@@ -9,18 +9,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
-from dexkit.hand import Floats, Side
+from dexkit.hand import ROBOT, Floats, Side, Subject
 
 __all__ = [
     "IDLE",
     "RECORD",
-    "ROBOT",
     "Beats",
     "Lost",
     "Phase",
@@ -34,10 +33,8 @@ _LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
-ROBOT = cast(Side, "robot")
-"""What a whole robot has where a hand has its side."""
 _EARLIER_ROBOT = "body"
-"""The same in recordings of earlier versions."""
+"""The name of the subject ``robot`` in recordings of earlier versions."""
 IDLE = 1e-3
 """Seconds by which timers are late on a machine that has nothing else to do."""
 
@@ -55,10 +52,10 @@ class Phase:
     """
 
     name: str
-    sides: tuple[Side, ...]
+    sides: tuple[Subject, ...]
     begin_ns: int
     end_ns: int = 0
-    targets: dict[Side, dict[int, float]] = field(default_factory=dict)
+    targets: dict[Subject, dict[int, float]] = field(default_factory=dict)
     params: dict[str, str] = field(default_factory=dict)
     observed: dict[str, float | None] = field(default_factory=dict)
 
@@ -147,7 +144,7 @@ class Stimulus:
     """
 
     phases: list[Phase] = field(default_factory=list)
-    objects: dict[Side, float | None] = field(default_factory=dict)
+    objects: dict[Subject, float | None] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
 
@@ -194,17 +191,17 @@ class Stimulus:
                 phases=[
                     Phase(
                         name=p["name"],
-                        sides=tuple(_side(s) for s in p["sides"]),
+                        sides=tuple(_subject(s) for s in p["sides"]),
                         begin_ns=time_of(p["begin_ns"]),
                         end_ns=time_of(p["end_ns"]),
-                        targets={_side(s): _joints(q) for s, q in p["targets"].items()},
+                        targets={_subject(s): _joints(q) for s, q in p["targets"].items()},
                         params=dict(p["params"]),
                         observed=dict(p["observed"]),
                     )
                     for p in phases
                 ],
                 objects={
-                    _side(s): None if q is None else float(q)
+                    _subject(s): None if q is None else float(q)
                     for s, q in _json(record["objects"]).items()
                 },
                 stalls=stalls_of(record["stalls"]),
@@ -214,8 +211,8 @@ class Stimulus:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
 
 
-def _side(name: str) -> Side:
-    return ROBOT if name in (ROBOT, _EARLIER_ROBOT) else Side(name)
+def _subject(name: str) -> Subject:
+    return ROBOT if name in (ROBOT.value, _EARLIER_ROBOT) else Side(name)
 
 
 def _joints(value: Any) -> dict[int, float]:

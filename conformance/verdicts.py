@@ -39,7 +39,7 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
 from dexkit.conformance.stimulus_record import IDLE, Lost
-from dexkit.hand import Side
+from dexkit.hand import Subject
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]
 
@@ -186,17 +186,21 @@ def _ms(seconds: float) -> str:
 
 
 class Judgement:
-    """One requirement on one side, on its way to a :class:`Result`.
+    """Makes the :class:`Result` of one requirement for one subject.
 
     :param requirement: at the level that the claims give it.
-    :param found: the results of this side so far, by requirement.
+    :param found: the results of this subject so far, by requirement.
     """
 
     def __init__(
-        self, requirement: Requirement, side: Side, claims: Claims, found: Mapping[str, Result]
+        self,
+        requirement: Requirement,
+        subject: Subject,
+        claims: Claims,
+        found: Mapping[str, Result],
     ) -> None:
         self.requirement = requirement
-        self._side = side
+        self._subject = subject
         self._claimed = claims.claimed(requirement)
         self._found = found
 
@@ -211,7 +215,7 @@ class Judgement:
         cause = outcome.cause or self.requirement.cause
         return Result(
             requirement=self.requirement,
-            side=str(self._side),
+            side=str(self._subject),
             verdict=verdict,
             figure=outcome.figure,
             observed=outcome.observed,

@@ -34,11 +34,11 @@ from dexkit.conformance.robot import (
 )
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
-from dexkit.conformance.stimulus_record import ROBOT, Stimulus
+from dexkit.conformance.stimulus_record import Stimulus
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side
 from dexkit.messages import decode
 from dexkit.robots import G1, H1, ROBOTS, RobotModel
 from dexkit.traces import Recorder, TraceEndpoint, open_trace

@@ -15,8 +15,7 @@ from dexkit.conformance.plots import PlotKind
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
 from dexkit.conformance.results import VERSION, Load, Overall, Stage, Verdict
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side
 from dexkit.traces import open_trace, sample_path
 from tests.conformance_helpers import short_run
 

@@ -36,7 +36,7 @@ def _reference(model: str) -> type:
 LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     name="usb",
     decode=lambda trace, dialect_name, sides: UsbRecording.of(trace),
-    subjects=lambda recording: recording.sides,
+    subjects=lambda recording: recording.sides.items(),
     context=UsbContext,
     # the script ends where a device no longer answers: what failed first explains a missing
     # phase better than its absence does

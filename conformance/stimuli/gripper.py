@@ -58,7 +58,7 @@ _BAD = {
 class GripperScript(HandScript):
     """The script of a gripper."""
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(self, plan: Plan[Side], say: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(plan, say)
         self._stroke = plan.dialect.q_open
         # the interface specification: in unitree_hg the gains, dq and tau of a command are not used

@@ -43,13 +43,13 @@ LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
 """Commands a second under load, twice and more what official clients send, and for how long."""
 
 
-class HandScript(Script):
+class HandScript(Script[Side]):
     """The stimulus for hands; subclasses have the phases of their models."""
 
     _settling = 0.4
     """Seconds that a hand must stand near its goal."""
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(self, plan: Plan[Side], say: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(plan, say)
         self._wire = Wire(plan.dialect)
         self._model: HandModel = model(plan.dialect.model)

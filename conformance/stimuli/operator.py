@@ -34,7 +34,7 @@ _DEEPEST = 0.5  # how far the profile closes a hand of several joints
 _POLL = 0.001  # s between two reads while the client waits for a state
 
 
-def _most(plan: Plan, side: Side) -> float:
+def _most(plan: Plan[Side], side: Side) -> float:
     """How far a side may close, 0 to 1, as :class:`~dexkit.teleop.Operator` takes it."""
     touch = plan.objects.get(side)
     if touch is None:
@@ -46,7 +46,8 @@ def _most(plan: Plan, side: Side) -> float:
 
 def operator_of(phase: Phase, dialect: Dialect) -> Operator:
     """The operator of a phase, from its parameters in the recording."""
-    most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in phase.sides}
+    hands = [s for s in phase.sides if isinstance(s, Side)]
+    most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in hands}
     return Operator(profile(phase.params["profile"], dialect.model), dialect, most=most)
 
 
@@ -64,8 +65,8 @@ def operate(script: HandScript) -> Steps:
     tick = begin = script._obs.now_ns
 
     def receive() -> float:
-        now = (script._obs.now_ns - begin) / 1e9
-        client.receive(now, {s: q for s, q in script._obs.q.items() if s in plan.sides})
+        now, q = (script._obs.now_ns - begin) / 1e9, script._obs.q
+        client.receive(now, {s: q[s] for s in plan.sides if s in q})
         return now
 
     while script._elapsed(phase) < operator.profile.duration:
@@ -86,4 +87,5 @@ def operate(script: HandScript) -> Steps:
             now = receive()
     script._end(phase)
     script._next_ns = script._obs.now_ns
-    script._goal.update({s: q for s, q in script._obs.q.items() if s in plan.sides})
+    last = script._obs.q
+    script._goal.update({s: last[s] for s in plan.sides if s in last})

@@ -46,7 +46,8 @@ from dexkit.conformance.stimuli.script import (
     Send,
     Steps,
 )
-from dexkit.conformance.stimulus_record import ROBOT, Phase
+from dexkit.conformance.stimulus_record import Phase
+from dexkit.hand import ROBOT, RobotSubject
 from dexkit.robots import robot
 
 __all__ = ["STEP", "RobotScript"]
@@ -62,12 +63,14 @@ _JOINT = "right_elbow"
 _NOTHING = Motor(kp=0.0, kd=0.0)
 
 
-class RobotScript(Script):
+class RobotScript(Script[RobotSubject]):
     """The stimulus for one robot."""
 
     motion = "joint"
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(
+        self, plan: Plan[RobotSubject], say: Callable[[str], None] = lambda text: None
+    ) -> None:
         super().__init__(plan, say)
         self._robot = robot(plan.dialect.model)
         self._coder = RobotWire(plan.dialect)

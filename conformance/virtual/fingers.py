@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.service import Sample, Service
-from dexkit.hand import Floats, JointMode, Side
+from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
 
@@ -266,7 +266,7 @@ class FingerService(Service):
             cls.hand = type(fault.__name__, (fault, hand), {})
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}

@@ -23,8 +23,8 @@ from dexkit.conformance.stimuli import (
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
-from dexkit.conformance.virtual.service import Sample, Service
-from dexkit.hand import Side
+from dexkit.conformance.virtual.service import Sample, TopicDevice
+from dexkit.hand import Subject
 
 __all__ = ["ORIGIN_NS", "log_time_ns", "run_virtual"]
 
@@ -39,25 +39,25 @@ def log_time_ns(seconds: float) -> int:
     return ORIGIN_NS + round(seconds * 1e9)
 
 
-class _Poses(Mapping[Side, Pose]):
+class _Poses(Mapping[Subject, Pose]):
     """The newest poses (0) or velocities (1) of all sides, decoded only when they are read."""
 
-    def __init__(self, wire: Wire, newest: Mapping[Side, bytes], which: int) -> None:
+    def __init__(self, wire: Wire, newest: Mapping[Subject, bytes], which: int) -> None:
         self._wire, self._newest, self._which = wire, newest, which
-        self._read: dict[Side, tuple[Pose, Pose] | None] = {}
+        self._read: dict[Subject, tuple[Pose, Pose] | None] = {}
 
-    def _state(self, side: Side) -> tuple[Pose, Pose] | None:
+    def _state(self, side: Subject) -> tuple[Pose, Pose] | None:
         if side not in self._read:
             self._read[side] = self._wire.read_state(self._newest[side], side)
         return self._read[side]
 
-    def __getitem__(self, side: Side) -> Pose:
+    def __getitem__(self, side: Subject) -> Pose:
         state = self._state(side)
         if state is None:
             raise KeyError(side)
         return state[self._which]
 
-    def __iter__(self) -> Iterator[Side]:
+    def __iter__(self) -> Iterator[Subject]:
         return (s for s in self._newest if self._state(s) is not None)
 
     def __len__(self) -> int:
@@ -70,7 +70,7 @@ class _Player:
     :ivar now: s, of the virtual clock.
     """
 
-    def __init__(self, plan: Plan, service_class: type[Service]) -> None:
+    def __init__(self, plan: Plan[Subject], service_class: type[TopicDevice]) -> None:
         self.now = 0.0
         self._plan, self._service_class = plan, service_class
         self._service = service_class(plan.dialect, plan.sides, plan.objects)
@@ -79,7 +79,7 @@ class _Player:
         self._topics = {s: self._wire.state_topics[s] for s in plan.sides}
         self._newest: dict[str, bytes] = {}
         self._joined_at: float | None = None
-        self._joined: dict[Side, float] = {}
+        self._joined: dict[Subject, float] = {}
         self._stopped: dict[str, float | None] = {}
         self._clients = 0
 
@@ -154,7 +154,7 @@ class _Player:
         )
 
 
-def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
+def run_virtual(plan: Plan[Subject], service_class: type[TopicDevice]) -> MemoryTrace:
     """Play the plan's script to a service of that class; the recording."""
     player = _Player(plan, service_class)
     script = script_for(plan)
