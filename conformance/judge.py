@@ -104,7 +104,7 @@ def _judge_one(
         if decided:
             return decided
     requirement = judgement.requirement
-    return judgement.of(
+    return judgement.run_check(
         lambda: layer.refine(context, check_of(requirement)(context)),
         lambda outcome: excuse(context.recording, requirement, outcome, whole),
     )

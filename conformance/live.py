@@ -17,9 +17,9 @@ from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.heartbeat import Heartbeat
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
-from dexkit.conformance.robot import wire_for
+from dexkit.conformance.robot import codec_for
 from dexkit.conformance.stimuli import (
     Action,
     Join,
@@ -85,12 +85,12 @@ def record_run(
     options: LiveOptions,
     path: Path,
     *,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
 ) -> bool:
     """Do the run and write its recording to ``path``.
 
-    :param say: told what happens, in plain words.
+    :param report: called with progress messages for the user.
     :param stop: ends the run early when set; what was recorded is kept.
     :returns: False when it was ended early.
     :raises ConformanceError: the hand's process cannot be started, or has died.
@@ -113,9 +113,9 @@ def record_run(
         # the recorder listens before the hand is there: nothing of its start is missed
         recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
         if rig_options.backend != EXTERNAL:
-            say(f"starting {rig_options.backend} on domain {rig_options.domain}")
+            report(f"starting {rig_options.backend} on domain {rig_options.domain}")
         rig = stack.enter_context(Rig(rig_options, stop))
-        if options.usb and not _judge_usb(rig, recorder, say, stop):
+        if options.usb and not _judge_usb(rig, recorder, report, stop):
             return False
         rig.serve()
         if stop.is_set():
@@ -131,7 +131,7 @@ def record_run(
         )
         sole.search()
         plan = options.plan()
-        script = script_for(plan, say)
+        script = script_for(plan, report)
         heart = stack.enter_context(Heartbeat())
         driver = stack.enter_context(_Driver(rig, plan, sole))
         sole.settle()
@@ -153,7 +153,7 @@ def record_run(
 
 
 def _judge_usb(
-    rig: Rig, recorder: Recorder, say: Callable[[str], None], stop: threading.Event
+    rig: Rig, recorder: Recorder, report: Callable[[str], None], stop: threading.Event
 ) -> bool:
     """The hands on USB, while nobody else has them; False when it was stopped."""
     from dexkit.conformance.usb.run import run
@@ -163,8 +163,8 @@ def _judge_usb(
         side: f"{server}/{where}" if server and "://" not in where else where
         for side, where in rig.devices.items()
     }
-    say(f"the {' and the '.join(map(str, devices))} hand on USB")
-    return run(devices, recorder, say=say, stop=stop)
+    report(f"the {' and the '.join(map(str, devices))} hand on USB")
+    return run(devices, recorder, report=report, stop=stop)
 
 
 def _node(options: RigOptions) -> DdsNode:
@@ -214,7 +214,7 @@ class _Driver:
     _stopped: dict[str, float | None] = field(default_factory=dict)
 
     def __enter__(self) -> _Driver:
-        self._wire = wire_for(self.plan.dialect)
+        self._codec = codec_for(self.plan.dialect)
         self._clock = RealClock()
         self._watch = PauseWatch(self._clock)
         # wall clock, as recordings have it, on a monotonic footing
@@ -281,7 +281,7 @@ class _Driver:
 
     def _new_client(self, type_name: str | None = None) -> _Client:
         claim = self.sole.announce()
-        return _Client(self.rig.options, self._wire, self.plan.sides, claim, type_name)
+        return _Client(self.rig.options, self._codec, self.plan.sides, claim, type_name)
 
     def _joining(self, role: Role) -> _Client | _Monitor:
         if role is Role.RIVAL:
@@ -289,9 +289,9 @@ class _Driver:
             rival.wait_matched(1.0)
             return rival
         if role is Role.STRANGER:
-            return self._new_client(self._wire.foreign.name)
+            return self._new_client(self._codec.foreign.name)
         qos = Qos("reliable", depth=None) if role is Role.LAGGARD else Qos.reader_default()
-        return _Monitor(self.rig.options, self._wire, self.plan.sides, qos)
+        return _Monitor(self.rig.options, self._codec, self.plan.sides, qos)
 
     def _stop_service(self) -> None:
         """End the services; how long that took, and until nobody publishes any more."""
@@ -313,11 +313,11 @@ class _Driver:
         if self._client is not None:
             self._newest.update(self._client.newest())
         for side in self.plan.sides:
-            payload = self._newest.get(self._wire.state_topics[side])
+            payload = self._newest.get(self._codec.state_topics[side])
             if payload is None:
                 continue
             with contextlib.suppress(WireError):
-                state = self._wire.read_state(payload, side)
+                state = self._codec.read_state(payload, side)
                 if state is not None:
                     q[side], dq[side] = state
         joined: dict[Subject, float] = {}
@@ -326,8 +326,8 @@ class _Driver:
                 if role is Role.MONITOR:
                     joined = other.first_states()
                 else:
-                    other.look()
-        machine = self._wire.machine
+                    other.read_slowly()
+        machine = self._codec.machine
         self._watch.restart()
         return Observation(self.now_ns, q, dq, joined, self._stopped, machine)
 
@@ -342,22 +342,22 @@ class _Client:
     def __init__(
         self,
         rig: RigOptions,
-        wire: Wire,
+        codec: MotorCodec,
         sides: tuple[Subject, ...],
         claim: bytes,
         type_name: str | None = None,
     ) -> None:
         self._node = _node(rig)
-        commands = {wire.command_topics[s] for s in sides}
-        states = {wire.state_topics[s] for s in sides} if type_name is None else set()
+        commands = {codec.command_topics[s] for s in sides}
+        states = {codec.state_topics[s] for s in sides} if type_name is None else set()
         self._states = states
-        kind = type_name or wire.command
+        kind = type_name or codec.command
         self._writers: dict[str, Writer] = {
             t: self._node.writer(t, kind, qos=Qos.writer_default(), user_data=claim)
             for t in commands
         }
         self._readers: dict[str, Reader] = {
-            t: self._node.reader(t, wire.state, qos=Qos.reader_default()) for t in states
+            t: self._node.reader(t, codec.state, qos=Qos.reader_default()) for t in states
         }
 
     def send(self, topic: str, payload: bytes, stamp_ns: int | None = None) -> None:
@@ -396,23 +396,25 @@ class _Client:
 class _Monitor:
     """Another listener: the late joiner, or a slow reader."""
 
-    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Subject, ...], qos: Qos) -> None:
+    def __init__(
+        self, rig: RigOptions, codec: MotorCodec, sides: tuple[Subject, ...], qos: Qos
+    ) -> None:
         self._node = _node(rig)
         self._sides = sides
-        self._wire = wire
+        self._codec = codec
         self._readers = {
-            t: self._node.reader(t, wire.state, qos=qos)
-            for t in {wire.state_topics[s] for s in sides}
+            t: self._node.reader(t, codec.state, qos=qos)
+            for t in {codec.state_topics[s] for s in sides}
         }
         self._begin = time.monotonic()
         self._matched: dict[str, float] = {}
         self._first: dict[str, float] = {}
-        self._looked = self._begin
+        self._last_read = self._begin
 
-    def look(self) -> None:
+    def read_slowly(self) -> None:
         """Read what has come, but no more than twice a second."""
-        if time.monotonic() - self._looked >= 0.5:
-            self._looked = time.monotonic()
+        if time.monotonic() - self._last_read >= 0.5:
+            self._last_read = time.monotonic()
             for reader in self._readers.values():
                 reader.take()
 
@@ -425,9 +427,9 @@ class _Monitor:
             if topic not in self._first and reader.take():
                 self._first[topic] = now - self._matched.get(topic, now)
         return {
-            s: self._first[self._wire.state_topics[s]]
+            s: self._first[self._codec.state_topics[s]]
             for s in self._sides
-            if self._wire.state_topics[s] in self._first
+            if self._codec.state_topics[s] in self._first
         }
 
     def close(self) -> None:

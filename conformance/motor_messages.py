@@ -18,7 +18,7 @@ from dexkit.hand import JointMode, Side, Subject
 from dexkit.messages import MessageType, message_type
 from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
-__all__ = ["Motor", "Motors", "Wire", "mode_byte"]
+__all__ = ["Motor", "MotorCodec", "Motors", "mode_byte"]
 
 # The sequence of motors in a message, and the type of one of them. Written down here and not
 # taken from MessageType.motor_sequence: the kit's reading does not depend on what it tests.
@@ -60,7 +60,7 @@ def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) ->
     return index | status << 4 | timeout << 7
 
 
-class Wire:
+class MotorCodec:
     """Encodes commands and reads states of one dialect.
 
     :param joints: of one subject; by default those of a hand of the dialect's model.

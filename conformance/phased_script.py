@@ -33,13 +33,13 @@ class PhasedScript(ABC, Generic[A, O, P]):
     """A stimulus that marks its phases.
 
     :param start: what is known before the first action.
-    :param say: called with progress messages for the user.
+    :param report: called with progress messages for the user.
     :ivar phases: what was done when, on the recording's clock; kept with the recording.
     """
 
-    def __init__(self, start: O, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(self, start: O, report: Callable[[str], None] = lambda text: None) -> None:
         self.phases: list[P] = []
-        self._say = say
+        self._report = report
         self._obs = start
         self._next_ns = 0
 

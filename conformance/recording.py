@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.median import median
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
 from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.errors import ConformanceError, UsageError
@@ -165,7 +165,7 @@ class Recording:
     """Which layer's requirements it is judged by."""
 
     @classmethod
-    def of(
+    def decode(
         cls,
         trace: TraceLike,
         *,
@@ -204,13 +204,13 @@ class Recording:
             marks.append(usb.origin_ns)
         origin = min([int(t[0]) for t in times] + marks, default=0)
         end = max([int(t[-1]) for t in times] + marks, default=0)
-        wire = Wire(chosen)
+        codec = MotorCodec(chosen)
         with np.errstate(invalid="ignore"):  # any NaN is a finding, not a surprise
             views: dict[Subject, SideView] = {
                 s: SideView(
                     s,
-                    _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
-                    _commands(wire, s, samples.get(chosen.topics(s)[0]), origin),
+                    _states(codec, s, samples.get(chosen.topics(s)[1]), origin),
+                    _commands(codec, s, samples.get(chosen.topics(s)[0]), origin),
                     joints_of(chosen, s),
                 )
                 for s in sorted(Side, key=lambda s: s is not Side.LEFT)
@@ -331,24 +331,24 @@ def _usb(trace: TraceLike) -> UsbRecording | None:
         return None
     from dexkit.conformance.usb.recording import UsbRecording  # few recordings have it
 
-    return UsbRecording.of(trace)
+    return UsbRecording.decode(trace)
 
 
 def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
     return np.asarray((times - origin) / 1e9, dtype=np.float64)
 
 
-def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> States:
-    topic = wire.dialect.topics(side)[1]
-    if samples is None or samples.type_name != wire.dialect.state_type:
-        t, none = np.empty(0), np.empty((0, wire.joints))
+def _states(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> States:
+    topic = codec.dialect.topics(side)[1]
+    if samples is None or samples.type_name != codec.dialect.state_type:
+        t, none = np.empty(0), np.empty((0, codec.joints))
         return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)
     columns = samples.decoded
     if columns is None:
-        columns = wire.state.columns(samples.payloads)
+        columns = codec.state.columns(samples.payloads)
 
-    def of(name: str) -> Floats:
-        return _joints(columns, wire, side, wire.state_sequence, name)
+    def column(name: str) -> Floats:
+        return _joints(columns, codec, side, codec.state_sequence, name)
 
     sent = _seconds(samples.publish_time_ns, origin)
     sent[samples.publish_time_ns == 0] = np.nan
@@ -356,12 +356,12 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
         sent=sent,
-        length=columns.count(wire.state_sequence),
-        q=of("q"),
-        dq=of("dq"),
-        ddq=of("ddq"),
-        tau=of("tau_est") * (wire.dialect.torque_units or 1.0),
-        mode=of("mode"),
+        length=columns.count(codec.state_sequence),
+        q=column("q"),
+        dq=column("dq"),
+        ddq=column("ddq"),
+        tau=column("tau_est") * (codec.dialect.torque_units or 1.0),
+        mode=column("mode"),
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
     )
@@ -375,36 +375,36 @@ def _is_blank(view: SideView) -> bool:
     return len(states) > 0 and not any(np.nan_to_num(a).any() for a in (*said, *drives))
 
 
-def _joints(columns: Columns, wire: Wire, side: Side, sequence: str, name: str) -> Floats:
+def _joints(columns: Columns, codec: MotorCodec, side: Side, sequence: str, name: str) -> Floats:
     """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
-    first = wire.dialect.index[side]
+    first = codec.dialect.index[side]
     # a joint's values lie together, for checks go joint by joint
-    return columns.table([f"{sequence}[{first + i}].{name}" for i in range(wire.joints)])
+    return columns.table([f"{sequence}[{first + i}].{name}" for i in range(codec.joints)])
 
 
-def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> Commands:
-    topic = wire.dialect.topics(side)[0]
-    if samples is None or samples.type_name != wire.dialect.cmd_type:
-        none = np.empty((0, wire.joints))
+def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> Commands:
+    topic = codec.dialect.topics(side)[0]
+    if samples is None or samples.type_name != codec.dialect.cmd_type:
+        none = np.empty((0, codec.joints))
         count = np.empty(0, np.intp)
         return Commands(topic, np.empty(0), count, none, none, none, none, none, none)
     columns = samples.decoded
     if columns is None:
-        columns = wire.command.columns(samples.payloads)
+        columns = codec.command.columns(samples.payloads)
 
-    def of(name: str) -> Floats:
-        return _joints(columns, wire, side, wire.command_sequence, name)
+    def column(name: str) -> Floats:
+        return _joints(columns, codec, side, codec.command_sequence, name)
 
     return Commands(
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
-        length=columns.count(wire.command_sequence),
-        q=of("q"),
-        dq=of("dq"),
-        tau=of("tau"),
-        kp=of("kp"),
-        kd=of("kd"),
-        mode=of("mode"),
+        length=columns.count(codec.command_sequence),
+        q=column("q"),
+        dq=column("dq"),
+        tau=column("tau"),
+        kp=column("kp"),
+        kd=column("kd"),
+        mode=column("mode"),
     )
 
 

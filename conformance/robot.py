@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.motor_messages import Motor, Motors, Wire
+from dexkit.conformance.motor_messages import Motor, MotorCodec, Motors
 from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.errors import ConformanceError, WireError
@@ -30,12 +30,12 @@ from dexkit.wire.low_level import encode_with_crc, verify_payload
 
 __all__ = [
     "SPOILS",
+    "RobotMotorCodec",
     "RobotRecording",
-    "RobotWire",
+    "codec_for",
     "robot_dialect",
     "robot_in",
     "robot_recording",
-    "wire_for",
 ]
 
 Flags = NDArray[np.bool_]
@@ -70,7 +70,7 @@ SPOILS = {
 """Wrong CRCs of commands."""
 
 
-class RobotWire(Wire):
+class RobotMotorCodec(MotorCodec):
     """Encodes commands and reads states of a robot.
 
     :ivar machine: ``mode_machine`` of the last state that was read; commands repeat it.
@@ -125,9 +125,9 @@ class RobotWire(Wire):
         return message
 
 
-def wire_for(dialect: Dialect) -> Wire:
+def codec_for(dialect: Dialect) -> MotorCodec:
     """The messages of a hand's or a robot's dialect."""
-    return RobotWire(dialect) if dialect.model in ROBOTS else Wire(dialect)
+    return RobotMotorCodec(dialect) if dialect.model in ROBOTS else MotorCodec(dialect)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,17 +280,17 @@ def _commands(model: RobotModel, samples: SampleArray | None, origin: int) -> Co
         )
     columns = samples.columns()
 
-    def of(name: str) -> Floats:
+    def column(name: str) -> Floats:
         return _used(columns, model, f"motor_cmd[].{name}")
 
     return Commands(
         topic=model.cmd_topic,
         t=_times(samples, origin)[0],
         length=np.where(columns.ok, model.slots, -1).astype(np.intp),
-        q=of("q"),
-        dq=of("dq"),
-        tau=of("tau"),
-        kp=of("kp"),
-        kd=of("kd"),
-        mode=of("mode"),
+        q=column("q"),
+        dq=column("dq"),
+        tau=column("tau"),
+        kp=column("kp"),
+        kd=column("kd"),
+        mode=column("mode"),
     )

@@ -27,7 +27,7 @@ from dexkit.conformance.results import RunResult
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import ROBOT, Side, Subject
@@ -339,7 +339,7 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
 
 def run_suite(
     options: SuiteOptions,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
     *,
     attempts: int = 2,
@@ -360,16 +360,16 @@ def run_suite(
     result: RunResult | None = None
     while result is None or (result.disturbed and attempts > 0):
         if result is not None:
-            say("the machine was too busy to be fair to the hand; once more")
+            report("the machine was too busy to be fair to the hand; once more")
         attempts -= 1
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(TemporaryFolder())
             if (domain := options.domain) is None:
                 domain = stack.enter_context(reserve_free_domain(options.interface)).domain
             path = options.recording or folder / "run.mcap"
-            if not record_run(live_options(options, domain), path, say=say, stop=stop):
+            if not record_run(live_options(options, domain), path, report=report, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")
-            say("judging the recording")
+            report("judging the recording")
             trace = open_trace(path)
             view = recording_of(trace, options.dialect.name, options.sides)
             if trace.damage:

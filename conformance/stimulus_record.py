@@ -98,7 +98,7 @@ class Beats:
     late_us: list[int] = field(default_factory=list)
 
     @classmethod
-    def of(cls, text: str) -> Beats:
+    def parse(cls, text: str) -> Beats:
         """Read the record's content.
 
         :raises TypeError, ValueError, TraceUnsupported: it is damaged.
@@ -205,7 +205,7 @@ class Stimulus:
                     for s, q in _json(record["objects"]).items()
                 },
                 stalls=stalls_of(record["stalls"]),
-                beats=Beats.of(record.get("beats", "{}")),
+                beats=Beats.parse(record.get("beats", "{}")),
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error

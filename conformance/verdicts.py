@@ -251,7 +251,9 @@ class Judgement:
                 return self.result(Verdict.BLOCKED, Outcome(None, reason=reason), before)
         return None
 
-    def of(self, check: Callable[[], Outcome], excuse: Callable[[Outcome], Excuse]) -> Result:
+    def run_check(
+        self, check: Callable[[], Outcome], excuse: Callable[[Outcome], Excuse]
+    ) -> Result:
         """What the check finds.
 
         :param excuse: what the machine has to do with a failure.

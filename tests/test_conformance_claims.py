@@ -75,7 +75,7 @@ def test_without_a_file_nothing_changes() -> None:
 
 
 def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
-    recording = Recording.of(short_run())
+    recording = Recording.decode(short_run())
     silent = judge(recording)
     assert of(silent, VELOCITY.id).requirement.level is Level.SHOULD
     assert silent.claims is None
@@ -94,7 +94,7 @@ def test_what_is_claimed_is_a_must_and_what_is_not_is_not_claimed() -> None:
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
     claims = Claims.parse(text) if text else Claims()
     (applied,) = claims.apply([requirement])
-    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: Excuse())
+    return Judgement(applied, Side.LEFT, claims, {}).run_check(lambda: outcome, lambda _: Excuse())
 
 
 @pytest.mark.parametrize("met", [None, True])

@@ -95,7 +95,7 @@ class Unhurried(ReferenceService):
 
 def judged(service: type[Service], claims: Claims | None = None) -> RunResult:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=PHASES)
-    return judge(Recording.of(run_virtual(plan, service)), claims=claims)
+    return judge(Recording.decode(run_virtual(plan, service)), claims=claims)
 
 
 def blamed(result: RunResult) -> set[str]:
@@ -120,13 +120,13 @@ def test_an_honest_hand_is_warned_at_most(service: type[Service], warned: set[st
 
 
 def test_a_hand_that_rests_where_it_is_told_to_be_is_not_frozen() -> None:
-    fresh = of(judge(Recording.of(listened(Hesitates))), "DEX1-FRESH-02")
+    fresh = of(judge(Recording.decode(listened(Hesitates))), "DEX1-FRESH-02")
     assert fresh.verdict is Verdict.PASS
     assert 0.08 < fresh.values["frozen_s"] < 0.15  # and not the second of rest before it
 
 
 def test_a_gripper_that_is_quick_for_its_size_is_not_taken_for_percent() -> None:
-    speed = of(judge(Recording.of(listened(Quick))), "DEX1-FIELD-14")
+    speed = of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-14")
     assert speed.verdict is Verdict.PASS
     assert 30 < speed.values["speed_rad_s"] < 60
 
@@ -139,7 +139,7 @@ def test_what_a_plain_hand_does_not_claim_is_not_held_against_it() -> None:
 
 def test_the_kits_own_restart_of_the_service_is_no_gap_of_the_hand() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"shutdown", "service-restart"}))
-    found = judge(Recording.of(run_virtual(plan, ReferenceService)))
+    found = judge(Recording.decode(run_virtual(plan, ReferenceService)))
     gap = of(found, "DEX1-RATE-03")
     assert gap.verdict is Verdict.PASS
     assert gap.values["max_gap_s"] < 0.1  # nor is it told as the longest
@@ -196,10 +196,12 @@ def test_nothing_is_told_of_motion_where_the_machine_was_overloaded(
     ("part", "late_ms"), [(0.02, 10.0), (0.05, 10.0), (0.05, 30.0), (0.2, 10.0)]
 )
 def test_late_stamps_do_not_bend_a_good_hands_acceleration(part: float, late_ms: float) -> None:
-    ratio = of(judge(Recording.of(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06")
+    ratio = of(
+        judge(Recording.decode(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06"
+    )
     assert ratio.verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE)
     turned = stamped_late(gripper.TurnedAcceleration, part, late_ms)
-    found = of(judge(Recording.of(turned)), "DEX1-FIELD-06")
+    found = of(judge(Recording.decode(turned)), "DEX1-FIELD-06")
     assert found.verdict is (Verdict.WARN if ratio.verdict is Verdict.PASS else ratio.verdict)
 
 
@@ -224,11 +226,11 @@ def listened(service: type[Service]) -> MemoryTrace:
 
 @pytest.mark.parametrize("off_s", [-3600.0, 0.4, 86400.0])
 def test_the_hands_clock_need_not_be_right(off_s: float) -> None:
-    right = judge(Recording.of(short_run()))
+    right = judge(Recording.decode(short_run()))
     trace = copy_of(short_run())
     topic = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     trace.rows[topic] = [(t, s + round(off_s * 1e9), p) for t, s, p in trace.rows[topic]]
-    found = judge(Recording.of(trace))
+    found = judge(Recording.decode(trace))
     assert [r.verdict for r in found.results] == [r.verdict for r in right.results]
     gap, was = of(found, "DEX1-WDOG-02"), of(right, "DEX1-WDOG-02")
     assert gap.values["max_gap_s"] == pytest.approx(was.values["max_gap_s"], abs=1e-6)

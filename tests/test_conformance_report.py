@@ -64,7 +64,7 @@ def parsed(page: str) -> Structure:
 
 @pytest.fixture(scope="module")
 def failing() -> str:
-    view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
+    view = Recording.decode(open_trace(sample_path("dex1_hand_dropout")))
     return render(judge(view, subject={"recording": "dex1_hand_dropout.mcap"}), view)
 
 
@@ -94,7 +94,7 @@ def test_it_knows_light_dark_phone_and_print(failing: str) -> None:
 
 
 def test_a_live_run_shows_its_phases() -> None:
-    view = Recording.of(short_run())
+    view = Recording.decode(short_run())
     page = render(judge(view, subject={"backend": "x", "device": "emulated"}), view)
     parsed(page)
     assert "No real hand was involved" in page
@@ -105,7 +105,7 @@ def test_a_live_run_shows_its_phases() -> None:
 def test_a_hand_that_was_never_heard_has_a_page_too() -> None:
     trace = copy_of(short_run())
     trace.rows = {k: v for k, v in trace.rows.items() if k[0].endswith("cmd")}
-    view = Recording.of(trace)
+    view = Recording.decode(trace)
     page = render(judge(view), view)
     parsed(page)
     assert "No state of this hand was received" in page
@@ -113,7 +113,7 @@ def test_a_hand_that_was_never_heard_has_a_page_too() -> None:
 
 def test_nan_in_states_does_not_reach_the_drawing() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"}))
-    view = Recording.of(run_virtual(plan, gripper.NanVelocity))
+    view = Recording.decode(run_virtual(plan, gripper.NanVelocity))
     assert "nan" not in "".join(re.findall(r' d="[^"]*"', render(judge(view), view)))
 
 
@@ -160,7 +160,7 @@ def test_a_busy_testing_machine_is_not_passed_over() -> None:
 
 
 def test_a_page_does_not_grow_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
+    view = Recording.decode(open_trace(sample_path("dex1_hand_dropout")))
     result = judge(view)
     monkeypatch.setattr("dexkit.conformance.report.html._PLOT_BUDGET", 1)
     page = render(result, view)
@@ -223,7 +223,7 @@ WRONG = {m.name: m.made for m in mutants() if m.model == "dex1-1"}
 def test_a_failure_shows_the_plots_of_its_requirement(
     name: str, phases: set[str], need: str, titles: list[str]
 ) -> None:
-    view = Recording.of(
+    view = Recording.decode(
         run_virtual(replace(PLAN, phases=frozenset(phases)), WRONG[name]),
         dialect_name="unitree_go",
         sides=(Side.LEFT,),
@@ -247,7 +247,7 @@ def test_a_usb_finding_shows_bytes_or_joints_or_descriptors() -> None:
         wrong_usb.OtherRelease: "<td>2.00</td>",
         wrong_usb.Slow: "from command to answer",
     }
-    view = Recording.of(short_run())
+    view = Recording.decode(short_run())
     every = catalogue("dex3-1", "usb")
     for device, title in kinds.items():
         kills = next(m.kills for m in mutants() if m.made is device)

@@ -27,7 +27,7 @@ from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.robot import (
     SPOILS,
-    RobotWire,
+    RobotMotorCodec,
     robot_dialect,
     robot_in,
     robot_recording,
@@ -74,9 +74,9 @@ def judged(trace: MemoryTrace, name: str) -> RunResult:
 
 @pytest.mark.parametrize("model", ROBOTS.values(), ids=NAMES)
 def test_commands_are_what_the_codec_reads(model: RobotModel) -> None:
-    wire = RobotWire(robot_dialect(model.name))
+    codec = RobotMotorCodec(robot_dialect(model.name))
     motors = [Motor(0.1 * i, 0.2, 0.3, 4.0, 0.5, i % 3) for i in range(model.slots)]
-    payload = wire.low_command(motors, 7)
+    payload = codec.low_command(motors, 7)
     assert verify_payload(model.cmd_type, payload)
     message = decode(model.cmd_type, payload)
     read = [(m.mode, m.q, m.dq, m.tau, m.kp, m.kd) for m in message.motor_cmd]
@@ -90,9 +90,9 @@ def test_commands_are_what_the_codec_reads(model: RobotModel) -> None:
 
 @pytest.mark.parametrize("kind", SPOILS)
 def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
-    wire = RobotWire(robot_dialect("h1"))
+    codec = RobotMotorCodec(robot_dialect("h1"))
     motors = [Motor(q=0.5)] * 20
-    good, bad = wire.low_command(motors, 0), wire.low_command(motors, 0, kind)
+    good, bad = codec.low_command(motors, 0), codec.low_command(motors, 0, kind)
     assert good[:-4] == bad[:-4]
     assert not verify_payload(H1.cmd_type, bad)
     right = crc_of(decode(H1.cmd_type, good))

@@ -155,7 +155,7 @@ def test_what_is_quick_is_derived_from_the_stimuli(name: str) -> None:
 
 def test_the_length_of_a_stimulus_is_that_of_a_run() -> None:
     plan = replace(plan_for(), phases=frozenset({"step", "nan", "squeeze"}), session=None)
-    recording = Recording.of(run_virtual(plan, ReferenceService))
+    recording = Recording.decode(run_virtual(plan, ReferenceService))
     assert length("dex1-1", plan.phases) == pytest.approx(recording.duration, rel=0.3)
 
 
@@ -204,7 +204,7 @@ def run_live(
     rig = RigOptions(EXTERNAL, sides, chosen, domain)
     with ServiceOnDds(service(chosen, sides, {}), domain):
         assert record_run(LiveOptions(rig, phases_for(wanted)), path)
-    return judge(Recording.of(open_trace(path), sides=sides), requirements=wanted)
+    return judge(Recording.decode(open_trace(path), sides=sides), requirements=wanted)
 
 
 def test_a_good_hand_passes_on_dds(tmp_path: Path) -> None:
@@ -251,7 +251,9 @@ def test_a_recording_of_nobody_is_a_failure_not_a_success(tmp_path: Path) -> Non
     path = tmp_path / "run.mcap"
     with Recorder(path):
         pass
-    result = judge(Recording.of(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)))
+    result = judge(
+        Recording.decode(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,))
+    )
     assert str(result.overall) == "fail"
     assert failed(result) == {("DEX1-TOPIC-01", "left")}
     assert result.stage == {"left": "no participant"}
@@ -279,11 +281,13 @@ def test_a_run_can_be_stopped_and_leaves_nothing_behind(tmp_path: Path) -> None:
     rig = RigOptions("sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain())
     stop = threading.Event()
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         if text.startswith("listening"):
             stop.set()
 
-    assert not record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap", say=say, stop=stop)
+    assert not record_run(
+        LiveOptions(rig, frozenset()), tmp_path / "run.mcap", report=report, stop=stop
+    )
     left = subprocess.run(
         ["pgrep", "-f", f"--domain {rig.domain} "], capture_output=True, text=True
     )
@@ -342,7 +346,7 @@ def test_the_emulated_ezgripper_passes_as_a_user_runs_it(tmp_path: Path) -> None
     assert files[1].read_text().startswith("<!doctype html>")
     assert "DEX1-FORCE-01-right" in files[3].read_text()
     # the recording alone gives the same verdicts
-    again = judge(Recording.of(open_trace(files[2])))
+    again = judge(Recording.decode(open_trace(files[2])))
     told = {r["id"]: r["verdict"] for r in result["results"]}
     found = {r.requirement.id: str(r.verdict) for r in again.results}
     assert {name: found[name] for name in told} == told

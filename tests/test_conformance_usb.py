@@ -24,6 +24,7 @@ from dexkit.conformance.mutants.matrix import Outcome, try_one
 from dexkit.conformance.mutants.trials import run_usb_mutant
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Verdict
+from dexkit.conformance.stimuli.usb import BUSES, DAMAGES
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
 from dexkit.conformance.usb.record import (
@@ -37,7 +38,6 @@ from dexkit.conformance.usb.record import (
 )
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
-from dexkit.conformance.usb.script import BUSES, DAMAGES
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.errors import ConformanceError, TraceUnsupported
 from dexkit.hand import Side
@@ -146,7 +146,7 @@ def test_a_recording_is_judged_from_the_file_as_it_was(tmp_path: Path) -> None:
     trace = open_trace(tmp_path / "run.mcap")
     assert trace.warnings == []
     assert trace.topics == ["usb/dex3/right/in", "usb/dex3/right/out"]
-    read = UsbRecording.of(trace)
+    read = UsbRecording.decode(trace)
     assert read is not None
     assert judge_layer(USB, read.since(live.origin_ns), usb()) == judge_layer(USB, live, usb())
 
@@ -263,8 +263,8 @@ def test_an_emulated_hand_passes_and_a_faulty_one_beside_it_does_not(
     ):
         faulty.wait_ready(threading.Event())
         devices = {Side.LEFT: hands, Side.RIGHT: faulty.place}
-        assert run(devices, recorder, say=said.append)
-    recording = UsbRecording.of(open_trace(tmp_path / "run.mcap"))
+        assert run(devices, recorder, report=said.append)
+    recording = UsbRecording.decode(open_trace(tmp_path / "run.mcap"))
     assert recording is not None
     assert set(recording.sides) == set(Side)
     results = judge_layer(USB, recording, usb())

@@ -176,7 +176,7 @@ def test_a_gap_no_longer_than_the_kits_own_lateness_is_not_blamed_on_the_hand() 
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     begin = trace.rows[key][0][0] + round(2.5e9)
     trace.rows[key] = [r for r in trace.rows[key] if not begin <= r[0] < begin + 200_000_000]
-    assert of(judge(Recording.of(trace)), GAP.id).verdict is Verdict.FAIL
+    assert of(judge(Recording.decode(trace)), GAP.id).verdict is Verdict.FAIL
     result = judge(with_beats(trace, [begin]))
     found = of(result, GAP.id)
     assert found.verdict is Verdict.BLOCKED
@@ -196,18 +196,18 @@ def test_a_gap_no_longer_than_the_kits_own_lateness_is_not_blamed_on_the_hand() 
 def test_a_client_that_could_not_keep_its_rate_blames_no_hand() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", OPERATOR}))
     trace = run_virtual(plan, LateState)
-    lag = of(judge(Recording.of(trace)), "DEX1-OPER-02")
+    lag = of(judge(Recording.decode(trace)), "DEX1-OPER-02")
     assert lag.verdict is Verdict.WARN
     commands = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
     trace.rows[commands] = trace.rows[commands][::2]
-    starved = of(judge(Recording.of(trace)), "DEX1-OPER-02")
+    starved = of(judge(Recording.decode(trace)), "DEX1-OPER-02")
     assert starved.verdict is Verdict.NOT_APPLICABLE
     assert "of 200 commands a second" in starved.reason
 
 
 def test_what_a_failure_blocks_names_it() -> None:
     trace = copy_of(short_run())
-    result = judge(Recording.of(trace, dialect_name="unitree_hg"))
+    result = judge(Recording.decode(trace, dialect_name="unitree_hg"))
     blocked = [r for r in result.results if r.verdict is Verdict.BLOCKED]
     assert blocked
     failing = {r.requirement.id for r in result.results if r.verdict is not Verdict.PASS}
@@ -221,7 +221,7 @@ def test_a_check_that_breaks_is_the_kits_error_and_blocks() -> None:
         raise ZeroDivisionError("1/0")
 
     found: dict[str, Result] = {}
-    error = Judgement(GAP, Side.LEFT, Claims(), found).of(broken, blame)
+    error = Judgement(GAP, Side.LEFT, Claims(), found).run_check(broken, blame)
     assert error.verdict is Verdict.ERROR
     assert error.reason == "the check itself failed: ZeroDivisionError: 1/0"
     found[GAP.id] = error
@@ -232,13 +232,15 @@ def test_a_check_that_breaks_is_the_kits_error_and_blocks() -> None:
 
 def test_a_failure_is_explained_in_full() -> None:
     outcome = Outcome(False, "x", "seen", evidence=(Evidence("rt/x", 1.5, 0, 2.0),))
-    result = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome, blame)
+    result = Judgement(GAP, Side.LEFT, Claims(), {}).run_check(lambda: outcome, blame)
     assert result.verdict is Verdict.FAIL
     lines = dict(line.strip().split(": ", 1) for line in result.explain().splitlines()[1:])
     assert {k.strip() for k in lines} >= {"required", "observed", "cause", "try", "source"}
     assert "rt/x at 1.500 s to 2.000 s" in result.explain()
     assert GAP.cause in result.explain()
-    told = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome.because("the moon"), blame)
+    told = Judgement(GAP, Side.LEFT, Claims(), {}).run_check(
+        lambda: outcome.because("the moon"), blame
+    )
     assert told.cause == "the moon"
 
 
@@ -276,7 +278,7 @@ def test_a_beat_that_was_due_in_a_stretch_counts_for_it() -> None:
 
 
 def test_a_stimulus_that_was_not_applied_says_what_to_do() -> None:
-    touch = of(judge(Recording.of(short_run())), "DEX1-FORCE-01")
+    touch = of(judge(Recording.decode(short_run())), "DEX1-FORCE-01")
     assert touch.verdict is Verdict.NOT_APPLICABLE
     assert touch.reason == (
         "the stimulus 'squeeze' was not applied in this run: put something between the fingers, "

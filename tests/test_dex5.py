@@ -312,7 +312,7 @@ def test_the_synthetic_session_is_what_its_helper_writes(tmp_path: Path) -> None
 
 
 def test_the_synthetic_session_is_judged_as_a_dex5() -> None:
-    recording = Recording.of(open_trace(sample_path("dex5_synthetic")))
+    recording = Recording.decode(open_trace(sample_path("dex5_synthetic")))
     assert recording.dialect is DEX5
     result = judge(recording)
     assert result.overall is Overall.PASS

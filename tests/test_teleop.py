@@ -45,7 +45,7 @@ pinches = st.floats(0.0, 12.0)
 
 @cache
 def recording(name: str) -> Recording:
-    return Recording.of(open_trace(sample_path(name)))
+    return Recording.decode(open_trace(sample_path(name)))
 
 
 def q_of(commands: Mapping[Side, tuple[JointCommand, ...]], side: Side) -> float:

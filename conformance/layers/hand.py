@@ -33,7 +33,7 @@ def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]
     hands = tuple(s for s in sides if isinstance(s, Side))
     if len(hands) < len(sides):
         raise UsageError("a hand is on the left or the right side", hint="give --side")
-    return Recording.of(trace, dialect_name=dialect_name, sides=hands)
+    return Recording.decode(trace, dialect_name=dialect_name, sides=hands)
 
 
 def subjects(recording: Recording) -> Iterable[tuple[Subject, SideView]]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.conformance.stimuli.script import (
     Action,
     Join,
@@ -25,7 +26,6 @@ from dexkit.conformance.stimuli.script import (
     StartService,
     StopService,
 )
-from dexkit.conformance.stimuli.session import Session
 from dexkit.models import model
 from dexkit.robots import ROBOTS
 
@@ -53,9 +53,9 @@ def script_class(model_name: str) -> type[Script[Any]]:
     return (ROBOTS.get(model_name) or model(model_name)).script.load()
 
 
-def script_for(plan: Plan[S], say: Callable[[str], None] = lambda text: None) -> Script[S]:
+def script_for(plan: Plan[S], report: Callable[[str], None] = lambda text: None) -> Script[S]:
     """The script of the plan's model."""
-    return script_class(plan.dialect.model)(plan, say)
+    return script_class(plan.dialect.model)(plan, report)
 
 
 def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:

@@ -56,7 +56,7 @@ def operate(script: HandScript) -> Steps:
     plan = script.plan
     if not plan.dialect.has_client:
         return  # no client of Unitree's speaks it, and none of the requirements applies
-    script._say("an operator at Unitree's client: full strokes, steps, slow motion")
+    script._report("an operator at Unitree's client: full strokes, steps, slow motion")
     phase = script._begin(OPERATOR, plan.sides, profile=PROFILE)
     phase.params.update({f"most_{s}": f"{_most(plan, s):.6g}" for s in plan.sides})
     operator = operator_of(phase, plan.dialect)
@@ -72,7 +72,7 @@ def operate(script: HandScript) -> Steps:
     while script._elapsed(phase) < operator.profile.duration:
         now = receive()
         commands = client.step(now, {}, operator.inputs(now, plan.sides))
-        payloads = script._wire.encode(
+        payloads = script._codec.encode(
             {s: [Motor(**m._asdict()) for m in motors] for s, motors in commands.items()}
         )
         # the next turn, without making up for turns that were missed

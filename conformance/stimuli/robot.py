@@ -35,7 +35,7 @@ from functools import partial
 
 from dexkit.command_age import PAUSE
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.robot import SPOILS, RobotWire
+from dexkit.conformance.robot import SPOILS, RobotMotorCodec
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -69,11 +69,11 @@ class RobotScript(Script[RobotSubject]):
     motion = "joint"
 
     def __init__(
-        self, plan: Plan[RobotSubject], say: Callable[[str], None] = lambda text: None
+        self, plan: Plan[RobotSubject], report: Callable[[str], None] = lambda text: None
     ) -> None:
-        super().__init__(plan, say)
+        super().__init__(plan, report)
         self._robot = robot(plan.dialect.model)
-        self._coder = RobotWire(plan.dialect)
+        self._codec = RobotMotorCodec(plan.dialect)
         self._joints = {ROBOT: tuple(self._robot.joint(slot) for slot in self._robot.used)}
         self._period_ns = round(1e9 / self._robot.teleop_rate)
         self._slot = self._robot.slot(_JOINT)
@@ -95,7 +95,7 @@ class RobotScript(Script[RobotSubject]):
         if ROBOT not in self._obs.q:
             yield from self._wake()
         if ROBOT not in self._obs.q:
-            self._say("no state: the rest of the script is left out")
+            self._report("no state: the rest of the script is left out")
             return
         self._start = dict(zip(self._robot.used, self._obs.q[ROBOT], strict=True))
         self._goal = {ROBOT: self._obs.q[ROBOT]}
@@ -164,7 +164,7 @@ class RobotScript(Script[RobotSubject]):
         sent = own if machine is None else machine
         key = (tuple(order), sent, spoil)
         if key != self._sent[0]:  # they are held for long, and encoded once
-            self._sent = (key, self._coder.low_command(order, sent, spoil))
+            self._sent = (key, self._codec.low_command(order, sent, spoil))
         yield from self._send([(self._robot.cmd_topic, self._sent[1])])
 
     def _keep(self, seconds: float) -> Steps:
@@ -226,12 +226,12 @@ class RobotScript(Script[RobotSubject]):
         self._end(phase)
 
     def _every_joint(self) -> Steps:
-        self._say("moving one joint at a time by 0.2 rad")
+        self._report("moving one joint at a time by 0.2 rad")
         for slot in self._robot.used:
             yield from self._step("joint", slot)
 
     def _stiffness(self) -> Steps:
-        self._say("a soft joint, a speed, a torque")
+        self._report("a soft joint, a speed, a torque")
         kp, _ = self._robot.client_gains[self._slot]
         soft = kp / 4
         self._order = self._with(kp=soft)
@@ -287,7 +287,7 @@ class RobotScript(Script[RobotSubject]):
         yield from self._keep(0.1)
 
     def _wrong_crc(self) -> Steps:
-        self._say("commands that are wrong: nothing may move")
+        self._report("commands that are wrong: nothing may move")
         for kind in SPOILS:
             order = self._wish()
             yield from self._bad("wrong-crc", partial(self._put, order, kind), 0.25, kind=kind)
@@ -314,7 +314,7 @@ class RobotScript(Script[RobotSubject]):
         wish = list(self._order)  # of every joint: the families' slots are not the same
         for slot in self._robot.used:
             wish[slot] = replace(wish[slot], q=wish[slot].q + self._inward(slot, STEP))
-        payload = self._coder.foreign_command(wish)
+        payload = self._codec.foreign_command(wish)
 
         def send() -> Steps:
             self._next_ns += self._period_ns
@@ -328,7 +328,9 @@ class RobotScript(Script[RobotSubject]):
     # -- silence and life cycle ----------------------------------------------------------------
 
     def _silence(self, name: str, seconds: float) -> Steps:
-        self._say("commands pause while a joint is driven: it may go on for a second, not longer")
+        self._report(
+            "commands pause while a joint is driven: it may go on for a second, not longer"
+        )
         speed = self._inward(self._slot, _SPEED)
         self._order = self._with(kp=0.0, dq=speed)
         yield from self._keep(0.3)
@@ -357,7 +359,7 @@ class RobotScript(Script[RobotSubject]):
         yield Leave()
 
     def _restart(self) -> Steps:
-        self._say("the commanding program is restarted: the new one must be obeyed")
+        self._report("the commanding program is restarted: the new one must be obeyed")
         yield Restart()
         self._next_ns = self._obs.now_ns
         yield from self._keep(0.2)

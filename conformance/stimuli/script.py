@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Generic, TypeVar
 
 from dexkit.conformance.phased_script import PhasedScript, play
-from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
 from dexkit.models import Dialect, model
@@ -166,8 +166,8 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
     motion = "step"
     """The phase in which the hand moves, for requirements that need any motion."""
 
-    def __init__(self, plan: Plan[S], say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(Observation(0), say)
+    def __init__(self, plan: Plan[S], report: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(Observation(0), report)
         self.plan = plan
         self._joints: dict[S, tuple[JointSpec, ...]] = {}
         self._goal: dict[S, Pose] = {}
@@ -223,6 +223,6 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
         return self._mark(Phase(name, tuple(sides), begin_ns, targets=goals, params=params))
 
     def _listen(self) -> Steps:
-        self._say("listening: the state must flow before the first command")
+        self._report("listening: the state must flow before the first command")
         phase = self._begin("listen", self.plan.sides)
         yield from self._through(phase, 1.2, lambda: self._wait(0.05))

@@ -177,7 +177,7 @@ class UsbRecord:
         try:
             found = cls(
                 stalls=stalls_of(record["stalls"]),
-                beats=Beats.of(record.get("beats", "{}")),
+                beats=Beats.parse(record.get("beats", "{}")),
             )
             for side in Side:
                 if str(side) in record:

@@ -162,4 +162,4 @@ class ReferenceService(Service):
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of these grippers on the wire."""
-        return self.wire.state_payload({s: [self.fields(s)] for s in sides}, length, **self.rest())
+        return self.codec.state_payload({s: [self.fields(s)] for s in sides}, length, **self.rest())

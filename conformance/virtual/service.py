@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dexkit.conformance.motor_messages import Motor, Wire
+from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.errors import WireError
@@ -145,8 +145,8 @@ class Service(TopicDevice):
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, tuple(sides), touch)
-        self.wire = Wire(dialect)
-        self._heard: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
+        self.codec = MotorCodec(dialect)
+        self._decoded: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         """Take a command message.
@@ -154,14 +154,14 @@ class Service(TopicDevice):
         :param client: which of the clients there have been sent it, from 0.
         """
         for side in self.sides:
-            if self.wire.command_topics[side] != topic:
+            if self.codec.command_topics[side] != topic:
                 continue
-            if self._heard.get(side, (b"", None))[0] != payload:
+            if self._decoded.get(side, (b"", None))[0] != payload:
                 try:
-                    self._heard[side] = (payload, self.wire.read_command(payload, side))
+                    self._decoded[side] = (payload, self.codec.read_command(payload, side))
                 except WireError:
                     continue
-            motors = self._heard[side][1]
+            motors = self._decoded[side][1]
             if motors is not None:
                 self.motors(side, motors)
 
@@ -171,13 +171,13 @@ class Service(TopicDevice):
 
     def positions(self, side: Side) -> Pose:
         """The pose of a hand."""
-        return (0.0,) * self.wire.joints
+        return (0.0,) * self.codec.joints
 
     def publish(self) -> list[Sample]:
         """One state of every hand."""
-        if self.wire.shared:
+        if self.codec.shared:
             return [self.sample(self.dialect.state_topic, self.sides)]
-        return [self.sample(self.wire.state_topics[s], (s,)) for s in self.sides]
+        return [self.sample(self.codec.state_topics[s], (s,)) for s in self.sides]
 
     def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
         """The state message of these sides."""
@@ -188,4 +188,4 @@ class Service(TopicDevice):
 
         :param length: motors in the sequence, if not the dialect's.
         """
-        return self.wire.state_payload({}, length)
+        return self.codec.state_payload({}, length)

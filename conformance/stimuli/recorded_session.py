@@ -38,7 +38,7 @@ class Session:
         :raises TraceError: it cannot be read.
         """
         trace = open_trace(path)
-        recording = Recording.of(trace)
+        recording = Recording.decode(trace)
         if trace.damage:
             raise TraceError(
                 f"{path.name} is damaged, and not replayed: {trace.damage[0]}",
