@@ -1,6 +1,6 @@
-"""The processes that a live run starts: emulated devices and services, through the command line.
+"""Start the processes of a live run: emulated devices, services, emulated robots.
 
-The kit reaches backends only as a user would; nothing of them runs in its own process.
+They are started by their ``dexkit`` commands; no backend runs in the kit's own process.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 EXTERNAL = "external"
-"""The backend's name for a service that somebody else runs."""
+"""The backend's name for a service that the kit does not start."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Emulation:
         return ("emulate", *arguments, *place)
 
 
-_CLOSED_AT = "1510"  # encoder tick of the emulated zero: told to both, so nothing has to move
+_CLOSED_AT = "1510"  # encoder tick of the zero, given to emulator and driver: no calibration run
 EMULATED: dict[str, Emulation] = {
     "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), True, {"zero": _CLOSED_AT}),
-    # an emulated motor shares the machine with all the rest, and may be late
+    # an emulated motor shares the machine with all other processes, and may answer late
     "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.1"}),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }
@@ -87,7 +87,7 @@ class Tool(child_processes.Tool):
 
 @dataclass(frozen=True)
 class RigOptions:
-    """What to bring up.
+    """The backend's processes and their options.
 
     :param backend: name, ``module:Class``, or :data:`EXTERNAL`.
     :param devices: path or serial number by side; empty for an emulated one.
@@ -122,9 +122,9 @@ class RigOptions:
         return settings.get("usb", "")
 
     def check(self) -> None:
-        """Refuse what makes no sense.
+        """Check that the options fit together.
 
-        :raises UsageError: with what to do instead.
+        :raises UsageError: they do not; its hint says what to do.
         """
         if self.backend == EXTERNAL and (self.devices or self.settings):
             raise UsageError(
@@ -142,7 +142,7 @@ class RigOptions:
 
 
 class Rig:
-    """Everything that runs during a live run, except the kit itself; a context manager.
+    """The processes of a live run; a context manager.
 
     Entering it starts the emulated devices, :meth:`serve` the services on them.
 
@@ -158,7 +158,7 @@ class Rig:
         self._services: list[Tool] = []
         self._ended: set[Tool] = set()
         self.devices: dict[Side, str] = dict(options.devices)
-        """Where each side's device is, for the backend."""
+        """The device of each side: the value of ``--device``."""
 
     def __enter__(self) -> Rig:
         try:
@@ -228,14 +228,14 @@ class Rig:
             return all(pool.map(Tool.stop, self._services))
 
     def _groups(self) -> list[tuple[Side, ...]]:
-        """The sides that one service serves: one each, unless they share their topics."""
+        """The sides of each service: one service a side, or one for both on shared topics."""
         hands = self.options.hands
         topics = {self.options.dialect.topics(s) for s in hands}
         return [(s,) for s in hands] if len(topics) == len(hands) else [hands]
 
     @property
     def _place_on_dds(self) -> tuple[str, ...]:
-        """The options of a program that say where it is on DDS."""
+        """The options for the DDS domain and interface."""
         return "--domain", str(self.options.domain), "--interface", self.options.interface
 
     def _serve(self, sides: Sequence[Side], settings: Sequence[str]) -> Tool:
@@ -267,7 +267,7 @@ class Rig:
         return tool
 
     def dead(self) -> Tool | None:
-        """A process that has ended although it should not."""
+        """A process that has ended unasked, or None."""
         return next((t for t in self.tools if not t.running and t not in self._ended), None)
 
 

@@ -1,7 +1,7 @@
-"""A live run: bring the hand up, drive it by the script, record; the recording is the result.
+"""Do a live run: start the backend, play the stimulus script on DDS, record all topics.
 
-The kit is three participants, each in the role of a program that a hand meets: the client that
-commands, the recorder, and later a monitor that joins in mid-session.
+The kit creates three DDS participants: the commanding client, the recorder, and later a monitor
+that joins during the run.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class LiveOptions:
     usb: bool = False
 
     def plan(self) -> Plan[Subject]:
-        """What the script is to do."""
+        """The plan of the stimulus script."""
         dialect = self.rig.dialect
         return Plan(
             dialect=dialect,
@@ -110,7 +110,7 @@ def record_run(
             for t in (*dialect.topics(s), dialect.low_rate_topic.format(side=s))
             if t
         }
-        # the recorder listens before the hand is there: nothing of its start is missed
+        # the recorder starts before the backend, so that it records the hand's first samples
         recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
         if rig_options.backend != EXTERNAL:
             report(f"starting {rig_options.backend} on domain {rig_options.domain}")
@@ -121,8 +121,8 @@ def record_run(
         if stop.is_set():
             return False
         if rig_options.backend == EXTERNAL:
-            _expect_somebody(recorder_node, options)
-        # two clients on one hand would fight, and a real one may carry something
+            _require_hand(recorder_node, options)
+        # a second client would interfere, and a real hand may hold something
         sole = SolePublisher(
             [Place(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
             hint="stop that client, or choose another --domain",
@@ -133,14 +133,14 @@ def record_run(
         plan = options.plan()
         script = script_for(plan, report)
         heart = stack.enter_context(Heartbeat())
-        driver = stack.enter_context(_Driver(rig, plan, sole))
+        player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
-        _meet(recorder_node, plan)
-        finished = driver.go_through(script, stop)
+        _wait_for_endpoints(recorder_node, plan)
+        finished = player.play_script(script, stop)
         recording.stop()
-        driver.close()
+        player.close()
         rig.stop()
-        # what the services and emulated devices had to say, counters included
+        # last output of the services and emulated devices, with their counters
         recorder.add_metadata(TOOLS, {repr(tool): tool.last_words for tool in rig.tools})
         stimulus = Stimulus(
             phases=[p for p in script.phases if p.end_ns],
@@ -155,7 +155,7 @@ def record_run(
 def _judge_usb(
     rig: Rig, recorder: Recorder, report: Callable[[str], None], stop: threading.Event
 ) -> bool:
-    """The hands on USB, while nobody else has them; False when it was stopped."""
+    """Play the USB script, before a service opens the devices; False when it was stopped."""
     from dexkit.conformance.usb.run import run
 
     server = rig.options.usb_server
@@ -171,8 +171,11 @@ def _node(options: RigOptions) -> DdsNode:
     return DdsNode(domain=options.domain, interface=options.interface)
 
 
-def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
-    """Thirty failures of a hand that is not there would hide the one thing to know."""
+def _require_hand(node: DdsNode, options: LiveOptions) -> None:
+    """Refuse a run without a hand: all its failures would have that one cause.
+
+    :raises ConformanceError: no endpoint of another program is on the hand's topics.
+    """
     rig = options.rig
     topics = {t for s in rig.sides for t in rig.dialect.topics(s)}
     if node.discovery.wait(
@@ -193,8 +196,8 @@ def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
     )
 
 
-def _meet(node: DdsNode, plan: Plan[Subject]) -> None:
-    """Wait until the hands' endpoints are known; a hand without any is the checks' finding."""
+def _wait_for_endpoints(node: DdsNode, plan: Plan[Subject]) -> None:
+    """Wait until the hands' endpoints are discovered; a check reports missing ones."""
     wanted = {t for s in plan.sides for t in plan.dialect.topics(s)}
     node.discovery.wait(
         lambda endpoints: wanted <= {e.topic for e in endpoints if not e.own},
@@ -203,7 +206,7 @@ def _meet(node: DdsNode, plan: Plan[Subject]) -> None:
 
 
 @dataclass
-class _Driver:
+class _LivePlayer:
     """Carries out the script's actions on DDS."""
 
     rig: Rig
@@ -213,11 +216,11 @@ class _Driver:
     _others: dict[Role, _Client | _Monitor] = field(default_factory=dict)
     _stopped: dict[str, float | None] = field(default_factory=dict)
 
-    def __enter__(self) -> _Driver:
+    def __enter__(self) -> _LivePlayer:
         self._codec = codec_for(self.plan.dialect)
         self._clock = RealClock()
         self._watch = PauseWatch(self._clock)
-        # wall clock, as recordings have it, on a monotonic footing
+        # log times are wall clock; the offset to the monotonic clock is constant during a run
         self._offset = time.time_ns() - round(self._clock.now() * 1e9)
         self._client: _Client | None = self._new_client()
         return self
@@ -235,10 +238,10 @@ class _Driver:
 
     @property
     def now_ns(self) -> int:
-        """Now, on the recording's clock."""
+        """The present log time."""
         return round(self._clock.now() * 1e9) + self._offset
 
-    def go_through(self, script: Script[Subject], stop: threading.Event) -> bool:
+    def play_script(self, script: Script[Subject], stop: threading.Event) -> bool:
         """Run the script; False when it was stopped."""
         return play(script, self._carry_out, stop.is_set)
 
@@ -254,14 +257,14 @@ class _Driver:
         if isinstance(action, Send):
             self._send(action)
         elif isinstance(action, Join):
-            self._others[action.role] = self._joining(action.role)
+            self._others[action.role] = self._create_participant(action.role)
         elif isinstance(action, Leave):
             self._others.pop(action.role).close()
         elif isinstance(action, Restart):
             assert self._client is not None
             self._client.close()
             self._client = None
-            time.sleep(0.1)  # a new process takes longer; the hand must see the old one go
+            time.sleep(0.1)  # a real restart takes longer; the hand must see the old writer leave
             self._client = self._new_client()
             self._client.wait_matched(1.0)
         elif isinstance(action, StopService):
@@ -274,7 +277,8 @@ class _Driver:
         sender = self._client if action.by is None else self._others[action.by]
         assert isinstance(sender, _Client)
         stamp = None if not action.age_s else time.time_ns() - round(action.age_s * 1e9)
-        if not self._watch.measure_pause():  # or the kit stood still since it made up its mind
+        # after a pause of the kit's own process the command would be stale
+        if not self._watch.measure_pause():
             for topic, payload in action.payloads:
                 sender.send(topic, payload, stamp)
         self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
@@ -283,7 +287,7 @@ class _Driver:
         claim = self.sole.announce()
         return _Client(self.rig.options, self._codec, self.plan.sides, claim, type_name)
 
-    def _joining(self, role: Role) -> _Client | _Monitor:
+    def _create_participant(self, role: Role) -> _Client | _Monitor:
         if role is Role.RIVAL:
             rival = self._new_client()
             rival.wait_matched(1.0)
@@ -294,7 +298,7 @@ class _Driver:
         return _Monitor(self.rig.options, self._codec, self.plan.sides, qos)
 
     def _stop_service(self) -> None:
-        """End the services; how long that took, and until nobody publishes any more."""
+        """End the services; measure the time until they have exited and their writers are gone."""
         assert self._client is not None
         begin = time.monotonic()
         polite = self.rig.end_services()
@@ -333,10 +337,10 @@ class _Driver:
 
 
 class _Client:
-    """The kit as the commanding program, with the official clients' quality of service.
+    """The commanding client, with the official clients' QoS.
 
-    :param claim: announced by all clients of one run, which are company to each other.
-    :param type_name: the type of its commands, if it is a stranger.
+    :param claim: the publisher claim that all clients of one run announce.
+    :param type_name: another type for its commands, in the role of a stranger.
     """
 
     def __init__(
@@ -361,11 +365,11 @@ class _Client:
         }
 
     def send(self, topic: str, payload: bytes, stamp_ns: int | None = None) -> None:
-        """Publish a command, with a source timestamp if it is not to be now."""
+        """Publish a command; ``stamp_ns`` is its source timestamp, by default now."""
         self._writers[topic].write_raw(payload, stamp_ns)
 
     def wait_matched(self, timeout: float) -> None:
-        """Wait until the hands listen to this client."""
+        """Wait until readers of the hands are matched with this client's writers."""
         end = time.monotonic() + timeout
         for writer in self._writers.values():
             writer.wait_matched(max(0.0, end - time.monotonic()))
@@ -394,7 +398,7 @@ class _Client:
 
 
 class _Monitor:
-    """Another listener: the late joiner, or a slow reader."""
+    """A second participant that reads states: the late joiner, or a slow reader."""
 
     def __init__(
         self, rig: RigOptions, codec: MotorCodec, sides: tuple[Subject, ...], qos: Qos
@@ -412,7 +416,7 @@ class _Monitor:
         self._last_read = self._begin
 
     def read_slowly(self) -> None:
-        """Read what has come, but no more than twice a second."""
+        """Take the samples, at most twice a second."""
         if time.monotonic() - self._last_read >= 0.5:
             self._last_read = time.monotonic()
             for reader in self._readers.values():

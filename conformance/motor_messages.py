@@ -61,7 +61,7 @@ def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) ->
 
 
 class MotorCodec:
-    """Encodes commands and reads states of one dialect.
+    """Encodes commands and decodes states of one dialect.
 
     :param joints: of one subject; by default those of a hand of the dialect's model.
     :param foreign: another command type, which the device must ignore; by default the other one
@@ -106,7 +106,7 @@ class MotorCodec:
         return int(status) if self._modes else 0
 
     def status(self, modes: NDArray[np.intp]) -> NDArray[np.intp]:
-        """What mode bytes of states say about their motors: 1 driven, 0 not."""
+        """The status in mode bytes of states: 1 driven, 0 not."""
         return np.asarray(modes >> 4 & 7) if self._ids else modes
 
     @cached_property
@@ -114,7 +114,7 @@ class MotorCodec:
         return message_type(self._command_motor).cls
 
     def encode(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
-        """(topic, payload) of the commands to these sides, all in one message if they share it.
+        """Encode commands to these sides as (topic, payload); one message if they share a topic.
 
         On a topic of its own a hand is sent as many motors as are given, however wrong.
         """
@@ -123,14 +123,14 @@ class MotorCodec:
     def encode_longer(
         self, hands: Mapping[Side, Motors], surplus: Motors
     ) -> list[tuple[str, bytes]]:
-        """The same with more motors behind those that there are."""
+        """Encode commands with surplus motors at the end of the sequence."""
         return [
             (topic, self._payload([*motors, *surplus]))
             for topic, motors in self._by_topic(hands).items()
         ]
 
     def encode_foreign(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
-        """The same in :attr:`foreign`, the command type of the family's other branch."""
+        """Encode commands in :attr:`foreign`, another command type of the Dex family."""
         sequence, motor = _SEQUENCE[self.foreign.name]
         kind = message_type(motor).cls
         found = []
@@ -153,7 +153,7 @@ class MotorCodec:
         return {self.dialect.cmd_topic: places}
 
     def encode_empty(self, sides: Sequence[Side]) -> list[tuple[str, bytes]]:
-        """The same with no motor in the sequence."""
+        """Encode commands with no motor in the sequence."""
         topics = dict.fromkeys(self.command_topics[side] for side in sides)
         return [(topic, self._payload([])) for topic in topics]
 
@@ -169,7 +169,7 @@ class MotorCodec:
     def read_state(
         self, data: bytes, side: Subject
     ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """(q, dq) of a side's joints in a state payload, or None if they are not all there.
+        """Decode (q, dq) of a subject's joints; None if the sequence is too short.
 
         :raises WireError: the payload is not of the dialect's state type.
         """
@@ -179,7 +179,7 @@ class MotorCodec:
         return tuple(m.q for m in motors), tuple(m.dq for m in motors)
 
     def read_command(self, data: bytes, side: Subject) -> tuple[Motor, ...] | None:
-        """A side's motors in a command payload, or None if they are not all there.
+        """Decode a subject's motors of a command; None if the sequence is too short.
 
         :raises WireError: the payload is not of the dialect's command type.
         """
@@ -201,7 +201,7 @@ class MotorCodec:
         length: int | None = None,
         **rest: Any,
     ) -> bytes:
-        """A state message, for hands that the kit plays itself.
+        """Encode a state message, for the reference hands.
 
         :param hands: fields of each side's motors.
         :param length: motors in the sequence, if not the dialect's.

@@ -1,4 +1,4 @@
-"""A recording as the checks see it: per side, columns of commands and states in seconds.
+"""Decode a recording of DDS topics into arrays of commands and states for each subject.
 
 Times are seconds from the beginning of the recording: ``t`` is reception, ``sent`` the source
 timestamp. Positions are in the dialect's radians, torques of states in N·m whatever the dialect's
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class TraceLike(Protocol):
-    """What is asked of a recording; :class:`dexkit.traces.Trace` is one."""
+    """The methods that judging needs of a recording; :class:`dexkit.traces.Trace` has them."""
 
     metadata: dict[str, dict[str, str]]
     warnings: list[str]
@@ -54,7 +54,7 @@ class TraceLike(Protocol):
 
     @property
     def endpoints(self) -> list[TraceEndpoint]:
-        """What discovery saw."""
+        """Every endpoint that DDS discovery reported."""
         ...
 
     def load(
@@ -66,7 +66,7 @@ class TraceLike(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """A side's states. What a sample lacks is NaN.
+    """The states of a subject. Values that a sample lacks are NaN.
 
     :param length: motors in the sequence; -1 where the sample does not decode.
     :param q: shape (n, n_joints), as ``dq``, ``ddq``, ``tau`` and ``mode``.
@@ -110,7 +110,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """The commands to a side, from whichever writer. What a sample lacks is NaN.
+    """The commands to a subject, of all writers. Values that a sample lacks are NaN.
 
     :param q: shape (n, n_joints), as ``dq``, ``tau``, ``kp``, ``kd`` and ``mode``.
     """
@@ -145,8 +145,8 @@ class Recording:
 
     :param origin_ns: log time of second 0.
     :param duration: seconds.
-    :param sides: every side that has a topic; ``judged`` names those to be judged.
-    :param stimulus: what the kit did, or None in a recording of somebody else's session.
+    :param sides: every subject that has a topic; ``judged`` names those to be judged.
+    :param stimulus: the phases of the stimulus, or None in a recording that no live run made.
     :param usb: what was transferred on USB, where the kit did that.
     """
 
@@ -194,7 +194,7 @@ class Recording:
                 f"no {model(chosen.model).title} topic of dialect {chosen.name} in this recording",
                 hint=f"it has: {names}",
             )
-        # the other side is decoded too: independence is judged with it
+        # the other side is decoded as well: checks of independence compare both
         topics = {t for s in Side for t in chosen.topics(s)} & present
         samples = trace.load(sorted(topics), decode=True) if topics else {}
         times = [s.log_time_ns for s in samples.values() if len(s)]
@@ -205,7 +205,7 @@ class Recording:
         origin = min([int(t[0]) for t in times] + marks, default=0)
         end = max([int(t[-1]) for t in times] + marks, default=0)
         codec = MotorCodec(chosen)
-        with np.errstate(invalid="ignore"):  # any NaN is a finding, not a surprise
+        with np.errstate(invalid="ignore"):  # NaN in a message is judged by the checks
             views: dict[Subject, SideView] = {
                 s: SideView(
                     s,
@@ -220,7 +220,7 @@ class Recording:
             judged = tuple(s for s in judged if s not in blank)
         else:
             blank = []
-        # the kit's own doing is no news: it sends another type to see that the hand ignores it
+        # the kit itself publishes another type in the phase 'foreign'
         phases = stimulus.phases if stimulus else []
         foreign = {s for p in phases if p.name == "foreign" for s in p.sides}
         own = tuple(f"{chosen.topics(s)[0]} carries " for s in foreign)
@@ -255,7 +255,7 @@ class Recording:
         return (time_ns - self.origin_ns) / 1e9
 
     def log_time(self, seconds: float) -> int:
-        """The other way round."""
+        """A second of this recording as a log time."""
         return self.origin_ns + round(seconds * 1e9)
 
     def phases(self, name: str, side: Subject | None = None) -> list[Phase]:
@@ -368,7 +368,7 @@ def _states(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: 
 
 
 def _is_blank(view: SideView) -> bool:
-    """Whether a side has a place in the messages, and nobody ever is in it."""
+    """Whether every state of a side is 0 and no command drives it."""
     states, commands = view.states, view.commands
     said = (states.q, states.dq, states.ddq, states.tau, states.mode)
     drives = (commands.kp, commands.kd, commands.tau)
@@ -378,7 +378,7 @@ def _is_blank(view: SideView) -> bool:
 def _joints(columns: Columns, codec: MotorCodec, side: Side, sequence: str, name: str) -> Floats:
     """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
     first = codec.dialect.index[side]
-    # a joint's values lie together, for checks go joint by joint
+    # the values of one joint are contiguous: checks read one joint at a time
     return columns.table([f"{sequence}[{first + i}].{name}" for i in range(codec.joints)])
 
 

@@ -1,4 +1,4 @@
-"""One run for the whole suite: options, run, verdicts, files."""
+"""Run the conformance suite: check options, do the live run, judge it, write result files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _FILES = 48  # descriptors of a run: DDS, recording, the pipes of its processes
 
 @dataclass(frozen=True)
 class SuiteOptions:
-    """What a run of the suite was asked for.
+    """The options of a run of the suite.
 
     :param domain: None for a free one.
     """
@@ -72,7 +72,7 @@ class SuiteOptions:
 
     @classmethod
     def from_pytest(cls, config: pytest.Config) -> SuiteOptions:
-        """From the command line of pytest.
+        """Read the options from pytest's command line.
 
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
@@ -127,7 +127,7 @@ class SuiteOptions:
         markdown: Path | None = None,
         recording: Path | None = None,
     ) -> SuiteOptions:
-        """Check and complete what a user gave.
+        """Check a user's options and fill in defaults.
 
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
@@ -202,7 +202,7 @@ class SuiteOptions:
         return options
 
     def rig(self, domain: int) -> RigOptions:
-        """What is to be brought up, on that domain."""
+        """The options of the backend's processes, on that domain."""
         return RigOptions(
             backend=self.backend,
             sides=self.sides,
@@ -216,7 +216,7 @@ class SuiteOptions:
 
     @property
     def subject(self) -> dict[str, str]:
-        """What a report says of what was judged."""
+        """Backend, device and object, for a result's ``subject``."""
         emulated = self.backend in EMULATED and not self.devices
         about = {"backend": self.backend}
         if self.devices:
@@ -248,7 +248,7 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
 
 
 def _robot_of(backend: str, dialect_name: str | None) -> str:
-    """The robot that is to be judged; empty for a hand.
+    """Name of the robot to be judged; empty for a hand.
 
     :raises UsageError: a backend and a dialect of two of them.
     """
@@ -278,9 +278,9 @@ def _dialect(
     devices: Mapping[Side, str],
     settings: Sequence[str],
 ) -> Dialect:
-    """The dialect to judge in: the one that is wanted, or the first of the backend's model.
+    """Choose the dialect: the one that was given, or the first of the backend's model.
 
-    A hand class says its model only once there is a hand of it: one is made, and not opened.
+    The model is an attribute of a hand object: one is created, and not opened.
 
     :raises UsageError: the backend needs a device, or its hand does not speak that dialect.
     :raises BackendError: it makes no hand.
@@ -307,7 +307,7 @@ def _dialect(
 def _by_side(
     values: Sequence[str], sides: Sequence[Side], kind: Callable[[str], T], option: str
 ) -> dict[Side, T]:
-    """``left=X`` and ``right=X``, or one value for the only side (or for each of them)."""
+    """Parse ``left=X`` and ``right=X``, or one value for all sides."""
     found: dict[Side, T] = {}
     for value in values:
         name, equals, rest = value.partition("=")

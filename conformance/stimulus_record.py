@@ -1,4 +1,4 @@
-"""The stimulus as the recording remembers it: what was done when, in a metadata record.
+"""The stimulus record: phases, targets and timer lateness of a run, as mcap metadata.
 
 A live run writes the record :data:`RECORD` into its recording, so that the recording alone says
 what the hand was asked to do and can be judged again at any time.
@@ -25,8 +25,8 @@ __all__ = [
     "Phase",
     "Stall",
     "Stimulus",
-    "stalls_of",
-    "time_of",
+    "parse_stalls",
+    "parse_time",
 ]
 
 _LATEST = 2**62  # ns since 1970: the year 2116
@@ -36,15 +36,15 @@ VERSION = 1
 _EARLIER_ROBOT = "body"
 """The name of the subject ``robot`` in recordings of earlier versions."""
 IDLE = 1e-3
-"""Seconds by which timers are late on a machine that has nothing else to do."""
+"""Seconds by which timers are late on an idle machine."""
 
 
 @dataclass
 class Phase:
-    """One stretch of the stimulus.
+    """One phase of the stimulus.
 
-    :param name: what was done: ``listen``, ``step``, ``silence``, ...
-    :param sides: the sides that it is about.
+    :param name: kind of stimulus: ``listen``, ``step``, ``silence``, ...
+    :param sides: the subjects that it is applied to.
     :param begin_ns: log time at which it began.
     :param targets: q that joints of each side were to reach, by their index, in the dialect's
         radians.
@@ -62,7 +62,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Stall:
-    """A stretch in which programs waited for a processor."""
+    """An interval in which programs waited for a processor."""
 
     begin_ns: int
     end_ns: int
@@ -70,7 +70,7 @@ class Stall:
 
 @dataclass(frozen=True)
 class Lost:
-    """By how much the kit's own timer was late in a stretch, beyond what an idle machine's is.
+    """Lateness of the kit's timer in an interval, beyond that on an idle machine.
 
     :param total: all of it, seconds: what one thing that happened then may have waited.
     :param mean: of each time, seconds: what a thing that happens again and again waited.
@@ -86,7 +86,7 @@ class Lost:
 
 @dataclass
 class Beats:
-    """By how much a timer of the kit's own was late, all along the run: the harness's jitter.
+    """Lateness of the kit's timer over the whole run.
 
     :param begin_ns: log time of offset 0.
     :param t_us: when it fired, microseconds from there.
@@ -99,15 +99,15 @@ class Beats:
 
     @classmethod
     def parse(cls, text: str) -> Beats:
-        """Read the record's content.
+        """Parse the record's content.
 
         :raises TypeError, ValueError, TraceUnsupported: it is damaged.
         """
         found = cls(**_json(text))
-        t, late = [time_of(t) for t in found.t_us], [time_of(t) for t in found.late_us]
+        t, late = [parse_time(t) for t in found.t_us], [parse_time(t) for t in found.late_us]
         if len(t) != len(late):
             raise ValueError("a heartbeat without a lateness")
-        return cls(time_of(found.begin_ns), t, late)
+        return cls(parse_time(found.begin_ns), t, late)
 
     def lateness(self, begin_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Median and 99th percentile of it in [begin, end], seconds; None if it is not known."""
@@ -118,7 +118,7 @@ class Beats:
         return float(median), float(high)
 
     def lost(self, begin_ns: int, end_ns: int) -> Lost | None:
-        """What was lost in [begin, end]; None if that is not known."""
+        """Lateness in [begin, end] beyond that of an idle machine; None if it is not known."""
         there = np.maximum(self._in(begin_ns, end_ns) - IDLE, 0.0)
         if not len(there):
             return None
@@ -134,7 +134,7 @@ class Beats:
 
 @dataclass
 class Stimulus:
-    """The whole record.
+    """The stimulus record.
 
     :param phases: in order of time.
     :param objects: where each side touches its object, or None where there is none: rad for a
@@ -176,7 +176,7 @@ class Stimulus:
 
     @classmethod
     def from_metadata(cls, record: Mapping[str, str]) -> Stimulus:
-        """Read it back.
+        """Parse the record's content.
 
         :raises TraceUnsupported: of another version, or damaged.
         """
@@ -192,8 +192,8 @@ class Stimulus:
                     Phase(
                         name=p["name"],
                         sides=tuple(_subject(s) for s in p["sides"]),
-                        begin_ns=time_of(p["begin_ns"]),
-                        end_ns=time_of(p["end_ns"]),
+                        begin_ns=parse_time(p["begin_ns"]),
+                        end_ns=parse_time(p["end_ns"]),
                         targets={_subject(s): _joints(q) for s, q in p["targets"].items()},
                         params=dict(p["params"]),
                         observed=dict(p["observed"]),
@@ -204,7 +204,7 @@ class Stimulus:
                     _subject(s): None if q is None else float(q)
                     for s, q in _json(record["objects"]).items()
                 },
-                stalls=stalls_of(record["stalls"]),
+                stalls=parse_stalls(record["stalls"]),
                 beats=Beats.parse(record.get("beats", "{}")),
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -222,15 +222,15 @@ def _joints(value: Any) -> dict[int, float]:
     return {0: float(value)}
 
 
-def stalls_of(text: str) -> list[Stall]:
+def parse_stalls(text: str) -> list[Stall]:
     """Read the stalls of a record.
 
     :raises TypeError, ValueError, TraceUnsupported: it is damaged.
     """
-    return [Stall(time_of(a), time_of(b)) for a, b in _json(text)]
+    return [Stall(parse_time(a), parse_time(b)) for a, b in _json(text)]
 
 
-def time_of(value: Any) -> int:
+def parse_time(value: Any) -> int:
     """A time or a duration, nanoseconds or microseconds."""
     if isinstance(value, bool) or not isinstance(value, int) or not -_LATEST <= value <= _LATEST:
         raise ValueError(f"{value!r} is not a time")
@@ -238,5 +238,5 @@ def time_of(value: Any) -> int:
 
 
 def _json(text: str) -> Any:
-    # what was measured may be NaN
+    # measured values may be NaN
     return parse_json(text, "the stimulus record", error=TraceUnsupported, finite=False)

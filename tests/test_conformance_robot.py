@@ -26,7 +26,7 @@ from dexkit.conformance.mutants.robot import CdrCrc, NoCrc, WaitsForCommands
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.robot import (
-    SPOILS,
+    WRONG_CRCS,
     RobotMotorCodec,
     robot_dialect,
     robot_in,
@@ -76,7 +76,7 @@ def judged(trace: MemoryTrace, name: str) -> RunResult:
 def test_commands_are_what_the_codec_reads(model: RobotModel) -> None:
     codec = RobotMotorCodec(robot_dialect(model.name))
     motors = [Motor(0.1 * i, 0.2, 0.3, 4.0, 0.5, i % 3) for i in range(model.slots)]
-    payload = codec.low_command(motors, 7)
+    payload = codec.encode_low_command(motors, 7)
     assert verify_payload(model.cmd_type, payload)
     message = decode(model.cmd_type, payload)
     read = [(m.mode, m.q, m.dq, m.tau, m.kp, m.kd) for m in message.motor_cmd]
@@ -88,11 +88,11 @@ def test_commands_are_what_the_codec_reads(model: RobotModel) -> None:
         assert (*message.head, message.level_flag) == (0xFE, 0xEF, 0xFF)
 
 
-@pytest.mark.parametrize("kind", SPOILS)
+@pytest.mark.parametrize("kind", WRONG_CRCS)
 def test_spoilt_commands_differ_in_the_crc_alone(kind: str) -> None:
     codec = RobotMotorCodec(robot_dialect("h1"))
     motors = [Motor(q=0.5)] * 20
-    good, bad = codec.low_command(motors, 0), codec.low_command(motors, 0, kind)
+    good, bad = codec.encode_low_command(motors, 0), codec.encode_low_command(motors, 0, kind)
     assert good[:-4] == bad[:-4]
     assert not verify_payload(H1.cmd_type, bad)
     right = crc_of(decode(H1.cmd_type, good))

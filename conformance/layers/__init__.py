@@ -87,7 +87,7 @@ def layer(name: str) -> Layer[Any, Any, Any]:
 
 
 def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
-    """Decode a recording of hands or of a robot.
+    """Decode the DDS part of a recording: hands or a robot.
 
     :param dialect_name: None to take what the topics show: hands, if there are any.
     :raises ConformanceError: it has none of their topics.

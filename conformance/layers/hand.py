@@ -61,7 +61,7 @@ def recorded(judgement: Judgement, context: Context) -> Result | None:
 
 
 def _missing(context: Context) -> str:
-    """What the recording lacks for this requirement, or nothing."""
+    """What the recording lacks for this requirement, as text; empty if nothing."""
     requirement, recording = context.requirement, context.recording
     if requirement.phase:
         if recording.stimulus is None:
@@ -81,10 +81,10 @@ def _missing(context: Context) -> str:
 
 
 def with_silence(context: Context, outcome: Outcome) -> Outcome:
-    """The outcome; a failure after the last state of all gets that as its cause."""
+    """Name the end of all states as the cause of a failure after it."""
     states, commands = context.states, context.commands
     ends = [e.end_s for e in outcome.evidence if e.end_s is not None]
-    if not ends and len(commands):  # no state, so no place either
+    if not ends and len(commands):  # without states the failure has no place in time
         ends = [float(commands.t[-1])]
     if outcome.met is not False or not len(states) or not ends:
         return outcome

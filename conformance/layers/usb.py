@@ -38,8 +38,8 @@ LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     decode=lambda trace, dialect_name, sides: UsbRecording.decode(trace),
     subjects=lambda recording: recording.sides.items(),
     context=UsbContext,
-    # the script ends where a device no longer answers: what failed first explains a missing
-    # phase better than its absence does
+    # not_blocked comes first: the script ends where a device no longer answers, and the first
+    # failure is the reason of missing phases
     preconditions=(claimed, not_blocked, _stimulus_applied),
     refine=lambda context, outcome: outcome,
     whole=lambda recording: None,

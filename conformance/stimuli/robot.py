@@ -35,7 +35,7 @@ from functools import partial
 
 from dexkit.command_age import PAUSE
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.robot import SPOILS, RobotMotorCodec
+from dexkit.conformance.robot import WRONG_CRCS, RobotMotorCodec
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -156,15 +156,15 @@ class RobotScript(Script[RobotSubject]):
         joint = self._robot.joint(slot)
         return by if self._here(slot) < (joint.q_min + joint.q_max) / 2 else -by
 
-    def _put(self, order: Motors, spoil: str = "", machine: int | None = None) -> Steps:
+    def _put(self, order: Motors, wrong_crc: str = "", machine: int | None = None) -> Steps:
         if self._dry:
             yield from self._send([])
             return
         own = self._obs.machine or self._robot.mode_machine or 0
         sent = own if machine is None else machine
-        key = (tuple(order), sent, spoil)
+        key = (tuple(order), sent, wrong_crc)
         if key != self._sent[0]:  # they are held for long, and encoded once
-            self._sent = (key, self._codec.low_command(order, sent, spoil))
+            self._sent = (key, self._codec.encode_low_command(order, sent, wrong_crc))
         yield from self._send([(self._robot.cmd_topic, self._sent[1])])
 
     def _keep(self, seconds: float) -> Steps:
@@ -288,7 +288,7 @@ class RobotScript(Script[RobotSubject]):
 
     def _wrong_crc(self) -> Steps:
         self._report("commands that are wrong: nothing may move")
-        for kind in SPOILS:
+        for kind in WRONG_CRCS:
             order = self._wish()
             yield from self._bad("wrong-crc", partial(self._put, order, kind), 0.25, kind=kind)
 
@@ -314,7 +314,7 @@ class RobotScript(Script[RobotSubject]):
         wish = list(self._order)  # of every joint: the families' slots are not the same
         for slot in self._robot.used:
             wish[slot] = replace(wish[slot], q=wish[slot].q + self._inward(slot, STEP))
-        payload = self._codec.foreign_command(wish)
+        payload = self._codec.encode_foreign_command(wish)
 
         def send() -> Steps:
             self._next_ns += self._period_ns
