@@ -38,7 +38,7 @@ def run() -> list[Result]:
         try:
             floor = _process(folder, "-c", "import numpy").seconds
             for title, sample in _SAMPLES.items():
-                judge(Recording.of(open_trace(sample_path(sample))))  # loads what it needs
+                judge(Recording.decode(open_trace(sample_path(sample))))  # loads what it needs
                 for wanted in _LENGTHS:
                     path = Path(folder) / f"{sample}_{wanted:g}.mcap"
                     _repeat(sample, path, wanted)
@@ -52,7 +52,7 @@ def _both(title: str, path: Path, folder: str, floor: float) -> list[Result]:
     length = open_trace(path).duration
     whole = _process(folder, "-m", "dexkit", "check", str(path))
     begin = os.times()
-    assert judge(Recording.of(open_trace(path))).judged
+    assert judge(Recording.decode(open_trace(path))).judged
     end = os.times()
     inside = end.user + end.system - begin.user - begin.system
     about = f"{length:.0f} s of both hands"

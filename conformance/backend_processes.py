@@ -1,6 +1,6 @@
-"""The processes that a live run starts: emulated devices and services, through the command line.
+"""Start the processes of a live run: emulated devices, services, emulated robots.
 
-The kit reaches backends only as a user would; nothing of them runs in its own process.
+They are started by their ``dexkit`` commands; no backend runs in the kit's own process.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from pathlib import Path
 
 from dexkit import child_processes
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from dexkit.models import MODELS, Dialect
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = [
-    "BODY_EMULATORS",
     "EMULATED",
     "EXTERNAL",
     "ON_USB",
+    "ROBOT_EMULATORS",
     "SIMULATED",
     "Emulation",
     "Rig",
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 EXTERNAL = "external"
-"""The backend's name for a service that somebody else runs."""
+"""The backend's name for a service that the kit does not start."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Emulation:
         return ("emulate", *arguments, *place)
 
 
-_CLOSED_AT = "1510"  # encoder tick of the emulated zero: told to both, so nothing has to move
+_CLOSED_AT = "1510"  # encoder tick of the zero, given to emulator and driver: no calibration run
 EMULATED: dict[str, Emulation] = {
     "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), True, {"zero": _CLOSED_AT}),
-    # an emulated motor shares the machine with all the rest, and may be late
+    # an emulated motor shares the machine with all other processes, and may answer late
     "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.1"}),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }
@@ -71,7 +71,7 @@ SIMULATED = tuple(m.simulator for m in MODELS.values() if m.simulator)
 """Backends without a device, which have a setting ``object``."""
 
 
-BODY_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
+ROBOT_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
 """Backends that are emulated robots: the names of their emulators."""
 
 
@@ -87,7 +87,7 @@ class Tool(child_processes.Tool):
 
 @dataclass(frozen=True)
 class RigOptions:
-    """What to bring up.
+    """The backend's processes and their options.
 
     :param backend: name, ``module:Class``, or :data:`EXTERNAL`.
     :param devices: path or serial number by side; empty for an emulated one.
@@ -97,13 +97,18 @@ class RigOptions:
     """
 
     backend: str
-    sides: tuple[Side, ...]
+    sides: tuple[Subject, ...]
     dialect: Dialect
     domain: int
     interface: str = "lo"
     devices: Mapping[Side, str] = field(default_factory=dict)
     objects: Mapping[Side, float] = field(default_factory=dict)
     settings: tuple[str, ...] = ()
+
+    @property
+    def hands(self) -> tuple[Side, ...]:
+        """The hands among the subjects: none where a robot is judged."""
+        return tuple(s for s in self.sides if isinstance(s, Side))
 
     @property
     def emulated(self) -> bool:
@@ -117,9 +122,9 @@ class RigOptions:
         return settings.get("usb", "")
 
     def check(self) -> None:
-        """Refuse what makes no sense.
+        """Check that the options fit together.
 
-        :raises UsageError: with what to do instead.
+        :raises UsageError: they do not; its hint says what to do.
         """
         if self.backend == EXTERNAL and (self.devices or self.settings):
             raise UsageError(
@@ -137,7 +142,7 @@ class RigOptions:
 
 
 class Rig:
-    """Everything that runs during a live run, except the kit itself; a context manager.
+    """The processes of a live run; a context manager.
 
     Entering it starts the emulated devices, :meth:`serve` the services on them.
 
@@ -153,7 +158,7 @@ class Rig:
         self._services: list[Tool] = []
         self._ended: set[Tool] = set()
         self.devices: dict[Side, str] = dict(options.devices)
-        """Where each side's device is, for the backend."""
+        """The device of each side: the value of ``--device``."""
 
     def __enter__(self) -> Rig:
         try:
@@ -177,7 +182,7 @@ class Rig:
         folder = self._stack.enter_context(TemporaryFolder("hands"))
         emulation = EMULATED[options.backend]
         emulators = {}
-        for s in options.sides:
+        for s in options.hands:
             command = emulation.command(s, folder / f"hand-{s}")
             emulators[s] = self._tool(*command, *_object(options, s))
         for s, tool in emulators.items():
@@ -192,14 +197,24 @@ class Rig:
         options = self.options
         if options.backend == EXTERNAL or self._stop.is_set():
             return
+        if options.backend in ROBOT_EMULATORS:
+            self._services = [self._start_robot(ROBOT_EMULATORS[options.backend])]
+        else:
+            self._services = self._start_hands()
+        for tool in self._services:
+            tool.wait_ready(self._stop)
+
+    def _start_robot(self, emulator: str) -> Tool:
+        return self._tool("emulate", emulator, "--quiet", *self._place_on_dds)
+
+    def _start_hands(self) -> list[Tool]:
+        options = self.options
         settings = list(options.settings)
         if options.emulated:
             given = {s.partition("=")[0] for s in settings}
             needed = EMULATED[options.backend].settings
             settings += [f"{k}={v}" for k, v in needed.items() if k not in given]
-        self._services = [self._serve(group, settings) for group in self._groups()]
-        for tool in self._services:
-            tool.wait_ready(self._stop)
+        return [self._serve(group, settings) for group in self._groups()]
 
     def end_services(self) -> bool | None:
         """Ask all services to end, at once.
@@ -213,17 +228,18 @@ class Rig:
             return all(pool.map(Tool.stop, self._services))
 
     def _groups(self) -> list[tuple[Side, ...]]:
-        """The sides that one service serves: one each, unless they share their topics."""
-        topics = {self.options.dialect.topics(s) for s in self.options.sides}
-        if len(topics) == len(self.options.sides):
-            return [(s,) for s in self.options.sides]
-        return [self.options.sides]
+        """The sides of each service: one service a side, or one for both on shared topics."""
+        hands = self.options.hands
+        topics = {self.options.dialect.topics(s) for s in hands}
+        return [(s,) for s in hands] if len(topics) == len(hands) else [hands]
+
+    @property
+    def _place_on_dds(self) -> tuple[str, ...]:
+        """The options for the DDS domain and interface."""
+        return "--domain", str(self.options.domain), "--interface", self.options.interface
 
     def _serve(self, sides: Sequence[Side], settings: Sequence[str]) -> Tool:
         options = self.options
-        place_on_dds = ("--domain", str(options.domain), "--interface", options.interface)
-        if options.backend in BODY_EMULATORS:
-            return self._tool("emulate", BODY_EMULATORS[options.backend], "--quiet", *place_on_dds)
         arguments = ["serve", options.backend, "--side"]
         arguments.append(str(sides[0]) if len(sides) == 1 else "both")
         for side in sides:
@@ -241,7 +257,7 @@ class Rig:
         return self._tool(
             *arguments,
             *("--dialect", options.dialect.name),
-            *place_on_dds,
+            *self._place_on_dds,
         )
 
     def _tool(self, *arguments: str) -> Tool:
@@ -251,7 +267,7 @@ class Rig:
         return tool
 
     def dead(self) -> Tool | None:
-        """A process that has ended although it should not."""
+        """A process that has ended unasked, or None."""
         return next((t for t in self.tools if not t.running and t not in self._ended), None)
 
 

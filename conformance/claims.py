@@ -1,4 +1,4 @@
-"""What a vendor claims: ``capabilities.toml``.
+"""Read a vendor's capability claims from ``capabilities.toml``.
 
 Not every hand has every unit (:data:`~dexkit.conformance.requirements.CAPABILITIES`). A file says
 which this one has::
@@ -36,7 +36,7 @@ _HAND = ("name", "vendor", "firmware", "model")
 
 @dataclass(frozen=True)
 class Claims:
-    """What is claimed of a hand.
+    """The capability claims for one hand.
 
     :param units: by unit, whether it is claimed; None without a file: nothing is said.
     :param hand: ``name``, ``vendor``, ``firmware``, ``model``, as far as they are given.
@@ -47,15 +47,15 @@ class Claims:
 
     @classmethod
     def parse(cls, text: str, origin: str = "capabilities.toml") -> Claims:
-        """Claims of a TOML text.
+        """Parse a TOML text.
 
         :raises UsageError: it is no TOML, or holds what is not known: a misspelt claim must not
             silently be none.
         """
-        return cls._of(documents.parse_toml(text, origin), origin)
+        return cls._from_document(documents.parse_toml(text, origin), origin)
 
     @classmethod
-    def _of(cls, document: Mapping[str, Any], origin: str) -> Claims:
+    def _from_document(cls, document: Mapping[str, Any], origin: str) -> Claims:
         hand, units = document.get("hand", {}), document.get("claims", {})
         unknown = sorted(set(document) - {"hand", "claims"})
         if unknown or not isinstance(hand, dict) or not isinstance(units, dict):
@@ -82,7 +82,7 @@ class Claims:
 
     @classmethod
     def load(cls, path: Path | None, model_name: str | None) -> Claims:
-        """Claims of a file; none without one.
+        """Read a file; without one, nothing is claimed or disclaimed.
 
         :param model_name: the model that it must be about; None for any.
 
@@ -90,7 +90,7 @@ class Claims:
         """
         if path is None:
             return cls()
-        claims = cls._of(documents.read_toml(path), path.name)
+        claims = cls._from_document(documents.read_toml(path), path.name)
         about = claims.hand.get("model")
         if about and model_name and about != model_name:
             raise UsageError(
@@ -106,7 +106,7 @@ class Claims:
         return self.units[requirement.capability]
 
     def apply(self, requirements: Iterable[Requirement]) -> tuple[Requirement, ...]:
-        """The requirements with what is claimed at its level: a SHOULD counts as a MUST."""
+        """Raise every SHOULD about a claimed unit to a MUST."""
         return tuple(
             replace(r, level=Level.MUST) if self.claimed(r) and r.level is Level.SHOULD else r
             for r in requirements
@@ -114,5 +114,5 @@ class Claims:
 
     @property
     def subject(self) -> dict[str, str]:
-        """What a report says of the hand."""
+        """The hand's name, vendor and firmware, for a result's ``subject``."""
         return {("hand" if k == "name" else k): v for k, v in self.hand.items() if k != "model"}

@@ -30,7 +30,7 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
     assert options is not None
     capture = request.config.pluginmanager.getplugin("capturemanager")
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         with capture.global_and_fixture_disabled():
             print(f"\n  ... {text}", end="", file=sys.stderr, flush=True)
 
@@ -41,7 +41,7 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
     # An early end must not leave a hand driven: services are ended in order.
     with stop_on_signals() as stop:
         try:
-            result = run_suite(options, say, stop.event)
+            result = run_suite(options, report, stop.event)
         except KeyboardInterrupt:
             end("the run was interrupted", 130, "; nothing was judged, which is not a pass")
         except DexkitError as error:

@@ -1,4 +1,4 @@
-"""The judging engine: from a recording to verdicts, for hands, robots and USB.
+"""Judge a recording: from decoded DDS or USB data to one verdict for each requirement.
 
 Every selected requirement is judged for each subject, in the catalogue's order. What differs from
 layer to layer is data, in :mod:`dexkit.conformance.layers`.
@@ -19,7 +19,7 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.verdicts import Judgement, excuse
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 
 __all__ = ["judge", "judge_layer"]
 
@@ -35,7 +35,7 @@ def judge(
 
     :param requirements: those to report; what they depend on is judged as well. None for all.
     :param claims: what the vendor claims of the hand.
-    :param subject: what to say of what was judged.
+    :param subject: entries for the result's ``subject``: backend, device, recording.
     """
     claims = claims or Claims()
     wanted = None if requirements is None else {r.id for r in requirements}
@@ -73,7 +73,7 @@ def judge_layer(
     requirements: Sequence[Requirement],
     claims: Claims | None = None,
 ) -> list[Result]:
-    """What is found for every requirement and subject of one layer, in the requirements' order.
+    """Judge every requirement of one layer for every subject; results in the requirements' order.
 
     :param requirements: all those of the layer that are about the model, at the levels that
         ``claims`` gives them: some are judged by what came before them.
@@ -82,7 +82,7 @@ def judge_layer(
     claims = claims or Claims()
     whole = layer.whole(recording)
     results: list[Result] = []
-    for subject, view in layer.subjects(recording).items():
+    for subject, view in layer.subjects(recording):
         found: dict[str, Result] = {}
         for requirement in requirements:
             judgement = Judgement(requirement, subject, claims, found)
@@ -104,14 +104,14 @@ def _judge_one(
         if decided:
             return decided
     requirement = judgement.requirement
-    return judgement.of(
+    return judgement.run_check(
         lambda: layer.refine(context, check_of(requirement)(context)),
         lambda outcome: excuse(context.recording, requirement, outcome, whole),
     )
 
 
 def _harness(recording: Recording) -> dict[str, float]:
-    """How fair the kit's own machine was; empty where somebody else recorded."""
+    """Load and timer jitter of the machine that the kit ran on; empty without a stimulus record."""
     if recording.stimulus is None:
         return {}
     figures = {"starved": recording.starved(0.0, recording.duration)}
@@ -121,8 +121,8 @@ def _harness(recording: Recording) -> dict[str, float]:
     return figures
 
 
-def _stage(recording: Recording, side: Side) -> Stage:
-    """How far a hand got."""
+def _stage(recording: Recording, side: Subject) -> Stage:
+    """The stage that a hand or robot reached, from discovery to motion."""
     hand = recording.sides[side]
     for q, joint in zip(hand.states.q.T, hand.joints, strict=True):
         good = q[np.isfinite(q)]
@@ -130,7 +130,7 @@ def _stage(recording: Recording, side: Side) -> Stage:
             return Stage.MOVING
     if len(hand.states):
         return Stage.SAMPLES_FLOWING
-    # a client's own endpoints, the kit's among them, are no sign of a hand
+    # endpoints of clients, the kit's included, do not show that a hand is present
     dialect = recording.dialect
     clients = {(dialect.topics(s)[0], "writer") for s in Side}
     clients |= {(dialect.topics(s)[1], "reader") for s in Side}

@@ -1,7 +1,7 @@
-"""A live run: bring the hand up, drive it by the script, record; the recording is the result.
+"""Do a live run: start the backend, play the stimulus script on DDS, record all topics.
 
-The kit is three participants, each in the role of a program that a hand meets: the client that
-commands, the recorder, and later a monitor that joins in mid-session.
+The kit creates three DDS participants: the commanding client, the recorder, and later a monitor
+that joins during the run.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import EXTERNAL, Rig, RigOptions
 from dexkit.conformance.heartbeat import Heartbeat
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
-from dexkit.conformance.robot import wire_for
+from dexkit.conformance.robot import codec_for
 from dexkit.conformance.stimuli import (
     Action,
     Join,
@@ -39,7 +39,7 @@ from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from dexkit.models import DIALECTS
 from dexkit.single_publisher import Place, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
@@ -69,8 +69,8 @@ class LiveOptions:
     force: bool = False
     usb: bool = False
 
-    def plan(self) -> Plan:
-        """What the script is to do."""
+    def plan(self) -> Plan[Subject]:
+        """The plan of the stimulus script."""
         dialect = self.rig.dialect
         return Plan(
             dialect=dialect,
@@ -85,12 +85,12 @@ def record_run(
     options: LiveOptions,
     path: Path,
     *,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
 ) -> bool:
     """Do the run and write its recording to ``path``.
 
-    :param say: told what happens, in plain words.
+    :param report: called with progress messages for the user.
     :param stop: ends the run early when set; what was recorded is kept.
     :returns: False when it was ended early.
     :raises ConformanceError: the hand's process cannot be started, or has died.
@@ -110,19 +110,19 @@ def record_run(
             for t in (*dialect.topics(s), dialect.low_rate_topic.format(side=s))
             if t
         }
-        # the recorder listens before the hand is there: nothing of its start is missed
+        # the recorder starts before the backend, so that it records the hand's first samples
         recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
         if rig_options.backend != EXTERNAL:
-            say(f"starting {rig_options.backend} on domain {rig_options.domain}")
+            report(f"starting {rig_options.backend} on domain {rig_options.domain}")
         rig = stack.enter_context(Rig(rig_options, stop))
-        if options.usb and not _judge_usb(rig, recorder, say, stop):
+        if options.usb and not _judge_usb(rig, recorder, report, stop):
             return False
         rig.serve()
         if stop.is_set():
             return False
         if rig_options.backend == EXTERNAL:
-            _expect_somebody(recorder_node, options)
-        # two clients on one hand would fight, and a real one may carry something
+            _require_hand(recorder_node, options)
+        # a second client would interfere, and a real hand may hold something
         sole = SolePublisher(
             [Place(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
             hint="stop that client, or choose another --domain",
@@ -131,16 +131,16 @@ def record_run(
         )
         sole.search()
         plan = options.plan()
-        script = script_for(plan, say)
+        script = script_for(plan, report)
         heart = stack.enter_context(Heartbeat())
-        driver = stack.enter_context(_Driver(rig, plan, sole))
+        player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
-        _meet(recorder_node, plan)
-        finished = driver.go_through(script, stop)
+        _wait_for_endpoints(recorder_node, plan)
+        finished = player.play_script(script, stop)
         recording.stop()
-        driver.close()
+        player.close()
         rig.stop()
-        # what the services and emulated devices had to say, counters included
+        # last output of the services and emulated devices, with their counters
         recorder.add_metadata(TOOLS, {repr(tool): tool.last_words for tool in rig.tools})
         stimulus = Stimulus(
             phases=[p for p in script.phases if p.end_ns],
@@ -153,9 +153,9 @@ def record_run(
 
 
 def _judge_usb(
-    rig: Rig, recorder: Recorder, say: Callable[[str], None], stop: threading.Event
+    rig: Rig, recorder: Recorder, report: Callable[[str], None], stop: threading.Event
 ) -> bool:
-    """The hands on USB, while nobody else has them; False when it was stopped."""
+    """Play the USB script, before a service opens the devices; False when it was stopped."""
     from dexkit.conformance.usb.run import run
 
     server = rig.options.usb_server
@@ -163,16 +163,19 @@ def _judge_usb(
         side: f"{server}/{where}" if server and "://" not in where else where
         for side, where in rig.devices.items()
     }
-    say(f"the {' and the '.join(map(str, devices))} hand on USB")
-    return run(devices, recorder, say=say, stop=stop)
+    report(f"the {' and the '.join(map(str, devices))} hand on USB")
+    return run(devices, recorder, report=report, stop=stop)
 
 
 def _node(options: RigOptions) -> DdsNode:
     return DdsNode(domain=options.domain, interface=options.interface)
 
 
-def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
-    """Thirty failures of a hand that is not there would hide the one thing to know."""
+def _require_hand(node: DdsNode, options: LiveOptions) -> None:
+    """Refuse a run without a hand: all its failures would have that one cause.
+
+    :raises ConformanceError: no endpoint of another program is on the hand's topics.
+    """
     rig = options.rig
     topics = {t for s in rig.sides for t in rig.dialect.topics(s)}
     if node.discovery.wait(
@@ -193,8 +196,8 @@ def _expect_somebody(node: DdsNode, options: LiveOptions) -> None:
     )
 
 
-def _meet(node: DdsNode, plan: Plan) -> None:
-    """Wait until the hands' endpoints are known; a hand without any is the checks' finding."""
+def _wait_for_endpoints(node: DdsNode, plan: Plan[Subject]) -> None:
+    """Wait until the hands' endpoints are discovered; a check reports missing ones."""
     wanted = {t for s in plan.sides for t in plan.dialect.topics(s)}
     node.discovery.wait(
         lambda endpoints: wanted <= {e.topic for e in endpoints if not e.own},
@@ -203,21 +206,21 @@ def _meet(node: DdsNode, plan: Plan) -> None:
 
 
 @dataclass
-class _Driver:
+class _LivePlayer:
     """Carries out the script's actions on DDS."""
 
     rig: Rig
-    plan: Plan
+    plan: Plan[Subject]
     sole: SolePublisher
     _newest: dict[str, bytes] = field(default_factory=dict)
     _others: dict[Role, _Client | _Monitor] = field(default_factory=dict)
     _stopped: dict[str, float | None] = field(default_factory=dict)
 
-    def __enter__(self) -> _Driver:
-        self._wire = wire_for(self.plan.dialect)
+    def __enter__(self) -> _LivePlayer:
+        self._codec = codec_for(self.plan.dialect)
         self._clock = RealClock()
         self._watch = PauseWatch(self._clock)
-        # wall clock, as recordings have it, on a monotonic footing
+        # log times are wall clock; the offset to the monotonic clock is constant during a run
         self._offset = time.time_ns() - round(self._clock.now() * 1e9)
         self._client: _Client | None = self._new_client()
         return self
@@ -235,10 +238,10 @@ class _Driver:
 
     @property
     def now_ns(self) -> int:
-        """Now, on the recording's clock."""
+        """The present log time."""
         return round(self._clock.now() * 1e9) + self._offset
 
-    def go_through(self, script: Script, stop: threading.Event) -> bool:
+    def play_script(self, script: Script[Subject], stop: threading.Event) -> bool:
         """Run the script; False when it was stopped."""
         return play(script, self._carry_out, stop.is_set)
 
@@ -254,14 +257,14 @@ class _Driver:
         if isinstance(action, Send):
             self._send(action)
         elif isinstance(action, Join):
-            self._others[action.role] = self._joining(action.role)
+            self._others[action.role] = self._create_participant(action.role)
         elif isinstance(action, Leave):
             self._others.pop(action.role).close()
         elif isinstance(action, Restart):
             assert self._client is not None
             self._client.close()
             self._client = None
-            time.sleep(0.1)  # a new process takes longer; the hand must see the old one go
+            time.sleep(0.1)  # a real restart takes longer; the hand must see the old writer leave
             self._client = self._new_client()
             self._client.wait_matched(1.0)
         elif isinstance(action, StopService):
@@ -274,27 +277,28 @@ class _Driver:
         sender = self._client if action.by is None else self._others[action.by]
         assert isinstance(sender, _Client)
         stamp = None if not action.age_s else time.time_ns() - round(action.age_s * 1e9)
-        if not self._watch.measure_pause():  # or the kit stood still since it made up its mind
+        # after a pause of the kit's own process the command would be stale
+        if not self._watch.measure_pause():
             for topic, payload in action.payloads:
                 sender.send(topic, payload, stamp)
         self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
 
     def _new_client(self, type_name: str | None = None) -> _Client:
         claim = self.sole.announce()
-        return _Client(self.rig.options, self._wire, self.plan.sides, claim, type_name)
+        return _Client(self.rig.options, self._codec, self.plan.sides, claim, type_name)
 
-    def _joining(self, role: Role) -> _Client | _Monitor:
+    def _create_participant(self, role: Role) -> _Client | _Monitor:
         if role is Role.RIVAL:
             rival = self._new_client()
             rival.wait_matched(1.0)
             return rival
         if role is Role.STRANGER:
-            return self._new_client(self._wire.foreign.name)
+            return self._new_client(self._codec.foreign.name)
         qos = Qos("reliable", depth=None) if role is Role.LAGGARD else Qos.reader_default()
-        return _Monitor(self.rig.options, self._wire, self.plan.sides, qos)
+        return _Monitor(self.rig.options, self._codec, self.plan.sides, qos)
 
     def _stop_service(self) -> None:
-        """End the services; how long that took, and until nobody publishes any more."""
+        """End the services; measure the time until they have exited and their writers are gone."""
         assert self._client is not None
         begin = time.monotonic()
         polite = self.rig.end_services()
@@ -308,64 +312,64 @@ class _Driver:
         }
 
     def _observe(self) -> Observation:
-        q: dict[Side, Pose] = {}
-        dq: dict[Side, Pose] = {}
+        q: dict[Subject, Pose] = {}
+        dq: dict[Subject, Pose] = {}
         if self._client is not None:
             self._newest.update(self._client.newest())
         for side in self.plan.sides:
-            payload = self._newest.get(self._wire.state_topics[side])
+            payload = self._newest.get(self._codec.state_topics[side])
             if payload is None:
                 continue
             with contextlib.suppress(WireError):
-                state = self._wire.read_state(payload, side)
+                state = self._codec.read_state(payload, side)
                 if state is not None:
                     q[side], dq[side] = state
-        joined: dict[Side, float] = {}
+        joined: dict[Subject, float] = {}
         for role, other in self._others.items():
             if isinstance(other, _Monitor):
                 if role is Role.MONITOR:
                     joined = other.first_states()
                 else:
-                    other.look()
-        machine = self._wire.machine
+                    other.read_slowly()
+        machine = self._codec.machine
         self._watch.restart()
         return Observation(self.now_ns, q, dq, joined, self._stopped, machine)
 
 
 class _Client:
-    """The kit as the commanding program, with the official clients' quality of service.
+    """The commanding client, with the official clients' QoS.
 
-    :param claim: announced by all clients of one run, which are company to each other.
-    :param type_name: the type of its commands, if it is a stranger.
+    :param claim: the publisher claim that all clients of one run announce.
+    :param type_name: another type for its commands, in the role of a stranger.
     """
 
     def __init__(
         self,
         rig: RigOptions,
-        wire: Wire,
-        sides: tuple[Side, ...],
+        codec: MotorCodec,
+        sides: tuple[Subject, ...],
         claim: bytes,
         type_name: str | None = None,
     ) -> None:
         self._node = _node(rig)
-        commands = {wire.command_topics[s] for s in sides}
-        states = {wire.state_topics[s] for s in sides} if type_name is None else set()
+        commands = {codec.command_topics[s] for s in sides}
+        states = {codec.state_topics[s] for s in sides} if type_name is None else set()
         self._states = states
-        kind = type_name or wire.command
+        kind = type_name or codec.command
         self._writers: dict[str, Writer] = {
             t: self._node.writer(t, kind, qos=Qos.writer_default(), user_data=claim)
             for t in commands
         }
         self._readers: dict[str, Reader] = {
-            t: self._node.reader(t, wire.state, qos=Qos.reader_default()) for t in states
+            t: self._node.reader(t, codec.state, qos=Qos.reader_default()) for t in states
         }
 
     def send(self, topic: str, payload: bytes, stamp_ns: int | None = None) -> None:
-        """Publish a command, with a source timestamp if it is not to be now."""
+        """Publish a command; ``stamp_ns`` is its source timestamp, by default now."""
         self._writers[topic].write_raw(payload, stamp_ns)
 
     def wait_matched(self, timeout: float) -> None:
-        """Wait until the hands listen to this client."""
+        """Wait until readers of the hands are matched with this client's writers."""
         end = time.monotonic() + timeout
         for writer in self._writers.values():
             writer.wait_matched(max(0.0, end - time.monotonic()))
@@ -394,29 +398,31 @@ class _Client:
 
 
 class _Monitor:
-    """Another listener: the late joiner, or a slow reader."""
+    """A second participant that reads states: the late joiner, or a slow reader."""
 
-    def __init__(self, rig: RigOptions, wire: Wire, sides: tuple[Side, ...], qos: Qos) -> None:
+    def __init__(
+        self, rig: RigOptions, codec: MotorCodec, sides: tuple[Subject, ...], qos: Qos
+    ) -> None:
         self._node = _node(rig)
         self._sides = sides
-        self._wire = wire
+        self._codec = codec
         self._readers = {
-            t: self._node.reader(t, wire.state, qos=qos)
-            for t in {wire.state_topics[s] for s in sides}
+            t: self._node.reader(t, codec.state, qos=qos)
+            for t in {codec.state_topics[s] for s in sides}
         }
         self._begin = time.monotonic()
         self._matched: dict[str, float] = {}
         self._first: dict[str, float] = {}
-        self._looked = self._begin
+        self._last_read = self._begin
 
-    def look(self) -> None:
-        """Read what has come, but no more than twice a second."""
-        if time.monotonic() - self._looked >= 0.5:
-            self._looked = time.monotonic()
+    def read_slowly(self) -> None:
+        """Take the samples, at most twice a second."""
+        if time.monotonic() - self._last_read >= 0.5:
+            self._last_read = time.monotonic()
             for reader in self._readers.values():
                 reader.take()
 
-    def first_states(self) -> dict[Side, float]:
+    def first_states(self) -> dict[Subject, float]:
         """Seconds from being matched to the first state, for the sides that have sent one."""
         now = time.monotonic()
         for topic, reader in self._readers.items():
@@ -425,9 +431,9 @@ class _Monitor:
             if topic not in self._first and reader.take():
                 self._first[topic] = now - self._matched.get(topic, now)
         return {
-            s: self._first[self._wire.state_topics[s]]
+            s: self._first[self._codec.state_topics[s]]
             for s in self._sides
-            if self._wire.state_topics[s] in self._first
+            if self._codec.state_topics[s] in self._first
         }
 
     def close(self) -> None:

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.hand import JointMode, Side
+from dexkit.hand import JointMode, Side, Subject
 from dexkit.messages import MessageType, message_type
 from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
-__all__ = ["Motor", "Motors", "Wire", "mode_byte"]
+__all__ = ["Motor", "MotorCodec", "Motors", "mode_byte"]
 
 # The sequence of motors in a message, and the type of one of them. Written down here and not
 # taken from MessageType.motor_sequence: the kit's reading does not depend on what it tests.
@@ -60,8 +60,8 @@ def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) ->
     return index | status << 4 | timeout << 7
 
 
-class Wire:
-    """Encodes commands and reads states of one dialect.
+class MotorCodec:
+    """Encodes commands and decodes states of one dialect.
 
     :param joints: of one subject; by default those of a hand of the dialect's model.
     :param foreign: another command type, which the device must ignore; by default the other one
@@ -78,7 +78,7 @@ class Wire:
         *,
         joints: int | None = None,
         foreign: str | None = None,
-        subjects: Sequence[Side] = tuple(Side),
+        subjects: Sequence[Subject] = tuple(Side),
     ) -> None:
         self.dialect = dialect
         self.joints = joints or len(model(dialect.model).joints[Side.LEFT])
@@ -93,8 +93,8 @@ class Wire:
         self._states: dict[int, Any] = {}
         self._ids = dialect.mode_byte is ModeByte.RIS
         self._modes = dialect.mode_byte is not ModeByte.UNUSED
-        self.command_topics = {s: dialect.topics(s)[0] for s in subjects}
-        self.state_topics = {s: dialect.topics(s)[1] for s in subjects}
+        self.command_topics: Mapping[Subject, str] = {s: dialect.topics(s)[0] for s in subjects}
+        self.state_topics: Mapping[Subject, str] = {s: dialect.topics(s)[1] for s in subjects}
         self.shared = len(set(self.command_topics.values())) < len(subjects)
 
     def mode(self, index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
@@ -106,7 +106,7 @@ class Wire:
         return int(status) if self._modes else 0
 
     def status(self, modes: NDArray[np.intp]) -> NDArray[np.intp]:
-        """What mode bytes of states say about their motors: 1 driven, 0 not."""
+        """The status in mode bytes of states: 1 driven, 0 not."""
         return np.asarray(modes >> 4 & 7) if self._ids else modes
 
     @cached_property
@@ -114,7 +114,7 @@ class Wire:
         return message_type(self._command_motor).cls
 
     def encode(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
-        """(topic, payload) of the commands to these sides, all in one message if they share it.
+        """Encode commands to these sides as (topic, payload); one message if they share a topic.
 
         On a topic of its own a hand is sent as many motors as are given, however wrong.
         """
@@ -123,14 +123,14 @@ class Wire:
     def encode_longer(
         self, hands: Mapping[Side, Motors], surplus: Motors
     ) -> list[tuple[str, bytes]]:
-        """The same with more motors behind those that there are."""
+        """Encode commands with surplus motors at the end of the sequence."""
         return [
             (topic, self._payload([*motors, *surplus]))
             for topic, motors in self._by_topic(hands).items()
         ]
 
     def encode_foreign(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
-        """The same in :attr:`foreign`, the command type of the family's other branch."""
+        """Encode commands in :attr:`foreign`, another command type of the Dex family."""
         sequence, motor = _SEQUENCE[self.foreign.name]
         kind = message_type(motor).cls
         found = []
@@ -152,8 +152,8 @@ class Wire:
             places[self.dialect.index[side]] = motors[0]
         return {self.dialect.cmd_topic: places}
 
-    def encode_empty(self, sides: tuple[Side, ...]) -> list[tuple[str, bytes]]:
-        """The same with no motor in the sequence."""
+    def encode_empty(self, sides: Sequence[Side]) -> list[tuple[str, bytes]]:
+        """Encode commands with no motor in the sequence."""
         topics = dict.fromkeys(self.command_topics[side] for side in sides)
         return [(topic, self._payload([])) for topic in topics]
 
@@ -167,9 +167,9 @@ class Wire:
         return self.command.encode(message)
 
     def read_state(
-        self, data: bytes, side: Side
+        self, data: bytes, side: Subject
     ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """(q, dq) of a side's joints in a state payload, or None if they are not all there.
+        """Decode (q, dq) of a subject's joints; None if the sequence is too short.
 
         :raises WireError: the payload is not of the dialect's state type.
         """
@@ -178,8 +178,8 @@ class Wire:
             return None
         return tuple(m.q for m in motors), tuple(m.dq for m in motors)
 
-    def read_command(self, data: bytes, side: Side) -> tuple[Motor, ...] | None:
-        """A side's motors in a command payload, or None if they are not all there.
+    def read_command(self, data: bytes, side: Subject) -> tuple[Motor, ...] | None:
+        """Decode a subject's motors of a command; None if the sequence is too short.
 
         :raises WireError: the payload is not of the dialect's command type.
         """
@@ -190,7 +190,7 @@ class Wire:
             Motor(q=m.q, dq=m.dq, tau=m.tau, kp=m.kp, kd=m.kd, mode=m.mode) for m in motors
         )
 
-    def _mine(self, motors: Sequence[Any], side: Side) -> Sequence[Any] | None:
+    def _mine(self, motors: Sequence[Any], side: Subject) -> Sequence[Any] | None:
         first = self.dialect.index[side]
         mine = motors[first : first + self.joints]
         return mine if len(mine) == self.joints else None
@@ -201,7 +201,7 @@ class Wire:
         length: int | None = None,
         **rest: Any,
     ) -> bytes:
-        """A state message, for hands that the kit plays itself.
+        """Encode a state message, for the reference hands.
 
         :param hands: fields of each side's motors.
         :param length: motors in the sequence, if not the dialect's.

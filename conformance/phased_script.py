@@ -30,16 +30,16 @@ P = TypeVar("P", bound=_Stretch)
 
 
 class PhasedScript(ABC, Generic[A, O, P]):
-    """A stimulus that marks its phases.
+    """A stimulus script that records its phases.
 
     :param start: what is known before the first action.
-    :param say: called with progress messages for the user.
+    :param report: called with progress messages for the user.
     :ivar phases: what was done when, on the recording's clock; kept with the recording.
     """
 
-    def __init__(self, start: O, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(self, start: O, report: Callable[[str], None] = lambda text: None) -> None:
         self.phases: list[P] = []
-        self._say = say
+        self._report = report
         self._obs = start
         self._next_ns = 0
 
@@ -48,12 +48,12 @@ class PhasedScript(ABC, Generic[A, O, P]):
         """The whole script."""
 
     def _do(self, action: A) -> Generator[A, O, O]:
-        """Have an action carried out; what was observed then."""
+        """Yield an action to the player; return what was observed after it."""
         self._obs = yield action
         return self._obs
 
     def _mark(self, phase: P) -> P:
-        """Note that a phase begins."""
+        """Record that a phase begins."""
         self.phases.append(phase)
         return phase
 
@@ -67,7 +67,7 @@ class PhasedScript(ABC, Generic[A, O, P]):
     def _repeat(
         self, seconds: float, step: Callable[[], Generator[A, O, None]]
     ) -> Generator[A, O, None]:
-        """Do the same for so long."""
+        """Repeat ``step`` for ``seconds``."""
         end = self._obs.now_ns + round(seconds * 1e9)
         while self._obs.now_ns < end:
             yield from step()
@@ -75,7 +75,7 @@ class PhasedScript(ABC, Generic[A, O, P]):
     def _through(
         self, phase: P, seconds: float, step: Callable[[], Generator[A, O, None]]
     ) -> Generator[A, O, None]:
-        """Do the same until a phase has taken so long, and end it."""
+        """Repeat ``step`` until the phase is ``seconds`` long, and end it."""
         while self._elapsed(phase) < seconds:
             yield from step()
         self._end(phase)

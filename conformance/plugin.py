@@ -23,7 +23,7 @@ __all__ = ["OPTIONS_KEY", "REPORTED_KEY", "RESULT_KEY", "WHY_KEY"]
 OPTIONS_KEY: pytest.StashKey[SuiteOptions | None] = pytest.StashKey()
 RESULT_KEY: pytest.StashKey[RunResult] = pytest.StashKey()
 REPORTED_KEY: pytest.StashKey[list[Result]] = pytest.StashKey()
-"""What the tests that ran have reported; ``-k`` can leave some out."""
+"""The results of the tests that ran; ``-k`` can leave some out."""
 WHY_KEY: pytest.StashKey[str] = pytest.StashKey()
 """Why there is no result, where a run came to none."""
 
@@ -41,8 +41,8 @@ _FILES = {
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Declare the suite's options.
 
-    Each also has a long name, ``--dexkit-NAME``. Should another plug-in of the environment own
-    the short one, that is the only one: this plug-in must not break anybody's pytest.
+    Each also has a long name, ``--dexkit-NAME``. It is the only one where another plug-in of the
+    environment has the short name, so that pytest does not fail there.
     """
     from dexkit.models import DIALECTS
     from dexkit.robots import ROBOTS
@@ -183,7 +183,7 @@ def _items(session: pytest.Session) -> list[pytest.Item]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """Nothing judged is never a success, and a MUST that is left open is no failure of the hand.
+    """Set the exit code: a run in which nothing was judged, or a MUST is open, does not pass.
 
     The suite's exit codes are those of ``dexkit check``: 0 pass, 1 fail, 2 not usable.
     """
@@ -192,7 +192,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     if config.option.collectonly or exitstatus not in usual:
         return
     if not _items(session) and config.stash[OPTIONS_KEY] is None:
-        return  # somebody's own tests
+        return  # a pytest run without the suite
     from dexkit.conformance.results import Overall, overall_of
 
     reported: list[Result] = config.stash[REPORTED_KEY]
@@ -204,10 +204,10 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> Iterator[None]:
-    """The table that a person reads, after everything else.
+    """Print the table of results at the end.
 
-    pytest's own lists of failures say the same again, each side by itself: they are left out, but
-    where they were asked for, or hold other tests.
+    pytest's own lists of failures are left out: they repeat the table, each side by itself. They
+    are printed when they were asked for, or hold other tests.
     """
     session = terminalreporter._session
     result = config.stash.get(RESULT_KEY, None)

@@ -1,4 +1,4 @@
-"""A recording as the checks see it: per side, columns of commands and states in seconds.
+"""Decode a recording of DDS topics into arrays of commands and states for each subject.
 
 Times are seconds from the beginning of the recording: ``t`` is reception, ``sent`` the source
 timestamp. Positions are in the dialect's radians, torques of states in N·m whatever the dialect's
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.median import median
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
 from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Floats, JointSpec, Side
+from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.robots import RobotModel
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class TraceLike(Protocol):
-    """What is asked of a recording; :class:`dexkit.traces.Trace` is one."""
+    """The methods that judging needs of a recording; :class:`dexkit.traces.Trace` has them."""
 
     metadata: dict[str, dict[str, str]]
     warnings: list[str]
@@ -54,7 +54,7 @@ class TraceLike(Protocol):
 
     @property
     def endpoints(self) -> list[TraceEndpoint]:
-        """What discovery saw."""
+        """Every endpoint that DDS discovery reported."""
         ...
 
     def load(
@@ -66,7 +66,7 @@ class TraceLike(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """A side's states. What a sample lacks is NaN.
+    """The states of a subject. Values that a sample lacks are NaN.
 
     :param length: motors in the sequence; -1 where the sample does not decode.
     :param q: shape (n, n_joints), as ``dq``, ``ddq``, ``tau`` and ``mode``.
@@ -110,7 +110,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """The commands to a side, from whichever writer. What a sample lacks is NaN.
+    """The commands to a subject, of all writers. Values that a sample lacks are NaN.
 
     :param q: shape (n, n_joints), as ``dq``, ``tau``, ``kp``, ``kd`` and ``mode``.
     """
@@ -131,9 +131,9 @@ class Commands:
 
 @dataclass(frozen=True, eq=False)
 class SideView:
-    """One hand in the recording."""
+    """One hand, or a robot, in the recording."""
 
-    side: Side
+    side: Subject
     states: States
     commands: Commands
     joints: tuple[JointSpec, ...]
@@ -145,19 +145,19 @@ class Recording:
 
     :param origin_ns: log time of second 0.
     :param duration: seconds.
-    :param sides: every side that has a topic; ``judged`` names those to be judged.
-    :param stimulus: what the kit did, or None in a recording of somebody else's session.
+    :param sides: every subject that has a topic; ``judged`` names those to be judged.
+    :param stimulus: the phases of the stimulus, or None in a recording that no live run made.
     :param usb: what was transferred on USB, where the kit did that.
     """
 
     dialect: Dialect
     origin_ns: int
     duration: float
-    sides: Mapping[Side, SideView]
+    sides: Mapping[Subject, SideView]
     channels: Sequence[ChannelInfo]
     endpoints: Sequence[TraceEndpoint]
     stimulus: Stimulus | None
-    judged: tuple[Side, ...]
+    judged: tuple[Subject, ...]
     notes: Sequence[str] = ()
     usb: UsbRecording | None = None
 
@@ -165,7 +165,7 @@ class Recording:
     """Which layer's requirements it is judged by."""
 
     @classmethod
-    def of(
+    def decode(
         cls,
         trace: TraceLike,
         *,
@@ -194,7 +194,7 @@ class Recording:
                 f"no {model(chosen.model).title} topic of dialect {chosen.name} in this recording",
                 hint=f"it has: {names}",
             )
-        # the other side is decoded too: independence is judged with it
+        # the other side is decoded as well: checks of independence compare both
         topics = {t for s in Side for t in chosen.topics(s)} & present
         samples = trace.load(sorted(topics), decode=True) if topics else {}
         times = [s.log_time_ns for s in samples.values() if len(s)]
@@ -204,13 +204,13 @@ class Recording:
             marks.append(usb.origin_ns)
         origin = min([int(t[0]) for t in times] + marks, default=0)
         end = max([int(t[-1]) for t in times] + marks, default=0)
-        wire = Wire(chosen)
-        with np.errstate(invalid="ignore"):  # any NaN is a finding, not a surprise
-            views = {
+        codec = MotorCodec(chosen)
+        with np.errstate(invalid="ignore"):  # NaN in a message is judged by the checks
+            views: dict[Subject, SideView] = {
                 s: SideView(
                     s,
-                    _states(wire, s, samples.get(chosen.topics(s)[1]), origin),
-                    _commands(wire, s, samples.get(chosen.topics(s)[0]), origin),
+                    _states(codec, s, samples.get(chosen.topics(s)[1]), origin),
+                    _commands(codec, s, samples.get(chosen.topics(s)[0]), origin),
                     joints_of(chosen, s),
                 )
                 for s in sorted(Side, key=lambda s: s is not Side.LEFT)
@@ -220,7 +220,7 @@ class Recording:
             judged = tuple(s for s in judged if s not in blank)
         else:
             blank = []
-        # the kit's own doing is no news: it sends another type to see that the hand ignores it
+        # the kit itself publishes another type in the phase 'foreign'
         phases = stimulus.phases if stimulus else []
         foreign = {s for p in phases if p.name == "foreign" for s in p.sides}
         own = tuple(f"{chosen.topics(s)[0]} carries " for s in foreign)
@@ -255,10 +255,10 @@ class Recording:
         return (time_ns - self.origin_ns) / 1e9
 
     def log_time(self, seconds: float) -> int:
-        """The other way round."""
+        """A second of this recording as a log time."""
         return self.origin_ns + round(seconds * 1e9)
 
-    def phases(self, name: str, side: Side | None = None) -> list[Phase]:
+    def phases(self, name: str, side: Subject | None = None) -> list[Phase]:
         """The phases of that name, about that side."""
         if self.stimulus is None:
             return []
@@ -331,24 +331,24 @@ def _usb(trace: TraceLike) -> UsbRecording | None:
         return None
     from dexkit.conformance.usb.recording import UsbRecording  # few recordings have it
 
-    return UsbRecording.of(trace)
+    return UsbRecording.decode(trace)
 
 
 def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
     return np.asarray((times - origin) / 1e9, dtype=np.float64)
 
 
-def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> States:
-    topic = wire.dialect.topics(side)[1]
-    if samples is None or samples.type_name != wire.dialect.state_type:
-        t, none = np.empty(0), np.empty((0, wire.joints))
+def _states(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> States:
+    topic = codec.dialect.topics(side)[1]
+    if samples is None or samples.type_name != codec.dialect.state_type:
+        t, none = np.empty(0), np.empty((0, codec.joints))
         return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)
     columns = samples.decoded
     if columns is None:
-        columns = wire.state.columns(samples.payloads)
+        columns = codec.state.columns(samples.payloads)
 
-    def of(name: str) -> Floats:
-        return _joints(columns, wire, side, wire.state_sequence, name)
+    def column(name: str) -> Floats:
+        return _joints(columns, codec, side, codec.state_sequence, name)
 
     sent = _seconds(samples.publish_time_ns, origin)
     sent[samples.publish_time_ns == 0] = np.nan
@@ -356,55 +356,55 @@ def _states(wire: Wire, side: Side, samples: SampleArray | None, origin: int) ->
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
         sent=sent,
-        length=columns.count(wire.state_sequence),
-        q=of("q"),
-        dq=of("dq"),
-        ddq=of("ddq"),
-        tau=of("tau_est") * (wire.dialect.torque_units or 1.0),
-        mode=of("mode"),
+        length=columns.count(codec.state_sequence),
+        q=column("q"),
+        dq=column("dq"),
+        ddq=column("ddq"),
+        tau=column("tau_est") * (codec.dialect.torque_units or 1.0),
+        mode=column("mode"),
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
     )
 
 
 def _is_blank(view: SideView) -> bool:
-    """Whether a side has a place in the messages, and nobody ever is in it."""
+    """Whether every state of a side is 0 and no command drives it."""
     states, commands = view.states, view.commands
     said = (states.q, states.dq, states.ddq, states.tau, states.mode)
     drives = (commands.kp, commands.kd, commands.tau)
     return len(states) > 0 and not any(np.nan_to_num(a).any() for a in (*said, *drives))
 
 
-def _joints(columns: Columns, wire: Wire, side: Side, sequence: str, name: str) -> Floats:
+def _joints(columns: Columns, codec: MotorCodec, side: Side, sequence: str, name: str) -> Floats:
     """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
-    first = wire.dialect.index[side]
-    # a joint's values lie together, for checks go joint by joint
-    return columns.table([f"{sequence}[{first + i}].{name}" for i in range(wire.joints)])
+    first = codec.dialect.index[side]
+    # the values of one joint are contiguous: checks read one joint at a time
+    return columns.table([f"{sequence}[{first + i}].{name}" for i in range(codec.joints)])
 
 
-def _commands(wire: Wire, side: Side, samples: SampleArray | None, origin: int) -> Commands:
-    topic = wire.dialect.topics(side)[0]
-    if samples is None or samples.type_name != wire.dialect.cmd_type:
-        none = np.empty((0, wire.joints))
+def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> Commands:
+    topic = codec.dialect.topics(side)[0]
+    if samples is None or samples.type_name != codec.dialect.cmd_type:
+        none = np.empty((0, codec.joints))
         count = np.empty(0, np.intp)
         return Commands(topic, np.empty(0), count, none, none, none, none, none, none)
     columns = samples.decoded
     if columns is None:
-        columns = wire.command.columns(samples.payloads)
+        columns = codec.command.columns(samples.payloads)
 
-    def of(name: str) -> Floats:
-        return _joints(columns, wire, side, wire.command_sequence, name)
+    def column(name: str) -> Floats:
+        return _joints(columns, codec, side, codec.command_sequence, name)
 
     return Commands(
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
-        length=columns.count(wire.command_sequence),
-        q=of("q"),
-        dq=of("dq"),
-        tau=of("tau"),
-        kp=of("kp"),
-        kd=of("kd"),
-        mode=of("mode"),
+        length=columns.count(codec.command_sequence),
+        q=column("q"),
+        dq=column("dq"),
+        tau=column("tau"),
+        kp=column("kp"),
+        kd=column("kd"),
+        mode=column("mode"),
     )
 
 

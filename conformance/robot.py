@@ -1,7 +1,7 @@
 """Robots in the conformance kit: their dialect, messages with a CRC, and decoded recordings.
 
 A robot has no sides: where a hand has a side, it has
-:data:`~dexkit.conformance.stimulus_record.ROBOT`. Its joints are those of the used motor slots, in
+:data:`dexkit.hand.ROBOT`. Its joints are those of the used motor slots, in
 their order. What hands do not have: a CRC in each message, and slots that are not used.
 """
 
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.motor_messages import Motor, Motors, Wire
+from dexkit.conformance.motor_messages import Motor, MotorCodec, Motors
 from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
-from dexkit.conformance.stimulus_record import RECORD, ROBOT, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.errors import ConformanceError, WireError
-from dexkit.hand import Floats, Side
+from dexkit.hand import ROBOT, Floats, Subject
 from dexkit.messages import Columns, message_type
 from dexkit.models import Dialect
 from dexkit.robots import H1, ROBOTS, RobotModel, robot
@@ -29,13 +29,13 @@ from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import encode_with_crc, verify_payload
 
 __all__ = [
-    "SPOILS",
+    "WRONG_CRCS",
+    "RobotMotorCodec",
     "RobotRecording",
-    "RobotWire",
+    "codec_for",
     "robot_dialect",
     "robot_in",
     "robot_recording",
-    "wire_for",
 ]
 
 Flags = NDArray[np.bool_]
@@ -62,7 +62,7 @@ def robot_dialect(name: str) -> Dialect:
     )
 
 
-SPOILS = {
+WRONG_CRCS = {
     "bit": "a CRC that is off by a bit",
     "zero": "a CRC of 0",
     "cdr": "a CRC over the CDR bytes",
@@ -70,8 +70,8 @@ SPOILS = {
 """Wrong CRCs of commands."""
 
 
-class RobotWire(Wire):
-    """Encodes commands and reads states of a robot.
+class RobotMotorCodec(MotorCodec):
+    """Encodes commands with their CRC and decodes states of a robot.
 
     :ivar machine: ``mode_machine`` of the last state that was read; commands repeat it.
     """
@@ -85,7 +85,7 @@ class RobotWire(Wire):
         self.machine = 0
 
     def read_state(
-        self, data: bytes, side: Side
+        self, data: bytes, side: Subject
     ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """(q, dq) of the used slots.
 
@@ -96,23 +96,23 @@ class RobotWire(Wire):
         motors = [message.motor_state[slot] for slot in self.robot.used]
         return tuple(m.q for m in motors), tuple(m.dq for m in motors)
 
-    def low_command(self, motors: Motors, machine: int, spoil: str = "") -> bytes:
-        """A command for all slots.
+    def encode_low_command(self, motors: Motors, machine: int, wrong_crc: str = "") -> bytes:
+        """Encode a command for all motor slots, with its CRC.
 
-        :param spoil: one of :data:`SPOILS`, for a CRC that is wrong in that way.
+        :param wrong_crc: one of :data:`WRONG_CRCS`, for a CRC that is wrong in that way.
         """
         message = self._message(self.command.name, motors)
         if hasattr(message, "mode_machine"):
             message.mode_machine = machine
         sealed = encode_with_crc(message)
-        if not spoil:
+        if not wrong_crc:
             return sealed
         right = int.from_bytes(sealed[-4:], "little")
-        crc = {"bit": right ^ 0x10, "zero": 0, "cdr": crc32_words(sealed[4:-4])}[spoil]
+        crc = {"bit": right ^ 0x10, "zero": 0, "cdr": crc32_words(sealed[4:-4])}[wrong_crc]
         return sealed[:-4] + crc.to_bytes(4, "little")
 
-    def foreign_command(self, motors: Motors) -> bytes:
-        """The same in the other family's type."""
+    def encode_foreign_command(self, motors: Motors) -> bytes:
+        """Encode a command in the other family's type, with its CRC."""
         return encode_with_crc(self._message(self.foreign.name, motors))
 
     def _message(self, type_name: str, motors: Sequence[Motor]) -> Any:
@@ -125,9 +125,9 @@ class RobotWire(Wire):
         return message
 
 
-def wire_for(dialect: Dialect) -> Wire:
-    """The messages of a hand's or a robot's dialect."""
-    return RobotWire(dialect) if dialect.model in ROBOTS else Wire(dialect)
+def codec_for(dialect: Dialect) -> MotorCodec:
+    """The codec of a hand's or robot's dialect."""
+    return RobotMotorCodec(dialect) if dialect.model in ROBOTS else MotorCodec(dialect)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class RobotRecording(Recording):
 
     @cached_property
     def commands_intact(self) -> Flags:
-        """Which commands do."""
+        """Which commands decode and carry the right CRC."""
         return _intact(self.robot.cmd_type, self.command_payloads)
 
 
@@ -175,7 +175,7 @@ def robot_in(trace: TraceLike) -> RobotModel | None:
     """The robot whose topics, of its types, are in a recording; None without any."""
     seen = {(c.topic, c.type_name) for c in trace.channels}
     seen |= {(e.topic, e.type_name) for e in trace.endpoints}
-    # the state first: a client of the other robot, the kit among them, is no robot
+    # the state topic first: a command topic alone may be a client's of the other robot
     for topic in ("state", "cmd"):
         for model in ROBOTS.values():
             if (getattr(model, f"{topic}_topic"), getattr(model, f"{topic}_type")) in seen:
@@ -203,8 +203,8 @@ def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
     marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
     origin = min([int(t[0]) for t in times] + marks, default=0)
     end = max([int(t[-1]) for t in times] + marks, default=0)
-    states = _right(samples.get(model.state_topic), model.state_type)
-    commands = _right(samples.get(model.cmd_topic), model.cmd_type)
+    states = _samples_of_type(samples.get(model.state_topic), model.state_type)
+    commands = _samples_of_type(samples.get(model.cmd_topic), model.cmd_type)
     low = states.columns() if states is not None else None
     with np.errstate(invalid="ignore"):
         hand = SideView(
@@ -233,7 +233,7 @@ def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
     )
 
 
-def _right(samples: SampleArray | None, type_name: str) -> SampleArray | None:
+def _samples_of_type(samples: SampleArray | None, type_name: str) -> SampleArray | None:
     if samples is None or samples.type_name != type_name or samples.problem:
         return None
     return samples
@@ -280,17 +280,17 @@ def _commands(model: RobotModel, samples: SampleArray | None, origin: int) -> Co
         )
     columns = samples.columns()
 
-    def of(name: str) -> Floats:
+    def column(name: str) -> Floats:
         return _used(columns, model, f"motor_cmd[].{name}")
 
     return Commands(
         topic=model.cmd_topic,
         t=_times(samples, origin)[0],
         length=np.where(columns.ok, model.slots, -1).astype(np.intp),
-        q=of("q"),
-        dq=of("dq"),
-        tau=of("tau"),
-        kp=of("kp"),
-        kd=of("kd"),
-        mode=of("mode"),
+        q=column("q"),
+        dq=column("dq"),
+        tau=column("tau"),
+        kp=column("kp"),
+        kd=column("kd"),
+        mode=column("mode"),
     )

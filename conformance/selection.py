@@ -1,4 +1,4 @@
-"""Which requirements a run is about: by id, by level, by what is claimed, by how long they take."""
+"""Select the requirements of a quick run, and print a selection."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from functools import cache
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side
 from dexkit.models import model
 from dexkit.robots import ROBOTS
 
@@ -18,7 +17,7 @@ __all__ = ["length", "print_selection", "quick"]
 
 @cache
 def length(model_name: str, phases: frozenset[str]) -> float:
-    """Seconds that a pair of hands which obey at once takes for these phases."""
+    """Duration of these phases, s, with hands or a robot that reach every goal at once."""
     if model_name in ROBOTS:
         plan = Plan(robot_dialect(model_name), (ROBOT,), phases=phases)
         return script_class(model_name)(plan).length()
@@ -27,10 +26,10 @@ def length(model_name: str, phases: frozenset[str]) -> float:
 
 
 def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
-    """The MUSTs that need no long observation.
+    """Select the MUSTs of a quick run.
 
-    Those stimuli that serve the most MUSTs for their length, as long as all together take no more
-    than the profile's ``quick_seconds``. What needs a recorded session takes too long.
+    Phases are added in the order of their duration per MUST, until the profile's
+    ``quick_seconds`` are used up. Requirements that need a recorded session are left out.
     """
     chosen: set[str] = set()
     for name in dict.fromkeys(r.model for r in requirements):
@@ -41,7 +40,7 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
                 if "replay" not in own:
                     needs.setdefault(own, []).append(r.id)
         budget = (ROBOTS.get(name) or model(name)).quick_seconds
-        least = length(name, frozenset()) - 0.1  # s; what needs no stimulus comes first
+        least = length(name, frozenset()) - 0.1  # s; requirements that need no stimulus come first
         phases: frozenset[str] = frozenset()
         for own in sorted(needs, key=lambda o: (length(name, o) - least) / len(needs[o])):
             if length(name, phases | own) <= budget:
@@ -51,7 +50,7 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
 
 
 def print_selection(requirements: Sequence[Requirement]) -> None:
-    """Print id, level, title, how sure the source is, the stimulus, and the unit, if any."""
+    """Print a table: id, level, title, confidence, stimulus and unit of each requirement."""
     rows = [("requirement", "level", "title", "confidence", "stimulus", "unit")]
     rows += [
         (r.id, str(r.level), r.title, r.confidence, r.needs, r.capability) for r in requirements

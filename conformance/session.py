@@ -1,4 +1,4 @@
-"""One run for the whole suite: options, run, verdicts, files."""
+"""Run the conformance suite: check options, do the live run, judge it, write result files."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.backend_processes import (
-    BODY_EMULATORS,
     EMULATED,
     EXTERNAL,
     ON_USB,
+    ROBOT_EMULATORS,
     SIMULATED,
     RigOptions,
 )
@@ -27,11 +27,10 @@ from dexkit.conformance.results import RunResult
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.stimuli.session import Session
-from dexkit.conformance.stimulus_record import ROBOT
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import DEX1_1, Dialect, dialect, model
 from dexkit.open_file_limit import require_open_files
 from dexkit.robots import ROBOTS
@@ -50,13 +49,13 @@ _FILES = 48  # descriptors of a run: DDS, recording, the pipes of its processes
 
 @dataclass(frozen=True)
 class SuiteOptions:
-    """What a run of the suite was asked for.
+    """The options of a run of the suite.
 
     :param domain: None for a free one.
     """
 
     backend: str
-    sides: tuple[Side, ...]
+    sides: tuple[Subject, ...]
     dialect: Dialect
     domain: int | None
     interface: str
@@ -73,7 +72,7 @@ class SuiteOptions:
 
     @classmethod
     def from_pytest(cls, config: pytest.Config) -> SuiteOptions:
-        """From the command line of pytest.
+        """Read the options from pytest's command line.
 
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
@@ -128,7 +127,7 @@ class SuiteOptions:
         markdown: Path | None = None,
         recording: Path | None = None,
     ) -> SuiteOptions:
-        """Check and complete what a user gave.
+        """Check a user's options and fill in defaults.
 
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
@@ -137,18 +136,19 @@ class SuiteOptions:
         if of_robot:
             _refuse_for_robots(side=side, device=devices, object=objects, set=settings, trace=trace)
         one_device = len(devices) == 1 and "=" not in devices[0]
-        sides = sides_of(side or ("left" if one_device else "both"))
-        if one_device and len(sides) > 1:
+        hands = sides_of(side or ("left" if one_device else "both"))
+        if one_device and len(hands) > 1:
             raise UsageError(
                 "one --device for two hands", hint="--device left=PATH --device right=PATH"
             )
-        named = _by_side(devices, sides, str, "--device")
+        named = _by_side(devices, hands, str, "--device")
+        sides: tuple[Subject, ...] = hands
         if of_robot:
             sides, chosen = (ROBOT,), robot_dialect(of_robot)
         else:
-            chosen = _dialect(backend, dialect_name, sides[0], named, settings)
+            chosen = _dialect(backend, dialect_name, hands[0], named, settings)
         touch = [o for o in objects if o != "none"]
-        by_side = _by_side(touch, sides, float, "--object")
+        by_side = _by_side(touch, hands, float, "--object")
         low, high, of_what = (5, 60, "opening") if chosen.q_open > 0 else (55, 75, "closing")
         for pct in by_side.values():
             if not low <= pct <= high:
@@ -202,7 +202,7 @@ class SuiteOptions:
         return options
 
     def rig(self, domain: int) -> RigOptions:
-        """What is to be brought up, on that domain."""
+        """The options of the backend's processes, on that domain."""
         return RigOptions(
             backend=self.backend,
             sides=self.sides,
@@ -216,7 +216,7 @@ class SuiteOptions:
 
     @property
     def subject(self) -> dict[str, str]:
-        """What a report says of what was judged."""
+        """Backend, device and object, for a result's ``subject``."""
         emulated = self.backend in EMULATED and not self.devices
         about = {"backend": self.backend}
         if self.devices:
@@ -248,18 +248,18 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
 
 
 def _robot_of(backend: str, dialect_name: str | None) -> str:
-    """The robot that is to be judged; empty for a hand.
+    """Name of the robot to be judged; empty for a hand.
 
     :raises UsageError: a backend and a dialect of two of them.
     """
-    started = BODY_EMULATORS.get(backend, "")
+    started = ROBOT_EMULATORS.get(backend, "")
     wanted = dialect_name if dialect_name in ROBOTS else ""
     if (started and dialect_name and wanted != started) or (
         wanted and not started and backend != EXTERNAL
     ):
         raise UsageError(
             f"{backend} does not speak {dialect_name}",
-            hint=f"robots: --backend {' or '.join(BODY_EMULATORS)}, or external with --dialect "
+            hint=f"robots: --backend {' or '.join(ROBOT_EMULATORS)}, or external with --dialect "
             f"{' or '.join(ROBOTS)}",
         )
     return started or wanted or ""
@@ -278,9 +278,9 @@ def _dialect(
     devices: Mapping[Side, str],
     settings: Sequence[str],
 ) -> Dialect:
-    """The dialect to judge in: the one that is wanted, or the first of the backend's model.
+    """Choose the dialect: the one that was given, or the first of the backend's model.
 
-    A hand class says its model only once there is a hand of it: one is made, and not opened.
+    The model is an attribute of a hand object: one is created, and not opened.
 
     :raises UsageError: the backend needs a device, or its hand does not speak that dialect.
     :raises BackendError: it makes no hand.
@@ -307,7 +307,7 @@ def _dialect(
 def _by_side(
     values: Sequence[str], sides: Sequence[Side], kind: Callable[[str], T], option: str
 ) -> dict[Side, T]:
-    """``left=X`` and ``right=X``, or one value for the only side (or for each of them)."""
+    """Parse ``left=X`` and ``right=X``, or one value for all sides."""
     found: dict[Side, T] = {}
     for value in values:
         name, equals, rest = value.partition("=")
@@ -339,7 +339,7 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
 
 def run_suite(
     options: SuiteOptions,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
     *,
     attempts: int = 2,
@@ -360,16 +360,16 @@ def run_suite(
     result: RunResult | None = None
     while result is None or (result.disturbed and attempts > 0):
         if result is not None:
-            say("the machine was too busy to be fair to the hand; once more")
+            report("the machine was too busy to be fair to the hand; once more")
         attempts -= 1
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(TemporaryFolder())
             if (domain := options.domain) is None:
                 domain = stack.enter_context(reserve_free_domain(options.interface)).domain
             path = options.recording or folder / "run.mcap"
-            if not record_run(live_options(options, domain), path, say=say, stop=stop):
+            if not record_run(live_options(options, domain), path, report=report, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")
-            say("judging the recording")
+            report("judging the recording")
             trace = open_trace(path)
             view = recording_of(trace, options.dialect.name, options.sides)
             if trace.damage:

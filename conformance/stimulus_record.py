@@ -1,4 +1,4 @@
-"""The stimulus as the recording remembers it: what was done when, in a metadata record.
+"""The stimulus record: phases, targets and timer lateness of a run, as mcap metadata.
 
 A live run writes the record :data:`RECORD` into its recording, so that the recording alone says
 what the hand was asked to do and can be judged again at any time.
@@ -9,45 +9,42 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
-from dexkit.hand import Floats, Side
+from dexkit.hand import ROBOT, Floats, Side, Subject
 
 __all__ = [
     "IDLE",
     "RECORD",
-    "ROBOT",
     "Beats",
     "Lost",
     "Phase",
     "Stall",
     "Stimulus",
-    "stalls_of",
-    "time_of",
+    "parse_stalls",
+    "parse_time",
 ]
 
 _LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
-ROBOT = cast(Side, "robot")
-"""What a whole robot has where a hand has its side."""
 _EARLIER_ROBOT = "body"
-"""The same in recordings of earlier versions."""
+"""The name of the subject ``robot`` in recordings of earlier versions."""
 IDLE = 1e-3
-"""Seconds by which timers are late on a machine that has nothing else to do."""
+"""Seconds by which timers are late on an idle machine."""
 
 
 @dataclass
 class Phase:
-    """One stretch of the stimulus.
+    """One phase of the stimulus.
 
-    :param name: what was done: ``listen``, ``step``, ``silence``, ...
-    :param sides: the sides that it is about.
+    :param name: kind of stimulus: ``listen``, ``step``, ``silence``, ...
+    :param sides: the subjects that it is applied to.
     :param begin_ns: log time at which it began.
     :param targets: q that joints of each side were to reach, by their index, in the dialect's
         radians.
@@ -55,17 +52,17 @@ class Phase:
     """
 
     name: str
-    sides: tuple[Side, ...]
+    sides: tuple[Subject, ...]
     begin_ns: int
     end_ns: int = 0
-    targets: dict[Side, dict[int, float]] = field(default_factory=dict)
+    targets: dict[Subject, dict[int, float]] = field(default_factory=dict)
     params: dict[str, str] = field(default_factory=dict)
     observed: dict[str, float | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Stall:
-    """A stretch in which programs waited for a processor."""
+    """An interval in which programs waited for a processor."""
 
     begin_ns: int
     end_ns: int
@@ -73,7 +70,7 @@ class Stall:
 
 @dataclass(frozen=True)
 class Lost:
-    """By how much the kit's own timer was late in a stretch, beyond what an idle machine's is.
+    """Lateness of the kit's timer in an interval, beyond that on an idle machine.
 
     :param total: all of it, seconds: what one thing that happened then may have waited.
     :param mean: of each time, seconds: what a thing that happens again and again waited.
@@ -89,7 +86,7 @@ class Lost:
 
 @dataclass
 class Beats:
-    """By how much a timer of the kit's own was late, all along the run: the harness's jitter.
+    """Lateness of the kit's timer over the whole run.
 
     :param begin_ns: log time of offset 0.
     :param t_us: when it fired, microseconds from there.
@@ -101,16 +98,16 @@ class Beats:
     late_us: list[int] = field(default_factory=list)
 
     @classmethod
-    def of(cls, text: str) -> Beats:
-        """Read the record's content.
+    def parse(cls, text: str) -> Beats:
+        """Parse the record's content.
 
         :raises TypeError, ValueError, TraceUnsupported: it is damaged.
         """
         found = cls(**_json(text))
-        t, late = [time_of(t) for t in found.t_us], [time_of(t) for t in found.late_us]
+        t, late = [parse_time(t) for t in found.t_us], [parse_time(t) for t in found.late_us]
         if len(t) != len(late):
             raise ValueError("a heartbeat without a lateness")
-        return cls(time_of(found.begin_ns), t, late)
+        return cls(parse_time(found.begin_ns), t, late)
 
     def lateness(self, begin_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Median and 99th percentile of it in [begin, end], seconds; None if it is not known."""
@@ -121,7 +118,7 @@ class Beats:
         return float(median), float(high)
 
     def lost(self, begin_ns: int, end_ns: int) -> Lost | None:
-        """What was lost in [begin, end]; None if that is not known."""
+        """Lateness in [begin, end] beyond that of an idle machine; None if it is not known."""
         there = np.maximum(self._in(begin_ns, end_ns) - IDLE, 0.0)
         if not len(there):
             return None
@@ -137,7 +134,7 @@ class Beats:
 
 @dataclass
 class Stimulus:
-    """The whole record.
+    """The stimulus record.
 
     :param phases: in order of time.
     :param objects: where each side touches its object, or None where there is none: rad for a
@@ -147,7 +144,7 @@ class Stimulus:
     """
 
     phases: list[Phase] = field(default_factory=list)
-    objects: dict[Side, float | None] = field(default_factory=dict)
+    objects: dict[Subject, float | None] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
 
@@ -179,7 +176,7 @@ class Stimulus:
 
     @classmethod
     def from_metadata(cls, record: Mapping[str, str]) -> Stimulus:
-        """Read it back.
+        """Parse the record's content.
 
         :raises TraceUnsupported: of another version, or damaged.
         """
@@ -194,28 +191,28 @@ class Stimulus:
                 phases=[
                     Phase(
                         name=p["name"],
-                        sides=tuple(_side(s) for s in p["sides"]),
-                        begin_ns=time_of(p["begin_ns"]),
-                        end_ns=time_of(p["end_ns"]),
-                        targets={_side(s): _joints(q) for s, q in p["targets"].items()},
+                        sides=tuple(_subject(s) for s in p["sides"]),
+                        begin_ns=parse_time(p["begin_ns"]),
+                        end_ns=parse_time(p["end_ns"]),
+                        targets={_subject(s): _joints(q) for s, q in p["targets"].items()},
                         params=dict(p["params"]),
                         observed=dict(p["observed"]),
                     )
                     for p in phases
                 ],
                 objects={
-                    _side(s): None if q is None else float(q)
+                    _subject(s): None if q is None else float(q)
                     for s, q in _json(record["objects"]).items()
                 },
-                stalls=stalls_of(record["stalls"]),
-                beats=Beats.of(record.get("beats", "{}")),
+                stalls=parse_stalls(record["stalls"]),
+                beats=Beats.parse(record.get("beats", "{}")),
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
 
 
-def _side(name: str) -> Side:
-    return ROBOT if name in (ROBOT, _EARLIER_ROBOT) else Side(name)
+def _subject(name: str) -> Subject:
+    return ROBOT if name in (ROBOT.value, _EARLIER_ROBOT) else Side(name)
 
 
 def _joints(value: Any) -> dict[int, float]:
@@ -225,15 +222,15 @@ def _joints(value: Any) -> dict[int, float]:
     return {0: float(value)}
 
 
-def stalls_of(text: str) -> list[Stall]:
+def parse_stalls(text: str) -> list[Stall]:
     """Read the stalls of a record.
 
     :raises TypeError, ValueError, TraceUnsupported: it is damaged.
     """
-    return [Stall(time_of(a), time_of(b)) for a, b in _json(text)]
+    return [Stall(parse_time(a), parse_time(b)) for a, b in _json(text)]
 
 
-def time_of(value: Any) -> int:
+def parse_time(value: Any) -> int:
     """A time or a duration, nanoseconds or microseconds."""
     if isinstance(value, bool) or not isinstance(value, int) or not -_LATEST <= value <= _LATEST:
         raise ValueError(f"{value!r} is not a time")
@@ -241,5 +238,5 @@ def time_of(value: Any) -> int:
 
 
 def _json(text: str) -> Any:
-    # what was measured may be NaN
+    # measured values may be NaN
     return parse_json(text, "the stimulus record", error=TraceUnsupported, finite=False)

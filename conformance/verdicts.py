@@ -1,12 +1,12 @@
-"""From a requirement and what its check found to a verdict; the same for topics and USB.
+"""Make a verdict of a requirement and its check's outcome; the same for DDS and USB.
 
-**Whose fault is it?** A machine that is short of processor time makes a good hand look late. Only
+**Machine or hand?** A machine that is short of processor time makes a correct hand look late. Only
 requirements of real time can suffer from it, and only as far as the machine is shown to have been
 late while it was judged:
 
-1. Each failure has a size: the seconds by which a good hand would have had to be late to look like
-   it (:class:`~dexkit.conformance.checks.Late`). A rate of 150 Hz where 200 are asked for is 1.7 ms
-   late each time; 50 Hz is 15 ms; a gap of 0.3 s where 0.1 s are allowed is 0.2 s late once.
+1. Each failure has a size: the delay, in seconds, that would make a correct hand fail in the same
+   way (:class:`~dexkit.conformance.checks.Late`). A rate of 150 Hz where 200 are asked for is
+   1.7 ms late each time; 50 Hz is 15 ms; a gap of 0.3 s where 0.1 s are allowed is 0.2 s late once.
 2. The kit's own timer is measured all the time (:mod:`~dexkit.conformance.heartbeat`). What it was
    late by at the failure's place, beyond what is usual on an idle machine, is what the machine has
    demonstrably lost.
@@ -39,7 +39,7 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
 from dexkit.conformance.stimulus_record import IDLE, Lost
-from dexkit.hand import Side
+from dexkit.hand import Subject
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]
 
@@ -80,7 +80,7 @@ class Machine(Protocol):
 
 @dataclass(frozen=True)
 class Excuse:
-    """What the machine has to do with a failure.
+    """Whether load of the machine explains a failure.
 
     :param disturbance: its load, and what was measured of it.
     :param text: what it was like, where it was not idle; else empty.
@@ -103,7 +103,7 @@ def excuse(
     outcome: Outcome,
     whole: tuple[float, float] | None = None,
 ) -> Excuse:
-    """Whether the machine that the kit ran on can have caused a failure; see the module.
+    """Decide whether load of the machine that the kit ran on can have caused a failure.
 
     :param whole: the run, for failures that have no place.
     """
@@ -130,7 +130,7 @@ def excuse(
 
 
 def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse | None:
-    """That the machine was overloaded, or None."""
+    """The excuse of a machine that was overloaded during the whole run; None if it was not."""
     lost = machine.lost(*whole) if whole is not None else None
     if lost is None or lost.mean < OVERLOADED:
         return None
@@ -142,7 +142,7 @@ def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse |
 
 
 def _sizes(outcome: Outcome, spans: Sequence[tuple[float, float]]) -> Sequence[float]:
-    """How late a good hand would have to be at each place of a failure."""
+    """The delay, in seconds, that would make a correct hand fail at each place."""
     if outcome.late is None:
         return [end - begin for begin, end in spans]
     sizes = outcome.late.seconds
@@ -186,17 +186,21 @@ def _ms(seconds: float) -> str:
 
 
 class Judgement:
-    """One requirement on one side, on its way to a :class:`Result`.
+    """Makes the :class:`Result` of one requirement for one subject.
 
     :param requirement: at the level that the claims give it.
-    :param found: the results of this side so far, by requirement.
+    :param found: the results of this subject so far, by requirement.
     """
 
     def __init__(
-        self, requirement: Requirement, side: Side, claims: Claims, found: Mapping[str, Result]
+        self,
+        requirement: Requirement,
+        subject: Subject,
+        claims: Claims,
+        found: Mapping[str, Result],
     ) -> None:
         self.requirement = requirement
-        self._side = side
+        self._subject = subject
         self._claimed = claims.claimed(requirement)
         self._found = found
 
@@ -211,7 +215,7 @@ class Judgement:
         cause = outcome.cause or self.requirement.cause
         return Result(
             requirement=self.requirement,
-            side=str(self._side),
+            side=str(self._subject),
             verdict=verdict,
             figure=outcome.figure,
             observed=outcome.observed,
@@ -227,11 +231,11 @@ class Judgement:
         )
 
     def not_applicable(self, reason: str) -> Result:
-        """It cannot be judged here."""
+        """The result *not applicable*, with its reason."""
         return self.result(Verdict.NOT_APPLICABLE, Outcome(None, reason=reason))
 
     def not_claimed(self) -> Result | None:
-        """The result, if it is about a unit that is not claimed."""
+        """The result *not claimed*, if the requirement's unit is not claimed; else None."""
         if self._claimed is not False:
             return None
         unit = self.requirement.capability
@@ -240,21 +244,23 @@ class Judgement:
         )
 
     def blocked(self) -> Result | None:
-        """The result, if something failed that it depends on."""
+        """The result *blocked*, if a requirement that it depends on failed; else None."""
         for before in self.requirement.after:
             if self._found[before].verdict in _OPEN:
                 reason = f"blocked by {before}"
                 return self.result(Verdict.BLOCKED, Outcome(None, reason=reason), before)
         return None
 
-    def of(self, check: Callable[[], Outcome], excuse: Callable[[Outcome], Excuse]) -> Result:
-        """What the check finds.
+    def run_check(
+        self, check: Callable[[], Outcome], excuse: Callable[[Outcome], Excuse]
+    ) -> Result:
+        """Call the check and make a result of its outcome.
 
-        :param excuse: what the machine has to do with a failure.
+        :param excuse: decides whether load of the machine explains a failure.
         """
         try:
             outcome = check()
-        except Exception as error:  # a check that breaks must not look like a hand that does
+        except Exception as error:  # an error of the kit is no failure of the hand
             text = f"the check itself failed: {type(error).__name__}: {error}"
             return self.result(Verdict.ERROR, Outcome(None, reason=text))
         if outcome.absent and self._claimed:

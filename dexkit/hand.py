@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum, IntFlag
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Final, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from dexkit.errors import CommandRejected, UsageError
 
 __all__ = [
+    "ROBOT",
     "CommandGate",
     "Floats",
     "Hand",
@@ -32,7 +33,9 @@ __all__ = [
     "JointMode",
     "JointSpec",
     "MotorError",
+    "RobotSubject",
     "Side",
+    "Subject",
     "SupplyState",
 ]
 
@@ -47,6 +50,21 @@ class Side(str, Enum):
 
     def __str__(self) -> str:
         return self.value
+
+
+class RobotSubject(str, Enum):
+    """What a robot has where a hand has its side."""
+
+    ROBOT = "robot"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+ROBOT: Final = RobotSubject.ROBOT
+
+Subject: TypeAlias = Side | RobotSubject
+"""What a conformance run judges: one hand, named by its side, or a robot."""
 
 
 class JointMode(IntEnum):

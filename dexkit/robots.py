@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from dexkit.errors import UsageError
-from dexkit.hand import JointSpec
+from dexkit.hand import JointSpec, RobotSubject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ DQ_STOP = 16000.0
 """A ``dq`` that means "no velocity" (docs/sources/unitree-dex.md#a8)."""
 
 
-_SCRIPT: Lazy[type[Script]] = Lazy("dexkit.conformance.stimuli.robot:RobotScript")
+_SCRIPT: Lazy[type[Script[RobotSubject]]] = Lazy("dexkit.conformance.stimuli.robot:RobotScript")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class RobotModel:
     # inferred: the sources are silent; the protection of the hands' motors trips after 1 s
     # (docs/sources/unitree-dex.md#b4)
     command_timeout: float = 1.0
-    script: Lazy[type[Script]] = _SCRIPT
+    script: Lazy[type[Script[RobotSubject]]] = _SCRIPT
 
     @property
     def slots(self) -> int:

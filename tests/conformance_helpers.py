@@ -53,7 +53,7 @@ def with_beats(
     stimulus.beats = Beats(first, sorted(beats), [beats[t] for t in sorted(beats)])
     stimulus.stalls = [Stall(first, first + 60 * 10**9)] if pressed else []
     trace.metadata[RECORD] = stimulus.to_metadata()
-    return Recording.of(trace)
+    return Recording.decode(trace)
 
 
 def of(result: RunResult, requirement: str, side: str = "left") -> Result:

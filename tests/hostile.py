@@ -181,7 +181,7 @@ def judged_result(folder: Path) -> tuple[dict[str, Any], Path]:
     from dexkit.traces import open_trace, sample_path
 
     path = sample_path("dex1_hand_dropout")
-    found = judge(Recording.of(open_trace(path)), subject={"recording": path.name})
+    found = judge(Recording.decode(open_trace(path)), subject={"recording": path.name})
     found.write_json(folder / "good.json")
     return json.loads((folder / "good.json").read_text()), path
 

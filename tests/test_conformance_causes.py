@@ -93,4 +93,4 @@ def test_passed_result_has_no_cause() -> None:
     from dexkit.conformance.recording import Recording
     from tests.conformance_helpers import short_run
 
-    assert of(judge(Recording.of(short_run())), "DEX1-RATE-01").cause == ""
+    assert of(judge(Recording.decode(short_run())), "DEX1-RATE-01").cause == ""

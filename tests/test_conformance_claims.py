@@ -76,7 +76,7 @@ def test_without_claims_file_verdicts_are_unchanged() -> None:
 
 
 def test_claimed_units_are_must_and_others_not_claimed() -> None:
-    recording = Recording.of(short_run())
+    recording = Recording.decode(short_run())
     silent = judge(recording)
     assert of(silent, VELOCITY.id).requirement.level is Level.SHOULD
     assert silent.claims is None
@@ -95,7 +95,7 @@ def test_claimed_units_are_must_and_others_not_claimed() -> None:
 def concluded(requirement: Requirement, text: str, outcome: Outcome) -> Result:
     claims = Claims.parse(text) if text else Claims()
     (applied,) = claims.apply([requirement])
-    return Judgement(applied, Side.LEFT, claims, {}).of(lambda: outcome, lambda _: Excuse())
+    return Judgement(applied, Side.LEFT, claims, {}).run_check(lambda: outcome, lambda _: Excuse())
 
 
 @each("met", [None, True])

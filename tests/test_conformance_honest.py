@@ -95,7 +95,7 @@ class Unhurried(ReferenceService):
 
 def judged(service: type[Service], claims: Claims | None = None) -> RunResult:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=PHASES)
-    return judge(Recording.of(run_virtual(plan, service)), claims=claims)
+    return judge(Recording.decode(run_virtual(plan, service)), claims=claims)
 
 
 def blamed(result: RunResult) -> set[str]:
@@ -120,13 +120,13 @@ def test_hand_within_the_limits_never_fails(service: type[Service], warned: set[
 
 
 def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
-    fresh = of(judge(Recording.of(listened(Hesitates))), "DEX1-FRESH-02")
+    fresh = of(judge(Recording.decode(listened(Hesitates))), "DEX1-FRESH-02")
     assert fresh.verdict is Verdict.PASS
     assert 0.08 < fresh.values["frozen_s"] < 0.15  # and not the second of rest before it
 
 
 def test_fast_gripper_is_not_judged_as_percent() -> None:
-    speed = of(judge(Recording.of(listened(Quick))), "DEX1-FIELD-14")
+    speed = of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-14")
     assert speed.verdict is Verdict.PASS
     assert 30 < speed.values["speed_rad_s"] < 60
 
@@ -139,7 +139,7 @@ def test_units_that_are_not_claimed_do_not_fail() -> None:
 
 def test_restart_of_the_service_by_the_kit_is_not_a_gap() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"shutdown", "service-restart"}))
-    found = judge(Recording.of(run_virtual(plan, ReferenceService)))
+    found = judge(Recording.decode(run_virtual(plan, ReferenceService)))
     gap = of(found, "DEX1-RATE-03")
     assert gap.verdict is Verdict.PASS
     assert gap.values["max_gap_s"] < 0.1  # nor is it reported as the longest
@@ -194,10 +194,12 @@ def test_motion_is_blocked_on_overloaded_machine(usual_ms: float, verdict: Verdi
     ("part", "late_ms"), [(0.02, 10.0), (0.05, 10.0), (0.05, 30.0), (0.2, 10.0)]
 )
 def test_late_timestamps_do_not_fail_acceleration_check(part: float, late_ms: float) -> None:
-    ratio = of(judge(Recording.of(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06")
+    ratio = of(
+        judge(Recording.decode(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06"
+    )
     assert ratio.verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE)
     turned = stamped_late(gripper.TurnedAcceleration, part, late_ms)
-    found = of(judge(Recording.of(turned)), "DEX1-FIELD-06")
+    found = of(judge(Recording.decode(turned)), "DEX1-FIELD-06")
     assert found.verdict is (Verdict.WARN if ratio.verdict is Verdict.PASS else ratio.verdict)
 
 
@@ -222,11 +224,11 @@ def listened(service: type[Service]) -> MemoryTrace:
 
 @pytest.mark.parametrize("off_s", [-3600.0, 0.4, 86400.0])
 def test_wrong_clock_of_the_hand_does_not_change_verdicts(off_s: float) -> None:
-    right = judge(Recording.of(short_run()))
+    right = judge(Recording.decode(short_run()))
     trace = copy_of(short_run())
     topic = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     trace.rows[topic] = [(t, s + round(off_s * 1e9), p) for t, s, p in trace.rows[topic]]
-    found = judge(Recording.of(trace))
+    found = judge(Recording.decode(trace))
     assert [r.verdict for r in found.results] == [r.verdict for r in right.results]
     gap, was = of(found, "DEX1-WDOG-02"), of(right, "DEX1-WDOG-02")
     assert gap.values["max_gap_s"] == pytest.approx(was.values["max_gap_s"], abs=1e-6)

@@ -31,7 +31,7 @@ CMD = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
 
 
 def judged(trace: MemoryTrace) -> RunResult:
-    return judge(Recording.of(trace))
+    return judge(Recording.decode(trace))
 
 
 @each("sent", [(Side.LEFT,), ()])
@@ -45,7 +45,7 @@ def test_second_type_on_command_topic_is_noted_unless_kit_sent_it(
         for kind in (CMD[1], "unitree_hg::msg::dds_::HandCmd_"):
             message = message_type(kind)
             recorder.put(CMD[0], kind, message.encode(message.cls()), log_time_ns=1)
-    notes = Recording.of(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)).notes
+    notes = Recording.decode(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)).notes
     assert any("carries 2 types" in note for note in notes) is not bool(sent)
 
 
@@ -54,7 +54,7 @@ def test_second_type_on_command_topic_is_noted_unless_kit_sent_it(
 
 @pytest.mark.parametrize("name", ["dex1_pick_place", "dex1_idle_then_startle"])
 def test_genuine_recordings_pass(name: str) -> None:
-    result = judge(Recording.of(open_trace(sample_path(name))))
+    result = judge(Recording.decode(open_trace(sample_path(name))))
     assert result.overall is Overall.PASS
     assert {v for v, n in result.counts().items() if n} == {Verdict.PASS, Verdict.NOT_APPLICABLE}
     for requirement in ("DEX1-START-01", "DEX1-RATE-03", "DEX1-FIELD-03", "DEX1-TRACK-01"):
@@ -63,7 +63,7 @@ def test_genuine_recordings_pass(name: str) -> None:
 
 
 def test_dropout_is_found_at_its_time() -> None:
-    result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
+    result = judge(Recording.decode(open_trace(sample_path("dex1_hand_dropout"))))
     assert result.overall is Overall.FAIL
     assert failed(result) == {("DEX1-RATE-03", "left")}
     gap = of(result, "DEX1-RATE-03").evidence[0]
@@ -78,7 +78,7 @@ def test_dropout_is_found_at_its_time() -> None:
 def test_legacy_recording_is_judged_in_legacy_dialect() -> None:
     trace = open_trace(sample_path("dex1_legacy_v1_1"))
     assert detect_dialect(trace).name == "unitree_actuator"
-    recording = Recording.of(trace)
+    recording = Recording.decode(trace)
     result = judge(recording)
     assert result.overall is Overall.PASS
     assert recording.judged == (Side.LEFT, Side.RIGHT)
@@ -91,17 +91,17 @@ def test_dex3_recording_is_not_judged_as_dex1() -> None:
     trace = open_trace(sample_path("dex3_pinch"))
     assert detect_dialect(trace).name == "dex3"
     with pytest.raises(ConformanceError, match="no Dex1-1 gripper topic"):
-        Recording.of(trace, dialect_name="unitree_go")
+        Recording.decode(trace, dialect_name="unitree_go")
 
 
 def test_wrong_dialect_fails_topic_requirements() -> None:
     trace = open_trace(sample_path("dex1_pick_place"))
-    result = judge(Recording.of(trace, dialect_name="unitree_hg"))
+    result = judge(Recording.decode(trace, dialect_name="unitree_hg"))
     assert failed(result) == {("DEX1-TOPIC-01", "left"), ("DEX1-TOPIC-01", "right")}
     assert of(result, "DEX1-RATE-01").verdict is Verdict.BLOCKED
     assert result.stage["left"] == "topic seen"
     with pytest.raises(ConformanceError, match="unitree_actuator"):
-        Recording.of(trace, dialect_name="unitree_actuator")
+        Recording.decode(trace, dialect_name="unitree_actuator")
 
 
 # ----------------------------------------------------------------------------- too little
@@ -109,7 +109,7 @@ def test_wrong_dialect_fails_topic_requirements() -> None:
 
 def test_requested_side_without_data_fails() -> None:
     trace = copy_of(short_run())
-    result = judge(Recording.of(trace, sides=(Side.LEFT, Side.RIGHT)))
+    result = judge(Recording.decode(trace, sides=(Side.LEFT, Side.RIGHT)))
     assert failed(result) == {("DEX1-TOPIC-01", "right"), ("DEX1-TOPIC-02", "right")}
     assert result.stage == {"left": "moving", "right": "participant seen"}
 
@@ -142,7 +142,7 @@ def test_empty_topic_does_not_pass() -> None:
 
 
 def test_run_without_judged_requirement_is_inconclusive() -> None:
-    recording = Recording.of(copy_of(short_run()))
+    recording = Recording.decode(copy_of(short_run()))
     only = select(catalogue(), prefixes=["DEX1-LIFE-01"])
     result = judge(recording, requirements=only)
     assert result.judged == 0
@@ -248,7 +248,7 @@ def damage(random_: random.Random, data: bytes) -> bytes:
 
 
 def test_result_file_is_read_back_unchanged(tmp_path: Path) -> None:
-    result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
+    result = judge(Recording.decode(open_trace(sample_path("dex1_hand_dropout"))))
     path = tmp_path / "r.json"
     result.write_json(path)
     again = read_json(path)

@@ -65,7 +65,7 @@ def parsed(page: str) -> Structure:
 
 @pytest.fixture(scope="module")
 def failing() -> str:
-    view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
+    view = Recording.decode(open_trace(sample_path("dex1_hand_dropout")))
     return render(judge(view, subject={"recording": "dex1_hand_dropout.mcap"}), view)
 
 
@@ -95,7 +95,7 @@ def test_page_has_styles_for_light_dark_phone_and_print(failing: str) -> None:
 
 
 def test_page_of_live_run_shows_phases() -> None:
-    view = Recording.of(short_run())
+    view = Recording.decode(short_run())
     page = render(judge(view, subject={"backend": "x", "device": "emulated"}), view)
     parsed(page)
     assert "No real hand was involved" in page
@@ -106,7 +106,7 @@ def test_page_of_live_run_shows_phases() -> None:
 def test_page_of_hand_without_state_is_written() -> None:
     trace = copy_of(short_run())
     trace.rows = {k: v for k, v in trace.rows.items() if k[0].endswith("cmd")}
-    view = Recording.of(trace)
+    view = Recording.decode(trace)
     page = render(judge(view), view)
     parsed(page)
     assert "No state of this hand was received" in page
@@ -114,7 +114,7 @@ def test_page_of_hand_without_state_is_written() -> None:
 
 def test_nan_in_states_is_not_drawn() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"}))
-    view = Recording.of(run_virtual(plan, gripper.NanVelocity))
+    view = Recording.decode(run_virtual(plan, gripper.NanVelocity))
     assert "nan" not in "".join(re.findall(r' d="[^"]*"', render(judge(view), view)))
 
 
@@ -161,7 +161,7 @@ def test_page_reports_a_busy_machine() -> None:
 
 
 def test_size_of_plots_on_page_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
+    view = Recording.decode(open_trace(sample_path("dex1_hand_dropout")))
     result = judge(view)
     monkeypatch.setattr("dexkit.conformance.report.html._PLOT_BUDGET", 1)
     page = render(result, view)
@@ -224,7 +224,7 @@ WRONG = {m.name: m.made for m in mutants() if m.model == "dex1-1"}
 def test_failure_shows_plots_of_its_requirement(
     name: str, phases: set[str], need: str, titles: list[str]
 ) -> None:
-    view = Recording.of(
+    view = Recording.decode(
         run_virtual(replace(PLAN, phases=frozenset(phases)), WRONG[name]),
         dialect_name="unitree_go",
         sides=(Side.LEFT,),
@@ -248,7 +248,7 @@ def test_usb_failure_shows_bytes_joints_or_descriptors() -> None:
         wrong_usb.OtherRelease: "<td>2.00</td>",
         wrong_usb.Slow: "from command to answer",
     }
-    view = Recording.of(short_run())
+    view = Recording.decode(short_run())
     every = catalogue("dex3-1", "usb")
     for device, title in kinds.items():
         kills = next(m.kills for m in mutants() if m.made is device)

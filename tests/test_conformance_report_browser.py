@@ -48,7 +48,7 @@ def seen(
     browser = chromium()
     if browser is None:
         pytest.skip("no chromium here")
-    view = Recording.of(open_trace(sample_path("dex1_hand_dropout")))
+    view = Recording.decode(open_trace(sample_path("dex1_hand_dropout")))
     result = judge(view)
     page = render(result, view, link="run.mcap")
     runs = [result_of_every_kind("a hand with quite a long name"), result_of_every_kind("b")]

@@ -232,7 +232,7 @@ def test_suite_writes_requested_report_files(tmp_path: Path) -> None:
         markdown=tmp_path / "r.md",
         report=tmp_path / "r.html",
     )
-    judge_recording(options, Recording.of(short_run(), sides=(Side.LEFT,)))
+    judge_recording(options, Recording.decode(short_run(), sides=(Side.LEFT,)))
     assert (tmp_path / "r.md").read_text().startswith("## ")
     assert "simulated" in (tmp_path / "r.html").read_text()
     with pytest.raises(UsageError, match="no such directory"):
@@ -252,7 +252,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("judged")
     source = sample_path("dex1_hand_dropout")
     (folder / "run.mcap").write_bytes(source.read_bytes())
-    view = Recording.of(open_trace(folder / "run.mcap"))
+    view = Recording.decode(open_trace(folder / "run.mcap"))
     judge(view, subject={"recording": "run.mcap"}).write_json(folder / "result.json")
     return folder
 

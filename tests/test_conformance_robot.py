@@ -26,19 +26,19 @@ from dexkit.conformance.mutants.robot import CdrCrc, NoCrc, WaitsForCommands
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
 from dexkit.conformance.robot import (
-    SPOILS,
-    RobotWire,
+    WRONG_CRCS,
+    RobotMotorCodec,
     robot_dialect,
     robot_in,
     robot_recording,
 )
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
-from dexkit.conformance.stimulus_record import ROBOT, Stimulus
+from dexkit.conformance.stimulus_record import Stimulus
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.errors import ConformanceError, UsageError
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side
 from dexkit.messages import decode
 from dexkit.robots import G1, H1, ROBOTS, RobotModel
 from dexkit.traces import Recorder, TraceEndpoint, open_trace
@@ -75,9 +75,9 @@ def judged(trace: MemoryTrace, name: str) -> RunResult:
 
 @each("model", ROBOTS.values(), ids=NAMES)
 def test_robot_commands_are_decoded_by_the_codec(model: RobotModel) -> None:
-    wire = RobotWire(robot_dialect(model.name))
+    codec = RobotMotorCodec(robot_dialect(model.name))
     motors = [Motor(0.1 * i, 0.2, 0.3, 4.0, 0.5, i % 3) for i in range(model.slots)]
-    payload = wire.low_command(motors, 7)
+    payload = codec.encode_low_command(motors, 7)
     assert verify_payload(model.cmd_type, payload)
     message = decode(model.cmd_type, payload)
     read = [(m.mode, m.q, m.dq, m.tau, m.kp, m.kd) for m in message.motor_cmd]
@@ -89,11 +89,11 @@ def test_robot_commands_are_decoded_by_the_codec(model: RobotModel) -> None:
         assert (*message.head, message.level_flag) == (0xFE, 0xEF, 0xFF)
 
 
-@each("kind", SPOILS)
+@each("kind", WRONG_CRCS)
 def test_damaged_commands_differ_only_in_crc(kind: str) -> None:
-    wire = RobotWire(robot_dialect("h1"))
+    codec = RobotMotorCodec(robot_dialect("h1"))
     motors = [Motor(q=0.5)] * 20
-    good, bad = wire.low_command(motors, 0), wire.low_command(motors, 0, kind)
+    good, bad = codec.encode_low_command(motors, 0), codec.encode_low_command(motors, 0, kind)
     assert good[:-4] == bad[:-4]
     assert not verify_payload(H1.cmd_type, bad)
     right = crc_of(decode(H1.cmd_type, good))

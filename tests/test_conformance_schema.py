@@ -15,8 +15,7 @@ from dexkit.conformance.plots import PlotKind
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
 from dexkit.conformance.results import VERSION, Load, Overall, Stage, Verdict
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side
 from dexkit.traces import open_trace, sample_path
 from tests.conformance_helpers import short_run
 
@@ -39,13 +38,13 @@ def test_schema_is_valid() -> None:
 
 @pytest.mark.parametrize("name", ["dex1_hand_dropout", "dex3_pinch"])
 def test_results_of_genuine_recordings_validate(name: str, tmp_path: Path) -> None:
-    result = judge(Recording.of(open_trace(sample_path(name))), subject={"recording": name})
+    result = judge(Recording.decode(open_trace(sample_path(name))), subject={"recording": name})
     result.write_json(tmp_path / "r.json")
     validate(json.loads((tmp_path / "r.json").read_text()))
 
 
 def test_a_result_with_claims_and_stimulus_validates() -> None:
-    recording = Recording.of(short_run(), sides=tuple(Side))
+    recording = Recording.decode(short_run(), sides=tuple(Side))
     claims = Claims.parse('[hand]\nname = "x"\n[claims]\nvelocity = true')
     data = json.loads(json.dumps(judge(recording, claims=claims).as_dict()))
     validate(data)

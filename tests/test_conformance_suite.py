@@ -155,7 +155,7 @@ def test_quick_selection_follows_length_of_stimuli(name: str) -> None:
 
 def test_length_of_stimulus_equals_length_of_run() -> None:
     plan = replace(plan_for(), phases=frozenset({"step", "nan", "squeeze"}), session=None)
-    recording = Recording.of(run_virtual(plan, ReferenceService))
+    recording = Recording.decode(run_virtual(plan, ReferenceService))
     assert length("dex1-1", plan.phases) == pytest.approx(recording.duration, rel=0.3)
 
 
@@ -204,7 +204,7 @@ def run_live(
     rig = RigOptions(EXTERNAL, sides, chosen, domain)
     with ServiceOnDds(service(chosen, sides, {}), domain):
         assert record_run(LiveOptions(rig, phases_for(wanted)), path)
-    return judge(Recording.of(open_trace(path), sides=sides), requirements=wanted)
+    return judge(Recording.decode(open_trace(path), sides=sides), requirements=wanted)
 
 
 def test_reference_hand_passes_on_dds(tmp_path: Path) -> None:
@@ -251,7 +251,9 @@ def test_recording_without_hand_fails(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path):
         pass
-    result = judge(Recording.of(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,)))
+    result = judge(
+        Recording.decode(open_trace(path), dialect_name="unitree_go", sides=(Side.LEFT,))
+    )
     assert str(result.overall) == "fail"
     assert failed(result) == {("DEX1-TOPIC-01", "left")}
     assert result.stage == {"left": "no participant"}
@@ -279,11 +281,13 @@ def test_stopped_run_leaves_no_process(tmp_path: Path) -> None:
     rig = RigOptions("sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain())
     stop = threading.Event()
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         if text.startswith("listening"):
             stop.set()
 
-    assert not record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap", say=say, stop=stop)
+    assert not record_run(
+        LiveOptions(rig, frozenset()), tmp_path / "run.mcap", report=report, stop=stop
+    )
     left = subprocess.run(
         ["pgrep", "-f", f"--domain {rig.domain} "], capture_output=True, text=True
     )
@@ -340,7 +344,7 @@ def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None
     assert files[1].read_text().startswith("<!doctype html>")
     assert "DEX1-FORCE-01-right" in files[3].read_text()
     # the recording alone gives the same verdicts
-    again = judge(Recording.of(open_trace(files[2])))
+    again = judge(Recording.decode(open_trace(files[2])))
     expected = {r["id"]: r["verdict"] for r in result["results"]}
     found = {r.requirement.id: str(r.verdict) for r in again.results}
     assert {name: found[name] for name in expected} == expected

@@ -24,6 +24,7 @@ from dexkit.conformance.mutants.matrix import Outcome, try_one
 from dexkit.conformance.mutants.trials import run_usb_mutant
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Verdict
+from dexkit.conformance.stimuli.usb import BUSES, DAMAGES
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
 from dexkit.conformance.usb.record import (
@@ -37,7 +38,6 @@ from dexkit.conformance.usb.record import (
 )
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
-from dexkit.conformance.usb.script import BUSES, DAMAGES
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.errors import ConformanceError, TraceUnsupported
 from dexkit.hand import Side
@@ -147,7 +147,7 @@ def test_recording_from_file_gives_same_verdicts(tmp_path: Path) -> None:
     trace = open_trace(tmp_path / "run.mcap")
     assert trace.warnings == []
     assert trace.topics == ["usb/dex3/right/in", "usb/dex3/right/out"]
-    read = UsbRecording.of(trace)
+    read = UsbRecording.decode(trace)
     assert read is not None
     assert judge_layer(USB, read.since(live.origin_ns), usb()) == judge_layer(USB, live, usb())
 
@@ -262,8 +262,8 @@ def test_emulated_hand_passes_and_faulty_hand_fails(hands: str, tmp_path: Path) 
     ):
         faulty.wait_ready(threading.Event())
         devices = {Side.LEFT: hands, Side.RIGHT: faulty.place}
-        assert run(devices, recorder, say=messages.append)
-    recording = UsbRecording.of(open_trace(tmp_path / "run.mcap"))
+        assert run(devices, recorder, report=messages.append)
+    recording = UsbRecording.decode(open_trace(tmp_path / "run.mcap"))
     assert recording is not None
     assert set(recording.sides) == set(Side)
     results = judge_layer(USB, recording, usb())

@@ -177,7 +177,7 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     begin = trace.rows[key][0][0] + round(2.5e9)
     trace.rows[key] = [r for r in trace.rows[key] if not begin <= r[0] < begin + 200_000_000]
-    assert of(judge(Recording.of(trace)), GAP.id).verdict is Verdict.FAIL
+    assert of(judge(Recording.decode(trace)), GAP.id).verdict is Verdict.FAIL
     result = judge(with_beats(trace, [begin]))
     found = of(result, GAP.id)
     assert found.verdict is Verdict.BLOCKED
@@ -197,18 +197,18 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
 def test_slow_client_of_the_kit_does_not_fail_the_hand() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", OPERATOR}))
     trace = run_virtual(plan, LateState)
-    lag = of(judge(Recording.of(trace)), "DEX1-OPER-02")
+    lag = of(judge(Recording.decode(trace)), "DEX1-OPER-02")
     assert lag.verdict is Verdict.WARN
     commands = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
     trace.rows[commands] = trace.rows[commands][::2]
-    starved = of(judge(Recording.of(trace)), "DEX1-OPER-02")
+    starved = of(judge(Recording.decode(trace)), "DEX1-OPER-02")
     assert starved.verdict is Verdict.NOT_APPLICABLE
     assert "of 200 commands a second" in starved.reason
 
 
 def test_blocked_result_names_the_failed_requirement() -> None:
     trace = copy_of(short_run())
-    result = judge(Recording.of(trace, dialect_name="unitree_hg"))
+    result = judge(Recording.decode(trace, dialect_name="unitree_hg"))
     blocked = [r for r in result.results if r.verdict is Verdict.BLOCKED]
     assert blocked
     failing = {r.requirement.id for r in result.results if r.verdict is not Verdict.PASS}
@@ -222,7 +222,7 @@ def test_exception_in_check_is_error_and_blocks() -> None:
         raise ZeroDivisionError("1/0")
 
     found: dict[str, Result] = {}
-    error = Judgement(GAP, Side.LEFT, Claims(), found).of(broken, blame)
+    error = Judgement(GAP, Side.LEFT, Claims(), found).run_check(broken, blame)
     assert error.verdict is Verdict.ERROR
     assert error.reason == "the check itself failed: ZeroDivisionError: 1/0"
     found[GAP.id] = error
@@ -233,13 +233,15 @@ def test_exception_in_check_is_error_and_blocks() -> None:
 
 def test_failure_has_full_explanation() -> None:
     outcome = Outcome(False, "x", "seen", evidence=(Evidence("rt/x", 1.5, 0, 2.0),))
-    result = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome, blame)
+    result = Judgement(GAP, Side.LEFT, Claims(), {}).run_check(lambda: outcome, blame)
     assert result.verdict is Verdict.FAIL
     lines = dict(line.strip().split(": ", 1) for line in result.explain().splitlines()[1:])
     assert {k.strip() for k in lines} >= {"required", "observed", "cause", "try", "source"}
     assert "rt/x at 1.500 s to 2.000 s" in result.explain()
     assert GAP.cause in result.explain()
-    result = Judgement(GAP, Side.LEFT, Claims(), {}).of(lambda: outcome.because("the moon"), blame)
+    result = Judgement(GAP, Side.LEFT, Claims(), {}).run_check(
+        lambda: outcome.because("the moon"), blame
+    )
     assert result.cause == "the moon"
 
 
@@ -277,7 +279,7 @@ def test_beat_due_in_an_interval_counts_for_it() -> None:
 
 
 def test_missing_stimulus_has_a_hint() -> None:
-    touch = of(judge(Recording.of(short_run())), "DEX1-FORCE-01")
+    touch = of(judge(Recording.decode(short_run())), "DEX1-FORCE-01")
     assert touch.verdict is Verdict.NOT_APPLICABLE
     assert touch.reason == (
         "the stimulus 'squeeze' was not applied in this run: put something between the fingers, "

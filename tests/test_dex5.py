@@ -310,7 +310,7 @@ def test_synthetic_session_matches_its_generator(tmp_path: Path) -> None:
 
 
 def test_synthetic_session_is_judged_as_dex5() -> None:
-    recording = Recording.of(open_trace(sample_path("dex5_synthetic")))
+    recording = Recording.decode(open_trace(sample_path("dex5_synthetic")))
     assert recording.dialect is DEX5
     result = judge(recording)
     assert result.overall is Overall.PASS

@@ -82,7 +82,7 @@ def session() -> Session:
 
 @cache
 def verdicts() -> RunResult:
-    return judge(Recording.of(open_trace(sample_path("dex1_legacy_v1_1"))))
+    return judge(Recording.decode(open_trace(sample_path("dex1_legacy_v1_1"))))
 
 
 def test_every_verdict() -> None:
@@ -149,7 +149,7 @@ def test_right_gripper_holds_the_object() -> None:
     held = (tau < -0.85) & (np.abs(s.states[:, INDEX[Side.RIGHT], 2]) < 0.02)
     assert held.sum() > 2 * 500  # s at 500 Hz
     assert q[held] == pytest.approx(2.37, abs=0.05)
-    recording = Recording.of(open_trace(sample_path("dex1_legacy_v1_1")))
+    recording = Recording.decode(open_trace(sample_path("dex1_legacy_v1_1")))
     assert recording.sides[Side.RIGHT].states.q[:, 0] == pytest.approx(q)
 
 
@@ -179,7 +179,7 @@ def test_absent_gripper_of_a_one_gripper_service_is_not_judged(
     missing: Side, tmp_path: Path
 ) -> None:
     there = Side.LEFT if missing is Side.RIGHT else Side.RIGHT
-    recording = Recording.of(open_trace(without(missing, tmp_path / "one.mcap", driven=False)))
+    recording = Recording.decode(open_trace(without(missing, tmp_path / "one.mcap", driven=False)))
     assert recording.judged == (there,)
     assert any(f"says nothing of the {missing} hand" in note for note in recording.notes)
     result = judge(recording)
@@ -189,10 +189,10 @@ def test_absent_gripper_of_a_one_gripper_service_is_not_judged(
 
 def test_commanded_gripper_without_state_is_judged(tmp_path: Path) -> None:
     path = without(Side.LEFT, tmp_path / "dead.mcap", driven=True)
-    result = judge(Recording.of(open_trace(path)))
+    result = judge(Recording.decode(open_trace(path)))
     assert of(result, "DEX1-TRACK-01", Side.LEFT).verdict is Verdict.FAIL
     assert result.overall is Overall.FAIL
-    asked = Recording.of(
+    asked = Recording.decode(
         open_trace(without(Side.LEFT, tmp_path / "asked.mcap", driven=False)),
         sides=(Side.LEFT,),
     )

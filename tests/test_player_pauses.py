@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimuli import Action, Observation, Plan, Send, Session, script_for
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
@@ -29,7 +29,7 @@ def driven(phase: str, after: int) -> Iterator[tuple[str, int, Send]]:
         phases=frozenset({"replay"}),
     )
     script = script_for(plan)
-    wire = Wire(GO)
+    codec = MotorCodec(GO)
     steps = script.run()
     now, count = 0, 0
     q: dict[Side, tuple[float, ...]] = dict.fromkeys(BOTH, (0.0,))
@@ -42,7 +42,7 @@ def driven(phase: str, after: int) -> Iterator[tuple[str, int, Send]]:
                 yield name, now, action
                 for topic, payload in action.payloads:
                     side = Side.LEFT if "left" in topic else Side.RIGHT
-                    q[side] = (wire.command.decode(payload).cmds[0].q,)
+                    q[side] = (codec.command.decode(payload).cmds[0].q,)
                 if name == phase:
                     count += 1
                     if count == after:
@@ -55,9 +55,9 @@ def driven(phase: str, after: int) -> Iterator[tuple[str, int, Send]]:
 
 
 def positions(rows: list[tuple[str, int, Send]], side: str) -> list[float]:
-    wire = Wire(GO)
+    codec = MotorCodec(GO)
     return [
-        float(wire.command.decode(payload).cmds[0].q)
+        float(codec.command.decode(payload).cmds[0].q)
         for _, _, send in rows
         for topic, payload in send.payloads
         if side in topic

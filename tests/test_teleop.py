@@ -45,7 +45,7 @@ pinches = st.floats(0.0, 12.0)
 
 @cache
 def recording(name: str) -> Recording:
-    return Recording.of(open_trace(sample_path(name)))
+    return Recording.decode(open_trace(sample_path(name)))
 
 
 def q_of(commands: Mapping[Side, tuple[JointCommand, ...]], side: Side) -> float:
@@ -415,11 +415,11 @@ def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
 
 @each("name", list(DIALECTS))
 def test_positions_come_back_from_the_wire(name: str) -> None:
-    from dexkit.conformance.motor_messages import Wire
+    from dexkit.conformance.motor_messages import MotorCodec
 
     spoken = DIALECTS[name]
     joints = len(MODELS[spoken.model].joints[LEFT])
-    kit, wire = Wire(spoken), ClientWire(spoken)
+    kit, wire = MotorCodec(spoken), ClientWire(spoken)
     wanted: dict[Side, Sequence[float]] = {
         LEFT: [0.25 * (i + 1) for i in range(joints)],
         RIGHT: [2.0 + 0.25 * i for i in range(joints)],

@@ -79,7 +79,7 @@ def test_a_stroke_of_both_grippers_is_measured_and_recorded(dex1: int, tmp_path:
         found = data["sides"][side]
         assert found["client_hz"] < 201  # what it is above 0 depends on the machine
         assert found["joints"]["gripper"]["stroke_s"] > 0.5  # the lead of 0.18 rad limits it
-    recording = Recording.of(open_trace(path))
+    recording = Recording.decode(open_trace(path))
     for side in Side:
         commands, states = recording.sides[side].commands, recording.sides[side].states
         assert set(commands.kp[:, 0]) == {5.0}

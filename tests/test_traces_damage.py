@@ -19,7 +19,7 @@ from mcap.writer import CompressionType
 from dexkit.cli import main
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.messages import message_type
 from dexkit.messages.columns import Columns
@@ -352,7 +352,7 @@ def test_columns_take_memory_for_the_samples_that_there_are(tmp_path: Path) -> N
         for i, data in enumerate(samples):
             recorder.put(STATE, STATE_TYPE, data, T0 + i)
     trace = open_trace(tmp_path / "a.mcap")
-    assert peak(lambda: judge(Recording.of(trace))) < 60 * size + 20 * 2**20
+    assert peak(lambda: judge(Recording.decode(trace))) < 60 * size + 20 * 2**20
 
 
 def work(path: Path, data: bytes) -> int:

@@ -237,7 +237,7 @@ def test_each_failure_is_told_once_and_the_verdict_comes_last(tmp_path: Path) ->
         "from dexkit.conformance.judge import judge\n"
         "from dexkit.conformance.recording import Recording\n"
         "from dexkit.traces import open_trace, sample_path\n"
-        "view = Recording.of(open_trace(sample_path('dex1_hand_dropout')))\n"
+        "view = Recording.decode(open_trace(sample_path('dex1_hand_dropout')))\n"
         "def run_suite(options, *args): return judge(view, requirements=options.requirements)\n"
         "session.run_suite = run_suite\n"
     )

@@ -20,7 +20,7 @@ from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.stimulus_record import Phase
-from dexkit.hand import JointSpec, Side
+from dexkit.hand import JointSpec, Side, Subject
 
 __all__ = [
     "CHECK_MODULES",
@@ -175,7 +175,7 @@ class Context(BaseContext[Recording, SideView]):
     """One requirement to be judged for one side of a recording of DDS topics."""
 
     @property
-    def side(self) -> Side:
+    def side(self) -> Subject:
         """The side to be judged."""
         return self.hand.side
 

@@ -14,7 +14,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_driven, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.hand import Floats, JointMode
 from dexkit.models import HandModel, JointRoles, model
 
@@ -244,7 +244,7 @@ def status(ctx: Context) -> Outcome:
             mode = _modes(ctx, ctx.states.between(a, b))
             if not len(mode):
                 return ctx.skipped(f"no state while {when}")
-            found = np.median(Wire(ctx.recording.dialect).status(mode), axis=0)
+            found = np.median(MotorCodec(ctx.recording.dialect).status(mode), axis=0)
             if (found != wanted).any():
                 joint = int(np.argmax(found != wanted))
                 return ctx.failed(

@@ -6,7 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.hand import JointMode
 
 
@@ -116,7 +116,7 @@ def last_state(ctx: Context) -> Outcome:
     begin, end = ctx.span(ctx.phases()[-1])
     modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]
     modes = modes[np.isfinite(modes).all(axis=1)]
-    status = Wire(ctx.recording.dialect).status(modes.astype(np.intp))
+    status = MotorCodec(ctx.recording.dialect).status(modes.astype(np.intp))
     if len(status) < 2 or not (status[0] == JointMode.FOC).all():
         return ctx.absent("the mode of this hand does not show whether it is driven")
     if not status[-1].any():

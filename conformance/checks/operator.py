@@ -70,7 +70,9 @@ def _judge(
     nothing: str,
 ) -> Outcome:
     """The joint with the worst figure against a tolerance."""
-    found = _felt(ctx.recording, ctx.side)
+    side = ctx.side
+    assert isinstance(side, Side), "these requirements are about hands"
+    found = _felt(ctx.recording, side)
     if isinstance(found, str):
         return ctx.skipped(found)
     figures = {i: value(f) for i, f in found.joints.items()}
@@ -88,7 +90,7 @@ def _judge(
     observed = ctx.named(text(worst), joint)
     if worst <= ctx.tolerance(limit, joint):
         return ctx.passed(text(worst), observed, **values)
-    wanted = 1.0 / client_for(ctx.recording.dialect, (ctx.side,)).period
+    wanted = 1.0 / client_for(ctx.recording.dialect, (side,)).period
     if found.client_hz < _PART * wanted:
         skipped = ctx.skipped(
             f"the kit's own client managed {found.client_hz:.0f} of {wanted:.0f} commands a "

@@ -11,7 +11,7 @@ recording to verdicts. Each layer is in a module of its own, imported when it is
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -25,7 +25,7 @@ from dexkit.robots import ROBOTS
 from dexkit.topics import HAND_TOPICS
 
 if TYPE_CHECKING:
-    from dexkit.hand import Side
+    from dexkit.hand import Subject
 
 __all__ = ["Layer", "Precondition", "claimed", "layer", "not_blocked", "recording_of"]
 
@@ -47,7 +47,7 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     :param decode: a recording's part that is about the layer; None where there is none. It takes
         the recording, the dialect's name (None for the one that the topics show) and the
         subjects to be judged (none for all that are there).
-    :param subjects: the part of a recording that is about each subject to be judged.
+    :param subjects: each subject to be judged, and the recording's part that is about it.
     :param context: what a check of the layer gets.
     :param preconditions: what is asked before the check, in this order; the first that has a
         result decides.
@@ -59,8 +59,8 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     """
 
     name: str
-    decode: Callable[[TraceLike, str | None, Sequence[Side]], RecordingT | None]
-    subjects: Callable[[RecordingT], Mapping[Side, ViewT]]
+    decode: Callable[[TraceLike, str | None, Sequence[Subject]], RecordingT | None]
+    subjects: Callable[[RecordingT], Iterable[tuple[Subject, ViewT]]]
     context: Callable[[RecordingT, ViewT, Requirement], ContextT]
     preconditions: Sequence[Precondition[ContextT]]
     refine: Callable[[ContextT, Outcome], Outcome]
@@ -86,8 +86,8 @@ def layer(name: str) -> Layer[Any, Any, Any]:
     return found
 
 
-def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
-    """Decode a recording of hands or of a robot.
+def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
+    """Decode the DDS part of a recording: hands or a robot.
 
     :param dialect_name: None to take what the topics show: hands, if there are any.
     :raises ConformanceError: it has none of their topics.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.checks import Context, Outcome
@@ -10,7 +10,8 @@ from dexkit.conformance.layers import Layer, claimed, not_blocked
 from dexkit.conformance.recording import Recording, SideView, TraceLike
 from dexkit.conformance.results import Result
 from dexkit.conformance.verdicts import Judgement
-from dexkit.hand import Side
+from dexkit.errors import UsageError
+from dexkit.hand import Side, Subject
 from dexkit.models import model
 
 __all__ = ["LAYER", "applies_to_dialect", "recorded", "subjects", "whole", "with_silence"]
@@ -28,13 +29,16 @@ _REMEDY = {
 """What to do, or why not, where a stimulus was not applied."""
 
 
-def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Side]) -> Recording:
-    return Recording.of(trace, dialect_name=dialect_name, sides=sides)
+def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
+    hands = tuple(s for s in sides if isinstance(s, Side))
+    if len(hands) < len(sides):
+        raise UsageError("a hand is on the left or the right side", hint="give --side")
+    return Recording.decode(trace, dialect_name=dialect_name, sides=hands)
 
 
-def subjects(recording: Recording) -> Mapping[Side, SideView]:
-    """The subjects to be judged."""
-    return {side: recording.sides[side] for side in recording.judged}
+def subjects(recording: Recording) -> Iterable[tuple[Subject, SideView]]:
+    """The subjects to be judged, each with its part of the recording."""
+    return [(subject, recording.sides[subject]) for subject in recording.judged]
 
 
 def whole(recording: Recording) -> tuple[float, float]:
@@ -57,7 +61,7 @@ def recorded(judgement: Judgement, context: Context) -> Result | None:
 
 
 def _missing(context: Context) -> str:
-    """What the recording lacks for this requirement, or nothing."""
+    """What the recording lacks for this requirement, as text; empty if nothing."""
     requirement, recording = context.requirement, context.recording
     if requirement.phase:
         if recording.stimulus is None:
@@ -77,10 +81,10 @@ def _missing(context: Context) -> str:
 
 
 def with_silence(context: Context, outcome: Outcome) -> Outcome:
-    """The outcome; a failure after the last state of all gets that as its cause."""
+    """Name the end of all states as the cause of a failure after it."""
     states, commands = context.states, context.commands
     ends = [e.end_s for e in outcome.evidence if e.end_s is not None]
-    if not ends and len(commands):  # no state, so no place either
+    if not ends and len(commands):  # without states the failure has no place in time
         ends = [float(commands.t[-1])]
     if outcome.met is not False or not len(states) or not ends:
         return outcome

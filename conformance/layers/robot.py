@@ -8,15 +8,14 @@ from dexkit.conformance.checks.robot import RobotContext
 from dexkit.conformance.layers import Layer, claimed, hand, not_blocked
 from dexkit.conformance.recording import SideView, TraceLike
 from dexkit.conformance.robot import RobotRecording, robot_in, robot_recording
-from dexkit.conformance.stimulus_record import ROBOT
 from dexkit.errors import UsageError
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Subject
 from dexkit.robots import H1
 
 __all__ = ["LAYER"]
 
 
-def _decode(trace: TraceLike, name: str | None, sides: Sequence[Side]) -> RobotRecording:
+def _decode(trace: TraceLike, name: str | None, sides: Sequence[Subject]) -> RobotRecording:
     if sides not in ((), (ROBOT,)):
         raise UsageError("a robot has no sides", hint="leave --side out")
     found = name or (robot_in(trace) or H1).name

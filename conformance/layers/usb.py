@@ -22,7 +22,7 @@ def _stimulus_applied(judgement: Judgement, context: UsbContext) -> Result | Non
 
 
 def _script(model: str) -> type:
-    from dexkit.conformance.usb.script import UsbScript
+    from dexkit.conformance.stimuli.usb import UsbScript
 
     return UsbScript
 
@@ -35,11 +35,11 @@ def _reference(model: str) -> type:
 
 LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     name="usb",
-    decode=lambda trace, dialect_name, sides: UsbRecording.of(trace),
-    subjects=lambda recording: recording.sides,
+    decode=lambda trace, dialect_name, sides: UsbRecording.decode(trace),
+    subjects=lambda recording: recording.sides.items(),
     context=UsbContext,
-    # the script ends where a device no longer answers: what failed first explains a missing
-    # phase better than its absence does
+    # not_blocked comes first: the script ends where a device no longer answers, and the first
+    # failure is the reason of missing phases
     preconditions=(claimed, not_blocked, _stimulus_applied),
     refine=lambda context, outcome: outcome,
     whole=lambda recording: None,

@@ -274,11 +274,11 @@ class EmptyIsZero(Service):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
-        if getattr(self.wire.command.decode(payload), self.wire.command_sequence):
+        if getattr(self.codec.command.decode(payload), self.codec.command_sequence):
             return
         for side in self.sides:
-            if self.wire.command_topics[side] == topic:
-                motors = (Motor(mode=self.wire.mode(i)) for i in range(self.wire.joints))
+            if self.codec.command_topics[side] == topic:
+                motors = (Motor(mode=self.codec.mode(i)) for i in range(self.codec.joints))
                 self.motors(side, tuple(motors))
 
 
@@ -289,8 +289,8 @@ class DiesOfEmpty(Service):
     dead_until = 0.0
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
-        sequence = getattr(self.wire.command.decode(payload), self.wire.command_sequence)
-        if not sequence and any(self.wire.command_topics[s] == topic for s in self.sides):
+        sequence = getattr(self.codec.command.decode(payload), self.codec.command_sequence)
+        if not sequence and any(self.codec.command_topics[s] == topic for s in self.sides):
             self.dead_until = self.now + 0.4
         super().receive(topic, payload, client)
 
@@ -303,11 +303,11 @@ class TakesTheLast(Service):
     """Obeys the last motors of an over-long command."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
-        message = self.wire.command.decode(payload)
-        motors = getattr(message, self.wire.command_sequence)
+        message = self.codec.command.decode(payload)
+        motors = getattr(message, self.codec.command_sequence)
         if len(motors) > self.dialect.length:
-            setattr(message, self.wire.command_sequence, motors[-self.dialect.length :])
-            payload = self.wire.command.encode(message)
+            setattr(message, self.codec.command_sequence, motors[-self.dialect.length :])
+            payload = self.codec.command.encode(message)
         super().receive(topic, payload, client)
 
 
@@ -319,9 +319,9 @@ class TakesAnyType(Service):
         message = message_type(type_name).decode(payload)
         motors = message.motor_cmd if hasattr(message, "motor_cmd") else message.cmds
         for side in self.sides:
-            if self.wire.command_topics[side] == topic:
+            if self.codec.command_topics[side] == topic:
                 first = self.dialect.index[side]
-                mine = motors[first : first + self.wire.joints]
+                mine = motors[first : first + self.codec.joints]
                 self.motors(side, tuple(Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in mine))
 
 

@@ -458,7 +458,7 @@ class AlwaysDriven(FingerService):
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        motors["mode"] |= self.wire.mode(0)
+        motors["mode"] |= self.codec.mode(0)
 
 
 class _IgnoresStatus(FingerHand):
@@ -599,13 +599,13 @@ class FillsUpWithZeros(FingerService):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
-        sequence = self.wire.command.decode(payload).motor_cmd
+        sequence = self.codec.command.decode(payload).motor_cmd
         for side in self.sides:
-            mine = self.wire.command_topics[side] == topic
-            if mine and 0 < len(sequence) < self.wire.joints:
+            mine = self.codec.command_topics[side] == topic
+            if mine and 0 < len(sequence) < self.codec.joints:
                 given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence]
-                missing = range(len(given), self.wire.joints)
-                self.motors(side, (*given, *(Motor(mode=self.wire.mode(i)) for i in missing)))
+                missing = range(len(given), self.codec.joints)
+                self.motors(side, (*given, *(Motor(mode=self.codec.mode(i)) for i in missing)))
 
 
 class _KeepsSpeed(FingerHand):

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from dexkit.conformance.layers import layer
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 
 __all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "wrong_hand"]
 
@@ -44,7 +44,7 @@ class Mutant:
     made: type[Any]
     kills: str
     also: tuple[str, ...] = ()
-    sides: tuple[Side, ...] = BOTH
+    sides: tuple[Subject, ...] = BOTH
     dialect: str = ""
     brief: bool = False
     whole: bool = False

@@ -12,7 +12,7 @@ import numpy as np
 from dexkit.conformance.mutants.registry import wrong_hand
 from dexkit.conformance.virtual import MemoryTrace, Sample
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
-from dexkit.hand import Floats, Side
+from dexkit.hand import Floats, RobotSubject, Subject
 from dexkit.messages import decode, message_type
 from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
@@ -37,7 +37,7 @@ class OtherState(_OtherFamily):
     """Publishes the other family's LowState_."""
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.state_type = self.others[1]
@@ -52,7 +52,7 @@ class OtherCommands(_OtherFamily):
     """Subscribes to the other family's LowCmd_."""
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.command_type = self.others[0]
@@ -186,7 +186,7 @@ class TurnedOnce(ReferenceRobot):
     """Publishes one joint a full turn off."""
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
         slot = self.robot.slot("right_knee")

@@ -22,10 +22,9 @@ from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.conformance.virtual import Service, run_virtual
+from dexkit.conformance.virtual import TopicDevice, run_virtual
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
-from dexkit.hand import Side
+from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import dialect, model
 from dexkit.robots import ROBOTS
 
@@ -55,7 +54,7 @@ def _session(model_name: str) -> Session | None:
     return Session.default(model_name).first_seconds(SESSION_SECONDS)
 
 
-def plan_for(name: str = "unitree_go", *, sides: Sequence[Side] | None = None) -> Plan:
+def plan_for(name: str = "unitree_go", *, sides: Sequence[Subject] | None = None) -> Plan[Subject]:
     """Every phase; for hands with a session to replay and an object in the right hand.
 
     :param name: of a dialect or a robot.
@@ -74,7 +73,7 @@ def plan_for(name: str = "unitree_go", *, sides: Sequence[Side] | None = None) -
     )
 
 
-def run_mutant(service: type[Service], plan: Plan | None = None) -> RunResult:
+def run_mutant(service: type[TopicDevice], plan: Plan[Subject] | None = None) -> RunResult:
     """Judge a service of hands, or a robot, on the virtual clock."""
     chosen = plan or plan_for()
     trace = run_virtual(chosen, service)
@@ -104,7 +103,7 @@ class TopicTrial(ABC):
         """The requirements that fail or warn."""
         return _blamed(run_mutant(mutant.made, self.plan(mutant, short=short)).results)
 
-    def plan(self, mutant: Mutant, *, short: bool = False) -> Plan:
+    def plan(self, mutant: Mutant, *, short: bool = False) -> Plan[Subject]:
         """The phases that show the fault: all, or those that its requirements need."""
         full = self._full(mutant)
         if mutant.brief or (short and not mutant.whole):
@@ -117,7 +116,7 @@ class TopicTrial(ABC):
         return full
 
     @abstractmethod
-    def _full(self, mutant: Mutant) -> Plan:
+    def _full(self, mutant: Mutant) -> Plan[Subject]:
         """Every phase."""
 
     @abstractmethod
@@ -133,7 +132,7 @@ class HandTrial(TopicTrial):
         one_joint = len(model(mutant.model).joints[Side.LEFT]) == 1
         return len(mutant.sides) * (1 if mutant.brief else 3) * (1 if one_joint else 2)
 
-    def _full(self, mutant: Mutant) -> Plan:
+    def _full(self, mutant: Mutant) -> Plan[Subject]:
         name = mutant.dialect or model(mutant.model).dialects[0].name
         return plan_for(name, sides=mutant.sides)
 
@@ -149,7 +148,7 @@ class RobotTrial(TopicTrial):
         """Roughly how long a run takes, in units of the shortest on DDS."""
         return 4.0
 
-    def _full(self, mutant: Mutant) -> Plan:
+    def _full(self, mutant: Mutant) -> Plan[Subject]:
         return plan_for(mutant.model)
 
     def _short(self, mutant: Mutant, needed: Sequence[Requirement]) -> frozenset[str]:
@@ -169,6 +168,7 @@ class UsbTrial:
         """The requirements that fail or warn; the script has no short form."""
         every = catalogue(mutant.model, mutant.layer)
         (side,) = mutant.sides
+        assert isinstance(side, Side), "a robot has no USB device"
         return _blamed(run_usb_mutant(mutant.made, every, side))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from dexkit.conformance.results import Overall, RunResult, Verdict, worst
-from dexkit.conformance.stimulus_record import ROBOT
+from dexkit.hand import ROBOT
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 
@@ -143,12 +143,12 @@ def part(result: RunResult) -> str:
 
 def nature(result: RunResult) -> str:
     """``emulated``, ``simulated``, ``recorded``, or empty for a real hand."""
-    from dexkit.conformance.backend_processes import BODY_EMULATORS, SIMULATED
+    from dexkit.conformance.backend_processes import ROBOT_EMULATORS, SIMULATED
 
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":
         return "emulated"
-    if name in (*SIMULATED, *BODY_EMULATORS) or name.startswith("virtual "):
+    if name in (*SIMULATED, *ROBOT_EMULATORS) or name.startswith("virtual "):
         return "simulated"
     return "" if name else "recorded"
 

@@ -20,7 +20,7 @@ from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.errors import UsageError
 from dexkit.escaping import html as escape
-from dexkit.hand import Floats, JointSpec, Side
+from dexkit.hand import Floats, JointSpec, Side, Subject
 
 __all__ = ["PHASES", "command_and_state", "operated", "phase_bands", "plots_of"]
 
@@ -137,7 +137,7 @@ def _drawn(scene: _Scene, plot: Plot) -> str:
 # ------------------------------------------------------------------------------- curves
 
 
-def phase_bands(view: Recording, side: Side, *, label: bool = True) -> list[Band]:
+def phase_bands(view: Recording, side: Subject, *, label: bool = True) -> list[Band]:
     """The phases of the stimulus, neighbours of one name joined."""
     if view.stimulus is None:
         return []
@@ -173,14 +173,15 @@ def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
 
 
 def wish(view: Recording, hand: SideView, joint: int) -> Line | None:
-    """The modelled operator's target of a joint, or None without such a phase."""
-    phases = view.phases(OPERATOR, hand.side)
-    if not phases:
+    """Where the modelled operator wanted a joint, or None without such a phase."""
+    side = hand.side
+    phases = view.phases(OPERATOR, side)
+    if not phases or not isinstance(side, Side):
         return None
     begin, end = view.seconds(phases[0].begin_ns), view.seconds(phases[0].end_ns)
     operator = operator_of(phases[0], view.dialect)
     t = np.asarray(np.arange(begin, end, 0.01), dtype=np.float64)
-    poses = [operator.intent(float(x) - begin, hand.side) for x in t]
+    poses = [operator.intent(float(x) - begin, side) for x in t]
     q = np.array([np.nan if pose is None else pose[joint] for pose in poses])
     return Line("where the operator wants it", "other", t, q)
 

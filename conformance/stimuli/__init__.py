@@ -8,8 +8,10 @@ share :mod:`~.stimuli.hand`. Robots have :mod:`~.stimuli.robot`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.conformance.stimuli.script import (
     Action,
     Join,
@@ -18,12 +20,12 @@ from dexkit.conformance.stimuli.script import (
     Plan,
     Restart,
     Role,
+    S,
     Script,
     Send,
     StartService,
     StopService,
 )
-from dexkit.conformance.stimuli.session import Session
 from dexkit.models import model
 from dexkit.robots import ROBOTS
 
@@ -46,14 +48,14 @@ __all__ = [
 ]
 
 
-def script_class(model_name: str) -> type[Script]:
-    """The script of a hand model or robot."""
+def script_class(model_name: str) -> type[Script[Any]]:
+    """The script of a hand model or robot; the model decides for which subjects."""
     return (ROBOTS.get(model_name) or model(model_name)).script.load()
 
 
-def script_for(plan: Plan, say: Callable[[str], None] = lambda text: None) -> Script:
+def script_for(plan: Plan[S], report: Callable[[str], None] = lambda text: None) -> Script[S]:
     """The script of the plan's model."""
-    return script_class(plan.dialect.model)(plan, say)
+    return script_class(plan.dialect.model)(plan, report)
 
 
 def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:

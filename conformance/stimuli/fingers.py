@@ -153,7 +153,7 @@ class FingerScript(HandScript):
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
         return [
-            Motor(q=q, kp=kp, kd=kd, mode=self._wire.mode(i))
+            Motor(q=q, kp=kp, kd=kd, mode=self._codec.mode(i))
             for i, (q, (kp, kd)) in enumerate(zip(pose, self._model.gains, strict=True))
         ]
 
@@ -171,7 +171,7 @@ class FingerScript(HandScript):
         yield from self._everyone(name, poses, most=1.5)
 
     def _one_by_one(self) -> Steps:
-        self._say("one joint after the other: no other joint may move")
+        self._report("one joint after the other: no other joint may move")
         sides = self.plan.sides
         motors = self._model.motors
         ways = (CLOSED, OPEN) if len(motors) <= _BOTH_WAYS else (CLOSED,)
@@ -188,14 +188,14 @@ class FingerScript(HandScript):
             yield from self._to("center", OPEN)
 
     def _alone(self, side: Side) -> Steps:
-        self._say(f"the {side} hand alone; the other one must not move")
+        self._report(f"the {side} hand alone; the other one must not move")
         for percent in (CLOSED - 5.0, OPEN):
             self._goal[side] = self._pose(side, percent)
             phase = self._begin("step", (side,), targets={side: dict(enumerate(self._goal[side]))})
             yield from self._until_settled(phase, (side,), least=0.6, most=1.5)
 
     def _bad(self, name: str) -> Steps:
-        self._say(_BAD[name])
+        self._report(_BAD[name])
         yield from self._hold(0.1)
         good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
         bursts: list[dict[Side, Motors]]
@@ -220,7 +220,7 @@ class FingerScript(HandScript):
             ]
         else:
             bursts = [{s: self._crossed(s, motors) for s, motors in good.items()}]
-        payloads = [self._wire.encode(hands) for hands in bursts]
+        payloads = [self._codec.encode(hands) for hands in bursts]
         if name == "out-of-range":
             yield from self._burst(name, payloads, 0.8, each=0.4)
         else:
@@ -250,12 +250,12 @@ class FingerScript(HandScript):
         first, other = self._roles.crossed
         target = self._other_place()[side][first]
         crossed = list(motors)
-        crossed[first] = replace(motors[first], q=target, mode=self._wire.mode(other))
-        crossed[other] = replace(motors[other], mode=self._wire.mode(first))
+        crossed[first] = replace(motors[first], q=target, mode=self._codec.mode(other))
+        crossed[other] = replace(motors[other], mode=self._codec.mode(first))
         return crossed
 
     def _stiff_and_soft(self) -> Steps:
-        self._say("a stiff step and a soft one: the gains must make a difference")
+        self._report("a stiff step and a soft one: the gains must make a difference")
         yield from self._to("center", OPEN)
         for name, percent, part in (("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, SOFTER)):
             poses = {s: self._pose(s, percent) for s in self.plan.sides}
@@ -271,7 +271,7 @@ class FingerScript(HandScript):
         yield from self._to("center", OPEN)
 
     def _unpulled(self, name: str) -> Steps:
-        self._say(
+        self._report(
             "commands without force (zero gains): the hand must not be pulled"
             if name == "limp"
             else "locked motors: they must not follow their q"
@@ -285,7 +285,7 @@ class FingerScript(HandScript):
         else:
             motors = {
                 s: [
-                    replace(m, mode=self._wire.mode(i, JointMode.BRAKE))
+                    replace(m, mode=self._codec.mode(i, JointMode.BRAKE))
                     for i, m in enumerate(every)
                 ]
                 for s, every in self._all(CLOSED).items()
@@ -302,7 +302,7 @@ class FingerScript(HandScript):
         targets: dict[Side, dict[int, float]] = {}
         for s in sides:
             motors = [
-                replace(m, mode=self._wire.mode(i, timeout=guard))
+                replace(m, mode=self._codec.mode(i, timeout=guard))
                 for i, m in enumerate(self._motors(s, self._goal[s]))
             ]
             far = self._pose(s, CLOSED)
@@ -320,16 +320,16 @@ class FingerScript(HandScript):
     def _guard(self) -> Steps:
         sides = self.plan.sides
         timeout = self._model.command_timeout
-        self._say("moving with time-out protection, and then ...")
+        self._report("moving with time-out protection, and then ...")
         yield from self._drive("guard-drive", sides, {}, guard=True)
-        self._say("... silence: after a second the motors must brake, and say so")
+        self._report("... silence: after a second the motors must brake, and say so")
         yield from self._silence("guard", timeout + 0.7)
-        self._say("they stay braked until the protection is cleared")
+        self._report("they stay braked until the protection is cleared")
         poses = {s: self._pose(s, CLOSED - 5.0) for s in sides}
         targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
         phase = self._begin("guard-latch", sides, targets=targets)
         guarded = {
-            s: [replace(m, mode=self._wire.mode(i, timeout=True)) for i, m in enumerate(motors)]
+            s: [replace(m, mode=self._codec.mode(i, timeout=True)) for i, m in enumerate(motors)]
             for s, motors in self._all(CLOSED - 5.0).items()
         }
         yield from self._hold(0.4, guarded)
@@ -345,7 +345,7 @@ class FingerScript(HandScript):
             s: self._motors(s, self._pose(s, self.plan.objects[s] + BEYOND)) for s in pressing
         }
         if pressing:
-            self._say("squeezing the object")
+            self._report("squeezing the object")
             targets = {
                 s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
                 for s in pressing
@@ -354,8 +354,8 @@ class FingerScript(HandScript):
             yield from self._hold(1.0, squeeze)
             self._end(phase)
         if self.plan.phases & {"silence", "resume"}:
-            self._say("slow motion without protection, and then ...")
+            self._report("slow motion without protection, and then ...")
             yield from self._drive("drive", free, squeeze, guard=False)
-            self._say("... silence: nothing may be left driven by a velocity, a grip is kept")
+            self._report("... silence: nothing may be left driven by a velocity, a grip is kept")
             yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)

@@ -58,8 +58,8 @@ _BAD = {
 class GripperScript(HandScript):
     """The script of a gripper."""
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(plan, say)
+    def __init__(self, plan: Plan[Side], report: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(plan, report)
         self._stroke = plan.dialect.q_open
         # the interface specification: in unitree_hg the gains, dq and tau of a command are not used
         self._gains_used = plan.dialect.gains_are_used
@@ -126,14 +126,14 @@ class GripperScript(HandScript):
     # -- phases -----------------------------------------------------------------------------
 
     def _steps(self, side: Side) -> Steps:
-        self._say(f"large steps of the {side} hand; the other one must not move")
+        self._report(f"large steps of the {side} hand; the other one must not move")
         for target in (self._high(), self._low(side), self._middle(side)):
             self._goal[side] = (target,)
             phase = self._begin("step", (side,), targets={side: {0: target}})
             yield from self._until_settled(phase, (side,), least=0.6, most=2.5)
 
     def _ends(self) -> Steps:
-        self._say("fully open and fully closed")
+        self._report("fully open and fully closed")
         sides = self.plan.sides
         yield from self._everyone("ends", dict.fromkeys(sides, (self._stroke,)), most=1.5)
         free = [s for s in sides if s not in self.plan.objects]
@@ -144,7 +144,7 @@ class GripperScript(HandScript):
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _bad(self, name: str) -> Steps:
-        self._say(_BAD[name])
+        self._report(_BAD[name])
         sides = self.plan.sides
         yield from self._hold(0.2)
         if name == "nan":
@@ -155,21 +155,21 @@ class GripperScript(HandScript):
         elif name == "long":
             good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
             far = [
-                self._wire.encode_longer(good, [Motor(q=self._high())] * more) for more in (1, 19)
+                self._codec.encode_longer(good, [Motor(q=self._high())] * more) for more in (1, 19)
             ]
             yield from self._burst(name, far, 0.5)
         elif name == "negative":
             kp, kd = self._model.client_gains
             aside = {s: self._middle(s) + 0.1 * self._stroke for s in sides}
             wrong = {s: (Motor(q=q, kp=-kp, kd=-kd),) for s, q in aside.items()}
-            yield from self._burst(name, [self._wire.encode(wrong)], 0.4)
+            yield from self._burst(name, [self._codec.encode(wrong)], 0.4)
         else:
-            yield from self._burst(name, [self._wire.encode_empty(sides)], 0.5)
+            yield from self._burst(name, [self._codec.encode_empty(sides)], 0.5)
         yield from self._everyone("recover", self._other_place(), after=name)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _all(self, motor: Motor) -> Payloads:
-        return self._wire.encode(dict.fromkeys(self.plan.sides, (motor,)))
+        return self._codec.encode(dict.fromkeys(self.plan.sides, (motor,)))
 
     def _not_finite(self) -> list[Motor]:
         """One bad field each; where it is not q, q is far away, to show whether it was taken."""
@@ -181,7 +181,7 @@ class GripperScript(HandScript):
         ]
 
     def _limp(self) -> Steps:
-        self._say("commands without force (zero gains): the hand must not be pulled")
+        self._report("commands without force (zero gains): the hand must not be pulled")
         sides = self.plan.sides
         yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
         low = {s: self._low(s) for s in sides}
@@ -200,7 +200,7 @@ class GripperScript(HandScript):
         beyond = {s: self.plan.objects[s] - 1.5 * LEAD * self._stroke for s in pressing}
         squeeze = {s: (Motor(q=q),) for s, q in beyond.items()}
         if pressing:
-            self._say("squeezing the object")
+            self._report("squeezing the object")
             phase = self._begin("squeeze", pressing, targets={s: {0: q} for s, q in beyond.items()})
             yield from self._hold(1.5, squeeze)
             self._end(phase)
@@ -208,13 +208,13 @@ class GripperScript(HandScript):
             return
         if free and self._gains_used:
             yield from self._drive(free, squeeze)
-        self._say("... silence: after a second the hand must brake")
+        self._report("... silence: after a second the hand must brake")
         yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
         yield from self._everyone("resume", self._other_place())
 
     def _drive(self, sides: Sequence[Side], others: Mapping[Side, Motors]) -> Steps:
         """Open at a steady low speed by velocity feedback alone, whatever the friction."""
-        self._say("slow motion, and then ...")
+        self._report("slow motion, and then ...")
         phase = self._begin("drive", sides)
         slow = 0.16 * self._stroke  # rad/s: far from the stop even after a whole time-out
         wanted = dict.fromkeys(sides, slow)

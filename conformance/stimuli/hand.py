@@ -9,9 +9,10 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
 from dexkit.command_age import PAUSE
-from dexkit.conformance.motor_messages import Motors, Wire
+from dexkit.conformance.motor_messages import MotorCodec, Motors
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli.operator import OPERATOR, operate
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -26,7 +27,6 @@ from dexkit.conformance.stimuli.script import (
     Steps,
     StopService,
 )
-from dexkit.conformance.stimuli.session import Session
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import HandModel, model
@@ -43,15 +43,15 @@ LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
 """Commands a second under load, twice and more what official clients send, and for how long."""
 
 
-class HandScript(Script):
+class HandScript(Script[Side]):
     """The stimulus for hands; subclasses have the phases of their models."""
 
     _settling = 0.4
     """Seconds that a hand must stand near its goal."""
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(plan, say)
-        self._wire = Wire(plan.dialect)
+    def __init__(self, plan: Plan[Side], report: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(plan, report)
+        self._codec = MotorCodec(plan.dialect)
         self._model: HandModel = model(plan.dialect.model)
         self._joints = {s: joints_of(plan.dialect, s) for s in Side}
         self._held: tuple[dict[Side, Pose], Payloads] = ({}, [])
@@ -64,7 +64,7 @@ class HandScript(Script):
         yield from self._listen()
         yield from self._approach()
         if not self._obs.q:
-            self._say("no state on any topic: the rest of the script is left out")
+            self._report("no state on any topic: the rest of the script is left out")
             return
         yield from self._provoke()
         if OPERATOR in self.plan.phases:
@@ -73,7 +73,7 @@ class HandScript(Script):
         if "two-writers" in self.plan.phases:
             yield from self._two_writers()
         if "restart" in self.plan.phases:
-            self._say("the commanding program is restarted: the new one must be obeyed")
+            self._report("the commanding program is restarted: the new one must be obeyed")
             yield Restart()
             yield from self._everyone("restart", self._other_place())
         yield from self._hold(0.2)
@@ -100,11 +100,11 @@ class HandScript(Script):
         """Every side holds its goal, but for those named."""
         if motors:
             every = {s: motors.get(s) or self._motors(s, q) for s, q in self._goal.items()}
-            yield from self._send(self._wire.encode({**every, **motors}))
+            yield from self._send(self._codec.encode({**every, **motors}))
             return
         if self._held[0] != self._goal:  # they are held for long, and encoded once
             hold = {s: self._motors(s, q) for s, q in self._goal.items()}
-            self._held = (dict(self._goal), self._wire.encode(hold))
+            self._held = (dict(self._goal), self._codec.encode(hold))
         yield from self._send(self._held[1])
 
     def _hold(self, seconds: float, motors: Mapping[Side, Motors] | None = None) -> Steps:
@@ -176,7 +176,7 @@ class HandScript(Script):
 
     def _approach(self) -> Steps:
         """Slowly to the middle: the first motion of an unknown hand."""
-        self._say("moving slowly to the middle")
+        self._report("moving slowly to the middle")
         phase = self._begin("approach", self.plan.sides)
         home = {s: self._home(s) for s in self.plan.sides}
         start = {s: self._obs.q.get(s, home[s]) for s in self.plan.sides}
@@ -223,16 +223,18 @@ class HandScript(Script):
         self._goal.update({s: tuple(m.q for m in motors) for s, motors in newest.items()})
         reachable = [s for s in sides if self._reachable(s)]
         yield from self._until_settled(None, reachable, least=0.6, most=2.0)
-        self._say(f"replaying {session.duration:.0f} s of the recorded session {session.name}")
+        self._report(f"replaying {session.duration:.0f} s of the recorded session {session.name}")
         phase = self._begin("replay", sides, session=session.name)
         start = self._obs.now_ns
         for i, (at, motors) in enumerate(timeline):
             late = self._obs.now_ns - start - at
             if late > PAUSE * 1e9:  # all that fell due, sent at once, would move the hand wildly
-                self._say(f"this program stood still for {late / 1e9:.2f} s; the session is held")
+                self._report(
+                    f"this program stood still for {late / 1e9:.2f} s; the session is held"
+                )
                 start += late
             newest.update(motors)
-            payloads = self._wire.encode(newest if self._wire.shared else motors)
+            payloads = self._codec.encode(newest if self._codec.shared else motors)
             later = timeline[i + 1][0] if i + 1 < len(timeline) else at + self._period_ns
             yield from self._do(Send(payloads, start + later))
         self._end(phase)
@@ -244,7 +246,7 @@ class HandScript(Script):
         return True
 
     def _late_joiner(self) -> Steps:
-        self._say("a second subscriber joins late: it must get the state at once")
+        self._report("a second subscriber joins late: it must get the state at once")
         phase = self._begin("late-joiner", self.plan.sides)
         yield Join()
         while self._elapsed(phase) < 3.0:
@@ -257,9 +259,9 @@ class HandScript(Script):
 
     def _foreign(self) -> Steps:
         """A stranger publishes another type on the command topics, with far targets."""
-        self._say("another type on the command topics: it must not reach the hand")
+        self._report("another type on the command topics: it must not reach the hand")
         yield from self._hold(0.2)
-        far = self._wire.encode_foreign(
+        far = self._codec.encode_foreign(
             {s: self._motors(s, pose) for s, pose in self._other_place().items()}
         )
         yield from self._do(Join(Role.STRANGER))
@@ -271,9 +273,9 @@ class HandScript(Script):
 
     def _flood(self) -> Steps:
         """Hundreds of commands at once to another place, the last of them back to this one."""
-        self._say(f"{FLOOD} commands at once: only the last one counts")
+        self._report(f"{FLOOD} commands at once: only the last one counts")
         yield from self._hold(0.2)
-        far = self._wire.encode(
+        far = self._codec.encode(
             {s: self._motors(s, pose) for s, pose in self._other_place().items()}
         )
         phase = self._begin("burst", self.plan.sides)
@@ -283,7 +285,7 @@ class HandScript(Script):
         self._end(phase)
 
     def _old_stamps(self) -> Steps:
-        self._say("a client whose clock is an hour behind: it must be obeyed")
+        self._report("a client whose clock is an hour behind: it must be obeyed")
         self._age_s = 3600.0
         yield from self._everyone("old-stamps", self._other_place(), most=1.5)
         self._age_s = 0.0
@@ -291,12 +293,12 @@ class HandScript(Script):
 
     def _load(self) -> Steps:
         """Many commands, and a reliable subscriber that hardly ever reads."""
-        self._say(f"{LOAD_RATE:g} commands a second and a slow reader: state must keep its rate")
+        self._report(f"{LOAD_RATE:g} commands a second and a slow reader: state must keep its rate")
         here, there = dict(self._goal), self._other_place()
         count = 40  # points of the way there and back
         parts = [0.3 * (1 - abs(2 * i / count - 1)) for i in range(count + 1)]
         points = [
-            self._wire.encode(
+            self._codec.encode(
                 {
                     s: self._motors(
                         s, tuple(a + part * (b - a) for a, b in zip(here[s], there[s], strict=True))
@@ -316,10 +318,10 @@ class HandScript(Script):
         yield from self._do(Leave(Role.LAGGARD))
 
     def _two_writers(self) -> Steps:
-        self._say("a second client commands another place, and goes again")
+        self._report("a second client commands another place, and goes again")
         yield from self._hold(0.2)
         there = self._other_place()
-        rival = self._wire.encode({s: self._motors(s, pose) for s, pose in there.items()})
+        rival = self._codec.encode({s: self._motors(s, pose) for s, pose in there.items()})
         targets = {s: dict(enumerate(pose)) for s, pose in there.items()}
         yield from self._do(Join(Role.RIVAL))
         phase = self._begin("two-writers", self.plan.sides, targets=targets)
@@ -340,12 +342,12 @@ class HandScript(Script):
 
     def _service_restart(self) -> Steps:
         """End the service and start it again, where the kit can."""
-        self._say("the service is stopped and started again")
+        self._report("the service is stopped and started again")
         phase = self._begin("shutdown", self.plan.sides)
         yield from self._do(StopService())
         if not self._obs.stopped:
             self.phases.remove(phase)
-            self._say("the kit has not started the service, so it does not restart it")
+            self._report("the kit has not started the service, so it does not restart it")
             return
         phase.observed = dict(self._obs.stopped)
         yield from self._do(StartService())

@@ -34,7 +34,7 @@ _DEEPEST = 0.5  # how far the profile closes a hand of several joints
 _POLL = 0.001  # s between two reads while the client waits for a state
 
 
-def _most(plan: Plan, side: Side) -> float:
+def _most(plan: Plan[Side], side: Side) -> float:
     """How far a side may close, 0 to 1, as :class:`~dexkit.teleop.Operator` takes it."""
     touch = plan.objects.get(side)
     if touch is None:
@@ -46,7 +46,8 @@ def _most(plan: Plan, side: Side) -> float:
 
 def operator_of(phase: Phase, dialect: Dialect) -> Operator:
     """The operator of a phase, from its parameters in the recording."""
-    most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in phase.sides}
+    hands = [s for s in phase.sides if isinstance(s, Side)]
+    most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in hands}
     return Operator(profile(phase.params["profile"], dialect.model), dialect, most=most)
 
 
@@ -55,7 +56,7 @@ def operate(script: HandScript) -> Steps:
     plan = script.plan
     if not plan.dialect.has_client:
         return  # no client of Unitree's speaks it, and none of the requirements applies
-    script._say("an operator at Unitree's client: full strokes, steps, slow motion")
+    script._report("an operator at Unitree's client: full strokes, steps, slow motion")
     phase = script._begin(OPERATOR, plan.sides, profile=PROFILE)
     phase.params.update({f"most_{s}": f"{_most(plan, s):.6g}" for s in plan.sides})
     operator = operator_of(phase, plan.dialect)
@@ -64,14 +65,14 @@ def operate(script: HandScript) -> Steps:
     tick = begin = script._obs.now_ns
 
     def receive() -> float:
-        now = (script._obs.now_ns - begin) / 1e9
-        client.receive(now, {s: q for s, q in script._obs.q.items() if s in plan.sides})
+        now, q = (script._obs.now_ns - begin) / 1e9, script._obs.q
+        client.receive(now, {s: q[s] for s in plan.sides if s in q})
         return now
 
     while script._elapsed(phase) < operator.profile.duration:
         now = receive()
         commands = client.step(now, {}, operator.inputs(now, plan.sides))
-        payloads = script._wire.encode(
+        payloads = script._codec.encode(
             {s: [Motor(**m._asdict()) for m in motors] for s, motors in commands.items()}
         )
         # the next turn, without making up for turns that were missed
@@ -86,4 +87,5 @@ def operate(script: HandScript) -> Steps:
             now = receive()
     script._end(phase)
     script._next_ns = script._obs.now_ns
-    script._goal.update({s: q for s, q in script._obs.q.items() if s in plan.sides})
+    last = script._obs.q
+    script._goal.update({s: last[s] for s in plan.sides if s in last})

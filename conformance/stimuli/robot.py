@@ -35,7 +35,7 @@ from functools import partial
 
 from dexkit.command_age import PAUSE
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.robot import SPOILS, RobotWire
+from dexkit.conformance.robot import WRONG_CRCS, RobotMotorCodec
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -46,7 +46,8 @@ from dexkit.conformance.stimuli.script import (
     Send,
     Steps,
 )
-from dexkit.conformance.stimulus_record import ROBOT, Phase
+from dexkit.conformance.stimulus_record import Phase
+from dexkit.hand import ROBOT, RobotSubject
 from dexkit.robots import robot
 
 __all__ = ["STEP", "RobotScript"]
@@ -62,15 +63,17 @@ _JOINT = "right_elbow"
 _NOTHING = Motor(kp=0.0, kd=0.0)
 
 
-class RobotScript(Script):
+class RobotScript(Script[RobotSubject]):
     """The stimulus for one robot."""
 
     motion = "joint"
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(plan, say)
+    def __init__(
+        self, plan: Plan[RobotSubject], report: Callable[[str], None] = lambda text: None
+    ) -> None:
+        super().__init__(plan, report)
         self._robot = robot(plan.dialect.model)
-        self._coder = RobotWire(plan.dialect)
+        self._codec = RobotMotorCodec(plan.dialect)
         self._joints = {ROBOT: tuple(self._robot.joint(slot) for slot in self._robot.used)}
         self._period_ns = round(1e9 / self._robot.teleop_rate)
         self._slot = self._robot.slot(_JOINT)
@@ -92,7 +95,7 @@ class RobotScript(Script):
         if ROBOT not in self._obs.q:
             yield from self._wake()
         if ROBOT not in self._obs.q:
-            self._say("no state: the rest of the script is left out")
+            self._report("no state: the rest of the script is left out")
             return
         self._start = dict(zip(self._robot.used, self._obs.q[ROBOT], strict=True))
         self._goal = {ROBOT: self._obs.q[ROBOT]}
@@ -153,15 +156,15 @@ class RobotScript(Script):
         joint = self._robot.joint(slot)
         return by if self._here(slot) < (joint.q_min + joint.q_max) / 2 else -by
 
-    def _put(self, order: Motors, spoil: str = "", machine: int | None = None) -> Steps:
+    def _put(self, order: Motors, wrong_crc: str = "", machine: int | None = None) -> Steps:
         if self._dry:
             yield from self._send([])
             return
         own = self._obs.machine or self._robot.mode_machine or 0
         sent = own if machine is None else machine
-        key = (tuple(order), sent, spoil)
+        key = (tuple(order), sent, wrong_crc)
         if key != self._sent[0]:  # they are held for long, and encoded once
-            self._sent = (key, self._coder.low_command(order, sent, spoil))
+            self._sent = (key, self._codec.encode_low_command(order, sent, wrong_crc))
         yield from self._send([(self._robot.cmd_topic, self._sent[1])])
 
     def _keep(self, seconds: float) -> Steps:
@@ -223,12 +226,12 @@ class RobotScript(Script):
         self._end(phase)
 
     def _every_joint(self) -> Steps:
-        self._say("moving one joint at a time by 0.2 rad")
+        self._report("moving one joint at a time by 0.2 rad")
         for slot in self._robot.used:
             yield from self._step("joint", slot)
 
     def _stiffness(self) -> Steps:
-        self._say("a soft joint, a speed, a torque")
+        self._report("a soft joint, a speed, a torque")
         kp, _ = self._robot.client_gains[self._slot]
         soft = kp / 4
         self._order = self._with(kp=soft)
@@ -284,8 +287,8 @@ class RobotScript(Script):
         yield from self._keep(0.1)
 
     def _wrong_crc(self) -> Steps:
-        self._say("commands that are wrong: nothing may move")
-        for kind in SPOILS:
+        self._report("commands that are wrong: nothing may move")
+        for kind in WRONG_CRCS:
             order = self._wish()
             yield from self._bad("wrong-crc", partial(self._put, order, kind), 0.25, kind=kind)
 
@@ -311,7 +314,7 @@ class RobotScript(Script):
         wish = list(self._order)  # of every joint: the families' slots are not the same
         for slot in self._robot.used:
             wish[slot] = replace(wish[slot], q=wish[slot].q + self._inward(slot, STEP))
-        payload = self._coder.foreign_command(wish)
+        payload = self._codec.encode_foreign_command(wish)
 
         def send() -> Steps:
             self._next_ns += self._period_ns
@@ -325,7 +328,9 @@ class RobotScript(Script):
     # -- silence and life cycle ----------------------------------------------------------------
 
     def _silence(self, name: str, seconds: float) -> Steps:
-        self._say("commands pause while a joint is driven: it may go on for a second, not longer")
+        self._report(
+            "commands pause while a joint is driven: it may go on for a second, not longer"
+        )
         speed = self._inward(self._slot, _SPEED)
         self._order = self._with(kp=0.0, dq=speed)
         yield from self._keep(0.3)
@@ -354,7 +359,7 @@ class RobotScript(Script):
         yield Leave()
 
     def _restart(self) -> Steps:
-        self._say("the commanding program is restarted: the new one must be obeyed")
+        self._report("the commanding program is restarted: the new one must be obeyed")
         yield Restart()
         self._next_ns = self._obs.now_ns
         yield from self._keep(0.2)

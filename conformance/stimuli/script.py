@@ -8,11 +8,12 @@ import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Generic, TypeVar
 
 from dexkit.conformance.phased_script import PhasedScript, play
-from dexkit.conformance.stimuli.session import Session
+from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.conformance.stimulus_record import Phase
-from dexkit.hand import JointSpec, Side
+from dexkit.hand import JointSpec, Side, Subject
 from dexkit.models import Dialect, model
 
 __all__ = [
@@ -71,9 +72,9 @@ class Observation:
     """
 
     now_ns: int
-    q: Mapping[Side, Pose] = field(default_factory=dict)
-    dq: Mapping[Side, Pose] = field(default_factory=dict)
-    joined: Mapping[Side, float] = field(default_factory=dict)
+    q: Mapping[Subject, Pose] = field(default_factory=dict)
+    dq: Mapping[Subject, Pose] = field(default_factory=dict)
+    joined: Mapping[Subject, float] = field(default_factory=dict)
     stopped: Mapping[str, float | None] = field(default_factory=dict)
     machine: int = 0
 
@@ -125,10 +126,13 @@ Action = Send | Join | Leave | Restart | StopService | StartService
 Steps = Generator[Action, Observation, None]
 """Part of a script."""
 
+S = TypeVar("S", bound=Subject)
+S_co = TypeVar("S_co", bound=Subject, covariant=True)
+
 
 @dataclass(frozen=True)
-class Plan:
-    """What to do to which hands.
+class Plan(Generic[S_co]):
+    """What to do to which hands, or to a robot.
 
     :param objects: where a side touches an object: in the dialect's radians for a hand of one
         joint, percent of closing for others.
@@ -137,36 +141,36 @@ class Plan:
     """
 
     dialect: Dialect
-    sides: tuple[Side, ...]
-    objects: Mapping[Side, float] = field(default_factory=dict)
+    sides: tuple[S_co, ...]
+    objects: Mapping[Subject, float] = field(default_factory=dict)
     session: Session | None = None
     phases: frozenset[str] = frozenset()
 
 
-def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Side, float]:
+def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Subject, float]:
     """Percents as the script takes them: of opening in radians, of closing as they are."""
     if not dialect.is_gripper:
-        return dict(percents)
+        return dict(percents.items())
     return {s: pct / 100 * dialect.q_open for s, pct in percents.items()}
 
 
-def default_objects(dialect: Dialect, sides: Sequence[Side]) -> dict[Side, float]:
+def default_objects(dialect: Dialect, sides: Sequence[Subject]) -> dict[Subject, float]:
     """The default objects of a pair of hands, as the script takes them."""
     percents = model(dialect.model).objects
     return object_places(dialect, {s: p for s, p in percents.items() if s in sides})
 
 
-class Script(PhasedScript[Action, Observation, Phase]):
+class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
     """The stimulus for one plan; each model's script has its phases, in its order."""
 
     motion = "step"
     """The phase in which the hand moves, for requirements that need any motion."""
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(Observation(0), say)
+    def __init__(self, plan: Plan[S], report: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(Observation(0), report)
         self.plan = plan
-        self._joints: dict[Side, tuple[JointSpec, ...]] = {}
-        self._goal: dict[Side, Pose] = {}
+        self._joints: dict[S, tuple[JointSpec, ...]] = {}
+        self._goal: dict[S, Pose] = {}
         self._age_s = 0.0
         self._period_ns = 0
 
@@ -174,8 +178,8 @@ class Script(PhasedScript[Action, Observation, Phase]):
         """Seconds that :meth:`run` takes with hands that reach their goals at once."""
         now = 0
         stopped: dict[str, float | None] = {}
-        still = {s: (0.0,) * len(self._joints[s]) for s in self.plan.sides}
-        joined = dict.fromkeys(self.plan.sides, 0.0)
+        still: dict[Subject, Pose] = {s: (0.0,) * len(self._joints[s]) for s in self.plan.sides}
+        joined: dict[Subject, float] = dict.fromkeys(self.plan.sides, 0.0)
 
         def carry_out(action: Action) -> Observation:
             nonlocal now, stopped
@@ -185,7 +189,7 @@ class Script(PhasedScript[Action, Observation, Phase]):
                 stopped = {"exit_s": 0.0, "gone_s": 0.0}
             elif isinstance(action, StartService):
                 now += _SERVICE_START_NS
-            return Observation(now, {**still, **self._goal}, still, joined, stopped)
+            return Observation(now, still | dict(self._goal.items()), still, joined, stopped)
 
         play(self, carry_out)
         return now / 1e9
@@ -206,17 +210,19 @@ class Script(PhasedScript[Action, Observation, Phase]):
     def _begin(
         self,
         name: str,
-        sides: Sequence[Side],
+        sides: Sequence[S],
         *,
-        targets: Mapping[Side, Mapping[int, float]] | None = None,
+        targets: Mapping[S, Mapping[int, float]] | None = None,
         **params: str,
     ) -> Phase:
         """Begin a phase; ``targets`` are its moving joints."""
-        goals = {s: dict(joints) for s, joints in (targets or {}).items()}
+        goals: dict[Subject, dict[int, float]] = {
+            s: dict(joints) for s, joints in (targets or {}).items()
+        }
         begin_ns = self._obs.now_ns
         return self._mark(Phase(name, tuple(sides), begin_ns, targets=goals, params=params))
 
     def _listen(self) -> Steps:
-        self._say("listening: the state must flow before the first command")
+        self._report("listening: the state must flow before the first command")
         phase = self._begin("listen", self.plan.sides)
         yield from self._through(phase, 1.2, lambda: self._wait(0.05))

@@ -15,10 +15,10 @@ import numpy as np
 
 from dexkit.conformance.checks import BaseContext, Outcome, check
 from dexkit.conformance.results import Evidence
+from dexkit.conformance.stimuli.usb import BUSES, DRIVEN, FREE
 from dexkit.conformance.usb.frames import NO_VALUE, STATE_SIZE, Scale, read_command
 from dexkit.conformance.usb.record import UsbPhase, topic
 from dexkit.conformance.usb.recording import Answer, Exchange, Floats, UsbRecording, UsbSide
-from dexkit.conformance.usb.script import BUSES, DRIVEN, FREE
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from dexkit.conformance.stimulus_record import Beats, Stall, stalls_of, time_of
+from dexkit.conformance.stimulus_record import Beats, Stall, parse_stalls, parse_time
 from dexkit.conformance.usb import RECORD
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
@@ -177,8 +177,8 @@ class UsbRecord:
             )
         try:
             found = cls(
-                stalls=stalls_of(record["stalls"]),
-                beats=Beats.of(record.get("beats", "{}")),
+                stalls=parse_stalls(record["stalls"]),
+                beats=Beats.parse(record.get("beats", "{}")),
             )
             for side in Side:
                 if str(side) in record:
@@ -200,7 +200,10 @@ def _side(plain: dict[str, Any]) -> SideRecord:
         buses=[(int(bus), int(number)) for bus, number in plain["buses"]],
         phases=[
             UsbPhase(
-                str(p["name"]), time_of(p["begin_ns"]), time_of(p["end_ns"]), dict(p["params"])
+                str(p["name"]),
+                parse_time(p["begin_ns"]),
+                parse_time(p["end_ns"]),
+                dict(p["params"]),
             )
             for p in plain["phases"]
         ],

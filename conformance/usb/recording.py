@@ -231,7 +231,7 @@ class UsbRecording:
     beats: Beats = field(default_factory=Beats)
 
     @classmethod
-    def of(cls, trace: TraceLike) -> UsbRecording | None:
+    def decode(cls, trace: TraceLike) -> UsbRecording | None:
         """Decode the USB part of ``trace``, or None when it has none.
 
         :raises TraceUnsupported: it cannot be read.

@@ -10,6 +10,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dexkit.clock import RealClock
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phased_script import play
+from dexkit.conformance.stimuli.usb import (
+    Action,
+    Alone,
+    In,
+    Observation,
+    Out,
+    Plan,
+    Reopen,
+    UsbScript,
+    Wait,
+)
 from dexkit.conformance.usb.access import UsbHost, bulk_pair, open_device
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -22,17 +33,6 @@ from dexkit.conformance.usb.record import (
     topic,
 )
 from dexkit.conformance.usb.recording import Endpoint
-from dexkit.conformance.usb.script import (
-    Action,
-    Alone,
-    In,
-    Observation,
-    Out,
-    Plan,
-    Reopen,
-    UsbScript,
-    Wait,
-)
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
 from dexkit.traces.recorder import Recorder
@@ -46,14 +46,14 @@ def run(
     devices: Mapping[Side, str],
     recorder: Recorder,
     *,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
 ) -> bool:
     """Play the script to all hands at the same time, and record their transfers.
 
     :param devices: where each hand is: ``usbip://host:port``, the same with ``/serial``, a serial
         number, or empty for the only one of its side on this machine.
-    :param say: called with progress messages for the user.
+    :param report: called with progress messages for the user.
     :param stop: ends the run early when set; the recording so far is kept.
     :returns: False when it was ended early.
     :raises ConformanceError: a hand is not there, or cannot be opened.
@@ -68,7 +68,7 @@ def run(
             turn = threading.Lock()
             runs = {
                 side: pool.submit(
-                    _play, side, host, recorder, turn, stop, say if i == 0 else lambda text: None
+                    _play, side, host, recorder, turn, stop, report if i == 0 else lambda text: None
                 )
                 for i, (side, host) in enumerate(hosts.items())
             }
@@ -91,7 +91,7 @@ def _play(
     recorder: Recorder,
     turn: threading.Lock,
     stop: threading.Event,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> SideRecord:
     descriptors: Descriptors = host.descriptors
     plan = Plan(side)
@@ -99,11 +99,11 @@ def _play(
     for inward in (False, True):
         recorder.add_foreign_channel(topic(side, inward=inward), SCHEMA_NAME, SCHEMA)
     if pair is None:
-        say("interface 0 has no pair of bulk endpoints: the device cannot be tested further")
+        report("interface 0 has no pair of bulk endpoints: the device cannot be tested further")
         return SideRecord(
             descriptors, list(plan.buses), trouble="there is no pair of bulk endpoints"
         )
-    script = UsbScript(plan, say)
+    script = UsbScript(plan, report)
     player = _Player(side, host, pair, recorder, turn)
     try:
         if not play(script, player.carry_out, stop.is_set):

@@ -8,7 +8,7 @@ requirement, and each wrong hand in :mod:`dexkit.conformance.mutants` changes on
 """
 
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
-from dexkit.conformance.virtual.service import Sample, Service
+from dexkit.conformance.virtual.service import Sample, Service, TopicDevice
 from dexkit.conformance.virtual.topics import run_virtual
 
-__all__ = ["MemoryTrace", "Sample", "Service", "run_virtual"]
+__all__ = ["MemoryTrace", "Sample", "Service", "TopicDevice", "run_virtual"]

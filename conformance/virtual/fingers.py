@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.service import Sample, Service
-from dexkit.hand import Floats, JointMode, Side
+from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
 
@@ -266,7 +266,7 @@ class FingerService(Service):
             cls.hand = type(fault.__name__, (fault, hand), {})
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
@@ -331,7 +331,7 @@ class FingerService(Service):
         """A state with its constant members: number of motors, sensor packets, attitude."""
         motor = message_type("unitree_hg::msg::dds_::MotorState_").cls
         packet = message_type("unitree_hg::msg::dds_::PressSensorState_").cls
-        message = self.wire.state.cls()
+        message = self.codec.state.cls()
         message.motor_state = [motor(temperature=(30, 40), vol=24.0) for _ in range(count)]
         message.press_sensor_state = [packet(temperature=(25.0,) * 12) for _ in range(self.sensors)]
         message.imu_state.quaternion = list(self.quaternion())
@@ -340,7 +340,7 @@ class FingerService(Service):
     def _message(self, count: int) -> tuple[bytearray, Any, Any]:
         """A message of so many motors, and views of the motors and packets in it; made once."""
         if count not in self._blank:
-            data = bytearray(self.wire.state.encode(self.message(count)))
+            data = bytearray(self.codec.state.encode(self.message(count)))
             at = 8  # header and length
             motors = np.frombuffer(data, _MOTOR, count, at)
             at += count * _MOTOR.itemsize + 4
@@ -369,7 +369,7 @@ class Dex3Service(FingerService):
     def low_rate(self, samples: list[Sample]) -> list[Sample]:
         """Copies of the states on the low-rate topics."""
         topics = {
-            self.wire.state_topics[s]: self.dialect.low_rate_topic.format(side=s)
+            self.codec.state_topics[s]: self.dialect.low_rate_topic.format(side=s)
             for s in self.sides
         }
         return [

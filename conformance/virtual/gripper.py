@@ -9,7 +9,7 @@ from typing import Any
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.service import Service
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from dexkit.models import DEX1_1, Dialect
 
 __all__ = ["ReferenceHand", "ReferenceService"]
@@ -115,7 +115,7 @@ class ReferenceService(Service):
     hand: type[ReferenceHand] = ReferenceHand
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(dialect.q_open, touch.get(s)) for s in self.sides}
@@ -162,4 +162,4 @@ class ReferenceService(Service):
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of these grippers on the wire."""
-        return self.wire.state_payload({s: [self.fields(s)] for s in sides}, length, **self.rest())
+        return self.codec.state_payload({s: [self.fields(s)] for s in sides}, length, **self.rest())

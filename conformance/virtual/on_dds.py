@@ -6,7 +6,7 @@ import threading
 import time
 
 from dexkit.clock import Rate
-from dexkit.conformance.virtual.service import Service
+from dexkit.conformance.virtual.service import TopicDevice
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.threads import Worker
 
@@ -17,10 +17,10 @@ class ServiceOnDds:
     """Runs a service in real time, in a thread; a context manager.
 
     It behaves as on the virtual clock, except for what only the virtual player can do:
-    :attr:`~Service.serves_late_readers`. Each writer of commands counts as a client.
+    :attr:`~TopicDevice.serves_late_readers`. Each writer of commands counts as a client.
     """
 
-    def __init__(self, service: Service, domain: int, interface: str = "lo") -> None:
+    def __init__(self, service: TopicDevice, domain: int, interface: str = "lo") -> None:
         self.service = service
         self._node = DdsNode(domain=domain, interface=interface)
         self._stop = threading.Event()

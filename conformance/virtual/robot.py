@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.robot import RobotWire
-from dexkit.conformance.stimulus_record import ROBOT
-from dexkit.conformance.virtual.service import Sample, Service
+from dexkit.conformance.virtual.service import Sample, TopicDevice
 from dexkit.errors import WireError
-from dexkit.hand import Floats, Side
+from dexkit.hand import ROBOT, Floats, RobotSubject, Subject
 from dexkit.messages import decode, message_type
 from dexkit.models import Dialect
-from dexkit.robots import RobotModel
+from dexkit.robots import RobotModel, robot
 from dexkit.wire.low_level import encode_with_crc, verify_payload
 
 __all__ = ["Orders", "ReferenceRobot"]
@@ -39,7 +37,7 @@ class Orders:
         self.machine = getattr(message, "mode_machine", None)
 
 
-class ReferenceRobot(Service):
+class ReferenceRobot(TopicDevice):
     """An H1 or a G1 that meets every requirement.
 
     :ivar q: of all slots, rad; ``dq`` and ``tau`` likewise.
@@ -53,11 +51,10 @@ class ReferenceRobot(Service):
     machine = 5
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
-        assert isinstance(self.wire, RobotWire)
-        self.robot: RobotModel = self.wire.robot
+        self.robot: RobotModel = robot(dialect.model)
         self.used = np.array(self.robot.used)
         self.enable = np.array(self.robot.enable)
         slots = self.robot.slots
@@ -152,10 +149,6 @@ class ReferenceRobot(Service):
         return goal, 1.0 - np.exp(-kp / drag * dt), np.where(stiff, 0.0, push / drag * dt)
 
     # -- states -----------------------------------------------------------------------------
-
-    def positions(self, side: Side) -> tuple[float, ...]:
-        """Where the joints are."""
-        return tuple(self.q[self.used].tolist())
 
     def publish(self) -> list[Sample]:
         """A state."""

@@ -1,20 +1,20 @@
-"""A service in memory that publishes hands on DDS topics on a virtual clock."""
+"""Devices on DDS topics, in memory and on a virtual clock."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.robot import wire_for
+from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.errors import WireError
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from dexkit.models import Dialect
 from dexkit.traces import TraceEndpoint
 
-__all__ = ["Sample", "Service"]
+__all__ = ["Sample", "Service", "TopicDevice"]
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,11 @@ class Sample:
     sent: float
 
 
-class Service:
-    """Publishes and subscribes as a service that meets every requirement.
+class TopicDevice(ABC):
+    """Publishes and subscribes as a device that meets every requirement of DDS and of timing."""
 
-    Its hands never move; each model's reference service simulates moving ones.
-
-    :param touch: where each side touches an object, in the plan's terms.
-    """
-
-    fault_sides: tuple[Side, ...] = tuple(Side)
-    """The hands that are needed, by default, to see a fault of a wrong hand."""
+    fault_sides: tuple[Subject, ...]
+    """The subjects that are needed, by default, to see a fault."""
 
     tick = 0.003
     """Seconds of a step of the virtual clock."""
@@ -55,22 +50,21 @@ class Service:
     """Whether a slow reliable reader is matched."""
 
     def __init__(
-        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Side, float]
+        self, dialect: Dialect, sides: Iterable[Subject], touch: Mapping[Subject, float]
     ) -> None:
         self.dialect = dialect
-        self.wire = wire_for(dialect)
-        self.sides = tuple(sides)
+        self.sides: tuple[Subject, ...] = tuple(sides)
         self.command_type = dialect.cmd_type
         self.state_type = dialect.state_type
         self.now = 0.0
         self.stamp = 0.0
         """Source timestamp of the command that is received, in its own time."""
         self._due = 0.0
-        self._heard: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
 
     @classmethod
     def recorded(cls, trace: MemoryTrace) -> None:
         """Change the recording of a run: a fault of the client shows only there."""
+        return
 
     @property
     def matches_clients(self) -> bool:
@@ -91,29 +85,15 @@ class Service:
             )
         return list(found.values())
 
+    @abstractmethod
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         """Take a command message.
 
         :param client: which of the clients there have been sent it, from 0.
         """
-        for side in self.sides:
-            if self.wire.command_topics[side] != topic:
-                continue
-            if self._heard.get(side, (b"", None))[0] != payload:
-                try:
-                    self._heard[side] = (payload, self.wire.read_command(payload, side))
-                except WireError:
-                    continue
-            motors = self._heard[side][1]
-            if motors is not None:
-                self.motors(side, motors)
 
     def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
         """Take a message of another type on a command topic: DDS does not deliver it."""
-        return
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        """Take one side's part of a command message."""
         return
 
     def begin(self, now: float) -> None:
@@ -122,7 +102,7 @@ class Service:
         self.now = self._due = now
 
     def brake(self) -> None:
-        """Brake the hands: the service ends."""
+        """Stop driving the motors: the program ends."""
         return
 
     def end(self) -> list[Sample]:
@@ -141,19 +121,63 @@ class Service:
         self._due += self.period
         return self.publish()
 
-    def positions(self, side: Side) -> Pose:
-        """The pose of a hand."""
-        return (0.0,) * self.wire.joints
-
     def live(self, dt: float) -> None:
         """Let time pass in the mechanics."""
         return
 
+    @abstractmethod
+    def publish(self) -> list[Sample]:
+        """The states of one period."""
+
+
+class Service(TopicDevice):
+    """A service of hands that meets every requirement of DDS and of timing.
+
+    Its own hands never move; each model's reference service simulates some.
+
+    :param touch: where each side touches an object, in the plan's terms.
+    """
+
+    fault_sides: tuple[Side, ...] = tuple(Side)
+    sides: tuple[Side, ...]
+
+    def __init__(
+        self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
+    ) -> None:
+        super().__init__(dialect, tuple(sides), touch)
+        self.codec = MotorCodec(dialect)
+        self._decoded: dict[Side, tuple[bytes, tuple[Motor, ...] | None]] = {}
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        """Take a command message.
+
+        :param client: which of the clients there have been sent it, from 0.
+        """
+        for side in self.sides:
+            if self.codec.command_topics[side] != topic:
+                continue
+            if self._decoded.get(side, (b"", None))[0] != payload:
+                try:
+                    self._decoded[side] = (payload, self.codec.read_command(payload, side))
+                except WireError:
+                    continue
+            motors = self._decoded[side][1]
+            if motors is not None:
+                self.motors(side, motors)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        """Take one side's part of a command message."""
+        return
+
+    def positions(self, side: Side) -> Pose:
+        """The pose of a hand."""
+        return (0.0,) * self.codec.joints
+
     def publish(self) -> list[Sample]:
         """One state of every hand."""
-        if self.wire.shared:
+        if self.codec.shared:
             return [self.sample(self.dialect.state_topic, self.sides)]
-        return [self.sample(self.wire.state_topics[s], (s,)) for s in self.sides]
+        return [self.sample(self.codec.state_topics[s], (s,)) for s in self.sides]
 
     def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
         """The state message of these sides."""
@@ -164,4 +188,4 @@ class Service:
 
         :param length: motors in the sequence, if not the dialect's.
         """
-        return self.wire.state_payload({}, length)
+        return self.codec.state_payload({}, length)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from dexkit.conformance.motor_messages import Wire
+from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
-from dexkit.conformance.robot import wire_for
+from dexkit.conformance.robot import codec_for
 from dexkit.conformance.stimuli import (
     Action,
     Join,
@@ -23,8 +23,8 @@ from dexkit.conformance.stimuli import (
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
-from dexkit.conformance.virtual.service import Sample, Service
-from dexkit.hand import Side
+from dexkit.conformance.virtual.service import Sample, TopicDevice
+from dexkit.hand import Subject
 
 __all__ = ["ORIGIN_NS", "log_time_ns", "run_virtual"]
 
@@ -39,25 +39,25 @@ def log_time_ns(seconds: float) -> int:
     return ORIGIN_NS + round(seconds * 1e9)
 
 
-class _Poses(Mapping[Side, Pose]):
+class _Poses(Mapping[Subject, Pose]):
     """The newest poses (0) or velocities (1) of all sides, decoded only when they are read."""
 
-    def __init__(self, wire: Wire, newest: Mapping[Side, bytes], which: int) -> None:
-        self._wire, self._newest, self._which = wire, newest, which
-        self._read: dict[Side, tuple[Pose, Pose] | None] = {}
+    def __init__(self, codec: MotorCodec, newest: Mapping[Subject, bytes], which: int) -> None:
+        self._codec, self._newest, self._which = codec, newest, which
+        self._read: dict[Subject, tuple[Pose, Pose] | None] = {}
 
-    def _state(self, side: Side) -> tuple[Pose, Pose] | None:
+    def _state(self, side: Subject) -> tuple[Pose, Pose] | None:
         if side not in self._read:
-            self._read[side] = self._wire.read_state(self._newest[side], side)
+            self._read[side] = self._codec.read_state(self._newest[side], side)
         return self._read[side]
 
-    def __getitem__(self, side: Side) -> Pose:
+    def __getitem__(self, side: Subject) -> Pose:
         state = self._state(side)
         if state is None:
             raise KeyError(side)
         return state[self._which]
 
-    def __iter__(self) -> Iterator[Side]:
+    def __iter__(self) -> Iterator[Subject]:
         return (s for s in self._newest if self._state(s) is not None)
 
     def __len__(self) -> int:
@@ -70,16 +70,16 @@ class _Player:
     :ivar now: s, of the virtual clock.
     """
 
-    def __init__(self, plan: Plan, service_class: type[Service]) -> None:
+    def __init__(self, plan: Plan[Subject], service_class: type[TopicDevice]) -> None:
         self.now = 0.0
         self._plan, self._service_class = plan, service_class
         self._service = service_class(plan.dialect, plan.sides, plan.objects)
         self.trace = MemoryTrace(endpoints=self._service.endpoints())
-        self._wire = wire_for(plan.dialect)
-        self._topics = {s: self._wire.state_topics[s] for s in plan.sides}
+        self._codec = codec_for(plan.dialect)
+        self._topics = {s: self._codec.state_topics[s] for s in plan.sides}
         self._newest: dict[str, bytes] = {}
         self._joined_at: float | None = None
-        self._joined: dict[Side, float] = {}
+        self._joined: dict[Subject, float] = {}
         self._stopped: dict[str, float | None] = {}
         self._clients = 0
 
@@ -133,7 +133,7 @@ class _Player:
         self._service.stamp = self.now - action.age_s
         for topic, payload in action.payloads:
             if action.by is Role.STRANGER:
-                self._service.foreign(topic, self._wire.foreign.name, payload)
+                self._service.foreign(topic, self._codec.foreign.name, payload)
                 continue
             log_ns = log_time_ns(self.now) + 50_000
             sent_ns = log_time_ns(self.now - action.age_s)
@@ -146,15 +146,15 @@ class _Player:
         newest = {s: self._newest[t] for s, t in self._topics.items() if t in self._newest}
         return Observation(
             log_time_ns(self.now),
-            _Poses(self._wire, newest, 0),
-            _Poses(self._wire, newest, 1),
+            _Poses(self._codec, newest, 0),
+            _Poses(self._codec, newest, 1),
             dict(self._joined),
             dict(self._stopped),
-            self._wire.machine,
+            self._codec.machine,
         )
 
 
-def run_virtual(plan: Plan, service_class: type[Service]) -> MemoryTrace:
+def run_virtual(plan: Plan[Subject], service_class: type[TopicDevice]) -> MemoryTrace:
     """Play the plan's script to a service of that class; the recording."""
     player = _Player(plan, service_class)
     script = script_for(plan)

@@ -14,6 +14,18 @@ from collections.abc import Mapping
 from functools import cache
 
 from dexkit.conformance.phased_script import play
+from dexkit.conformance.stimuli.usb import BUSES as MAP
+from dexkit.conformance.stimuli.usb import (
+    Action,
+    Alone,
+    In,
+    Observation,
+    Out,
+    Plan,
+    Reopen,
+    UsbScript,
+    Wait,
+)
 from dexkit.conformance.usb.frames import (
     BUSES,
     COMMAND_SIZES,
@@ -26,18 +38,6 @@ from dexkit.conformance.usb.frames import (
 )
 from dexkit.conformance.usb.record import TIMED_OUT, Descriptors, SideRecord, Transfer
 from dexkit.conformance.usb.recording import UsbRecording, UsbSide
-from dexkit.conformance.usb.script import BUSES as MAP
-from dexkit.conformance.usb.script import (
-    Action,
-    Alone,
-    In,
-    Observation,
-    Out,
-    Plan,
-    Reopen,
-    UsbScript,
-    Wait,
-)
 from dexkit.conformance.virtual.topics import ORIGIN_NS, log_time_ns
 from dexkit.hand import Side
 from dexkit.models import DEX3_1

@@ -102,7 +102,7 @@ def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
     about = result.subject
     sides = [Side(name) for name in about.get("sides", "").split(", ") if name in _SIDES]
     trace = open_trace(path)
-    view = Recording.of(trace, dialect_name=about.get("dialect"), sides=sides)
+    view = Recording.decode(trace, dialect_name=about.get("dialect"), sides=sides)
     for text in trace.damage:
         click.echo(f"warning: {path}: {text}", err=True)
     when = utc_date(view.origin_ns).isoformat(timespec="seconds")

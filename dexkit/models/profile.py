@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from dexkit.hand import HandSpec, JointSpec, Side
+from dexkit.hand import HandSpec, JointSpec, Side, Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ class Dialect:
     :param model: name of the hand model.
     :param cmd_topic: command topic; ``{side}`` is replaced by ``left`` or ``right``.
     :param cmd_type: DDS type name of the command.
-    :param index: position of a side's first motor in the sequence (0 unless both share a topic).
+    :param index: position of a subject's first motor in the sequence (0 unless both sides share
+        a topic).
     :param length: motors in the sequence.
     :param q_open: q of a fully open gripper, rad, where 0 is closed; NaN for hands whose joints
         have no such scale.
@@ -73,7 +74,7 @@ class Dialect:
     state_topic: str
     cmd_type: str
     state_type: str
-    index: dict[Side, int]
+    index: Mapping[Subject, int]
     length: int
     q_open: float
     summary: str
@@ -85,8 +86,8 @@ class Dialect:
     low_rate_topic: str = ""
     torque_units: tuple[float, ...] = ()
 
-    def topics(self, side: Side) -> tuple[str, str]:
-        """(command topic, state topic) of a side."""
+    def topics(self, side: Subject) -> tuple[str, str]:
+        """(command topic, state topic) of a side or a robot."""
         return self.cmd_topic.format(side=side), self.state_topic.format(side=side)
 
     @property
@@ -242,7 +243,7 @@ class HandModel:
     client_gains: tuple[float, float]
     rest_q: dict[Side, tuple[float, ...]]
     requirements: tuple[str | Path, ...]
-    script: Lazy[type[Script]]
+    script: Lazy[type[Script[Side]]]
     reference: Lazy[type[Service]]
     quick_seconds: float
     vendor_ids: dict[Side, int] = field(default_factory=dict)

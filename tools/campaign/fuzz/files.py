@@ -169,7 +169,7 @@ def _judged(rng: random.Random, scratch: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        result = judge(Recording.of(open_trace(path)))
+        result = judge(Recording.decode(open_trace(path)))
         render(result)
 
     return Target(make, run)
@@ -214,7 +214,7 @@ def damaged_json(content: Any, rng: random.Random) -> str:
 def _result() -> dict[str, Any]:
     from dexkit.traces import sample_path
 
-    result = judge(Recording.of(open_trace(sample_path("dex1_hand_dropout"))))
+    result = judge(Recording.decode(open_trace(sample_path("dex1_hand_dropout"))))
     return dict(result.as_dict())
 
 

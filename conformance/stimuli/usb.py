@@ -165,8 +165,8 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
     :ivar finished: it went through to its last command, which locks every motor.
     """
 
-    def __init__(self, plan: Plan, say: Callable[[str], None] = lambda text: None) -> None:
-        super().__init__(Observation(0), say)
+    def __init__(self, plan: Plan, report: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(Observation(0), report)
         self.plan = plan
         self.trouble = ""
         self.finished = False
@@ -296,7 +296,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         yield from self._repeat(seconds, exchange)
 
     def _talk(self) -> Steps:
-        self._say("exchanging frames without motion")
+        self._report("exchanging frames without motion")
         yield from self._silence(0.1)  # reads what another program has left unread
         phase = self._begin("quiet")
         yield from self._silence(0.15)
@@ -344,7 +344,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         return bool(self._q)
 
     def _motion(self) -> Steps:
-        self._say("moving one joint at a time by 0.2 rad")
+        self._report("moving one joint at a time by 0.2 rad")
         hold = self._holding()
         yield from self._during(0.05, self._frame(hold))
         for joint in range(len(self._joints)):
@@ -392,7 +392,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         return self._frame(mixed, sizes={bus: size})
 
     def _damage(self) -> Steps:
-        self._say("damaged frames: nothing may move")
+        self._report("damaged frames: nothing may move")
         for kind in DAMAGES:
             yield from self._settle(0.03)
             phase = self._begin("malformed", kind=kind)
@@ -439,7 +439,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         self._end(phase)
 
     def _protection(self) -> Steps:
-        self._say("time-out protection: a pause, then 1.5 s of silence while a finger moves")
+        self._report("time-out protection: a pause, then 1.5 s of silence while a finger moves")
         spec = self._joints[DRIVEN]
         hold = self._holding()
         yield from self._exchange(self._frame(self._holding(protect=False)))
@@ -486,7 +486,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         self._end(phase)
 
     def _reopen(self) -> Steps:
-        self._say("releasing the interface and claiming it again")
+        self._report("releasing the interface and claiming it again")
         hold = self._frame(self._holding())
         yield from self._exchange(hold)
         phase = self._begin("reopen")

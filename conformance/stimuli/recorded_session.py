@@ -38,13 +38,17 @@ class Session:
         :raises TraceError: it cannot be read.
         """
         trace = open_trace(path)
-        recording = Recording.of(trace)
+        recording = Recording.decode(trace)
         if trace.damage:
             raise TraceError(
                 f"{path.name} is damaged, and not replayed: {trace.damage[0]}",
                 hint="'dexkit info' names all of the damage",
             )
-        found = {s: v.commands for s, v in recording.sides.items() if len(v.commands)}
+        found = {
+            s: recording.sides[s].commands
+            for s in Side
+            if s in recording.sides and len(recording.sides[s].commands)
+        }
         if not found:
             raise ConformanceError(
                 f"{path.name} holds no commands to replay",
