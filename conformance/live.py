@@ -41,7 +41,7 @@ from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
-from dexkit.single_publisher import Place, SolePublisher
+from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
 
@@ -124,7 +124,7 @@ def record_run(
             _expect_somebody(recorder_node, options)
         # two clients on one hand would fight, and a real one may carry something
         sole = SolePublisher(
-            [Place(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
+            [NodeTopics(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
             hint="stop that client, or choose another --domain",
             force=options.force,
             yields=True,
@@ -141,7 +141,7 @@ def record_run(
         driver.close()
         rig.stop()
         # what the services and emulated devices had to say, counters included
-        recorder.add_metadata(TOOLS, {repr(tool): tool.last_words for tool in rig.tools})
+        recorder.add_metadata(TOOLS, {repr(tool): tool.last_lines for tool in rig.tools})
         stimulus = Stimulus(
             phases=[p for p in script.phases if p.end_ns],
             objects={s: plan.objects.get(s) for s in plan.sides},
@@ -247,7 +247,7 @@ class _Driver:
         self._do(action)
         dead = self.rig.dead()
         if dead is not None:
-            raise ConformanceError(f"{dead!r} has ended", hint=dead.last_words)
+            raise ConformanceError(f"{dead!r} has ended", hint=dead.last_lines)
         return self._observe()
 
     def _do(self, action: Action) -> None:

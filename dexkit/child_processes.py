@@ -32,9 +32,9 @@ STOP_TIMEOUT = 5.0
 _START = Path(__file__).resolve().with_name("_start") / "dexkit"
 
 END_WITH_PARENT = "DEXKIT_END_WITH_PARENT"
-"""Environment variable: set for a command that is to end when whoever started it is killed. It is
-the number of a pipe's descriptor that nobody writes and whose other end only the parent has: when
-that is closed, however it came to it, the parent is gone."""
+"""Environment variable: set for a command that is to end when its parent is killed. It is
+the number of a pipe's descriptor that is never written and whose other end only the parent has:
+when that is closed, however it came to it, the parent is gone."""
 
 
 def command_line(*arguments: str) -> list[str]:
@@ -81,7 +81,7 @@ class Tool:
     :param on_line: is given each line that it prints, in a thread that must not be kept long.
     :param environment: variables that it has beside those of this process.
 
-    :cvar error: what is raised when it ends, or says nothing, before it is ready; its last words
+    :cvar error: what is raised when it ends, or prints nothing, before it is ready; its last lines
         are the hint.
     """
 
@@ -158,12 +158,12 @@ class Tool:
         return self._process.poll()
 
     @property
-    def last_words(self) -> str:
+    def last_lines(self) -> str:
         """The last lines that it printed."""
         return "\n".join(self._tail)
 
     def wait_ready(self, stop: threading.Event, timeout: float = READY_TIMEOUT) -> None:
-        """Wait until it says that it is ready, or ``stop`` is set."""
+        """Wait until it prints that it is ready, or ``stop`` is set."""
         end = time.monotonic() + timeout
         while not (came := self.ready.wait(0.05)) and time.monotonic() < end:
             if stop.is_set():
@@ -173,7 +173,7 @@ class Tool:
             silent = (
                 "it printed nothing; a driver whose first exchange() never returns looks like that"
             )
-            raise self.error(f"{self!r} {what}", hint=self.last_words or silent)
+            raise self.error(f"{self!r} {what}", hint=self.last_lines or silent)
 
     def stop(self) -> bool:
         """End it, politely at first. May be called twice.

@@ -57,7 +57,7 @@ class RealClock:
 
 
 class ManualClock:
-    """A clock that moves only when told to; for mechanics, estimators and device logic.
+    """A clock that moves only when advanced; for mechanics, estimators and device logic.
 
     ``sleep_until`` moves the clock itself, so single-threaded code runs through hours in
     microseconds.

@@ -50,5 +50,5 @@ class Console(rich.console.Console):
                 yield Segment(visible(text), segment.style)
 
     def on_broken_pipe(self) -> None:
-        """Say it as any other stream does."""
+        """Report a broken pipe as any other stream does."""
         raise OutputError("cannot write standard output: Broken pipe")

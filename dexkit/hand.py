@@ -128,7 +128,7 @@ class JointSpec:
 
 @dataclass(frozen=True)
 class HandSpec:
-    """What a hand says of itself.
+    """The properties of a hand: model, side, joints and rates.
 
     :param model: name in :data:`dexkit.models.MODELS`, for example ``"dex1-1"``.
     :param side: which hand.

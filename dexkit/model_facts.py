@@ -184,7 +184,7 @@ def _backends(model: str, plugins: bool) -> list[dict[str, str]]:
     ]
 
 
-# -- how they are said, in the terminal and on the page -------------------------------------
+# -- as text, in the terminal and on the page -----------------------------------------------
 
 
 def indices(values: Sequence[int]) -> str:

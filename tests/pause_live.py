@@ -226,7 +226,7 @@ def stop_and_continue(
             outcome.tries.append(
                 _one(tool, hand, client_domain, stopped, leaves=number % 2 == 0, chance=chance)
             )
-            assert tool.running, f"{name} ended: {tool.last_words}"
+            assert tool.running, f"{name} ended: {tool.last_lines}"
     return outcome
 
 

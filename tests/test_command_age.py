@@ -17,9 +17,9 @@ from dexkit.command_age import (
     PAUSE,
     QUIET,
     SETTLE,
-    Ages,
     PauseWatch,
-    Promptly,
+    SampleAges,
+    WriteDeadline,
 )
 from dexkit.errors import HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
@@ -65,12 +65,12 @@ class TestPauseWatch:
 
 def test_what_takes_too_long_is_not_written() -> None:
     clock = ManualClock()
-    promptly = Promptly(clock)
+    deadline = WriteDeadline(clock)
     clock.advance(PAUSE)
-    promptly.check()
+    deadline.check()
     clock.suspend(0.01)
-    with pytest.raises(HandTimeout, match="stood still"):
-        promptly.check()
+    with pytest.raises(HandTimeout, match="was paused"):
+        deadline.check()
 
 
 # -- a program and its clients in virtual time ------------------------------------------------
@@ -129,7 +129,7 @@ class Program:
         spec = DEX1_1.spec(Side.LEFT, io_rate=1 / STEP, simulated=True)
         self.core = HandCore(spec, DEX1_1, self.clock)
         self.core.opened(spec)
-        self.ages = Ages()
+        self.ages = SampleAges()
         self.receiving, self.exchanging = PauseWatch(self.clock), PauseWatch(self.clock)
         self.commands: list[Sent] = []
         self.driven: list[tuple[float, Sent]] = []  # what each exchange sent, and when
@@ -411,7 +411,7 @@ def test_client_with_a_drifting_clock_is_obeyed(drift: float) -> None:
 
 def test_a_drifting_clock_is_followed_for_hours() -> None:
     for drift in (-DRIFT, DRIFT):
-        ages = Ages()
+        ages = SampleAges()
         source = Source(5.0, drift)
         for i in range(20_000):
             at = i * 0.5
@@ -423,7 +423,7 @@ class TestLongSilence:
 
     @staticmethod
     def ages(source: Source, times: list[float], late: dict[float, float]) -> list[float]:
-        ages = Ages()
+        ages = SampleAges()
         for i in range(100):
             ages.age(1, source.stamp(i * 0.01), i * 0.01 + 0.001)
         return [ages.age(1, source.stamp(t), t + late.get(t, 0.001)) for t in times]
@@ -448,7 +448,7 @@ class TestLongSilence:
         assert ages[-1] < 0.01
 
     def test_after_a_pause_it_must_be_confirmed_anew(self) -> None:
-        ages, source = Ages(), Source(9.0)
+        ages, source = SampleAges(), Source(9.0)
         for i in range(100):
             ages.age(1, source.stamp(i * 0.01), i * 0.01)
         ages.resumed(2.0 + FORGET)
@@ -458,7 +458,7 @@ class TestLongSilence:
 
 
 def test_writers_that_come_and_go_are_not_kept() -> None:
-    ages = Ages()
+    ages = SampleAges()
     for number in range(10_000):
         ages.age(number, Source().stamp(1.0), 1.0)
     assert len(ages._writers) <= 64

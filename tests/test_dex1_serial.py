@@ -608,7 +608,7 @@ def test_calibration_on_the_command_line() -> None:
 @each(
     ("arguments", "says"),
     [
-        (["dex1-serial"], "say which hand"),
+        (["dex1-serial"], "no hand is given"),
         (["dex1-serial", "--side", "left", "--speed"], "--speed means nothing for dex1-serial"),
         (["ezgripper", "--side", "left"], "--side means nothing for ezgripper"),
     ],

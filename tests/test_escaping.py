@@ -209,7 +209,7 @@ def test_a_result_full_of_escapes_shows_none(tmp_path: Path) -> None:
 
 
 def test_the_doctor_shows_names_of_peers_clean() -> None:
-    from dexkit.doctor import Observations, Wish, diagnose, readiness, verdict
+    from dexkit.doctor import Observations, Scope, diagnose, readiness, verdict
     from dexkit.doctor.observations import DomainView, Endpoint, Participant
     from dexkit.doctor.report import print_report
 
@@ -225,12 +225,12 @@ def test_the_doctor_shows_names_of_peers_clean() -> None:
     )
     views = (DomainView(1, peers, ends), DomainView(2, peers))
     seen = Observations(domains=views, looked_at=("lo",), seconds=1.0)
-    wish = Wish()
-    findings = diagnose(seen, wish)
+    scope = Scope()
+    findings = diagnose(seen, scope)
     assert findings
     out = io.StringIO()
     console = Console(file=out, width=120)
-    print_report(console, seen, findings, verdict(seen, findings, wish), readiness(seen, wish))
+    print_report(console, seen, findings, verdict(seen, findings, scope), readiness(seen, scope))
     clean(out.getvalue())
     assert all(len(line) < 3000 for line in out.getvalue().splitlines())
 

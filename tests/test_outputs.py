@@ -220,7 +220,7 @@ def test_closed_standard_input_asks_no_question(tmp_path: Path, gripper: tuple[s
         text=True,
     )
     assert done.returncode == 2
-    assert "nobody can be asked" in done.stderr
+    assert "cannot ask whether" in done.stderr
     assert "--yes" in done.stderr
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dexkit.bridge import Bridge, End
+from dexkit.bridge import Bridge, BridgeEnd
 from dexkit.bridge.core import PATIENCE, Commands, States
 from dexkit.clock import ManualClock, RealClock
 from dexkit.command_age import PAUSE
@@ -117,7 +117,7 @@ def test_a_service_that_was_suspended_obeys_only_what_was_sent_later(
                 client.until(lambda: core.driving, 2.0)
         assert core.counters.brakes >= 2
         assert service.snapshot()["pauses"] == counters.pauses
-    assert sum("stood still" in record.message for record in caplog.records) == 1
+    assert sum("was paused" in record.message for record in caplog.records) == 1
 
 
 def test_the_state_says_that_the_hand_brakes() -> None:
@@ -241,7 +241,7 @@ def test_a_held_command_is_not_sent_to_the_dex3() -> None:
 def _refuses(hand: Hand, clock: Slow, command: HandCommand) -> None:
     clock.armed = True
     try:
-        with pytest.raises(HandTimeout, match="stood still"):
+        with pytest.raises(HandTimeout, match="was paused"):
             hand.exchange(command)
     finally:
         clock.armed = False
@@ -307,7 +307,10 @@ class TestBridge:
             DdsNode(near) as client,
             DdsNode(far) as gripper,
             Bridge(
-                End(client_node, GO), End(gripper_node, ACTUATOR), sides=(LEFT,), clock=clock
+                BridgeEnd(client_node, GO),
+                BridgeEnd(gripper_node, ACTUATOR),
+                sides=(LEFT,),
+                clock=clock,
             ) as bridge,
         ):
             writer = client.writer(CMD, GO.cmd_type)

@@ -87,7 +87,7 @@ class TestModeByte:
         assert understood([1] * N).is_brake
         (remark,) = mapping().remarks(message([1] * N), LEFT)
         assert remark.counter == "wrong_ids"
-        assert "mode byte 0x01 of motor 0 says id 1, status 0" in remark.text
+        assert "mode byte 0x01 of motor 0 has id 1, status 0" in remark.text
         assert "locks it" in remark.text
         assert "send 0x10 (0x10 | index) to drive motor 0" in remark.text
 
@@ -98,7 +98,7 @@ class TestModeByte:
         assert understood(modes).mode.tolist() == [1, 1, 0, 1, 1, 1, 1]
         (remark,) = mapping().remarks(message(modes), LEFT)
         assert remark.counter == "unknown_status"
-        assert "motor 2 says id 2, status 6" in remark.text
+        assert "motor 2 has id 2, status 6" in remark.text
 
     def test_motors_go_by_index_whatever_their_id(self) -> None:
         commands = message([0x10 | (N - 1 - i) for i in range(N)])
@@ -539,7 +539,7 @@ class TestService:
         said = [r.getMessage() for r in caplog.records]
         assert len(said) == 5
         assert sum("q of middle_1 = 0.3 rad is outside -1.7453 .. 0" in text for text in said) == 1
-        assert sum("mode byte 0x01 of motor 0 says id 1" in text for text in said) == 1
+        assert sum("mode byte 0x01 of motor 0 has id 1" in text for text in said) == 1
 
     def test_a_joint_that_stays_tripped_is_explained(
         self, node: FakeNode, caplog: pytest.LogCaptureFixture

@@ -19,7 +19,7 @@ from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.robots import G1
 from dexkit.service import HandService
-from dexkit.single_publisher import LOOK, SETTLE, Claim, Place, SolePublisher
+from dexkit.single_publisher import SEARCH, SETTLE, Claim, NodeTopics, SolePublisher
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.live import LiveClient
 from dexkit.traces import sample_path
@@ -92,7 +92,7 @@ class Program:
     def __init__(self, net: Network, name: str, start: float, skew: float, **options: bool) -> None:
         self.net, self.name, self.skew = net, name, skew
         self.node = FakeNode()
-        self.sole = SolePublisher([Place(self.node, {TOPIC})], hint="", **options)
+        self.sole = SolePublisher([NodeTopics(self.node, {TOPIC})], hint="", **options)
         self.started = self.gone = False
         net.programs.append(self)
         net.at(start, self._start)
@@ -100,7 +100,7 @@ class Program:
     def _start(self) -> None:
         self.started = True
         self._step()
-        self.net.at(self.net.now + LOOK, self._announce)
+        self.net.at(self.net.now + SEARCH, self._announce)
 
     def _announce(self) -> None:
         if not self._step():
@@ -179,7 +179,7 @@ def test_publisher_without_a_claim_is_respected() -> None:
 
     def sole(**options: bool) -> tuple[FakeNode, SolePublisher]:
         node = FakeNode()
-        return node, SolePublisher([Place(node, {TOPIC})], hint="stop it", **options)
+        return node, SolePublisher([NodeTopics(node, {TOPIC})], hint="stop it", **options)
 
     node, one = sole()
     node.known["v"] = vendor
@@ -208,7 +208,7 @@ def test_publisher_without_a_claim_is_respected() -> None:
             assert one.rivals == 1
             del node.known["v"]
             one.check()
-            assert one.company() is None
+            assert one.describe_rival() is None
 
 
 def test_invalid_claims_are_ignored() -> None:
@@ -228,13 +228,13 @@ def test_invalid_claims_are_ignored() -> None:
 
 def test_a_flood_of_publishers_is_counted_and_not_kept(caplog: pytest.LogCaptureFixture) -> None:
     node = FakeNode()
-    one = SolePublisher([Place(node, {TOPIC})], hint="")
+    one = SolePublisher([NodeTopics(node, {TOPIC})], hint="")
     one.begin()
     for i in range(1000):
         node.known = {f"k{i}": Seen(f"k{i}", process=f"p{i}")}
         one.check()
     assert one.rivals == 1000
-    assert len(one._told) == 1
+    assert len(one._known_rivals) == 1
     assert len(caplog.records) == 20
 
 

@@ -138,14 +138,14 @@ def test_the_hint_comes_after_five_seconds_once(capsys: pytest.CaptureFixture[st
         waiting({LEFT: ""}, 60.0)
         said = capsys.readouterr().err
         assert said.count("waiting for state of left ...") == 1
-        assert said.count(f"'dexkit doctor --domain {node.domain}' says what is wrong") == 1
+        assert said.count(f"'dexkit doctor --domain {node.domain}' reports what is wrong") == 1
 
 
 def test_hands_that_speak_another_dialect_are_named(dex3: int) -> None:
     result = teleop("full-stroke", "--domain", dex3, "--wait", 1.0)
     assert isinstance(result.exception, DexkitError)
     assert result.exception.exit_code == 1
-    assert result.exception.hint == "there are hands that speak dex3: --dialect dex3"
+    assert result.exception.hint == "there are hands with the dialect dex3: --dialect dex3"
 
 
 def test_when_interrupted_it_locks_a_dex3_where_it_is(dex3: int) -> None:
@@ -207,7 +207,7 @@ def test_after_a_stop_it_begins_where_the_hand_is_now(dex1: int, tmp_path: Path)
             q, end = 0.0, time.monotonic() + 2 * PAUSE
             while (
                 q < 5.0 or time.monotonic() < end
-            ):  # somebody else moves the hand meanwhile, and goes again
+            ):  # another program moves the hand meanwhile, and goes again
                 writer.write(there)
                 newest = take_until(states, bool, 8)
                 q = newest[-1].message.states[0].q
@@ -219,7 +219,7 @@ def test_after_a_stop_it_begins_where_the_hand_is_now(dex1: int, tmp_path: Path)
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 130
             said.seek(0)
-            assert "stood still for" in said.read()
+            assert "was paused for" in said.read()
 
 
 def test_the_profiles_are_listed_without_any_hand() -> None:

@@ -101,7 +101,7 @@ PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [
     (SERVE, HandService, "_exchange"),
     (SERVE, HandService, "_compose"),
     (SERVE, Publisher, "_run"),
-    (BRIDGE, bridge_module._Way, "_turn"),
+    (BRIDGE, bridge_module._DirectionLoop, "_run_once"),
     (BRIDGE, DdsNode, "_dispatch"),
     (ROBOT, Publisher, "_run"),
     (ROBOT, EmulatedRobot, "_live"),

@@ -258,4 +258,4 @@ def test_each_failure_is_told_once_and_the_verdict_comes_last(tmp_path: Path) ->
         assert ("FAILED" in run.stdout) == bool(more)
         told = run.stdout.index("FAIL: a MUST is not met")
         assert told > run.stdout.rindex(advice) > run.stdout.index("DEX1-RATE-03 ")
-        assert "(-v says why)" in " ".join(run.stdout.split())
+        assert "(-v shows why)" in " ".join(run.stdout.split())

@@ -96,7 +96,7 @@ def dds_options(
 ) -> Callable[[F], F]:
     """``--domain`` and ``--interface``; the interface defaults to loopback.
 
-    :param domain_default_text: what ``--help`` says where there is no fixed default.
+    :param domain_default_text: what ``--help`` prints where there is no fixed default.
     """
     suffix = f"  [default: {domain_default_text}]" if domain_default_text else ""
     domain = click.option(

@@ -28,7 +28,7 @@ class Participant:
 
     :param key: GUID prefix, hex.
     :param vendor: name of the DDS implementation.
-    :param version: of CycloneDDS, or empty where it is not told.
+    :param version: of CycloneDDS, or empty where it is not announced.
     :param process: name that it announces, or empty.
     :param pid: process id that it announces, or 0.
     :param host: machine that it announces, or empty.
@@ -94,7 +94,7 @@ class Stream:
     :param q: positions of the last sample, rad; empty when none could be decoded.
     :param q_span: the furthest that any joint moved, rad.
     :param nonzero: some position of some sample was not exactly 0.
-    :param undecodable: samples that were not what their type says.
+    :param undecodable: samples that do not decode as their type.
     """
 
     topic: str
@@ -170,7 +170,7 @@ class Environment:
     :param sdk: version of unitree_sdk2py or unitree-sdk2 that is installed, or empty.
     :param sdk_error: why it does not import, or empty.
     :param uri: CYCLONEDDS_URI, or empty.
-    :param uri_error: why it is of no use, or empty.
+    :param uri_error: why it cannot be used, or empty.
     """
 
     python: str = "3.10.0"

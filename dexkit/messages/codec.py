@@ -90,7 +90,7 @@ def check_end(name: str, data: Buffer, end: int) -> None:
 
 
 def explain(message: object, kind: Struct, error: Exception) -> EncodeError:
-    """Find the member that cannot be encoded and say what is wrong with it."""
+    """Find the member that cannot be encoded, and raise an error that names it."""
     problem = _find(message, kind, kind.name)
     return EncodeError(problem or f"{kind.name}: {type(error).__name__}: {error}")
 

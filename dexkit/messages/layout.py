@@ -1,4 +1,4 @@
-"""What the ``.idl`` files say: structs, members, and where each member lies in plain CDR.
+"""Parse the ``.idl`` files: structs, members, and the offset of each member in plain CDR.
 
 The generator, the schema texts, the error messages, the bulk decoder and the CycloneDDS types
 are all made from :data:`STRUCTS`, so a layout is written down once, in ``idl/*.idl``.

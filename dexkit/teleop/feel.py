@@ -121,16 +121,16 @@ def feel(
     return Feel(
         stroke_s=max(strokes, default=math.nan),
         stroke_mean_s=sum(strokes) / len(strokes) if strokes else math.nan,
-        reaction_s=_worst([s.reaction_s for s in steps]),
-        overshoot=_worst([s.overshoot for s in steps]),
-        stuck=_worst([s.stuck for s in steps]),
+        reaction_s=_maximum([s.reaction_s for s in steps]),
+        overshoot=_maximum([s.overshoot for s in steps]),
+        stuck=_maximum([s.stuck for s in steps]),
         lag_s=lag,
         lag_rms=rms,
         steps=tuple(steps),
     )
 
 
-def _worst(values: Sequence[float]) -> float:
+def _maximum(values: Sequence[float]) -> float:
     return max((v for v in values if not math.isnan(v)), default=math.nan)
 
 
@@ -205,7 +205,7 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
     jumps = ~(change <= _STEADY * GRID * stroke)
     moves = change > 1e-6 * stroke
     # only what depends on a steady motion whatever the lag is: its past, as far back as the search
-    use = np.flatnonzero(~_lately(jumps, back) & _lately(moves, back))
+    use = np.flatnonzero(~_any_of_last(jumps, back) & _any_of_last(moves, back))
     use = use[use >= back]
     if len(use) * GRID < _LAG_LEAST:
         return math.nan, math.nan
@@ -219,7 +219,7 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
     return best
 
 
-def _lately(where: NDArray[np.bool_], points: int) -> NDArray[np.bool_]:
+def _any_of_last(where: NDArray[np.bool_], points: int) -> NDArray[np.bool_]:
     """Whether it was so at any of the last points, this one included."""
     count = np.concatenate(([0], np.cumsum(where)))
     at = np.arange(1, len(count))
