@@ -232,7 +232,7 @@ class TestByPath:
         "path", ["no_such_package:x", "tests.service_helpers:nope", "tests.service_helpers:", ":x"]
     )
     def test_path_to_nothing_is_refused(self, path: str) -> None:
-        with pytest.raises(BackendBroken, match="cannot load|is a module, not a backend"):
+        with pytest.raises(BackendBroken, match=r"cannot load|is a module, not a backend"):
             backend(path)
 
     def test_hint_distinguishes_missing_module_from_misspelt_name(self) -> None:

@@ -117,7 +117,7 @@ class TestAddress:
 
     @given(st.text(max_size=30))
     @settings(max_examples=100, deadline=None)
-    def test_any_text_is_an_address_or_refused(self, text: str) -> None:
+    def test_any_text_is_parsed_as_an_address_or_refused(self, text: str) -> None:
         for attempt in (text, "usbip://" + text):
             try:
                 server, _ = parse_server(attempt)
@@ -456,7 +456,9 @@ class TestOpening:
             hand_on(server).open()
 
     @pytest.mark.parametrize("number", [errno.ENODEV, errno.EIO, errno.ENOENT])
-    def test_gone_while_it_is_opened(self, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_device_lost_during_open_is_reported(
+        self, number: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fake = FakeBackend(FakeHand())
         fake.fail["claim_interface"] = usb_error(number)
         with pytest.raises(HandLost):
@@ -469,7 +471,7 @@ class TestOpening:
         with fake_hand(fake, monkeypatch) as hand:
             hand.exchange(GO)
 
-    def test_no_serial_number_is_no_obstacle(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_serial_number_is_accepted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         fake.fail["ctrl_transfer"] = usb_error(errno.EPIPE)
         with fake_hand(fake, monkeypatch) as hand:
@@ -874,7 +876,7 @@ class TestTroubleOnTheWay:
     @pytest.mark.parametrize(
         ("protect", "says"), [(True, "within a second"), (False, "cut their power")]
     )
-    def test_motors_that_could_not_be_braked_are_said(
+    def test_motors_that_could_not_be_braked_are_reported(
         self,
         protect: bool,
         says: str,

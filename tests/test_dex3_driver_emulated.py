@@ -146,7 +146,7 @@ class TestFaults:
             assert not (state.fault & ~np.uint32(LOST | TRIPPED)).any()
 
     @pytest.mark.parametrize("fault", ["stall", "stall-out"])
-    def test_a_stall_is_cleared(self, fault: str) -> None:
+    def test_stalled_endpoint_is_cleared_by_the_driver(self, fault: str) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject(fault)
             drive(hand, go(GOAL[Side.LEFT]), lambda s: hand.statistics.link.stalls == 1)
@@ -306,7 +306,7 @@ class TestService:
                 wait_until(lambda: core.driving)
                 assert core.counters.reconnects == 1
 
-    def test_attempts_to_reopen_keep_coming(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_attempts_to_reopen_continue(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """After a long absence too, a hand is looked for every half second."""
         pauses: list[float] = []
 

@@ -43,7 +43,7 @@ scales = st.sampled_from(d.SCALES)
 # --- units
 
 
-def test_factors_of_the_fact_sheet() -> None:
+def test_factors_equal_the_documented_ones() -> None:
     # docs/sources/unitree-dex.md#c9, "Combined"
     for scale, direct, geared in (
         (units.POSITION, 563240.4, 1116050.5),
@@ -56,7 +56,7 @@ def test_factors_of_the_fact_sheet() -> None:
         assert scale.factor(214) == pytest.approx(geared, rel=2e-5)
 
 
-def test_figures_of_the_fact_sheet() -> None:
+def test_figures_equal_the_documented_ones() -> None:
     # docs/sources/unitree-dex.md#c6, docs/sources/unitree-dex.md#c9: 24 V and 58 V, full scales;
     # 0.76 N m of a joint
     assert round(24 * units.VOLTAGE.factor()) == 22696

@@ -248,7 +248,7 @@ def test_a_hand_on_another_domain(looked: _Looked) -> None:
         assert "DDS-NOBODY" not in {f.id for f in diagnose(seen, scope)}
 
 
-def test_the_dialect_that_was_asked_for_counts(looked: _Looked) -> None:
+def test_only_the_requested_dialect_is_judged(looked: _Looked) -> None:
     assert "DDS-TYPE" in looked.findings("good", "unitree_hg")
     assert "DDS-OTHER-STACK" in looked.findings("good", "unitree_actuator")
     assert "DDS-OTHER-STACK" in looked.findings("other stack", "unitree_go")

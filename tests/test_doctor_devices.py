@@ -73,7 +73,7 @@ def test_silent_port_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _ids(port) == {"SERIAL-NO-ANSWER"}
 
 
-def test_a_port_that_is_in_use_is_left_alone() -> None:
+def test_port_in_use_is_not_opened() -> None:
     hold = (
         "import serial, sys; p = serial.Serial(sys.argv[1], exclusive=True); "
         "print('open', flush=True); sys.stdin.read()"
@@ -164,7 +164,7 @@ def test_a_usbip_server() -> None:
 # --- surroundings
 
 
-def test_a_configuration_that_can_be_read(tmp_path: Path) -> None:
+def test_readable_cyclonedds_uri_has_no_finding(tmp_path: Path) -> None:
     good = "<CycloneDDS><Domain/></CycloneDDS>"
     file = tmp_path / "dds.xml"
     file.write_text('<?xml version="1.0"?>\n' + good)

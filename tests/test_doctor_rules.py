@@ -248,7 +248,7 @@ def test_missing_multicast_is_no_fault_with_dexkit_or_static_peers() -> None:
     assert _ids(Observations(domains=(view,), interfaces=(DEAF,))) == set()
 
 
-def test_a_process_that_does_not_answer_is_on_another_interface() -> None:
+def test_silent_process_is_reported_on_another_interface() -> None:
     eth = dataclasses.replace(ETH, discovery=True)
     seen = Observations(
         domains=(_without(GOOD, "hand"),),
@@ -273,7 +273,7 @@ def test_port_in_use_by_a_service_is_no_finding() -> None:
     assert (found.id, found.severity) == ("SERIAL-BUSY", Severity.NOTE)
 
 
-def test_a_device_that_is_asked_about_is_not_a_client_that_waits() -> None:
+def test_device_check_reports_no_waiting_client() -> None:
     (found,) = [
         f
         for f in diagnose(Observations(domains=(DomainView(0),)), Scope(devices_only=True))
@@ -307,7 +307,7 @@ def test_unrelated_topic_name_is_no_misspelling(topic: str) -> None:
     assert nearly(topic) is None
 
 
-def test_topics_are_whole_in_a_narrow_terminal() -> None:
+def test_topics_are_not_cut_in_a_narrow_terminal() -> None:
     seen = _seen(_legacy())
     text = io.StringIO()
     console = Console(file=text, width=80)

@@ -162,7 +162,7 @@ def test_stale_link_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
         pass
 
 
-def test_a_link_to_something_that_exists_is_not_taken(tmp_path: Path) -> None:
+def test_link_to_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
     link = tmp_path / "gripper"
     with emulated_ezgripper(link=link) as gripper:
         with pytest.raises(EmulatorError) as caught, emulated_ezgripper(link=link):
@@ -312,7 +312,7 @@ def test_client_must_have_the_servos_baud_rate(speed: int, answers: bool) -> Non
         assert gripper.bus.counters.garbled == (0 if answers else len(PING))
 
 
-def test_any_baud_rate_when_told_so() -> None:
+def test_any_baud_rate_option_accepts_all_rates() -> None:
     with (
         emulated_ezgripper(check_baudrate=False) as gripper,
         client(gripper.path, termios.B9600) as opened,
@@ -424,7 +424,7 @@ def emulate_dex3(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.Signals) -> None:
+def test_hand_prints_its_address_commands_and_counters(signum: signal.Signals) -> None:
     process = emulate_dex3("--side", "both", "--serial", "A1", "--serial", "B2")
     assert process.stdout is not None
     lines = [process.stdout.readline().decode().rstrip() for _ in range(7)]
@@ -500,7 +500,7 @@ def test_help_lists_the_devices_and_their_options() -> None:
     assert CliRunner().invoke(command, ["dex9"]).exit_code == 2
 
 
-def test_a_hand_on_every_address_is_attached_by_the_machines_name() -> None:
+def test_hand_on_every_address_prints_the_host_name() -> None:
     from dexkit.cli.emulate.dex3_usb import _how_to
 
     name = socket.gethostname()

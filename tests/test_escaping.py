@@ -79,7 +79,7 @@ def test_unencodable_characters_are_replaced(monkeypatch: pytest.MonkeyPatch) ->
     assert raw.getvalue() == b"\\u624b \\x1b[31m\\udc80\n\\u624b\n\\u624b\n"
 
 
-def test_a_console_has_its_own_colours_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_console_prints_no_colours_of_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(sys, "stdout", out)
     with guarded():
@@ -156,7 +156,7 @@ def nasty_recording(path: Path) -> Path:
     return path
 
 
-def test_a_recording_full_of_escapes_prints_none(
+def test_recording_with_escape_sequences_prints_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class NoNode:
@@ -185,7 +185,7 @@ def test_a_recording_full_of_escapes_prints_none(
     assert STATE_TYPE
 
 
-def test_a_result_full_of_escapes_shows_none(tmp_path: Path) -> None:
+def test_result_with_escape_sequences_shows_none(tmp_path: Path) -> None:
     from tests.report_helpers import result_of_every_kind
 
     result = result_of_every_kind(NASTY)
@@ -208,7 +208,7 @@ def test_a_result_full_of_escapes_shows_none(tmp_path: Path) -> None:
     ElementTree.parse(tmp_path / "j.xml")
 
 
-def test_the_doctor_shows_names_of_peers_clean() -> None:
+def test_doctor_escapes_names_of_peers() -> None:
     from dexkit.doctor import Observations, Scope, diagnose, readiness, verdict
     from dexkit.doctor.observations import DomainView, Endpoint, Participant
     from dexkit.doctor.report import print_report

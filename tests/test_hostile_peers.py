@@ -137,13 +137,13 @@ def fuzz(domain: int, seed: int, peers: int) -> None:
         assert len(node.discovery.participants()) > peers // 6
 
 
-def test_random_announcements_harm_nothing() -> None:
+def test_random_announcements_do_not_stop_discovery() -> None:
     for seed in range(3):
         fuzz(free_domain(), seed, 60)
 
 
 @pytest.mark.soak
-def test_many_random_announcements_harm_nothing() -> None:
+def test_many_random_announcements_do_not_stop_discovery() -> None:
     for seed in range(100, 200):
         fuzz(free_domain(), seed, 100)
 

@@ -449,7 +449,7 @@ for host in "127.0.0.1", "10.9.1.1":
 # --- without networks
 
 
-def test_the_filter_goes_by_the_interface_alone() -> None:
+def test_filter_depends_on_the_interface_only() -> None:
     with (
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock,
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender,
@@ -514,7 +514,7 @@ def test_without_free_file_descriptors_nothing_starts(monkeypatch: pytest.Monkey
     DdsNode(free_domain()).close()
 
 
-def test_a_user_may_go_on_without_a_filter_and_is_warned(
+def test_running_without_a_filter_can_be_allowed_and_logs_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(interface_filter, "accept_only", _refuse)

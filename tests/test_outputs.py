@@ -124,7 +124,7 @@ def test_full_or_closed_standard_output_is_an_error(
     os.close(full)
 
 
-def test_interpreter_prints_nothing_about_it_on_exit() -> None:
+def test_interpreter_prints_no_error_on_exit() -> None:
     no_reader, pipe = os.pipe()
     os.close(no_reader)
     for place, code in ((os.open("/dev/full", os.O_WRONLY), 2), (pipe, 141)):
@@ -140,7 +140,7 @@ def test_interpreter_prints_nothing_about_it_on_exit() -> None:
         assert done.stderr.count(b"\n") == (1 if code == 2 else 0), done.stderr
 
 
-def test_without_standard_streams_nothing_is_written_into_what_is_opened_next(
+def test_output_without_standard_streams_goes_into_no_other_file(
     tmp_path: Path,
 ) -> None:
     _, recording = hostile.judged_result(tmp_path)
@@ -210,7 +210,9 @@ def test_no_file_gets_the_number_of_a_standard_stream(tmp_path: Path, closed: st
 
 
 @pytest.mark.parametrize("gripper", [("ezgripper",), ("dex1-serial", "--side", "left")])
-def test_closed_standard_input_asks_no_question(tmp_path: Path, gripper: tuple[str, ...]) -> None:
+def test_question_without_standard_input_is_an_error(
+    tmp_path: Path, gripper: tuple[str, ...]
+) -> None:
     command = command_line("calibrate", *gripper, "--device", str(tmp_path))
     done = subprocess.run(
         ["sh", "-c", 'exec "$@" <&-', "sh", *command],

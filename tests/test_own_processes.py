@@ -202,7 +202,7 @@ def test_folders_of_killed_programs_are_removed_and_those_of_others_stay(tempora
         living.communicate("")
 
 
-def test_a_folder_that_was_swept_before_its_lock_is_made_again(
+def test_folder_removed_before_its_lock_is_made_again(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     genuine = fcntl.flock

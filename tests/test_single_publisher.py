@@ -174,7 +174,7 @@ def test_forced_publishers_stay_and_log_a_warning(caplog: pytest.LogCaptureFixtu
     ]
 
 
-def test_publisher_without_a_claim_is_respected() -> None:
+def test_publisher_gives_way_to_one_without_a_claim() -> None:
     vendor = Seen("v", process="vendor")
 
     def sole(**options: bool) -> tuple[FakeNode, SolePublisher]:
@@ -226,7 +226,7 @@ def test_invalid_claims_are_ignored() -> None:
         assert Claim.decode(data) is None, data[:40]
 
 
-def test_a_flood_of_publishers_is_counted_and_not_kept(caplog: pytest.LogCaptureFixture) -> None:
+def test_many_publishers_are_counted_and_not_stored(caplog: pytest.LogCaptureFixture) -> None:
     node = FakeNode()
     one = SolePublisher([NodeTopics(node, {TOPIC})], hint="")
     one.begin()
@@ -277,7 +277,7 @@ def test_one_of_two_simultaneous_services_remains() -> None:
             one.stop()
 
 
-def test_a_service_that_finds_an_earlier_one_late_brakes_and_ends() -> None:
+def test_service_that_discovers_an_earlier_one_late_brakes_and_ends() -> None:
     dds_domain = free_domain()
     with DdsNode(dds_domain) as near, DdsNode(dds_domain) as far:
         with service(near) as served:

@@ -59,7 +59,7 @@ def test_dying_worker_raises_in_every_waiter(caplog: pytest.LogCaptureFixture) -
     assert worker.daemon
 
 
-def test_a_foreseen_error_is_raised_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+def test_dexkit_error_of_a_worker_is_raised_unchanged(caplog: pytest.LogCaptureFixture) -> None:
     def lose() -> None:
         raise HandLost("it is gone", hint="look for it")
 
@@ -138,7 +138,7 @@ def test_a_program_that_loses_a_thread_ends_with_an_error(
     assert "error: " in captured.err
 
 
-def test_what_was_recorded_before_is_kept(tmp_path: Path) -> None:
+def test_recording_before_the_failure_is_kept(tmp_path: Path) -> None:
     domain = free_domain()
     path = tmp_path / "a.mcap"
     with DdsNode(domain) as hand, DdsNode(domain) as node:

@@ -285,7 +285,7 @@ class Half:
 """
 
 
-def test_a_half_written_hand_is_told_what_is_missing(tmp_path: Path) -> None:
+def test_incomplete_hand_class_error_names_missing_members(tmp_path: Path) -> None:
     runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     runner.workspace.mkdir()
     (runner.workspace / "mine.py").write_text(HALF)

@@ -27,7 +27,7 @@ def calibrate_dex1(device: str | None, side: str | None, *, dry_run: bool, yes: 
         raise UsageError("cannot ask whether the jaws are closed: no terminal", hint="give --yes")
     with Dex1Serial(Side(side), Dex1Settings(device=device)) as hand:
         q = float(hand.exchange(HandCommand.brake(1)).q[0])
-        click.echo(f"motor {hand.id} on {hand.path} reports the jaws at {q:.3f} rad")
+        click.echo(f"motor {hand.id} on {hand.path} reports that the jaws are at {q:.3f} rad")
         if dry_run:
             return
         question = "Nothing will move. Hold the jaws closed by hand; they become 0. Ready?"
