@@ -1,4 +1,4 @@
-"""Tables and coloured text on a terminal, clean whatever is in them (:mod:`dexkit.escaping`)."""
+"""Print tables and coloured text on a terminal, with control characters escaped."""
 
 from __future__ import annotations
 

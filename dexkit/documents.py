@@ -1,4 +1,4 @@
-"""Files that a user gives, and files that dexkit writes.
+"""Read and check files of users, and write files completely or not at all.
 
 Reading raises one typed error that names the file, whatever is wrong with it: not there, a folder,
 a device, a pipe, too large, no UTF-8, no JSON or TOML, nested without end, a key twice, a number

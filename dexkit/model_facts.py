@@ -1,4 +1,4 @@
-"""A model as plain data: what ``dexkit models --json`` prints and the page is made of.
+"""A model as plain data, for ``dexkit models --json`` and the page in the docs.
 
 SI units, named in the keys; what a model does not have is ``None`` or an empty list.
 

@@ -189,7 +189,7 @@ class SolePublisher:
                 text = self._describe(topics, other)
                 if text not in self._logged and len(self._logged) < _MAX_WARNINGS:
                     self._logged.add(text)
-                    log.warning("%s; the two fight", text)
+                    log.warning("%s; their samples mix", text)
         self._known_rivals = present
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Which topic is whose: the hand topics of all dialects."""
+"""The hand topics of all dialects, with their dialect and side."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ class Leaks(_Live):
         watched = WatchedProcess("leaky", program.process.pid)
         for number in range(12):
             time.sleep(0.05)
-            watched.look(0.05 * number)
+            watched.measure(0.05 * number)
         program.end()
         for kind, text in watched.problems():
             batch.found(kind, self.name, text)

@@ -471,7 +471,7 @@ class TestOneMessageIntoTwoTopics:
         wire = Wire(GO, ACTUATOR)
         assert set(q_of(GO, "state", wire.state(LEFT))) == {LEFT}
         assert wire.states.counts.blank == 1
-        # it may be commanded all the same: nobody is there to obey
+        # it may be commanded all the same: there is no gripper
         assert len(wire.command(LEFT) + wire.later(PATIENCE)) == 1
 
     def test_gripper_at_zero_is_present_after_another_position(self) -> None:
@@ -482,7 +482,7 @@ class TestOneMessageIntoTwoTopics:
     def test_one_side_of_both(self) -> None:
         wire = Wire(GO, ACTUATOR, (RIGHT,))
         assert set(q_of(GO, "state", wire.state(*BOTH))) == {RIGHT}
-        (right, left) = motors(wire.command(RIGHT, q=1.5, kp=5.0))  # waits for nobody
+        (right, left) = motors(wire.command(RIGHT, q=1.5, kp=5.0))  # does not wait
         assert (right.q, right.kp) == (3.0, 5.0)
         assert (left.q, left.kp) == (1.0, 0.0)  # where it was seen
         assert wire.commands.inputs == {"rt/dex1/right/cmd": (RIGHT,)}

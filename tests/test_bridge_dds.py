@@ -146,7 +146,7 @@ def test_other_publishers_are_refused(dds_domain: int, dds_node: DdsNode) -> Non
             ):
                 bridge.start()
             wait_until(lambda: bridge.rival() is None)  # that its end is known, too
-        # the other way round that would be a client: nobody is in the way
+        # the other way round that would be a client, which is no rival
         with (
             dds_node.writer(GO.topics(LEFT)[0], GO.cmd_type),
             Bridge(BridgeEnd(other, GO), BridgeEnd(other, ACTUATOR)),

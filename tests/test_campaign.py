@@ -135,7 +135,7 @@ def test_a_finding_is_kept_once_with_its_input(tmp_path: Path) -> None:
     state.progress_of("fuzz:x").units = 12
     state.save()
     again = State.load(tmp_path, None, fresh=False)
-    assert (again.seed, again.of("fuzz:x").units) == ("5", 12)
+    assert (again.seed, again.progress_of("fuzz:x").units) == ("5", 12)
     assert again.findings == state.findings
     assert again.times[one.id] == 2
     assert not State.load(tmp_path, "6", fresh=True).findings

@@ -244,7 +244,7 @@ def clients(draw: st.DrawFn, begin: float, end: float) -> Client:
     spells.append((period, draw(st.floats(begin, end)), draw(st.floats(begin, end))))
     if draw(st.booleans()):
         spells.append((period, end + draw(st.floats(0.0, 0.5)), end + 2.0))
-    # A clock that jumps while samples are stuck, or that says nothing, tells nothing of them:
+    # A clock that jumps while samples are stuck, or that is not usable, shows nothing about them:
     # then the socket must have been emptied in time.
     blind = bool(jumps) or kind in ("constant", "none")
     return Client(
@@ -312,7 +312,7 @@ def test_steady_client_is_obeyed_0_2_s_after_a_pause(
     ids=["normal", "coarse", "constant", "none"],
 )
 def test_new_client_after_a_pause_is_obeyed(source: Source, most: float) -> None:
-    """It was never heard before: by its pace, or when the socket has long been emptied."""
+    """It was not received before: by its pace, or when the socket has long been emptied."""
     program = Program()
     sent = stream(1, source, every(0.005, 4.1, 6.0), lambda i: 0.001)
     program.run(sent, 6.0, [(1.0, 4.0, False)])
@@ -403,7 +403,7 @@ def test_client_with_a_jumping_clock_is_obeyed_again() -> None:
 
 @pytest.mark.parametrize("drift", [-0.5, 3.0], ids=["slow", "fast"])
 def test_client_with_a_drifting_clock_is_obeyed(drift: float) -> None:
-    """Timestamps in other units, say: obeyed at least after a time that no network lags."""
+    """Timestamps in other units, for example: obeyed at least after a time that no network lags."""
     program = Program()
     program.run(stream(1, Source(drift=drift), every(0.1, 0.5, 40.0), lambda i: 0.001), 40.0)
     assert max(t - s.at for t, s in program.driven if t > 38.0) < 0.13

@@ -1,7 +1,7 @@
 """dexkit's codec against CycloneDDS's own serialisation, byte for byte.
 
 Two references: the classes that dexkit makes for CycloneDDS from its layouts, and those of
-Unitree's SDK, which somebody else wrote.
+Unitree's SDK, which is independent code.
 """
 
 from __future__ import annotations

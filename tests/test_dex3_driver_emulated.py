@@ -86,7 +86,7 @@ def test_both_hands_reach_their_goals(process: bool) -> None:
 
 
 def test_the_units_are_right_on_both_ends() -> None:
-    """What the motors are told and what the driver reads are the mechanics's own values."""
+    """Commands to the motors and states that the driver reads are the mechanics's own values."""
     with emulated_dex3() as emulated:
         assert isinstance(emulated, Dex3Hands)
         mechanics = emulated.device().mechanics
@@ -208,7 +208,7 @@ for count in range(10**9):
             process.stdout.close()
             wait_until(lambda: all(device.tripped), what="the motors to stop")
             assert time.monotonic() - killed > 0.9
-            # whoever comes next finds a hand that works
+            # the next driver works
             with hand_at(emulated.url) as hand:
                 assert not hand.exchange(HandCommand.brake(7)).fault.any()
 

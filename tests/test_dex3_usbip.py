@@ -461,7 +461,7 @@ def test_pending_reads_are_limited() -> None:
             for seqnum in range(MOST_PARKED + 1, many + 1):
                 assert reply(hog) == (protocol.RET_SUBMIT, seqnum, -errno.ENOMEM, 0)
             assert held(inside(hands)) == MOST_PARKED
-            # control transfers and writes are served all the same, and an answer makes room
+            # control transfers and writes are served all the same, and an answer frees a place
             submit(hog, many + 1, OUT, 2, brake())
             assert {reply(hog)[1] for _ in range(1)} == {1}
             protocol._recvall(hog, STATE.size)
@@ -495,7 +495,7 @@ def test_duplicate_sequence_number_ends_the_connection() -> None:
 
 def test_a_reply_never_claims_more_than_it_carries() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
-        # a read whose setup packet says write: 255 bytes wanted, none there
+        # a read whose setup packet has direction write: 255 bytes wanted, none there
         setup = bytes((0x00, 5, 1, 0, 0, 0, 255, 0))
         sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 1, 0x10002, IN, 0, 0, 255, 0, 0, 0, setup))
         assert reply(sock) == (protocol.RET_SUBMIT, 1, 0, 0)

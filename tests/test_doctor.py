@@ -206,7 +206,7 @@ def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> Non
 
 
 @pytest.mark.parametrize(
-    ("situation", "name", "says"),
+    ("situation", "name", "expected"),
     [
         ("nobody", "DDS-NOBODY", "no hand on any domain"),
         ("one side", "DDS-ONE-SIDE", "not rt/dex1/right/state"),
@@ -223,11 +223,11 @@ def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> Non
     ],
 )
 def test_each_fault_gets_its_diagnosis(
-    looked: _Looked, situation: str, name: str, says: str
+    looked: _Looked, situation: str, name: str, expected: str
 ) -> None:
     found = looked.findings(situation)
     assert name in found, sorted(found)
-    assert says in found[name].seen
+    assert expected in found[name].seen
     assert found[name].fix
     if situation not in ("two publishers", "frozen"):
         assert all(looked.ready(situation).values())

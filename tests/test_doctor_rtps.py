@@ -85,12 +85,12 @@ def test_observer_requests_missing_discovery_data() -> None:
     assert {a.writer for a in asked} == {rtps.SEDP_PUBLICATIONS, rtps.SEDP_SUBSCRIPTIONS}
     assert not any(a.final for a in asked)
     assert not observer.settled
-    told = observer.receive(_addressed(packets.CYCLONE_0_10_PUBLICATION), 0.1)
+    sent = observer.receive(_addressed(packets.CYCLONE_0_10_PUBLICATION), 0.1)
     assert wanted == [("rt/dex1/left/cmd", GO)]
     # it announces a reader of that topic, best-effort and without a type object
     readers = [
         rtps.parse_endpoint(i.payload, writer=False)
-        for p, _ in told
+        for p, _ in sent
         for _, i in rtps.parse_message(p)[1]
         if isinstance(i, Data)
     ]

@@ -44,12 +44,12 @@ def refused(read: Callable[[Path], Any], path: Path, what: str) -> bool:
     try:
         read(path)
     except DexkitError as error:
-        told = str(error)
+        printed = str(error)
     else:
         return False
-    assert path.name in told or "force table" in told, f"{what}: {told}"
-    assert len(told) < 1000
-    assert not hostile.raw(told)
+    assert path.name in printed or "force table" in printed, f"{what}: {printed}"
+    assert len(printed) < 1000
+    assert not hostile.raw(printed)
     return True
 
 
@@ -149,7 +149,7 @@ def test_error_names_the_place_and_the_expected_value(tmp_path: Path) -> None:
     result = result_of_every_kind()
     result.write_json(tmp_path / "r.json")
     good = json.loads((tmp_path / "r.json").read_text())
-    for place, value, told in (
+    for place, value, printed in (
         (("results", 2, "evidence", 0, "time_s"), "soon", 'time_s must be a number, not "soon"'),
         (("results", 2, "verdict"), "good", "results[2].verdict must be one of"),
         (("results", 2, "side"), hostile.MISSING, "results[2] has no side"),
@@ -163,7 +163,7 @@ def test_error_names_the_place_and_the_expected_value(tmp_path: Path) -> None:
         (tmp_path / "r.json").write_text(json.dumps(hostile.replaced(good, place, value)))
         with pytest.raises(UsageError) as caught:
             read_json(tmp_path / "r.json")
-        assert told in str(caught.value)
+        assert printed in str(caught.value)
 
 
 def test_records_in_a_recording_are_read_or_refused() -> None:

@@ -195,7 +195,7 @@ def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
 
 
 @each(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "expected"),
     [
         ([], 2, "--link"),
         (["--id", "253"], 2, "253"),
@@ -206,13 +206,13 @@ def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
         (["--latency-timer", "-1"], 2, "-1"),
     ],
 )
-def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, says: str) -> None:
+def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, expected: str) -> None:
     if arguments:
         arguments = ["--link", str(tmp_path / "g"), *arguments]
     process = emulate(*arguments)
     _, err = process.communicate(timeout=60)
     assert process.returncode == code
-    assert says in err.decode()
+    assert expected in err.decode()
     assert "Traceback" not in err.decode()
     assert list(tmp_path.iterdir()) == []
 
@@ -474,7 +474,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
 
 
 @each(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (["--serial", "a", "--serial", "b"], "2 serial numbers for 1 hand"),
         (["--out-endpoint", "0x81"], "an OUT endpoint is 0x01 to 0x0f, not 0x81"),
@@ -484,9 +484,9 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
         (["--side", "middle"], "middle"),
     ],
 )
-def test_invalid_hand_options_are_refused(arguments: list[str], says: str) -> None:
+def test_invalid_hand_options_are_refused(arguments: list[str], expected: str) -> None:
     _, err = emulate_dex3(*arguments).communicate(timeout=60)
-    assert says in err.decode()
+    assert expected in err.decode()
     assert "Traceback" not in err.decode()
 
 

@@ -165,7 +165,7 @@ def test_recording_with_escape_sequences_prints_none(
 
     monkeypatch.setattr("dexkit.dds.DdsNode", NoNode)
     path = str(nasty_recording(tmp_path / "nasty.mcap"))
-    told = 0
+    printed = 0
     for arguments in (
         ["info", path],
         ["info", path, "--json"],
@@ -179,9 +179,9 @@ def test_recording_with_escape_sequences_prints_none(
         code, out, err = hostile.run_command(arguments)
         assert code in (0, 1, 2), arguments
         clean(out + err, data="--json" in arguments)
-        told += len(out + err)
+        printed += len(out + err)
         assert all(len(line) < 15_000 for line in (out + err).splitlines()) or "--json" in arguments
-    assert told > 1000
+    assert printed > 1000
     assert STATE_TYPE
 
 

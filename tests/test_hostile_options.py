@@ -163,7 +163,7 @@ _WORDS = (
 
 
 def fault_text(rng: random.Random) -> str:
-    """A fault specification, or what somebody may write for one."""
+    """A fault specification, or a text that looks like one."""
     if rng.random() < 0.5:
         return "".join(rng.choice(_WORDS + hostile.NUMBERS) for _ in range(rng.randint(0, 8)))
     keys = [

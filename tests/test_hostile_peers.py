@@ -83,7 +83,7 @@ def _random_policies(rng: random.Random) -> bytes:
     """Policies, user data and type information of random content, some of them valid.
 
     Type information keeps its form: CycloneDDS 0.10.5 itself aborts at an identifier of a kind
-    that it does not expect (``ddsi_typeid_kind_impl``), which nobody above it can prevent.
+    that it does not expect (``ddsi_typeid_kind_impl``), which no code above it can prevent.
     """
     described = CYCLONE_0_10_PUBLICATION.index(struct.pack("<HH", _TYPE_INFORMATION, 0x94))
     information = bytearray(CYCLONE_0_10_PUBLICATION[described + 4 : described + 4 + 0x94])

@@ -117,8 +117,8 @@ def test_full_or_closed_standard_output_is_an_error(
                     with pytest.raises(SystemExit) as ended:
                         main(arguments)
                 assert ended.value.code == code, (arguments, err.getvalue())
-                told = "error: cannot write standard output: No space left on device\n"
-                assert err.getvalue() == (told if code == 2 else "")
+                printed = "error: cannot write standard output: No space left on device\n"
+                assert err.getvalue() == (printed if code == 2 else "")
                 stream.close()  # what is left in it raises nothing
     os.close(pipe)
     os.close(full)

@@ -53,7 +53,7 @@ def mapping(fill: Fill = Fill.KNOWN, side: Side = LEFT) -> DialectMap:
 
 
 def message(modes: list[int] | None = None, **fields: float) -> unitree_hg.HandCmd_:
-    """As xr_teleoperate's controller sends it, unless told otherwise."""
+    """As xr_teleoperate's controller sends it, unless given otherwise."""
     values = {"kp": 1.5, "kd": 0.2, **fields}
     modes = modes if modes is not None else [0x10 | i for i in range(N)]
     return unitree_hg.HandCmd_([unitree_hg.MotorCmd_(mode=m, **values) for m in modes])  # type: ignore[arg-type]
@@ -460,7 +460,7 @@ class TestTimeouts:
 
 
 class InstantDex3:
-    """Is where it is told to be."""
+    """A hand that is always at its goal."""
 
     def __init__(self, side: Side = LEFT) -> None:
         self.spec = spec(side)

@@ -70,7 +70,7 @@ class Network:
     def at(self, time: float, what: Callable[[], None]) -> None:
         heapq.heappush(self._events, (time, next(self._count), what))
 
-    def tell(self, sender: Program, news: Callable[[Program], None]) -> None:
+    def deliver(self, sender: Program, news: Callable[[Program], None]) -> None:
         for other in self.programs:
             if other is sender:
                 continue
@@ -109,7 +109,7 @@ class Program:
         self.sole._claim = Claim(since, self.net.random.getrandbits(64))
         self.sole._phase = type(self.sole._phase).SETTLE
         mine = Seen(self.name, self.sole.announce(), process=self.name)
-        self.net.tell(self, lambda other: other._hear(mine))
+        self.net.deliver(self, lambda other: other._discover(mine))
         self.net.at(self.net.now + SETTLE, self._begin)
 
     def _begin(self) -> None:
@@ -117,7 +117,7 @@ class Program:
             self.sole.begin()
             self._step()
 
-    def _hear(self, seen: Seen) -> None:
+    def _discover(self, seen: Seen) -> None:
         self.node.known[seen.key] = seen
         if self.started:
             self._step()
@@ -131,7 +131,7 @@ class Program:
                 self.sole.check()
             except TopicConflict:
                 self.gone = True
-                self.net.tell(self, lambda other: other._miss(self.name))
+                self.net.deliver(self, lambda other: other._miss(self.name))
         return not self.gone
 
 
@@ -169,8 +169,8 @@ def test_forced_publishers_stay_and_log_a_warning(caplog: pytest.LogCaptureFixtu
     assert first.sole.rivals == second.sole.rivals == 1
     said = sorted(r.getMessage() for r in caplog.records)
     assert said == [
-        f"first publishes {TOPIC} on domain 1, too; the two fight",
-        f"second publishes {TOPIC} on domain 1, too; the two fight",
+        f"first publishes {TOPIC} on domain 1, too; their samples mix",
+        f"second publishes {TOPIC} on domain 1, too; their samples mix",
     ]
 
 
@@ -292,7 +292,7 @@ def test_service_that_discovers_an_earlier_one_late_brakes_and_ends() -> None:
         # it left without a last state, which would be the other one's
         with service(near) as served, far.writer(TOPIC, GO.state_type):
             wait_until(lambda: served.snapshot()["rivals"] == 1)
-            assert served.failure is None  # the vendor's came later: told, and no more
+            assert served.failure is None  # the vendor's came later: only logged
 
 
 def test_replay_gives_way_to_a_new_publisher() -> None:

@@ -26,10 +26,10 @@ from dexkit.teleop import (
     StateReceiver,
     StickyFilter,
     client_for,
-    feel,
     profile,
     profiles_for,
     recorded,
+    tracking_figures,
 )
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
 from dexkit.teleop.client_codec import ClientWire
@@ -513,7 +513,7 @@ def test_stroke_time_of_a_first_order_hand() -> None:
     def wanted(t: float) -> float:
         return 5.4 if t >= 1.0 else 0.0
 
-    found = feel(*first_order(wanted, delay=0.0, tau=0.1, end=3.0), wanted, 5.4)
+    found = tracking_figures(*first_order(wanted, delay=0.0, tau=0.1, end=3.0), wanted, 5.4)
     # from 5 to 95 % of the way: ln(0.95 / 0.05) time constants
     assert found.stroke_s == pytest.approx(0.1 * math.log(19), abs=0.01)
     assert found.overshoot == 0.0
@@ -525,23 +525,23 @@ def test_delay_is_measured_as_lag_and_reaction() -> None:
     def slow(t: float) -> float:
         return 2.7 + 2.0 * math.sin(1.5 * t)
 
-    found = feel(*first_order(slow, delay=0.12, tau=0.0, end=6.0), slow, 5.4)
+    found = tracking_figures(*first_order(slow, delay=0.12, tau=0.0, end=6.0), slow, 5.4)
     assert found.lag_s == pytest.approx(0.12, abs=0.004)
 
     def step(t: float) -> float:
         return 4.0 if t >= 1.0 else 0.0
 
-    found = feel(*first_order(step, delay=0.12, tau=0.01, end=3.0), step, 5.4)
+    found = tracking_figures(*first_order(step, delay=0.12, tau=0.01, end=3.0), step, 5.4)
     assert found.reaction_s == pytest.approx(0.12, abs=0.01)
 
 
 def test_hand_at_rest_has_infinite_stroke_time_and_no_lag() -> None:
     t: Floats = np.asarray(np.arange(0.0, 4.0, 0.002))
-    still = feel(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
+    still = tracking_figures(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
     assert still.stroke_s == math.inf
     assert math.isnan(still.reaction_s)
     assert still.stuck == pytest.approx(5.4)
-    moving = feel(t, np.zeros_like(t), lambda x: 2.7 + math.sin(3 * x), 5.4)
+    moving = tracking_figures(t, np.zeros_like(t), lambda x: 2.7 + math.sin(3 * x), 5.4)
     assert math.isnan(moving.lag_s)
 
 
@@ -549,7 +549,7 @@ def test_hand_at_rest_has_infinite_stroke_time_and_no_lag() -> None:
 @given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))
 def test_figures_are_never_negative(values: list[float], goal: float) -> None:
     t: Floats = np.asarray(np.arange(len(values)) * 0.05)
-    found = feel(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
+    found = tracking_figures(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
     assert all(x >= 0.0 for x in found.figures().values())
 
 

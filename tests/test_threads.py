@@ -40,16 +40,16 @@ def die(*args: object, **options: object) -> None:
 
 def test_dying_worker_raises_in_every_waiter(caplog: pytest.LogCaptureFixture) -> None:
     owner: list[Exception] = []
-    heard: list[Worker] = []
+    dead: list[Worker] = []
     threads.forget()
-    with threads.on_death(heard.append), threads.on_death(die), stop_on_signals() as stop:
+    with threads.on_death(dead.append), threads.on_death(die), stop_on_signals() as stop:
         worker = Worker("test", die, 1, 2, failed=owner.append)
         worker.start()
         assert stop.wait(10)
     worker.join()
     assert isinstance(worker.failure, Injected)
     assert owner == [worker.failure]
-    assert heard == [worker]
+    assert dead == [worker]
     assert "the test thread died" in caplog.text
     for check in (worker.check, threads.check):
         with pytest.raises(DexkitError, match="the test thread died: Injected: injected"):
@@ -190,9 +190,9 @@ def test_a_node_whose_dispatcher_died_frees_its_waiters(monkeypatch: pytest.Monk
 
 def test_dying_thread_of_an_emulator_or_tool_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Tool, "_listen", die)
-    heard: list[Worker] = []
-    with threads.on_death(heard.append), Tool("--version"):
-        wait_until(lambda: heard)
+    dead: list[Worker] = []
+    with threads.on_death(dead.append), Tool("--version"):
+        wait_until(lambda: dead)
     monkeypatch.setattr(Port, "run", die)
     port = Port.__new__(Port)
     port.error = None

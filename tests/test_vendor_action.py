@@ -139,7 +139,7 @@ def test_every_input_is_in_the_document() -> None:
 
 @pytest.fixture
 def pretended(tmp_path: Path) -> Runner:
-    """A python that notes its arguments and exits as the file ``status`` says."""
+    """A python that notes its arguments and exits with the code in the file ``status``."""
     programs = tmp_path / "bin"
     programs.mkdir()
     note = f"""#!/bin/bash

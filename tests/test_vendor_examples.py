@@ -84,7 +84,7 @@ def test_example_hand_uses_dex1_units(acme: ModuleType) -> None:
         state = hand.exchange(HandCommand.brake(1))
         assert state.q == pytest.approx([0.2 * 5.4])
         assert state.temperature == pytest.approx([31.2])
-        assert np.isnan(state.voltage).all()  # not known, so not told
+        assert np.isnan(state.voltage).all()  # not known, so not reported
         assert drive(hand, HandCommand.position([2.7]), 2.7) == 0.0
         hand.close()
         hand.close()
@@ -256,6 +256,6 @@ def test_each_failure_is_printed_once_before_the_verdict(tmp_path: Path) -> None
         assert run.returncode == 1, run.stdout + run.stderr
         assert (run.stdout.count(advice) == 1) == (not more)
         assert ("FAILED" in run.stdout) == bool(more)
-        told = run.stdout.index("FAIL: a MUST is not met")
-        assert told > run.stdout.rindex(advice) > run.stdout.index("DEX1-RATE-03 ")
+        verdict_at = run.stdout.index("FAIL: a MUST is not met")
+        assert verdict_at > run.stdout.rindex(advice) > run.stdout.index("DEX1-RATE-03 ")
         assert "(-v shows why)" in " ".join(run.stdout.split())

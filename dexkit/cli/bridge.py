@@ -188,7 +188,7 @@ def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
 
 
 def _rates(bridge: Bridge) -> Iterator[str]:
-    """The status line, again and again."""
+    """Format the rates for the status line."""
     directions = {"cmd": bridge.commands, "state": bridge.states}
     before: dict[tuple[str, Side], int] = {}
     last = time.monotonic()

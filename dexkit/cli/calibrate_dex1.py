@@ -1,4 +1,4 @@
-"""``dexkit calibrate dex1-serial``: have a Dex1-1's motor store where closed is."""
+"""``dexkit calibrate dex1-serial``: store the closed position in a Dex1-1's motor."""
 
 from __future__ import annotations
 

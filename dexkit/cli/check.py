@@ -32,7 +32,7 @@ from dexkit.robots import ROBOTS
     type=click.Choice(["auto", *DIALECTS, *ROBOTS]),
     default="auto",
     show_default=True,
-    help="How the hand speaks, or which robot it is; auto takes it from topics and types.",
+    help="Dialect of the hand, or model of the robot; auto takes it from topics and types.",
 )
 @require_option("DEX1-RATE")
 @click.option(

@@ -1,4 +1,4 @@
-"""What the doctor needs the drivers for: who answers on a serial port or a USB/IP server.
+"""Find servos on a serial port and hands on a USB/IP server, for the doctor.
 
 Serial ports are looked at from outside: who may use them, who does. Only a port that the user
 names is opened and asked.

@@ -317,4 +317,4 @@ def latency_timer_option(default: float) -> Callable[[F], F]:
 
 def any_baudrate_option() -> Callable[[F], F]:
     """``--any-baudrate``."""
-    return click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
+    return click.option("--any-baudrate", is_flag=True, help="Accept clients at any baud rate.")

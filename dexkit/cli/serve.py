@@ -237,7 +237,7 @@ def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[st
 
 
 def _dialect(hands: Sequence[Hand], name: str | None) -> Dialect:
-    """The dialect called ``name``, or the first that the hands speak."""
+    """The dialect called ``name``, or the first of the hand model."""
     model = model_by_name(hands[0].spec.model)
     if name is None:
         return model.dialects[0]
@@ -311,7 +311,7 @@ class _Rate:
 
 
 def _line(service: HandService, rate: float) -> tuple[str, str]:
-    """How a service is doing, and the same in brief."""
+    """The status of a service, and its short form."""
     hands = []
     brief = []
     for side, core in service.cores.items():

@@ -298,7 +298,7 @@ def _report(session: Session, operator: Operator, nominal: float, *, as_json: bo
     model = model_by_name(operator.dialect.model)
     found: dict[str, Any] = {}
     for side in session.sides:
-        figures = session.feel(operator, side)
+        figures = session.tracking(operator, side)
         joints = {model.joints[side][i].name: f.figures() for i, f in figures.items()}
         found[str(side)] = {"client_hz": session.command_rate(side), "joints": joints}
     if as_json:

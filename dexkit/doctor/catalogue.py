@@ -1,4 +1,4 @@
-"""Every diagnosis that the doctor knows: the source of the report, the table in the docs, --json.
+"""The diagnoses of the doctor: texts for the report, the page in the docs and --json.
 
 Ids are stable and never used again for something else.
 """

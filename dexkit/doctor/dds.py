@@ -1,4 +1,4 @@
-"""Looking at domains: the sockets of the observers, and what they saw as observations."""
+"""Observe DDS domains: sockets for the observers, and their results as observations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be seen, as plain data: what the rules judge and what ``--json`` prints."""
+"""Observations as plain data: input of the rules, and output of ``--json``."""
 
 from __future__ import annotations
 

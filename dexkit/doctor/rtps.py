@@ -1,4 +1,4 @@
-"""As much of the RTPS wire protocol as it takes to look at a domain, sans IO.
+"""Parse and build the RTPS messages that the observer of a domain needs, sans IO.
 
 An observer speaks RTPS itself instead of joining with CycloneDDS, for three reasons. It sees
 peers that CycloneDDS 0.10 does not survive: what kills a 0.10 process is the type object that an

@@ -1,4 +1,4 @@
-"""From what was seen to what is wrong: pure functions, no IO."""
+"""Derive findings from observations: pure functions, no IO."""
 
 from __future__ import annotations
 

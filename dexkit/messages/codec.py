@@ -1,4 +1,4 @@
-"""What the generated codecs share: encapsulation, the checks on hostile input, and good errors.
+"""Common code of the generated codecs: encapsulation, checks of input, and errors.
 
 A sample is a 4-byte encapsulation header (two bytes representation identifier, two bytes
 options) followed by the data (XTypes 1.3, 7.6.3.1). ``00 01`` is plain CDR (XCDR1) little

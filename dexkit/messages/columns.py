@@ -1,4 +1,4 @@
-"""Many samples of one type at once, as numpy columns.
+"""Decode many samples of one type at once, as numpy columns.
 
 Samples of equal shape (byte order, sequence lengths) are looked at as one structured array, so a
 recording is read at memory speed instead of object by object.

@@ -1,4 +1,4 @@
-"""The profile of a hand model: all that dexkit knows of it, or where that is.
+"""The profile of a hand model: joints, dialects, rates, and references to its other data.
 
 Facts are values: joints, topics, types, rates, poses. Code that works for one model only (codec,
 client, stimulus script, reference service, wrong hands) is named by a

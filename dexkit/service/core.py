@@ -1,4 +1,4 @@
-"""What the service decides about one hand, without threads, DDS or devices.
+"""Decide commands and state of one hand: watchdog, limits, faults; no threads, DDS or devices.
 
 :class:`HandCore` gets events (a command came, an exchange succeeded or failed, the
 link was opened) and returns what follows: the command for the next exchange and the state to

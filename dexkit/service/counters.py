@@ -1,4 +1,4 @@
-"""What the service counts; logged at exit and on SIGUSR1."""
+"""Counters of the service, logged at exit and on SIGUSR1."""
 
 from __future__ import annotations
 

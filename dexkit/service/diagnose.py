@@ -1,4 +1,4 @@
-"""Why a client and this service do not meet, from what discovery shows."""
+"""Find peers that do not match this service, from DDS discovery."""
 
 from __future__ import annotations
 

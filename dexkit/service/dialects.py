@@ -1,4 +1,4 @@
-"""Dialects: what a command message means to a hand, and how a hand's state is put in a message.
+"""Translate command messages to hand commands, and hand states to messages, by dialect.
 
 Pure functions of values; which topics and types a dialect uses is in :mod:`dexkit.models`.
 

@@ -1,4 +1,4 @@
-"""The state of a hand of several joints as the bytes of a ``HandState_``, fast enough for 1000 Hz.
+"""Encode the state of a hand with several joints as a ``HandState_``, fast enough for 1000 Hz.
 
 The seven motors and nine sensor packets of a Dex3-1 are some 340 values, 1000 times a second for
 each hand. Here they are copied into the bytes of a message that was encoded once, array by array;

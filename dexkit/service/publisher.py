@@ -1,4 +1,4 @@
-"""The thread that keeps the deadlines of published state.
+"""The thread that publishes states at fixed deadlines.
 
 One for all the hands of a process: threads that compete for the interpreter lock at the same
 deadlines make each other late, and their waiting costs more than their work.

@@ -30,8 +30,8 @@ from dexkit.models import Dialect, model
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.client_codec import ClientWire
-from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator
+from dexkit.teleop.tracking import TrackingFigures, tracking_figures
 
 __all__ = ["LiveClient", "Session"]
 
@@ -69,7 +69,7 @@ class Session:
         rows = self.commands.get(side, [])
         return (len(rows) - 1) / (rows[-1][0] - rows[0][0]) if len(rows) > 1 else 0.0
 
-    def feel(self, operator: Operator, side: Side) -> dict[int, Feel]:
+    def tracking(self, operator: Operator, side: Side) -> dict[int, TrackingFigures]:
         """The figures of each joint that the operator moves."""
         rows = self.states.get(side, [])
         if len(rows) < 2:
@@ -80,7 +80,7 @@ class Session:
         found = {}
         for i, joint in enumerate(model(spoken.model).joints[side]):
             stroke = spoken.q_open if spoken.is_gripper else joint.stroke
-            figures = feel(
+            figures = tracking_figures(
                 t,
                 q[:, i],
                 lambda at, i=i: _joint_value(operator.intent(at, side), i),  # type: ignore[misc]
@@ -99,7 +99,7 @@ class LiveClient:
     """A client's endpoints on a node, and its loops.
 
     :param client: fresh, for the sides that it is to drive.
-    :param force: command beside others. Two clients on one hand would fight, and a real one may
+    :param force: command beside others. Two clients on one hand would alternate, and a real one may
         carry something: this one gives way to other clients.
     :raises TopicConflict: another program commands one of these hands. So do :meth:`wait_ready` and
         :meth:`perform`, when one starts to.

@@ -1,4 +1,4 @@
-"""What an operator does: profiles, and the operator who performs one.
+"""Teleoperation profiles, and the modelled operator who performs one.
 
 A profile defines how far each joint is closed (0 open, 1 closed) as a function of time, the same
 for both hands. :class:`Operator` makes of it what hand tracking would give the client, at the main

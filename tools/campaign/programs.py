@@ -485,14 +485,14 @@ class _Runs(Case):
             self.spec.works(scene, program)
         except WaitTimeout as error:
             program.end()
-            self.look(batch, program)
+            self.check_output(batch, program)
             raise WaitTimeout(f"{error}; it printed: {program.output[-1500:]}") from None
         except BaseException:
             program.end()
             raise
         return program
 
-    def look(self, batch: Batch, program: Program) -> None:
+    def check_output(self, batch: Batch, program: Program) -> None:
         """A traceback is a finding, whatever else happens."""
         traceback = traceback_in(program.output)
         if traceback is not None:
@@ -512,7 +512,7 @@ class _Runs(Case):
                 batch.found("ended by itself", self.name, f"{code}: {program.output[-2000:]}")
         elif code not in self.spec.codes:
             batch.found("exit code", f"{self.name} {how}", f"{code}: {program.output[-2000:]}")
-        self.look(batch, program)
+        self.check_output(batch, program)
         left = program.left_behind()
         if left:
             batch.found("child left behind", f"{self.name} {how}", "\n".join(left))
@@ -584,7 +584,7 @@ class StopCase(_Runs):
             if program.running or self.spec.ready:
                 self.ended(batch, scene, program, signal.SIGTERM)
             else:
-                self.look(batch, program)
+                self.check_output(batch, program)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 program.process.send_signal(signal.SIGCONT)

@@ -42,7 +42,7 @@ class WatchedProcess:
     files: list[int] = field(default_factory=list)
     threads: list[int] = field(default_factory=list)
 
-    def look(self, now: float) -> None:
+    def measure(self, now: float) -> None:
         """Take one sample; none when it is gone."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             with open(f"/proc/{self.pid}/statm") as file:
@@ -123,7 +123,7 @@ class SoakCase(Case):
                 if now - looked >= (1.0 if batch.sample else _PERIOD):
                     looked = now
                     for one in watched:
-                        one.look(now - began)
+                        one.measure(now - began)
             batch.units += int(time.monotonic() - began)
             for one in watched:
                 for kind, text in one.problems():

@@ -1,4 +1,4 @@
-"""``dexkit emulate all``: a robot with two hands, for a teleoperation developer.
+"""``dexkit emulate all``: a robot with two hands, as processes.
 
 Robot and hands are processes of their own. In one process they would share an interpreter lock:
 with a G1 beside two Dex3-1 the hands fell from 1000 to 960 states a second, and the robot

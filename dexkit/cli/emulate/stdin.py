@@ -1,4 +1,4 @@
-"""Faults as lines of standard input, while an emulator runs."""
+"""Read faults as lines of standard input, while an emulator runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an operator would feel: figures from where a hand was and where it was wanted.
+"""Compute how a hand follows its goal: stroke time, reaction, lag, overshoot and error.
 
 - *stroke*: seconds from 5 to 95 % of the whole stroke, from steps over two fifths of it or more;
   of a step that goes less far, what the whole would take at the same mean speed.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 
-__all__ = ["FROM", "TO", "Feel", "Step", "feel", "steps_of"]
+__all__ = ["FROM", "TO", "Step", "TrackingFigures", "steps_of", "tracking_figures"]
 
 FROM, TO = 0.05, 0.95
 """Parts of a stroke between which its time is taken."""
@@ -65,7 +65,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Feel:
+class TrackingFigures:
     """The figures of one joint: the worst of its steps. NaN where there was no occasion.
 
     :param stroke_s: the slowest stroke, seconds; ``stroke_mean_s`` the mean of all.
@@ -87,7 +87,7 @@ class Feel:
         return {name: float(v) for name, v in found.items() if not math.isnan(v)}
 
 
-def feel(
+def tracking_figures(
     t: Floats,
     q: Floats,
     wanted: Callable[[float], float | None],
@@ -95,7 +95,7 @@ def feel(
     *,
     begin: float | None = None,
     end: float | None = None,
-) -> Feel:
+) -> TrackingFigures:
     """The figures of one joint.
 
     :param t: seconds of each state, ascending, shape (n,).
@@ -107,18 +107,18 @@ def feel(
     good = np.isfinite(q)
     t, q = t[good], q[good]
     if len(t) < 2:
-        return Feel()
+        return TrackingFigures()
     first = float(t[0]) if begin is None else max(begin, float(t[0]))
     last = float(t[-1]) if end is None else min(end, float(t[-1]))
     grid: Floats = np.asarray(np.arange(first, last, GRID))
     if len(grid) < 2:
-        return Feel()
+        return TrackingFigures()
     goal: Floats = np.array([math.nan if (x := wanted(float(g))) is None else x for g in grid])
     position: Floats = q[np.searchsorted(t, grid, "right") - 1]
     steps = steps_of(grid, position, goal, stroke)
     strokes = [s.stroke_s for s in steps if not math.isnan(s.stroke_s)]
     lag, rms = _lag(grid, position, goal, stroke)
-    return Feel(
+    return TrackingFigures(
         stroke_s=max(strokes, default=math.nan),
         stroke_mean_s=sum(strokes) / len(strokes) if strokes else math.nan,
         reaction_s=_maximum([s.reaction_s for s in steps]),
