@@ -38,8 +38,8 @@ when that is closed, however it came to it, the parent is gone."""
 
 
 def command_line(*arguments: str) -> list[str]:
-    """What starts ``dexkit ARGUMENTS`` with this interpreter, and imports nothing from the working
-    folder, as ``python -P`` does where there is one.
+    """The command that starts ``dexkit ARGUMENTS`` with this interpreter, and imports nothing from
+    the working folder, as ``python -P`` does where there is one.
     """
     return [sys.executable, str(_START), *arguments]
 
@@ -154,7 +154,7 @@ class Tool:
 
     @property
     def exit_code(self) -> int | None:
-        """How it ended, negative for a signal; None while it runs."""
+        """The exit code, negative for a signal; None while it runs."""
         return self._process.poll()
 
     @property

@@ -132,7 +132,7 @@ class WriteDeadline:
 
 @dataclass(slots=True)
 class _Writer:
-    """What is known of one writer. Times ours, but for ``source`` and ``began_source``.
+    """Clock and latency of one writer. Times are ours, except ``source`` and ``began_source``.
 
     :ivar offset: least reception minus source; ``at``: when that was seen.
     :ivar source: newest source timestamp, ``moved``: when it last changed; ``received``: last

@@ -119,12 +119,12 @@ class Qos:
 
     @classmethod
     def writer_default(cls) -> Qos:
-        """What Unitree's writers offer."""
+        """The QoS that Unitree's writers offer."""
         return cls("reliable")
 
     @classmethod
     def reader_default(cls) -> Qos:
-        """What Unitree's readers request."""
+        """The QoS that Unitree's readers request."""
         return cls("best_effort")
 
     def __str__(self) -> str:
@@ -595,7 +595,7 @@ def _release_domain(number: int) -> None:
 
 
 class _Handle:
-    """What readers and writers share: the entity, matching, closing."""
+    """Base of readers and writers: the entity, matching, closing."""
 
     def __init__(self, node: DdsNode, topic: str, kind: MessageType, qos: Qos) -> None:
         self.node = node
@@ -798,7 +798,7 @@ class Reader(_Handle):
 
 
 class Discovery:
-    """Who publishes and subscribes what. Belongs to a node: :attr:`DdsNode.discovery`.
+    """The endpoints and participants of a domain. Belongs to a node: :attr:`DdsNode.discovery`.
 
     :ivar unreadable: announcements left out because they could not be read.
     """
@@ -967,7 +967,7 @@ class DdsNode:
 
     @property
     def failure(self) -> Exception | None:
-        """What ended the dispatcher, or None: without it nothing is discovered or received."""
+        """The error that ended the dispatcher thread, which discovers and receives; or None."""
         return self._thread.failure
 
     def writer(
@@ -1188,7 +1188,7 @@ class DdsNode:
 
 
 def _taken(reader: int, kind: type[Any]) -> Iterator[tuple[Any, bool]]:
-    """What a built-in reader has: the sample, which lives for one turn, and whether it is alive."""
+    """Take the samples of a built-in reader, each valid for one turn; and whether it is alive."""
     cyclone = _cyclone()
     while True:
         samples = (ctypes.c_void_p * _TAKE_CHUNK)()

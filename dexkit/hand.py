@@ -50,7 +50,7 @@ class Side(str, Enum):
 
 
 class JointMode(IntEnum):
-    """What a joint's motor does; the RIS_Mode status values of Unitree's motors.
+    """Mode of a joint's motor: the RIS_Mode status values of Unitree's motors.
 
     (docs/sources/unitree-dex.md#b4, "Mode byte".)
     """
@@ -351,11 +351,11 @@ class HandState:
 
 @runtime_checkable
 class Hand(Protocol):
-    """What every backend implements. ``exchange`` is called from one thread."""
+    """The interface of every backend. ``exchange`` is called from one thread."""
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is. May be read before ``open``; ``io_rate`` may become exact in it."""
+        """The properties of this hand. May be read before ``open``, which may refine the rate."""
         ...
 
     def open(self) -> None:

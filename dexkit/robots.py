@@ -142,7 +142,7 @@ class RobotModel:
 
 @dataclass(frozen=True)
 class _Kind:
-    """What the two joints of a pair, or one in the middle, have in common; left hand side."""
+    """Limits that the two joints of a pair share, or of one in the middle; left hand side."""
 
     q_min: float
     q_max: float

@@ -46,7 +46,7 @@ _PATTERN = re.compile(rb"dexkit-claim 1 ([0-9]{1,20}) ([0-9a-f]{16})")
 
 @dataclass(frozen=True, order=True)
 class Claim:
-    """What a writer announces of itself; the smaller one stays.
+    """Publisher claim, announced in a writer's USER_DATA; the publisher with the smaller one stays.
 
     :param since: when it was announced, wall clock, ns. A wrong clock makes another one win, not
         two.

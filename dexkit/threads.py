@@ -54,7 +54,7 @@ class Worker(threading.Thread):
         self._failed = failed
 
     def run(self) -> None:
-        """What the thread does; not to be called."""
+        """Run the target; called by the thread only."""
         try:
             self._work(*self._arguments)
         except Exception as error:

@@ -146,7 +146,7 @@ class Bridge:
 
     @property
     def failure(self) -> Exception | None:
-        """What ended a thread that the bridge needs, those of its nodes included; or None."""
+        """The error that ended a thread of the bridge or of its nodes; or None."""
         needed = [loop.thread.failure for loop in self._loops]
         needed += [self.client.node.failure, self.gripper.node.failure]
         return next((error for error in needed if error is not None), None)

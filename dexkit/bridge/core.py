@@ -119,7 +119,7 @@ class Direction(ABC):
         self._waits_since: float | None = None
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Outgoing]:
-        """What follows from a sample.
+        """Take a sample; return the messages to be sent for it.
 
         :param now: seconds on the clock that :attr:`due` is on, too.
         """
@@ -139,7 +139,7 @@ class Direction(ABC):
         return None if self._waits_since is None else self._waits_since + PATIENCE
 
     def flush(self, now: float) -> list[Outgoing]:
-        """What has waited long enough for the other side."""
+        """Return the messages whose wait for the other side is over."""
         due = self.due
         return self._send_shared(now) if due is not None and now >= due else []
 
@@ -263,7 +263,7 @@ class States(Direction):
         return [s for s in self.sides if s in self._newest and not self._is_live(s, now)]
 
     def position(self, side: Side) -> float | None:
-        """Where a gripper was last seen, rad of its own dialect, bridged or not."""
+        """The last known position of a gripper, rad of its own dialect, bridged or not."""
         return self._positions.get(side)
 
     def forget_positions(self) -> None:
@@ -271,7 +271,7 @@ class States(Direction):
         self._positions.clear()
 
     def paused(self) -> None:
-        """As of any direction; nor does anybody know where the grippers are now."""
+        """As of any direction; also forget the positions of the grippers."""
         super().paused()
         self.forget_positions()
 

@@ -79,7 +79,7 @@ class PartCodec:
         self.length = spoken.length
 
     def count(self, message: Any) -> int:
-        """How many motors a message has."""
+        """The number of motors in a message."""
         return len(getattr(message, self._sequence))
 
     def take(self, message: Any, side: Side) -> Any | None:
@@ -126,7 +126,7 @@ def translator(source: Dialect, target: Dialect, kind: str) -> Translator:
 
 
 class Reachable:
-    """Where a gripper of unitree_hg is sent for a position that it cannot be sent to.
+    """Replaces a goal that unitree_hg cannot express by the nearest one that it can.
 
     To the nearer end of the gap. But if it rests there, and for ``DWELL`` the command has been
     ``ELSEWHERE`` and not there, to the other end, until the command changes. xr_teleoperate needs

@@ -12,7 +12,7 @@ __all__ = ["DIAGNOSES", "Diagnosis", "Finding", "Severity"]
 
 
 class Severity(Enum):
-    """How bad it is."""
+    """Severity of a finding."""
 
     ERROR = "error"
     """A client or a hand cannot work like this."""

@@ -55,7 +55,7 @@ class Participant:
 
     @property
     def name(self) -> str:
-        """How to call it in a sentence."""
+        """Its name in messages."""
         who = self.command or self.process or self.vendor
         if len(who) > 60:
             who = who[:57] + "..."
@@ -84,7 +84,7 @@ class Endpoint:
 
 @dataclass(frozen=True)
 class Stream:
-    """What one writer sent while it was looked at.
+    """Statistics of what one writer sent while it was observed.
 
     :param writer: key of the endpoint.
     :param seconds: how long was looked.
@@ -123,7 +123,7 @@ class DomainView:
         return next((p for p in self.participants if p.key == key), None)
 
     def stream(self, endpoint: Endpoint) -> Stream | None:
-        """What a writer sent, if it was looked at."""
+        """Statistics of a writer, if it was observed."""
         return next((s for s in self.streams if s.writer == endpoint.key), None)
 
     def owner(self, endpoint: Endpoint) -> str:

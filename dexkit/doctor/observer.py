@@ -119,7 +119,7 @@ class Observer:
 
     @property
     def addresses(self) -> list[Locator]:
-        """Where the participants found take discovery messages."""
+        """Locators at which the discovered participants take discovery messages."""
         return [place for peer in self._peers.values() for place in peer.places]
 
     def receive(self, packet: bytes, now: float, address: str = "") -> list[Send]:

@@ -205,7 +205,7 @@ Submessage = Data | DataFrag | Heartbeat | Gap | AckNack
 
 @dataclass(frozen=True)
 class ParticipantData:
-    """What a participant announces of itself.
+    """The announcement of a participant.
 
     :param prefix: GUID prefix, 12 bytes.
     :param version: of CycloneDDS, e.g. ``"0.10.5"``, or empty.
@@ -245,7 +245,7 @@ class Policies:
 
 @dataclass(frozen=True)
 class EndpointData:
-    """What a reader or writer announces of itself.
+    """The announcement of a reader or writer.
 
     :param guid: 16 bytes.
     :param type_hash: of the complete type, hex, as :attr:`dexkit.dds.Endpoint.type_hash`; empty

@@ -35,7 +35,7 @@ _DURABILITY = ("volatile", "transient_local", "transient", "persistent")
 
 @dataclass(frozen=True)
 class Scope:
-    """What the user asked about.
+    """The domain and dialects that are judged.
 
     :param domain: None for all domains with a hand or a client.
     :param dialects: those that count; empty for all that are found.

@@ -305,7 +305,7 @@ class HandCore:
         return self._holding
 
     def next_command(self) -> HandCommand:
-        """What the next exchange sends: the newest command, or the brake.
+        """The command for the next exchange: the newest one, or the brake.
 
         The brake before the first command, during a fault, and after a (re)connection, a fault or
         a pause until a command comes that is newer.
@@ -333,7 +333,7 @@ class HandCore:
         return command
 
     def view(self) -> StateView | None:
-        """What is to be published now; None before the first exchange.
+        """The state to be published now; None before the first exchange.
 
         The same object is returned until something changes.
         """
@@ -353,7 +353,7 @@ class HandCore:
     # -- details ----------------------------------------------------------------------------
 
     def _only_newer(self, now: float) -> None:
-        """What was sent until now does not count any more."""
+        """Ignore all commands that were sent until now."""
         with self._lock:
             self._not_before = now
 

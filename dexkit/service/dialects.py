@@ -158,7 +158,7 @@ class DialectMap(ABC):
         )
 
     def motors(self, message: Any) -> int:
-        """How many motors a command message has; more or fewer than :attr:`length` is odd."""
+        """The number of motors in a command message, which should be :attr:`length`."""
         return len(self._motor_commands(message))
 
     @property
@@ -182,7 +182,7 @@ class DialectMap(ABC):
         )
 
     def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
-        """What is odd about a command that :meth:`command` understands."""
+        """Remarks on a command that :meth:`command` accepts."""
         return ()
 
     @abstractmethod

@@ -301,7 +301,7 @@ class HandService:
 
     @property
     def failure(self) -> Exception | None:
-        """What ended a thread that the service needs, its node's and publisher's included."""
+        """The error that ended a thread of the service, its node or its publisher; or None."""
         return self._failure or self._publisher.failure or getattr(self._node, "failure", None)
 
     # -- status and counters ----------------------------------------------------------------

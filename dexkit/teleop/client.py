@@ -336,7 +336,7 @@ class Dex1Client(TeleopClient):
 
     @property
     def targets(self) -> Mapping[Side, float]:
-        """Where the operator wants each gripper, before clipping and smoothing, rad."""
+        """The target of each gripper, before clipping and filter, rad."""
         return self._targets
 
     def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
@@ -345,7 +345,7 @@ class Dex1Client(TeleopClient):
         return True
 
     def target_of(self, pinch: float) -> float:
-        """Where a pinch value wants the gripper, rad."""
+        """The target for a pinch value, rad."""
         part = (pinch - PINCH_MIN) / (PINCH_MAX - PINCH_MIN)
         return self.dialect.q_open * min(max(part, 0.0), 1.0)
 

@@ -41,7 +41,7 @@ _NAP = 0.1
 
 @dataclass
 class Session:
-    """What was sent and seen, in seconds from the operator's beginning, without pauses.
+    """Commands and states of a session, in seconds from the operator's start, without pauses.
 
     :ivar pauses: when the client was paused, and for how many seconds.
     """
@@ -256,7 +256,7 @@ class LiveClient:
             self._writers[topic].write_raw(payload, now_ns)
 
     def _read(self, now: float) -> dict[Side, Pose]:
-        """What has come; it is handed to the client."""
+        """Read the states, and hand them to the client."""
         found: dict[Side, Pose] = {}
         for topic, reader in self._readers.items():
             for sample in reader.take()[-1:]:

@@ -90,7 +90,7 @@ class Operator:
         self._joints = model(spoken.model).joints
 
     def intent(self, t: float, side: Side) -> Pose | None:
-        """Where the operator wants a hand at ``t`` seconds, rad; None without tracking data."""
+        """The operator's target for a hand at ``t`` seconds, rad; None without tracking data."""
         since = t - self.profile.lead_in
         if since < -1e-9:
             return None
@@ -120,7 +120,7 @@ class Operator:
         return math.floor(t * self.rate + 1e-6) / self.rate
 
     def inputs(self, t: float, sides: Iterable[Side]) -> dict[Side, Pose | None]:
-        """What the client is given at ``t``, as :data:`dexkit.teleop.client.Inputs`."""
+        """The input of the client at ``t``, as :data:`dexkit.teleop.client.Inputs`."""
         at = self.sampled_at(t)
         return {s: self._input(self.intent(at, s)) for s in sides}
 
