@@ -1,4 +1,4 @@
-"""What the bridge adds to a message's way.
+"""Measure the latency that the bridge adds to a message.
 
 Two processes stand between this one's two domains: ``dexkit bridge``, and as the peer a bare echo
 that does nothing but write the bytes of each sample again, with the same readers, writers and
@@ -110,9 +110,9 @@ def route(node: DdsNode, topic: str, type_name: str, writers: list[Writer], data
 
     for writer in writers:
         if not writer.wait_matched(10):
-            raise DexkitError(f"nobody reads {writer.topic}")
+            raise DexkitError(f"no process reads {writer.topic}")
     if not reader.wait_matched(10):
-        raise DexkitError(f"nobody writes {topic}")
+        raise DexkitError(f"no process writes {topic}")
     return Route(ask, answered, arrival)
 
 

@@ -3,7 +3,7 @@
 ``dexkit serve sim-dex3 --side both`` in a process of its own, a subscriber here. The peer of the
 jitter is a loop that keeps the same deadlines and does nothing else, run afterwards; that of the
 processor time the simulation without a service; that of the encoder the message codec of
-:mod:`dexkit.messages`, which is given a message that somebody else has filled.
+:mod:`dexkit.messages`, which gets a message that is already filled.
 """
 
 from __future__ import annotations

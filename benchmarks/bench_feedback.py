@@ -1,4 +1,4 @@
-"""Why the speed of feedback matters: full-stroke time under xr_teleoperate's own rule.
+"""Measure the full-stroke time under xr_teleoperate's limit, for several state rates.
 
 The client clips each command to 0.18 rad from the last reported position and smooths it over
 three values (docs/sources/unitree-dex.md#b1, docs/sources/unitree-dex.md#b7), so what is reported
@@ -98,7 +98,7 @@ class TeleopClient:
 
 
 def direct_time(target: float = _STROKE) -> float:
-    """Seconds from 5 to 95 % when the gripper is told the end at once."""
+    """Seconds from 5 to 95 % when the end is commanded at once."""
     clock = ManualClock()
     gripper = VirtualGripper(clock)
     gripper.exchange(HandCommand.position(target))

@@ -33,7 +33,7 @@ def _best(function: Callable[[], object], number: int) -> float:
     return min(timeit.repeat(function, number=number, repeat=30)) / number * 1e6
 
 
-def _plainly() -> int:
+def _python_crc() -> int:
     """The CRC of the command with struct and a table, from the message."""
     m = COMMAND
     motors = [v for c in m.motor_cmd for v in (c.mode, c.q, c.dq, c.tau, c.kp, c.kd, *c.reserve)]
@@ -67,8 +67,8 @@ def run() -> list[Result]:
                     ratio=peer / ours,
                 )
             )
-    assert _plainly() == crc_of_payload(CASES[0][1], encode(COMMAND))
-    ours, plain = _best(lambda: encode_with_crc(COMMAND), 100), _best(_plainly, 5)
+    assert _python_crc() == crc_of_payload(CASES[0][1], encode(COMMAND))
+    ours, plain = _best(lambda: encode_with_crc(COMMAND), 100), _best(_python_crc, 5)
     results.append(
         Result(
             name="encode with CRC, LowCmd_ of an H1",

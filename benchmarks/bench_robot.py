@@ -25,7 +25,7 @@ def _best(function: Callable[[], object], number: int = TICKS) -> float:
     return min(runs) / number * 1e6
 
 
-def _order(model: RobotModel) -> bytes:
+def _command(model: RobotModel) -> bytes:
     """The rest position, held."""
     kind = message_type(model.cmd_type)
     message = kind.decode(kind.encode(kind.cls()))
@@ -43,13 +43,13 @@ def run() -> list[Result]:
     results = []
     for model in ROBOTS.values():
         robot = RobotMechanics(model)
-        order = _order(model)
+        command = _command(model)
         now = 0.0
 
-        def tick(robot: RobotMechanics = robot, order: bytes = order) -> None:
+        def tick(robot: RobotMechanics = robot, command: bytes = command) -> None:
             nonlocal now
             now += 1.0 / robot.model.state_rate
-            robot.command(order, now)
+            robot.command(command, now)
             robot.advance(now)
             robot.state(now)
 

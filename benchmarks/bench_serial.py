@@ -1,4 +1,4 @@
-"""How fast a gripper is exchanged with over a serial line, and at what cost.
+"""Measure exchanges a second with a gripper on a serial line, and their processor time.
 
 The gripper is emulated in a process of its own, with the time that bytes take at 1 Mbaud, 4 us
 return delay and a USB adapter's latency timer of 1 ms. Compared with
@@ -51,7 +51,7 @@ def _open(path: str) -> tuple[PortHandler, PacketHandler]:
     return port, PacketHandler(2.0)
 
 
-def _naive(path: str) -> tuple[float, float]:
+def _one_call_a_register(path: str) -> tuple[float, float]:
     """Force, position, then each measurement: seven SDK calls, each with its own answer."""
     port, packets = _open(path)
     measured = (
@@ -103,7 +103,7 @@ def run() -> list[Result]:
         with hand:
             rate, cost = _rate(lambda: hand.exchange(command))
             lost = hand.bus_statistics.retries
-        naive, _ = _naive(gripper.path)
+        naive, _ = _one_call_a_register(gripper.path)
         sdk_rate, sdk_cost = _sdk_port(gripper.path)
     sent, received = exchange_bytes()
     return [

@@ -1,4 +1,4 @@
-"""Publish jitter at 500 Hz and the way of a command to the wire.
+"""Measure publish jitter at 500 Hz and the latency from a command to the serial line.
 
 Two emulated EZGrippers, each in its own process, served by two more processes through the real
 driver. The emulators stand in for hardware with processors of its own, so they run at a lower

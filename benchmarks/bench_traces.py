@@ -1,4 +1,4 @@
-"""Recordings: how fast they are written and read, and how exactly they are played."""
+"""Measure the speed of writing and reading recordings, and the timing of replay."""
 
 from __future__ import annotations
 

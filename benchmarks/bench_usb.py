@@ -1,4 +1,4 @@
-"""How fast a Dex3-1 is exchanged with over USB, and at what cost.
+"""Measure exchanges a second with a Dex3-1 on USB, and their processor time.
 
 The hand is emulated in a process of its own and reached by USB/IP on this machine's loopback:
 what is measured is the driver, the USB/IP client, TCP and the emulator, not a USB wire. Compared

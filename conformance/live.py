@@ -41,7 +41,7 @@ from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject
 from dexkit.models import DIALECTS
-from dexkit.single_publisher import Place, SolePublisher
+from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
 
@@ -124,7 +124,7 @@ def record_run(
             _require_hand(recorder_node, options)
         # a second client would interfere, and a real hand may hold something
         sole = SolePublisher(
-            [Place(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
+            [NodeTopics(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
             hint="stop that client, or choose another --domain",
             force=options.force,
             yields=True,
@@ -141,7 +141,7 @@ def record_run(
         player.close()
         rig.stop()
         # last output of the services and emulated devices, with their counters
-        recorder.add_metadata(TOOLS, {repr(tool): tool.last_words for tool in rig.tools})
+        recorder.add_metadata(TOOLS, {repr(tool): tool.last_lines for tool in rig.tools})
         stimulus = Stimulus(
             phases=[p for p in script.phases if p.end_ns],
             objects={s: plan.objects.get(s) for s in plan.sides},
@@ -250,7 +250,7 @@ class _LivePlayer:
         self._do(action)
         dead = self.rig.dead()
         if dead is not None:
-            raise ConformanceError(f"{dead!r} has ended", hint=dead.last_words)
+            raise ConformanceError(f"{dead!r} has ended", hint=dead.last_lines)
         return self._observe()
 
     def _do(self, action: Action) -> None:

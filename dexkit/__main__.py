@@ -9,7 +9,7 @@ __all__ = ["start"]
 
 
 def start() -> None:
-    """Run the command line; ends with whoever started it, if that was asked for."""
+    """Run the command line; end with the parent process, if that was asked for."""
     if os.environ.get(END_WITH_PARENT):
         end_with_parent()
     main()

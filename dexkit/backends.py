@@ -39,7 +39,7 @@ GROUP = "dexkit.backends"
 
 @dataclass(frozen=True)
 class BackendOptions:
-    """What a user can say about the hand to open.
+    """The options with which a user chooses and configures a hand.
 
     :param side: which hand.
     :param device: path, serial number or address of the device; None where none is needed.
@@ -70,7 +70,8 @@ class Backend:
     """A way to be a hand.
 
     :param summary: one line for ``dexkit backends``.
-    :param model: hand model that it implements; empty where only a hand of it can tell.
+    :param model: hand model that it implements; empty where it is known only after the hand was
+        made.
     :param needs: what must be there: ``"--device PATH or serial number"``, or empty.
     :param make: makes the hand, without opening it.
     :param needs_device: refuse to start without a device.
@@ -182,7 +183,7 @@ def _check(hand: object, side: Side, model: str) -> None:
     :raises BackendBroken: naming what is missing or wrong.
     """
     name = type(hand).__name__
-    # a property that raises AttributeError is there, and its own error says more
+    # a property that raises AttributeError exists, and its own error is more precise
     absent = object()
     missing = [
         part
@@ -202,11 +203,11 @@ def _check(hand: object, side: Side, model: str) -> None:
         )
     if spec.side is not side:
         raise BackendBroken(
-            f"{name} was asked for the {side} hand, and its spec says {spec.side}",
+            f"{name} was asked for the {side} hand, and its spec has {spec.side}",
             hint="hand the side that is given on to the spec",
         )
     if model and spec.model != model:
-        raise BackendBroken(f"the backend says that it is a {model}, and {name} is a {spec.model}")
+        raise BackendBroken(f"the backend declares a {model}, and {name} is a {spec.model}")
 
 
 def _where(error: BaseException) -> str:

@@ -32,14 +32,14 @@ STOP_TIMEOUT = 5.0
 _START = Path(__file__).resolve().with_name("_start") / "dexkit"
 
 END_WITH_PARENT = "DEXKIT_END_WITH_PARENT"
-"""Environment variable: set for a command that is to end when whoever started it is killed. It is
-the number of a pipe's descriptor that nobody writes and whose other end only the parent has: when
-that is closed, however it came to it, the parent is gone."""
+"""Environment variable: set for a command that is to end when its parent is killed. It is
+the number of a pipe's descriptor that is never written and whose other end only the parent has:
+when that is closed, however it came to it, the parent is gone."""
 
 
 def command_line(*arguments: str) -> list[str]:
-    """What starts ``dexkit ARGUMENTS`` with this interpreter, and imports nothing from the working
-    folder, as ``python -P`` does where there is one.
+    """The command that starts ``dexkit ARGUMENTS`` with this interpreter, and imports nothing from
+    the working folder, as ``python -P`` does where there is one.
     """
     return [sys.executable, str(_START), *arguments]
 
@@ -81,7 +81,7 @@ class Tool:
     :param on_line: is given each line that it prints, in a thread that must not be kept long.
     :param environment: variables that it has beside those of this process.
 
-    :cvar error: what is raised when it ends, or says nothing, before it is ready; its last words
+    :cvar error: what is raised when it ends, or prints nothing, before it is ready; its last lines
         are the hint.
     """
 
@@ -154,16 +154,16 @@ class Tool:
 
     @property
     def exit_code(self) -> int | None:
-        """How it ended, negative for a signal; None while it runs."""
+        """The exit code, negative for a signal; None while it runs."""
         return self._process.poll()
 
     @property
-    def last_words(self) -> str:
+    def last_lines(self) -> str:
         """The last lines that it printed."""
         return "\n".join(self._tail)
 
     def wait_ready(self, stop: threading.Event, timeout: float = READY_TIMEOUT) -> None:
-        """Wait until it says that it is ready, or ``stop`` is set."""
+        """Wait until it prints that it is ready, or ``stop`` is set."""
         end = time.monotonic() + timeout
         while not (came := self.ready.wait(0.05)) and time.monotonic() < end:
             if stop.is_set():
@@ -173,7 +173,7 @@ class Tool:
             silent = (
                 "it printed nothing; a driver whose first exchange() never returns looks like that"
             )
-            raise self.error(f"{self!r} {what}", hint=self.last_words or silent)
+            raise self.error(f"{self!r} {what}", hint=self.last_lines or silent)
 
     def stop(self) -> bool:
         """End it, politely at first. May be called twice.

@@ -1,4 +1,4 @@
-"""Time: a clock that is real or driven by hand, and the rate that keeps absolute deadlines.
+"""Clocks, real or advanced by a test, and a rate that keeps absolute deadlines.
 
 Everything that waits takes a :class:`Clock`. :class:`Rate` paces a loop; :func:`wait_until` is the
 wait that it and the player of recordings share.
@@ -57,7 +57,7 @@ class RealClock:
 
 
 class ManualClock:
-    """A clock that moves only when told to; for mechanics, estimators and device logic.
+    """A clock that moves only when advanced; for mechanics, estimators and device logic.
 
     ``sleep_until`` moves the clock itself, so single-threaded code runs through hours in
     microseconds.

@@ -1,19 +1,20 @@
-"""Age of received commands, and pauses of a program's own loops: what is too old to be obeyed.
+"""Estimate the age of received samples, and detect pauses of a program's own loops.
 
-A process may stand still at any point (stopped, suspended, swapped out, in a debugger, not
+A process may be paused at any point (stopped, suspended, swapped out, in a debugger, not
 scheduled), and what was sent to it meanwhile waits in the socket. After a pause, nothing that may
 have been sent before its end moves a hand; without one, neither does a command that is more than
 :data:`PAUSE` seconds older than its writer's commands usually are.
 
-:class:`PauseWatch` notices pauses, :class:`Ages` says how old a sample is, :class:`Promptly` keeps
-a driver from writing a command that it got before a pause. None has a thread or DDS. Times are
-those of :meth:`dexkit.clock.Clock.since_boot`, which go on while the machine is suspended and do
-not jump with the wall clock.
+:class:`PauseWatch` detects pauses, :class:`SampleAges` estimates how old a sample is, and
+:class:`WriteDeadline` keeps a driver from writing a command that it got before a pause. None has a
+thread or DDS. Times are those of :meth:`dexkit.clock.Clock.since_boot`, which go on while the
+machine is suspended and do not jump with the wall clock.
 
-**How old a sample is.** A sample says when it was written, on its writer's clock. How that clock
-relates to ours is unknown, it may be hours off; but reception minus source timestamp is that
-offset plus the sample's latency, so the least difference seen of a writer (its *baseline*) is the
-offset plus its least latency, and what a sample exceeds it by is its age. The baseline moves by
+**How old a sample is.** A sample carries the time at which it was written, on its writer's clock.
+How that clock relates to ours is unknown, it may be hours off; but reception minus source timestamp
+is that offset plus the sample's latency, so the least difference seen of a writer (its *baseline*)
+is the offset plus its least latency, and what a sample exceeds it by is its age. The baseline moves
+by
 :data:`DRIFT` to follow clocks that run differently, and has to be confirmed anew after
 :data:`FORGET` seconds without a sample.
 
@@ -25,8 +26,8 @@ that lie ``SETTLE`` seconds or more apart on both clocks alike: while a queue is
 source timestamps run faster than ours. Samples of a writer that is not confirmed count
 :data:`QUIET` seconds after the pause, when the socket has long been emptied.
 
-**When the writer's clock jumps** its old baseline is worthless, and a machine that stood still
-with all its clocks (a virtual one) sees the same. The writer counts again when its new baseline is
+**When the writer's clock jumps** its old baseline is worthless, and a virtual machine that was
+paused with all its clocks sees the same. The writer counts again when its new baseline is
 confirmed, or after :data:`QUIET` seconds; so does one that is late after a long silence (its
 machine was suspended). Timestamps that do not go on are no clock: such a writer is obeyed as one
 without a baseline.
@@ -45,15 +46,24 @@ from dataclasses import dataclass
 from dexkit.clock import Clock
 from dexkit.errors import HandTimeout
 
-__all__ = ["DRIFT", "FORGET", "PAUSE", "QUIET", "SETTLE", "Ages", "PauseWatch", "Promptly"]
+__all__ = [
+    "DRIFT",
+    "FORGET",
+    "PAUSE",
+    "QUIET",
+    "SETTLE",
+    "PauseWatch",
+    "SampleAges",
+    "WriteDeadline",
+]
 
 PAUSE = 0.25
-"""Seconds: a loop that was away for longer stood still, and a command that is older is old."""
+"""Seconds: a loop that did not run for longer had a pause, and an older command is stale."""
 SETTLE = 0.2
 """Seconds by which a baseline is confirmed, and that a command must have been sent after the end
 of a pause. Covers a least latency of 0.14 s with the drift of a minute of silence."""
 QUIET = 1.0
-"""Seconds after a pause until samples count whose age cannot be told."""
+"""Seconds after a pause until samples count whose age cannot be determined."""
 DRIFT = 500e-6
 """Most that a clock runs fast or slow: what NTP slews by (RFC 5905: 500 PPM)."""
 FORGET = 60.0
@@ -61,13 +71,15 @@ FORGET = 60.0
 
 _IN_PACE = 0.02  # seconds by which two samples' latencies may differ to confirm a baseline
 _JUMP = 0.05  # seconds; a timestamp that goes back by more, or a baseline that falls by more
-_REPEATS = 0.1  # seconds; a clock that stands still for longer is none. Coarse ones tick faster
+_REPEATS = (
+    0.1  # seconds; a clock that does not advance for longer is not used. Coarse ones tick faster
+)
 _HOPELESS = 10.0  # seconds of lateness that no network has; then the timestamps are no clock
-_WRITERS = 64  # remembered; the one heard longest ago is forgotten first
+_WRITERS = 64  # remembered; the one whose last sample is oldest is forgotten first
 
 
 class PauseWatch:
-    """Notices when a loop stood still. For one thread, but for :meth:`away`.
+    """Detects pauses of a loop. For one thread, but for :meth:`away`.
 
     :param clock: :meth:`~dexkit.clock.Clock.since_boot` of it is used.
     """
@@ -94,8 +106,8 @@ class PauseWatch:
         return now - last
 
 
-class Promptly:
-    """From the command that a driver is given to the bytes that it writes.
+class WriteDeadline:
+    """The time that a driver has from getting a command to writing it: :data:`PAUSE`.
 
     :param clock: as for :class:`PauseWatch`.
     """
@@ -112,7 +124,7 @@ class Promptly:
         away = self._clock.since_boot() - self._since
         if away > PAUSE:
             raise HandTimeout(
-                f"this program stood still for {away:.2f} s before a command was written; "
+                f"this program was paused for {away:.2f} s before a command was written; "
                 "it was not sent",
                 hint="was it stopped or suspended, or is the machine too busy?",
             )
@@ -120,23 +132,24 @@ class Promptly:
 
 @dataclass(slots=True)
 class _Writer:
-    """What is known of one writer. Times ours, but for ``source`` and ``began_source``.
+    """Clock and latency of one writer. Times are ours, except ``source`` and ``began_source``.
 
     :ivar offset: least reception minus source; ``at``: when that was seen.
-    :ivar source: newest source timestamp, ``moved``: when it last changed; ``heard``: last sample.
+    :ivar source: newest source timestamp, ``moved``: when it last changed; ``received``: last
+        sample.
     :ivar began: since when the baseline is being confirmed, ``began_source`` and
         ``began_offset``: the sample of then.
     :ivar confirmed: the baseline can be trusted.
     :ivar doubted: since when a clock that was trusted has been in doubt, because it jumped.
     :ivar late: since when every sample was late.
-    :ivar clockless: its timestamps say nothing.
+    :ivar clockless: its timestamps are not usable.
     """
 
     offset: float
     at: float
     source: float
     moved: float
-    heard: float
+    received: float
     began: float
     began_source: float
     began_offset: float
@@ -151,8 +164,8 @@ class _Writer:
         self.confirmed = False
 
 
-class Ages:
-    """How old samples are that come from any number of writers. Thread-safe."""
+class SampleAges:
+    """Estimates the age of samples from any number of writers. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -199,7 +212,7 @@ class Ages:
         """Seconds beyond the baseline, which is kept up to date; infinite while it is in doubt."""
         self._check_clock(known, source, now)
         before, known.source = known.source, source
-        silent, known.heard = now - known.heard > FORGET, now
+        silent, known.received = now - known.received > FORGET, now
         if known.clockless:
             return 0.0
         offset = now - source
@@ -232,7 +245,7 @@ class Ages:
 
     @staticmethod
     def _check_clock(known: _Writer, source: float, now: float) -> None:
-        """Whether the timestamps say anything at all."""
+        """Note when the timestamps do not advance; they are then not used."""
         if source != known.source:
             known.moved = now
         elif now - known.moved > _REPEATS:

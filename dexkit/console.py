@@ -1,4 +1,4 @@
-"""Tables and coloured text on a terminal, clean whatever is in them (:mod:`dexkit.escaping`)."""
+"""Print tables and coloured text on a terminal, with control characters escaped."""
 
 from __future__ import annotations
 
@@ -50,5 +50,5 @@ class Console(rich.console.Console):
                 yield Segment(visible(text), segment.style)
 
     def on_broken_pipe(self) -> None:
-        """Say it as any other stream does."""
+        """Report a broken pipe as any other stream does."""
         raise OutputError("cannot write standard output: Broken pipe")

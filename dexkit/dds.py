@@ -119,12 +119,12 @@ class Qos:
 
     @classmethod
     def writer_default(cls) -> Qos:
-        """What Unitree's writers offer."""
+        """The QoS that Unitree's writers offer."""
         return cls("reliable")
 
     @classmethod
     def reader_default(cls) -> Qos:
-        """What Unitree's readers request."""
+        """The QoS that Unitree's readers request."""
         return cls("best_effort")
 
     def __str__(self) -> str:
@@ -164,8 +164,8 @@ class Sample:
 class Participant:
     """A process's presence on the domain.
 
-    :param process: name and pid if the other side tells them (CycloneDDS does), or empty.
-    :param pid: process id, or 0 if it is not told.
+    :param process: name and pid if the participant announces them (CycloneDDS does), or empty.
+    :param pid: process id, or 0 if it is not announced.
     """
 
     key: str
@@ -183,7 +183,7 @@ class Endpoint:
     :param own: it belongs to this node.
     :param key: unique id of the endpoint; ``participant`` that of its participant.
     :param process: name and pid of the process that it lives in, if known.
-    :param user_data: what its owner says of it (USER_DATA), or empty.
+    :param user_data: its USER_DATA, or empty.
     :param type_hash: hash of the complete type if the other side announces one, or empty; two
         endpoints whose ``type_name`` is the same but whose hash differs disagree on the layout.
     """
@@ -346,8 +346,8 @@ class _Cyclone:
             None, pointer, reference, ctypes.POINTER(ctypes.c_uint32)
         )(("ddsi_typeid_ser", self.lib))
         self.ddsi_typeid_fini: Any = ctypes.CFUNCTYPE(None, pointer)(("ddsi_typeid_fini", self.lib))
-        # Nothing on stderr; what goes wrong is asked for when it is needed (_why). The sink has
-        # to be a C function, since it is called by threads that hold CycloneDDS's locks, and one
+        # Nothing on stderr; _setup_error_text gets the text when it is needed. The sink has to be a
+        # C function, since it is called by threads that hold CycloneDDS's locks, and one
         # without effect: abs() of the unused first argument.
         self.lib.dds_set_log_sink(ctypes.CDLL(None).abs, None)
         self.data_available = int(core.DDSStatus.DataAvailable)
@@ -478,7 +478,7 @@ class _Domain:
     """A domain of this process; its configuration is that of the first node."""
 
     interface: str
-    entity: Any  # None when somebody else in this process configured the domain
+    entity: Any  # None when other code in this process configured the domain
     nodes: int = 0
     sockets: DomainSockets | None = None  # None when nothing is kept out
 
@@ -517,31 +517,31 @@ def _acquire_domain(number: int, interface: str) -> None:
         if error.code != _PRECONDITION_NOT_MET:
             raise DdsSetupError(
                 f"domain {number} cannot be set up on {interface}: "
-                f"{_why(number, interface) or error}",
+                f"{_setup_error_text(number, interface) or error}",
                 hint=f"this machine has: {', '.join(interfaces())}; at most "
                 f"{_MAX_PARTICIPANT_INDEX} processes share a domain",
             ) from error
         _log.warning(
             "domain %d was configured by other code in this process; its interface is used, not "
-            "%s, and whoever reaches any network of this machine can take part",
+            "%s, and any machine on any network of this one can take part",
             number,
             interface,
         )
         entity = None
     else:
         try:
-            sockets = _shut_out_others(number, interface, before)
+            sockets = _filter_interfaces(number, interface, before)
             code = cyclone.dds_domain_set_deafmute(entity._ref, False, False, _INFINITY)
             if code != _OK:
-                raise DdsSetupError(f"domain {number} stays deaf (CycloneDDS says {code})")
+                raise DdsSetupError(f"domain {number} cannot receive (CycloneDDS error {code})")
         except BaseException:
             cyclone.delete(entity)
             raise
     _domains[number] = _Domain(interface, entity, 1, sockets)
 
 
-def _shut_out_others(number: int, interface: str, before: dict[int, int]) -> DomainSockets | None:
-    """Let in what comes by ``interface`` only. The domain is deaf when this is called.
+def _filter_interfaces(number: int, interface: str, before: dict[int, int]) -> DomainSockets | None:
+    """Accept only packets that arrive on ``interface``. The domain is deaf when this is called.
 
     :returns: None when the user allows all interfaces.
     :raises DdsSetupError: the system has no such filter.
@@ -564,7 +564,7 @@ def _shut_out_others(number: int, interface: str, before: dict[int, int]) -> Dom
         ) from error
 
 
-def _why(number: int, interface: str) -> str:
+def _setup_error_text(number: int, interface: str) -> str:
     """Try once more, with CycloneDDS's warnings going to a file, and return them."""
     cyclone = _cyclone()
     with tempfile.TemporaryDirectory(prefix="dexkit-") as folder:
@@ -595,7 +595,7 @@ def _release_domain(number: int) -> None:
 
 
 class _Handle:
-    """What readers and writers share: the entity, matching, closing."""
+    """Base of readers and writers: the entity, matching, closing."""
 
     def __init__(self, node: DdsNode, topic: str, kind: MessageType, qos: Qos) -> None:
         self.node = node
@@ -707,7 +707,7 @@ class Writer(_Handle):
             data = data + bytes(-len(data) % 4)  # the wire unit is 4 bytes
         if not self._registered:
             # Our types have no key, so a topic has one instance. Unless it is registered,
-            # CycloneDDS makes and frees it with each sample that nobody must acknowledge, and
+            # CycloneDDS makes and frees it with each sample that needs no acknowledgement, and
             # at 2000 samples a second its collector takes 5 % of a processor.
             self._registered = True
             _cyclone().layer.ddspy_register_instance(self._ref, data)
@@ -798,7 +798,7 @@ class Reader(_Handle):
 
 
 class Discovery:
-    """Who publishes and subscribes what. Belongs to a node: :attr:`DdsNode.discovery`.
+    """The endpoints and participants of a domain. Belongs to a node: :attr:`DdsNode.discovery`.
 
     :ivar unreadable: announcements left out because they could not be read.
     """
@@ -876,15 +876,15 @@ class Discovery:
             known = endpoint.key in self._endpoints
             self._endpoints[endpoint.key] = endpoint
         if not known:
-            self._tell(DiscoveryEvent(True, endpoint))
+            self._notify_listeners(DiscoveryEvent(True, endpoint))
 
     def _remove(self, key: str) -> None:
         with self._lock:
             endpoint = self._endpoints.pop(key, None)
         if endpoint is not None:
-            self._tell(DiscoveryEvent(False, endpoint))
+            self._notify_listeners(DiscoveryEvent(False, endpoint))
 
-    def _tell(self, event: DiscoveryEvent) -> None:
+    def _notify_listeners(self, event: DiscoveryEvent) -> None:
         for callback in list(self._callbacks):
             try:
                 callback(event)
@@ -967,7 +967,7 @@ class DdsNode:
 
     @property
     def failure(self) -> Exception | None:
-        """What ended the dispatcher, or None: without it nothing is discovered or received."""
+        """The error that ended the dispatcher thread, which discovers and receives; or None."""
         return self._thread.failure
 
     def writer(
@@ -1006,8 +1006,8 @@ class DdsNode:
         :param qos: default :meth:`Qos.reader_default`.
         :param depth: overrides the depth of ``qos``.
         :param most: keep every sample until it is taken, up to so many; later ones are dropped
-            and counted (:attr:`Reader.refused`). Without it the oldest is dropped, and nobody
-            can tell.
+            and counted (:attr:`Reader.refused`). Without it the oldest is dropped, and
+            is not counted.
         :param on_data: called without arguments, in the dispatcher thread, when something has
             arrived. It must return at once: set an event, put into a queue.
         :raises DdsSetupError: the endpoint cannot be made.
@@ -1114,13 +1114,13 @@ class DdsNode:
 
     def _dispatch(self) -> None:
         cyclone = _cyclone()
-        room = 64
-        tokens = (ctypes.c_ssize_t * room)()
+        most = 64
+        tokens = (ctypes.c_ssize_t * most)()
         sockets = self._sockets if self._sockets and not self._sockets.fixed else None
         patience = _LOOK_EVERY_NS if sockets else _INFINITY
         look_at = time.monotonic()
         while True:
-            count = cyclone.dds_waitset_wait(self._waitset, tokens, room, patience)
+            count = cyclone.dds_waitset_wait(self._waitset, tokens, most, patience)
             if not self._alive():
                 return
             if count < 0:
@@ -1128,8 +1128,8 @@ class DdsNode:
             if sockets and time.monotonic() >= look_at:
                 look_at = time.monotonic() + _LOOK_EVERY_NS * 1e-9
                 sockets.follow()
-            # more than `room` triggered entities trigger again at once
-            for token in sorted(set(tokens[: min(count, room)])):
+            # more than `most` triggered entities trigger again at once
+            for token in sorted(set(tokens[: min(count, most)])):
                 with self._dispatching:
                     if not self._alive():
                         return  # a callback has closed the node
@@ -1184,11 +1184,11 @@ class DdsNode:
         except Exception:
             self.discovery.unreadable += 1
             if self.discovery.unreadable == 1:
-                _log.exception("an announcement of a peer cannot be read (said once)")
+                _log.exception("an announcement of a peer cannot be read (logged once)")
 
 
 def _taken(reader: int, kind: type[Any]) -> Iterator[tuple[Any, bool]]:
-    """What a built-in reader has: the sample, which lives for one turn, and whether it is alive."""
+    """Take the samples of a built-in reader, each valid for one turn; and whether it is alive."""
     cyclone = _cyclone()
     while True:
         samples = (ctypes.c_void_p * _TAKE_CHUNK)()
@@ -1264,7 +1264,7 @@ def _endpoint(data: Any, kind: str, owner: Participant | None, own_key: str) -> 
 
 
 def _user_data(qos: int) -> bytes:
-    """What the owner of a discovered endpoint says of it."""
+    """The USER_DATA of a discovered endpoint."""
     cyclone = _cyclone()
     value, size = ctypes.c_void_p(), ctypes.c_size_t()
     if not cyclone.dds_qget_userdata(qos, ctypes.byref(value), ctypes.byref(size)) or not value:

@@ -1,6 +1,6 @@
 """Restrict the sockets that CycloneDDS opens for a domain to one network interface.
 
-CycloneDDS 0.10 binds them to all addresses, tells nobody which they are, and asks for the index
+CycloneDDS 0.10 binds them to all addresses, has no call that returns them, and asks for the index
 of its interface once. So they are found among the sockets of the process, get a filter
 (:mod:`dexkit.interface_filter`), and follow an interface that is unplugged and comes back as
 another one.
@@ -28,7 +28,7 @@ __all__ = ["DomainSockets", "open_sockets"]
 _log = logging.getLogger(__name__)
 
 _GROUP = "239.255.0.1"  # of discovery, and of samples by default (RTPS 9.6.2.3)
-_EMPTY = b"RTPS\2\1\0\0" + bytes(12)  # a header without a submessage: nobody minds it
+_EMPTY = b"RTPS\2\1\0\0" + bytes(12)  # a header without a submessage: receivers ignore it
 _EARLY_PATIENCE = 5000  # looks, 1 ms apart
 _WAKE_EVERY = 0.01  # seconds
 _INTERNET = (socket.AF_INET, socket.AF_INET6)
@@ -36,7 +36,7 @@ _WILDCARD = ("0.0.0.0", "::")
 
 
 def open_sockets() -> dict[int, int]:
-    """Sockets of this process, inode to a file descriptor; none where the system does not tell."""
+    """Sockets of this process, inode to a file descriptor; empty where there is no /proc."""
     found = {}
     with contextlib.suppress(OSError):
         for name in os.listdir("/proc/self/fd"):
@@ -50,7 +50,7 @@ def open_sockets() -> dict[int, int]:
 class DomainSockets:
     """The sockets of one domain, restricted to what comes by its interface, or from this machine.
 
-    The domain is to be deaf at first: it must not hear what came before the filter was there.
+    The domain is to be deaf at first: it must not receive what came before the filter was set.
 
     :param before: :func:`open_sockets` before CycloneDDS made the domain.
     :raises OSError: they are not found, or the system has no such filter.
@@ -135,7 +135,7 @@ class DomainSockets:
                     sender.sendto(_EMPTY, (address, port))
 
     def _settle(self) -> None:
-        """Wait until CycloneDDS has read, deaf, what came before the filter was there.
+        """Wait until CycloneDDS has read and dropped what came before the filter was set.
 
         An empty packet goes to each socket, behind what waits there. When nothing waits any more
         it has been read, and what CycloneDDS had read before it has been thrown away.
@@ -154,9 +154,9 @@ class DomainSockets:
         )
 
     def follow(self) -> None:
-        """Look whether the interface is still the one that is heard, act upon it, and say so.
+        """Follow a change of the interface: set the filters again and log it.
 
-        To be called twice a second or so; cheap.
+        To be called about twice a second; cheap.
         """
         with self._lock:
             indices = interface_filter.accepted_indices(self.interface)
@@ -181,12 +181,17 @@ class DomainSockets:
             self._filter()
         except OSError as error:
             # the filters of before are in force, for an index that nothing has any more
-            _log.error("network interface %s is not heard any more: %s", self.interface, error)
+            _log.error(
+                "nothing is received on network interface %s any more: %s", self.interface, error
+            )
             return
         try:
             group = self._group(socket.if_nametoindex(self.interface))
         except OSError:
-            _log.error("network interface %s is gone: only this machine is heard", self.interface)
+            _log.error(
+                "network interface %s is gone: only packets of this machine are received",
+                self.interface,
+            )
             return
         # what CycloneDDS did with the interface that was there before
         for sock in filter(self._of_multicast, self._receiving):
@@ -195,7 +200,7 @@ class DomainSockets:
         for sock in self._sending:
             with contextlib.suppress(OSError):
                 sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, group)
-        _log.warning("network interface %s is back, and heard again", self.interface)
+        _log.warning("network interface %s is back, and receives again", self.interface)
 
     @contextlib.contextmanager
     def ending(self) -> Iterator[None]:
@@ -228,6 +233,6 @@ class DomainSockets:
             self._poke(loopback)
 
     def close(self) -> None:
-        """Let go of the sockets; their filters stay."""
+        """Close the duplicated sockets; their filters stay."""
         for sock in self._sockets():
             sock.close()

@@ -1,4 +1,4 @@
-"""Files that a user gives, and files that dexkit writes.
+"""Read and check files of users, and write files completely or not at all.
 
 Reading raises one typed error that names the file, whatever is wrong with it: not there, a folder,
 a device, a pipe, too large, no UTF-8, no JSON or TOML, nested without end, a key twice, a number
@@ -118,9 +118,9 @@ def parse_json(
             parse_constant=_no_number if finite else None,
             parse_float=_finite if finite else None,
             parse_int=_whole,
-            object_pairs_hook=_once,
+            object_pairs_hook=_without_duplicates,
         )
-        _shallow(document)
+        _limit_depth(document)
     except RecursionError:
         raise error(f"{origin} is not valid JSON: {_TOO_DEEP}", hint=hint) from None
     except ValueError as why:
@@ -139,7 +139,7 @@ def parse_toml(
     """
     try:
         document = tomllib.loads(text, parse_float=_finite)
-        _shallow(document)
+        _limit_depth(document)
     except RecursionError:
         raise error(f"{origin} is not valid TOML: {_TOO_DEEP}", hint=hint) from None
     except ValueError as why:
@@ -167,7 +167,7 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def _without_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
@@ -176,7 +176,7 @@ def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _shallow(document: Any) -> None:
+def _limit_depth(document: Any) -> None:
     """Refuse what is nested too deeply, or has huge numbers (TOML's parser leaves them).
 
     :raises ValueError: it is.
@@ -312,7 +312,7 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links (Python 3.10)
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise UsageError(
-            f"cannot write {path}: {why}", hint="its folder must be writable and have room"
+            f"cannot write {path}: {why}", hint="its folder must be writable and its disk not full"
         ) from error
 
 

@@ -1,6 +1,6 @@
 """Reserve a DDS domain on this machine, so that two runs that start at once do not share one.
 
-Discovery alone cannot tell: two programs that look at the same time both find the domain empty.
+Discovery alone is not enough: two programs that search at the same time both find the domain empty.
 So a domain is reserved by binding a UDP port of it that DDS never uses. The kernel gives the port
 to one process of the machine (of the network namespace) and takes it back when the process ends.
 """
@@ -24,7 +24,7 @@ _PORT = 248  # discovery of the last participant, 119 (RTPS 9.6.1.1); dexkit use
 class ReservedDomain:
     """One domain, kept from other runs of this machine until it is closed.
 
-    Programs that are told their domain do not reserve it.
+    Programs with a given domain do not reserve it.
 
     :ivar domain: its number.
     :raises OSError: another process has it.

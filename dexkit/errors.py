@@ -116,7 +116,7 @@ class HandFault(HandError):
 
 
 class HandNotFound(HandError):
-    """Nothing answers where the hand was said to be."""
+    """Nothing answers at the place that was given for the hand."""
 
 
 class HandRefused(HandError):
@@ -132,7 +132,7 @@ class WireError(DexkitError, ValueError):
 
 
 class TruncatedError(WireError):
-    """The data end before the format says they may."""
+    """The data end before the message is complete."""
 
 
 class OversizeError(WireError):
@@ -214,7 +214,7 @@ class EmulatorError(DexkitError):
 
 
 class ConformanceError(DexkitError):
-    """The kit itself cannot judge; says nothing about the hand."""
+    """The kit itself cannot judge; this is no result about the hand."""
 
     exit_code = 2
 

@@ -192,7 +192,7 @@ class _Trusted:
 
 
 def output_error(what: object, error: OSError) -> OutputError:
-    """What to raise when a file or stream cannot be written."""
+    """The error to raise when a file or stream cannot be written."""
     found = OutputError(f"cannot write {what}: {error.strerror or error}")
     if error.errno == errno.EPIPE:
         found.exit_code = 141  # as of a program that dies of SIGPIPE

@@ -68,7 +68,7 @@ Subject: TypeAlias = Side | RobotSubject
 
 
 class JointMode(IntEnum):
-    """What a joint's motor does; the RIS_Mode status values of Unitree's motors.
+    """Mode of a joint's motor: the RIS_Mode status values of Unitree's motors.
 
     (docs/sources/unitree-dex.md#b4, "Mode byte".)
     """
@@ -146,7 +146,7 @@ class JointSpec:
 
 @dataclass(frozen=True)
 class HandSpec:
-    """What a hand says of itself.
+    """The properties of a hand: model, side, joints and rates.
 
     :param model: name in :data:`dexkit.models.MODELS`, for example ``"dex1-1"``.
     :param side: which hand.
@@ -369,11 +369,11 @@ class HandState:
 
 @runtime_checkable
 class Hand(Protocol):
-    """What every backend implements. ``exchange`` is called from one thread."""
+    """The interface of every backend. ``exchange`` is called from one thread."""
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is. May be read before ``open``; ``io_rate`` may become exact in it."""
+        """The properties of this hand. May be read before ``open``, which may refine the rate."""
         ...
 
     def open(self) -> None:

@@ -45,8 +45,8 @@ ALL_INTERFACES = "DEXKIT_ALL_INTERFACES"
 """Environment variable: ``1`` goes on where the system has no such filter, open to all networks."""
 
 HINT = (
-    "this needs Linux, and a sandbox that permits SO_ATTACH_FILTER. Where nobody else is on any "
-    f"network of this machine, {ALL_INTERFACES}=1 goes on without"
+    "this needs Linux, and a sandbox that permits SO_ATTACH_FILTER. Where no other machine is on "
+    f"any network of this machine, {ALL_INTERFACES}=1 goes on without"
 )
 """What to do when the system has no such filter."""
 
@@ -63,12 +63,12 @@ _IFF_LOOPBACK = 0x8
 
 
 def all_interfaces_allowed() -> bool:
-    """Whether the user has said to go on without a filter."""
+    """Whether the user allows to run without a filter."""
     return os.environ.get(ALL_INTERFACES) == "1"
 
 
 def _ask(request: int, interface: str) -> bytes:
-    """What the kernel says of an interface; empty when there is no such one, or nothing to say."""
+    """The result of an ioctl for an interface; empty when it fails."""
     if sys.platform != "linux":
         return b""
     import fcntl

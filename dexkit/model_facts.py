@@ -1,4 +1,4 @@
-"""A model as plain data: what ``dexkit models --json`` prints and the page is made of.
+"""A model as plain data, for ``dexkit models --json`` and the page in the docs.
 
 SI units, named in the keys; what a model does not have is ``None`` or an empty list.
 
@@ -184,7 +184,7 @@ def _backends(model: str, plugins: bool) -> list[dict[str, str]]:
     ]
 
 
-# -- how they are said, in the terminal and on the page -------------------------------------
+# -- as text, in the terminal and on the page -----------------------------------------------
 
 
 def indices(values: Sequence[int]) -> str:

@@ -1,6 +1,6 @@
-"""How robots are drawn.
+"""Layout of the drawings of robots.
 
-Schematic: chosen so that the labels have room, not measured and not to scale. Lengths in px on the
+Schematic: chosen so that the labels fit, not measured and not to scale. Lengths in px on the
 sheet, y downward, relative to the middle of the neck.
 """
 

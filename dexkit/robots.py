@@ -142,7 +142,7 @@ class RobotModel:
 
 @dataclass(frozen=True)
 class _Kind:
-    """What the two joints of a pair, or one in the middle, have in common; left hand side."""
+    """Limits that the two joints of a pair share, or of one in the middle; left hand side."""
 
     q_min: float
     q_max: float
@@ -207,7 +207,7 @@ H1 = RobotModel(
     family="unitree_go",
     motor_temperatures=1,
     has_battery=True,
-    battery_cells=15,  # as many as its state has room for (docs/sources/unitree-dex.md#a2)
+    battery_cells=15,  # as many as its state has fields for (docs/sources/unitree-dex.md#a2)
     teleop_name="H1",
     requirements=("h1.toml",),
     quick_seconds=13.0,

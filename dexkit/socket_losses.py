@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["DdsSockets"]
+__all__ = ["ReceiveBuffers"]
 
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
@@ -23,8 +23,8 @@ _FD = Path("/proc/self/fd")
 _SNMP = Path("/proc/net/snmp")
 
 
-class DdsSockets:
-    """The sockets that a domain's samples come to, in this process.
+class ReceiveBuffers:
+    """The receive buffers of the sockets that a domain's samples come to, in this process.
 
     They are known by their ports (RTPS 9.6.1.1): 7400 + 250 x domain and the 250 that follow; the
     odd ones are for samples, the even ones for discovery. A domain with other port numbers has

@@ -19,7 +19,7 @@ from types import TracebackType
 __all__ = ["PREFIX", "TemporaryFolder", "sweep"]
 
 PREFIX = "dexkit-scratch-"
-"""Of their names; a folder of such a name that nobody has locked is removed."""
+"""Prefix of their names; a folder with it that no process has locked is removed."""
 
 
 class TemporaryFolder:
@@ -37,8 +37,8 @@ class TemporaryFolder:
             lock = _open(self.path)
             if lock is not None:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-                if _is(self.path, lock):
-                    break  # nobody swept it between its making and its lock
+                if _is_same_file(self.path, lock):
+                    break  # not removed by another process before it was locked
                 os.close(lock)
         self._lock = lock
 
@@ -76,7 +76,7 @@ def sweep(folder: Path | None = None) -> list[Path]:
 
 
 def _abandoned(path: Path) -> bool:
-    """Remove a folder if nobody has locked it; whether it was so."""
+    """Remove a folder if no process has locked it; whether it was removed."""
     about = path.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.geteuid():
         return False
@@ -84,7 +84,7 @@ def _abandoned(path: Path) -> bool:
     if lock is None:
         return False
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises where somebody has it
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises where another process has it
         shutil.rmtree(path, ignore_errors=True)
         return True
     finally:
@@ -99,7 +99,7 @@ def _open(path: Path) -> int | None:
         return None
 
 
-def _is(path: Path, descriptor: int) -> bool:
+def _is_same_file(path: Path, descriptor: int) -> bool:
     with contextlib.suppress(FileNotFoundError):
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     return False

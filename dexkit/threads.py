@@ -1,14 +1,14 @@
-"""Threads whose death is heard.
+"""Threads that end the program when they die.
 
 A thread of Python that dies of an exception leaves the rest of the program running: a recorder
 that records nothing, a service whose state stands still. There is one rule for every thread of
 dexkit: **one that dies ends the program, with a message and an error exit code.**
 
 :class:`Worker` is that rule. When its function raises, it logs why, keeps the exception as
-:attr:`Worker.failure`, tells its owner (``failed``), and tells everybody who asked by
+:attr:`Worker.failure`, calls its owner (``failed``), and calls all listeners of
 :func:`on_death`. :func:`~dexkit.stop_signals.stop_on_signals` asks: its request is set, so that the
 program ends in good order, as on Ctrl-C: hands brake, recordings are finished. Last of all the
-command line asks :func:`check` and exits with 1.
+command line calls :func:`check` and exits with 1.
 """
 
 from __future__ import annotations
@@ -34,8 +34,7 @@ class Worker(threading.Thread):
     """A thread that runs ``target(*args)`` once; it does not keep the process from ending.
 
     :param name: what it does, for messages: ``"the NAME thread died"``.
-    :param failed: called in the thread with the exception that ended it, before anybody else is
-        told.
+    :param failed: called in the thread with the exception that ended it, before all listeners.
 
     :ivar failure: what ended it, or None.
     """
@@ -55,14 +54,14 @@ class Worker(threading.Thread):
         self._failed = failed
 
     def run(self) -> None:
-        """What the thread does; not to be called."""
+        """Run the target; called by the thread only."""
         try:
             self._work(*self._arguments)
         except Exception as error:
             self.failure = error
-            self._tell(error)
+            self._notify(error)
 
-    def _tell(self, error: Exception) -> None:
+    def _notify(self, error: Exception) -> None:
         with _lock:
             del _dead[:-_KEPT]
             _dead.append(self)
@@ -75,11 +74,14 @@ class Worker(threading.Thread):
         if self._failed is not None:
             failed = self._failed
             owner = [lambda: failed(error)]
-        for tell in [*owner, *((lambda hear=hear: hear(self)) for hear in listeners)]:
+        for notify in [
+            *owner,
+            *((lambda listener=listener: listener(self)) for listener in listeners),
+        ]:
             try:
-                tell()
+                notify()
             except Exception:
-                _log.exception("telling of a thread that died failed")
+                _log.exception("a listener failed for a thread that died")
 
     def check(self) -> None:
         """Raise if it has died.
@@ -98,15 +100,15 @@ class Worker(threading.Thread):
 
 
 @contextlib.contextmanager
-def on_death(hear: Callable[[Worker], object]) -> Iterator[None]:
-    """Have ``hear`` called with every worker that dies meanwhile, in its thread."""
+def on_death(listener: Callable[[Worker], object]) -> Iterator[None]:
+    """Call ``listener`` with every worker that dies meanwhile, in its thread."""
     with _lock:
-        _listeners.append(hear)
+        _listeners.append(listener)
     try:
         yield
     finally:
         with _lock:
-            _listeners.remove(hear)
+            _listeners.remove(listener)
 
 
 def check() -> None:
@@ -121,6 +123,6 @@ def check() -> None:
 
 
 def forget() -> None:
-    """Begin anew: what died before is no longer told by :func:`check`."""
+    """Reset :func:`check`: workers that died before are no longer reported."""
     with _lock:
         _dead.clear()

@@ -1,4 +1,4 @@
-"""Which topic is whose: the hand topics of all dialects."""
+"""The hand topics of all dialects, with their dialect and side."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["HAND_TOPICS", "Role", "roles", "topics_of"]
 
 @dataclass(frozen=True)
 class Role:
-    """What a topic is in a dialect.
+    """The role of a topic in a dialect: state or command, and its sides.
 
     :param kind: ``"cmd"``, ``"state"`` or ``"low"`` (the low-rate copy of the state).
     :param sides: whose; both where they share it.
@@ -54,5 +54,5 @@ HAND_TOPICS = frozenset(_TABLE)
 
 
 def roles(topic: str, type_name: str | None = None) -> list[Role]:
-    """What a topic is, in each dialect that has it, of one type or any."""
+    """The roles of a topic in each dialect that has it, of one type or any."""
     return [r for r in _TABLE.get(topic, []) if type_name in (None, r.type_name)]

@@ -15,7 +15,7 @@ from tools.campaign.case import Batch, Case, Lane, Skip
 from tools.campaign.fuzz import Difference, FuzzCase, Target
 from tools.campaign.mutate import mutator
 from tools.campaign.process import Program, traceback_in
-from tools.campaign.soak import Watched
+from tools.campaign.soak import WatchedProcess
 
 CORPUS = [b"head" + bytes(12)]
 
@@ -122,10 +122,10 @@ class Leaks(_Live):
     def run(self, batch: Batch) -> None:
         program = Program(batch, ["tests.campaign_programs", "leak"])
         program.wait_for("ready:")
-        watched = Watched("leaky", program.process.pid)
+        watched = WatchedProcess("leaky", program.process.pid)
         for number in range(12):
             time.sleep(0.05)
-            watched.look(0.05 * number)
+            watched.measure(0.05 * number)
         program.end()
         for kind, text in watched.problems():
             batch.found(kind, self.name, text)

@@ -142,9 +142,9 @@ def run_command(arguments: list[str]) -> tuple[int, str, str]:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
-        told = "".join(traceback.format_exception(error)[-4:])
+        printed = "".join(traceback.format_exception(error)[-4:])
         shown = [a if len(a) < 80 else f"{a[:40]}... ({len(a)})" for a in arguments]
-        raise Crash(f"dexkit {shown!r}\n{told}") from error
+        raise Crash(f"dexkit {shown!r}\n{printed}") from error
     raise Crash("main() came back")
 
 

@@ -1,4 +1,4 @@
-"""A stranger who commands a hand: RTPS packets by hand, knowing no more than the domain.
+"""A attacker who commands a hand: RTPS packets by hand, knowing no more than the domain.
 
 Nothing is received, so nothing has to be let through to it. Its participant claims to be at
 127.0.0.1, as a process of the machine would, and its writer is best effort. As a program:
@@ -23,7 +23,7 @@ from dexkit.doctor import rtps
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
 
-__all__ = ["Stranger"]
+__all__ = ["Attacker"]
 
 _INDICES = 4  # participants of the machine that are tried
 _WRITER = bytes.fromhex("00000103")  # a writer without a key
@@ -42,7 +42,7 @@ def _locator(address: str, port: int) -> bytes:
     return struct.pack("<iI", 1, port) + bytes(12) + socket.inet_aton(address)
 
 
-class Stranger:
+class Attacker:
     """Packets of one participant with a writer for each topic.
 
     :param q: where each command wants the hand.
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--pause", type=float, default=0.02)
     parser.add_argument("--port", type=int, action="append", default=[], help="all of it here, too")
     options = parser.parse_args()
-    stranger = Stranger(options.topic or ("rt/dex1/left/cmd",))
+    attacker = Attacker(options.topic or ("rt/dex1/left/cmd",))
     ways: list[tuple[_Plain | _Forged, str]] = []
     for way in options.to:
         address, _, sender = way.partition("@")
@@ -156,7 +156,7 @@ def main() -> None:
     print("attacking", flush=True)
     sent = 0
     for number in count(1):
-        packets = stranger.round(number)
+        packets = attacker.round(number)
         for packet in dict.fromkeys(packet for packet, _ in packets):
             for port in options.port:
                 for out, address in ways:

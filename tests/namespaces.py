@@ -3,8 +3,8 @@
     with network(Link("robot", "net0", "10.9.0.1", "friend", "port0", "10.9.0.2")) as hosts:
         hosts["robot"].run("ping", "-c1", "10.9.0.2")
 
-It works for root, and for others where user namespaces are permitted. :func:`unavailable` says why
-not; a test module does ``pytest.skip(why, allow_module_level=True)`` then.
+It works for root, and for others where user namespaces are permitted. :func:`unavailable` gives the
+reason not; a test module does ``pytest.skip(why, allow_module_level=True)`` then.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ UV = find_uv_bin()  # of the dev group, wherever the tests were started from
 class Optional(NamedTuple):
     """One thing that may be missing.
 
-    :ivar name: what it is, as the line at the start says it.
+    :ivar name: what it is, for the line at the start.
     :ivar there: whether this machine has it.
     :ivar tests: files of the tests that are skipped without it, without ``test_`` and ``.py``.
     """
@@ -93,5 +93,5 @@ def header(optional: Iterable[Optional] = OPTIONAL) -> str:
     missing = [o for o in optional if not o.there()]
     if not missing:
         return "optional: everything is here, no test is skipped"
-    told = ", ".join(f"{o.name} (tests of {', '.join(o.tests)})" for o in missing)
-    return f"not on this machine, so their tests are skipped: {told}"
+    printed = ", ".join(f"{o.name} (tests of {', '.join(o.tests)})" for o in missing)
+    return f"not on this machine, so their tests are skipped: {printed}"

@@ -1,7 +1,7 @@
 """A service or bridge that is stopped in motion (SIGSTOP) and continued after its client has gone.
 
 ``python -m tests.pause_live --tries 50`` does it with every backend at the same time and prints a
-table; what moved counts as a failure. While the program stands still, the client tells the hand to
+table; what moved counts as a failure. While the program is paused, the client commands the hand to
 go back to where it came from, and leaves. What is measured is how far it goes back afterwards: a
 hand that only comes to rest does not go back at all.
 
@@ -143,7 +143,7 @@ def _serve(*arguments: object) -> Iterator[Tool]:
 
 @contextlib.contextmanager
 def _published(spoken: Dialect, domain: int) -> Iterator[Callable[[], Array]]:
-    """Where the hand says that it is."""
+    """The position that the hand reports."""
     n = len(model(spoken.model).joints[SIDE])
     with DdsNode(domain) as node:
         reader = node.reader(spoken.topics(SIDE)[1], spoken.state_type)
@@ -226,7 +226,7 @@ def stop_and_continue(
             outcome.tries.append(
                 _one(tool, hand, client_domain, stopped, leaves=number % 2 == 0, chance=chance)
             )
-            assert tool.running, f"{name} ended: {tool.last_words}"
+            assert tool.running, f"{name} ended: {tool.last_lines}"
     return outcome
 
 

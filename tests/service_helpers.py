@@ -17,7 +17,7 @@ from tests.patience import PATIENCE
 
 
 class ScriptedHand:
-    """Goes to where it is told at once; can be unplugged, made to fail, or to hang."""
+    """A hand that reaches its goal at once; can be unplugged, made to fail, or to hang."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Nothing that the tests inherit from whoever started them decides what they find.
+"""Run the tests in a fixed environment, independent of the one they are started in.
 
 A shell leaves signals ignored (``nohup``, a job in the background of a script), a language, a time
 zone, a width of its terminal, a mask for new files, and what is in the home directory.
@@ -70,7 +70,7 @@ def _signals() -> None:
         if number == signal.SIGINT:
             signal.signal(number, signal.default_int_handler)
         elif number == signal.SIGHUP:
-            # whoever says nohup wants the run to survive the terminal, and it does
+            # a run under nohup survives its terminal
             signal.signal(number, lambda *_: None)
         else:
             signal.signal(number, signal.SIG_DFL)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.bridge.core import PATIENCE, SILENT, Commands, Outgoing, States
-from dexkit.bridge.translate import Part, Reachable, translator
+from dexkit.bridge.translate import PartCodec, Reachable, translator
 from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.models import DEX1_1, Dialect, dialect
@@ -61,7 +61,7 @@ def near(value: float) -> Any:
 def on_wire(spoken: Dialect, kind: str, part: Any) -> Any:
     """A part as it comes out of the message it was sent in."""
     side = LEFT
-    codec = Part(spoken, kind)
+    codec = PartCodec(spoken, kind)
     message = codec.type.decode(codec.type.encode(codec.put({side: part})))
     return codec.take(message, side)
 
@@ -143,7 +143,7 @@ class TestTranslation:
         state = unitree_go.MotorState_(q=value, dq=value, ddq=value, tau_est=value)
         for kind, part in (("cmd", command), ("state", state)):
             there = on_wire(HG, kind, translator(GO, HG, kind)(part))
-            assert Part(HG, kind).is_finite(there)
+            assert PartCodec(HG, kind).is_finite(there)
 
 
 def near_all(state: unitree_go.MotorState_) -> tuple[Any, ...]:
@@ -177,7 +177,7 @@ class Wire:
     def _messages(
         spoken: Dialect, kind: str, sides: tuple[Side, ...], q: float, fields: dict[str, Any]
     ) -> list[tuple[str, bytes]]:
-        codec = Part(spoken, kind)
+        codec = PartCodec(spoken, kind)
         motor = unitree_go.MotorCmd_ if kind == "cmd" else unitree_go.MotorState_
         parts = {}
         for side in sides:
@@ -201,7 +201,7 @@ class Wire:
 
 def q_of(spoken: Dialect, kind: str, out: list[Outgoing]) -> dict[Side, Any]:
     """The q, of 0 .. 5.4, of each side in the newest messages."""
-    codec, found = Part(spoken, kind), {}
+    codec, found = PartCodec(spoken, kind), {}
     for message in out:
         for side in Side:
             if spoken.topics(side)[0 if kind == "cmd" else 1] == message.topic:
@@ -244,7 +244,7 @@ class TestEveryPair:
         self, client: Dialect, gripper: Dialect, field: str, bad: float
     ) -> None:
         wire = Wire(client, gripper)
-        codec = Part(client, "cmd")
+        codec = PartCodec(client, "cmd")
         for side in Side:
             good = translator(GO, client, "cmd")(unitree_go.MotorCmd_(q=1.0))
             setattr(codec.motor(good), field, bad)
@@ -260,7 +260,7 @@ class TestEveryPair:
         wire = Wire(client, gripper)
         topic = client.topics(LEFT)[0]
         assert wire.commands.receive(topic, b"junk", wire.now) == []
-        empty = Part(client, "cmd").type
+        empty = PartCodec(client, "cmd").type
         assert wire.commands.receive(topic, empty.encode(empty.cls()), wire.now) == []
         counts = wire.commands.counts
         assert (counts.received, counts.undecodable) == (2, 1)
@@ -471,7 +471,7 @@ class TestOneMessageIntoTwoTopics:
         wire = Wire(GO, ACTUATOR)
         assert set(q_of(GO, "state", wire.state(LEFT))) == {LEFT}
         assert wire.states.counts.blank == 1
-        # it may be commanded all the same: nobody is there to obey
+        # it may be commanded all the same: there is no gripper
         assert len(wire.command(LEFT) + wire.later(PATIENCE)) == 1
 
     def test_gripper_at_zero_is_present_after_another_position(self) -> None:
@@ -482,7 +482,7 @@ class TestOneMessageIntoTwoTopics:
     def test_one_side_of_both(self) -> None:
         wire = Wire(GO, ACTUATOR, (RIGHT,))
         assert set(q_of(GO, "state", wire.state(*BOTH))) == {RIGHT}
-        (right, left) = motors(wire.command(RIGHT, q=1.5, kp=5.0))  # waits for nobody
+        (right, left) = motors(wire.command(RIGHT, q=1.5, kp=5.0))  # does not wait
         assert (right.q, right.kp) == (3.0, 5.0)
         assert (left.q, left.kp) == (1.0, 0.0)  # where it was seen
         assert wire.commands.inputs == {"rt/dex1/right/cmd": (RIGHT,)}

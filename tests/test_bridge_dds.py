@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from dexkit.bridge import Bridge, End
-from dexkit.bridge.translate import Part, translator
+from dexkit.bridge import Bridge, BridgeEnd
+from dexkit.bridge.translate import PartCodec, translator
 from dexkit.cli import cli
 from dexkit.dds import DdsNode
 from dexkit.errors import TopicConflict, UsageError
@@ -34,7 +34,7 @@ class Client:
 
     def __init__(self, node: DdsNode, spoken: Dialect) -> None:
         self._spoken = spoken
-        self._cmd, self._state = Part(spoken, "cmd"), Part(spoken, "state")
+        self._cmd, self._state = PartCodec(spoken, "cmd"), PartCodec(spoken, "state")
         self._translate = translator(GO, spoken, "cmd")
         topics = {s: spoken.topics(s) for s in Side}
         self._writers = {
@@ -135,7 +135,7 @@ def test_a_client_drives_grippers_of_another_dialect(
 
 def test_other_publishers_are_refused(dds_domain: int, dds_node: DdsNode) -> None:
     with DdsNode(dds_domain) as other:
-        bridge = Bridge(End(other, ACTUATOR), End(other, GO))
+        bridge = Bridge(BridgeEnd(other, ACTUATOR), BridgeEnd(other, GO))
         for taken, kind in (
             (ACTUATOR.state_topic, ACTUATOR.state_type),
             (GO.topics(LEFT)[0], GO.cmd_type),
@@ -145,11 +145,11 @@ def test_other_publishers_are_refused(dds_domain: int, dds_node: DdsNode) -> Non
                 pytest.raises(TopicConflict, match=f"already publishes {taken}"),
             ):
                 bridge.start()
-            wait_until(lambda: bridge.others() is None)  # that its end is known, too
-        # the other way round that would be a client: nobody is in the way
+            wait_until(lambda: bridge.rival() is None)  # that its end is known, too
+        # the other way round that would be a client, which is no rival
         with (
             dds_node.writer(GO.topics(LEFT)[0], GO.cmd_type),
-            Bridge(End(other, GO), End(other, ACTUATOR)),
+            Bridge(BridgeEnd(other, GO), BridgeEnd(other, ACTUATOR)),
         ):
             pass
 
@@ -157,7 +157,7 @@ def test_other_publishers_are_refused(dds_domain: int, dds_node: DdsNode) -> Non
 def test_bridge_in_the_opposite_direction_is_refused_and_ends_the_first(dds_domain: int) -> None:
     with bridging(ACTUATOR, GO, "--domain", dds_domain) as bridge, DdsNode(dds_domain) as node:
         bridge.ready()
-        back = End(node, GO), End(node, ACTUATOR)
+        back = BridgeEnd(node, GO), BridgeEnd(node, ACTUATOR)
         with pytest.raises(TopicConflict, match="answer each other"):
             Bridge(*back).start()
         with Bridge(*back, force=True):
@@ -201,20 +201,20 @@ def test_bridge_ends_after_its_duration(dds_domain: int) -> None:
 
 def test_bridge_between_equal_ends_is_refused(dds_node: DdsNode) -> None:
     with pytest.raises(UsageError, match="would answer itself"):
-        Bridge(End(dds_node, GO), End(dds_node, GO))
+        Bridge(BridgeEnd(dds_node, GO), BridgeEnd(dds_node, GO))
     with pytest.raises(UsageError, match="of a dex3-1"):
-        Bridge(End(dds_node, GO), End(dds_node, dialect("dex3")))
+        Bridge(BridgeEnd(dds_node, GO), BridgeEnd(dds_node, dialect("dex3")))
     with pytest.raises(UsageError, match="grippers are bridged"):
-        Bridge(*(End(dds_node, dialect("dex3")),) * 2)
+        Bridge(*(BridgeEnd(dds_node, dialect("dex3")),) * 2)
 
 
 def test_bridge_can_be_used_from_python(dds_node: DdsNode) -> None:
-    client, gripper = End(dds_node, ACTUATOR), End(dds_node, GO)
+    client, gripper = BridgeEnd(dds_node, ACTUATOR), BridgeEnd(dds_node, GO)
     with Bridge(client, gripper, sides=[RIGHT]) as bridge:
         assert (bridge.clients, bridge.grippers) == (0, 0)
         with DdsNode(dds_node.domain) as other:
             with pytest.raises(TopicConflict, match="already publishes"):
-                Bridge(End(other, ACTUATOR), End(other, GO)).start()
+                Bridge(BridgeEnd(other, ACTUATOR), BridgeEnd(other, GO)).start()
             states = other.reader(ACTUATOR.state_topic, ACTUATOR.state_type)
             hand = other.writer(GO.topics(RIGHT)[1], GO.state_type)
             assert hand.wait_matched(60)

@@ -20,7 +20,7 @@ from dexkit.errors import UsageError
 from tools.campaign.case import ROOT, Finding
 from tools.campaign.mutate import mutator
 from tools.campaign.process import traceback_in
-from tools.campaign.soak import Watched, slope
+from tools.campaign.soak import WatchedProcess, slope
 from tools.campaign.state import State
 
 PLANTED = {
@@ -132,10 +132,10 @@ def test_a_finding_is_kept_once_with_its_input(tmp_path: Path) -> None:
     assert not state.add(Finding("fuzz:x", "ValueError", "a.py:f", "second", "5", 9, 9, "11"))
     assert state.add(Finding("fuzz:x", "ValueError", "a.py:g"))
     assert (tmp_path / "findings" / f"{one.id}.bin").read_bytes() == b"\x00\xff"
-    state.of("fuzz:x").units = 12
+    state.progress_of("fuzz:x").units = 12
     state.save()
     again = State.load(tmp_path, None, fresh=False)
-    assert (again.seed, again.of("fuzz:x").units) == ("5", 12)
+    assert (again.seed, again.progress_of("fuzz:x").units) == ("5", 12)
     assert again.findings == state.findings
     assert again.times[one.id] == 2
     assert not State.load(tmp_path, "6", fresh=True).findings
@@ -161,7 +161,7 @@ def test_a_traceback_is_seen_in_a_log_and_a_message_is_not() -> None:
 
 
 def test_growth_of_memory_and_descriptors_is_distinguished_from_noise() -> None:
-    steady, leaky, files = (Watched(name, 0) for name in ("steady", "leaky", "files"))
+    steady, leaky, files = (WatchedProcess(name, 0) for name in ("steady", "leaky", "files"))
     for number in range(360):
         for one, memory, descriptors in (
             (steady, 45.0 + number % 3 * 0.1, 9 + number % 2),

@@ -26,7 +26,7 @@ def test_good_recording_passes(name: str, capsys: pytest.CaptureFixture[str]) ->
     assert check(sample_path(name)) == 0
     out = capsys.readouterr().out
     assert "PASS: every MUST that could be judged is met" in out
-    assert "(-v says why)" in out
+    assert "(-v shows why)" in out
 
 
 def test_recording_with_a_dropout_fails_with_an_explanation(

@@ -112,7 +112,7 @@ def test_real_clock_is_the_monotonic_clock() -> None:
 
 @pytest.mark.realtime
 def test_a_real_rate_does_not_drift() -> None:
-    """No deadline is early, and each is where the first says, however late the machine is."""
+    """No deadline is early, and each follows from the first, however late the machine is."""
     rate = Rate(500.0, spin=100e-6)
     first = rate.deadline
     while rate.loops + rate.misses < 50:

@@ -17,9 +17,9 @@ from dexkit.command_age import (
     PAUSE,
     QUIET,
     SETTLE,
-    Ages,
     PauseWatch,
-    Promptly,
+    SampleAges,
+    WriteDeadline,
 )
 from dexkit.errors import HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
@@ -58,19 +58,19 @@ class TestPauseWatch:
         watch.restart()
         assert watch.measure_pause() == 0.0
 
-    def test_the_real_clock_goes_on_in_suspend(self) -> None:
+    def test_real_clock_advances_during_suspend(self) -> None:
         clock = RealClock()
         assert clock.since_boot() >= clock.now() - 0.1
 
 
-def test_what_takes_too_long_is_not_written() -> None:
+def test_late_command_is_not_written() -> None:
     clock = ManualClock()
-    promptly = Promptly(clock)
+    deadline = WriteDeadline(clock)
     clock.advance(PAUSE)
-    promptly.check()
+    deadline.check()
     clock.suspend(0.01)
-    with pytest.raises(HandTimeout, match="stood still"):
-        promptly.check()
+    with pytest.raises(HandTimeout, match="was paused"):
+        deadline.check()
 
 
 # -- a program and its clients in virtual time ------------------------------------------------
@@ -129,7 +129,7 @@ class Program:
         spec = DEX1_1.spec(Side.LEFT, io_rate=1 / STEP, simulated=True)
         self.core = HandCore(spec, DEX1_1, self.clock)
         self.core.opened(spec)
-        self.ages = Ages()
+        self.ages = SampleAges()
         self.receiving, self.exchanging = PauseWatch(self.clock), PauseWatch(self.clock)
         self.commands: list[Sent] = []
         self.driven: list[tuple[float, Sent]] = []  # what each exchange sent, and when
@@ -244,7 +244,7 @@ def clients(draw: st.DrawFn, begin: float, end: float) -> Client:
     spells.append((period, draw(st.floats(begin, end)), draw(st.floats(begin, end))))
     if draw(st.booleans()):
         spells.append((period, end + draw(st.floats(0.0, 0.5)), end + 2.0))
-    # A clock that jumps while samples are stuck, or that says nothing, tells nothing of them:
+    # A clock that jumps while samples are stuck, or that is not usable, shows nothing about them:
     # then the socket must have been emptied in time.
     blind = bool(jumps) or kind in ("constant", "none")
     return Client(
@@ -282,7 +282,7 @@ def test_nothing_sent_before_a_pause_ends_moves_the_hand_after_it(data: st.DataO
     suspended=st.booleans(),
 )
 @settings(max_examples=15)
-def test_a_steady_client_is_obeyed_again_after_a_fifth_of_a_second(
+def test_steady_client_is_obeyed_0_2_s_after_a_pause(
     offset: float, drift: float, latency: float, pause: float, rate: float, suspended: bool
 ) -> None:
     begin, end = 1.5, 1.5 + pause
@@ -311,8 +311,8 @@ def test_a_steady_client_is_obeyed_again_after_a_fifth_of_a_second(
     ],
     ids=["normal", "coarse", "constant", "none"],
 )
-def test_a_client_that_comes_after_a_pause(source: Source, most: float) -> None:
-    """It was never heard before: by its pace, or when the socket has long been emptied."""
+def test_new_client_after_a_pause_is_obeyed(source: Source, most: float) -> None:
+    """It was not received before: by its pace, or when the socket has long been emptied."""
     program = Program()
     sent = stream(1, source, every(0.005, 4.1, 6.0), lambda i: 0.001)
     program.run(sent, 6.0, [(1.0, 4.0, False)])
@@ -320,7 +320,7 @@ def test_a_client_that_comes_after_a_pause(source: Source, most: float) -> None:
     assert begin + most <= program.driven[0][0] < begin + most + 0.1
 
 
-def test_a_single_command_after_a_pause_counts_where_that_can_be_told() -> None:
+def test_single_command_after_a_pause_is_obeyed_if_its_age_is_known() -> None:
     def after(at: float, *, known: bool) -> bool:
         before = every(0.01, 0.5, 1.0) if known else []
         program = Program()
@@ -346,7 +346,7 @@ def test_a_single_command_after_a_pause_counts_where_that_can_be_told() -> None:
     lags=st.lists(st.tuples(st.floats(1.0, 5.0), st.floats(0.0, 2.5)), min_size=1, max_size=4),
 )
 @settings(max_examples=15)
-def test_a_command_that_comes_late_does_not_count(
+def test_late_command_is_not_obeyed(
     offset: float, drift: float, least: float, lags: list[tuple[float, float]]
 ) -> None:
     """A network that lags, or CycloneDDS's receiving thread alone that stood still."""
@@ -369,7 +369,7 @@ def test_a_command_that_comes_late_does_not_count(
     assert program.core.counters.accepted == len(sent) - stale >= in_time
 
 
-def test_a_network_that_has_become_slow_is_not_obeyed_and_is_again_when_it_is_fast() -> None:
+def test_commands_over_a_slow_network_are_ignored_until_it_is_fast_again() -> None:
     program = Program()
     slow = stream(
         1,
@@ -384,7 +384,7 @@ def test_a_network_that_has_become_slow_is_not_obeyed_and_is_again_when_it_is_fa
 
 
 @each("size", [-7200.0, -5.0, -0.4, -0.1, 0.1, 0.4, 5.0, 7200.0])
-def test_a_client_whose_clock_is_set_goes_on(size: float) -> None:
+def test_client_whose_clock_is_set_is_obeyed(size: float) -> None:
     program = Program()
     source = Source(12.0, jumps=((2.0, size),))
     program.run(stream(1, source, every(0.005, 0.5, 4.0), lambda i: 0.001), 4.0)
@@ -403,15 +403,15 @@ def test_client_with_a_jumping_clock_is_obeyed_again() -> None:
 
 @pytest.mark.parametrize("drift", [-0.5, 3.0], ids=["slow", "fast"])
 def test_client_with_a_drifting_clock_is_obeyed(drift: float) -> None:
-    """Timestamps in other units, say: obeyed at least after a time that no network lags."""
+    """Timestamps in other units, for example: obeyed at least after a time that no network lags."""
     program = Program()
     program.run(stream(1, Source(drift=drift), every(0.1, 0.5, 40.0), lambda i: 0.001), 40.0)
     assert max(t - s.at for t, s in program.driven if t > 38.0) < 0.13
 
 
-def test_a_drifting_clock_is_followed_for_hours() -> None:
+def test_clock_drift_is_compensated_for_hours() -> None:
     for drift in (-DRIFT, DRIFT):
-        ages = Ages()
+        ages = SampleAges()
         source = Source(5.0, drift)
         for i in range(20_000):
             at = i * 0.5
@@ -423,17 +423,17 @@ class TestLongSilence:
 
     @staticmethod
     def ages(source: Source, times: list[float], late: dict[float, float]) -> list[float]:
-        ages = Ages()
+        ages = SampleAges()
         for i in range(100):
             ages.age(1, source.stamp(i * 0.01), i * 0.01 + 0.001)
         return [ages.age(1, source.stamp(t), t + late.get(t, 0.001)) for t in times]
 
-    def test_its_next_command_counts_at_once(self) -> None:
+    def test_next_command_after_a_client_pause_is_obeyed(self) -> None:
         for drift in (-DRIFT, 0.0, DRIFT):
             (age,) = self.ages(Source(9.0, drift), [3600.0], {})
             assert age <= 1e-3
 
-    def test_what_a_suspended_client_had_sent_before_does_not(self) -> None:
+    def test_commands_sent_before_a_client_suspend_are_not_obeyed(self) -> None:
         """Its machine wakes up after an hour and sends what it still has, then goes on."""
         old = [1.0, 1.01, 1.02]
         new = every(0.01, 3600.0, 3601.0)
@@ -447,8 +447,8 @@ class TestLongSilence:
         assert ages[0] == math.inf
         assert ages[-1] < 0.01
 
-    def test_after_a_pause_it_must_be_confirmed_anew(self) -> None:
-        ages, source = Ages(), Source(9.0)
+    def test_baseline_is_confirmed_again_after_a_pause(self) -> None:
+        ages, source = SampleAges(), Source(9.0)
         for i in range(100):
             ages.age(1, source.stamp(i * 0.01), i * 0.01)
         ages.resumed(2.0 + FORGET)
@@ -457,8 +457,8 @@ class TestLongSilence:
         assert ages.age(1, source.stamp(at + SETTLE), at + SETTLE) < 0.01
 
 
-def test_writers_that_come_and_go_are_not_kept() -> None:
-    ages = Ages()
+def test_old_writers_are_forgotten() -> None:
+    ages = SampleAges()
     for number in range(10_000):
         ages.age(number, Source().stamp(1.0), 1.0)
     assert len(ages._writers) <= 64

@@ -148,7 +148,7 @@ def test_discovery_reports_process_topic_type_and_qos(dds_node: DdsNode) -> None
         assert found["reader", CMDS, False].qos == Qos("reliable", "transient_local", None)
         assert found["reader", STATES, True].qos == Qos("best_effort", "volatile", 7)
         assert len({e.participant for e in found.values()}) == 2
-        # same process: the other node says who it is
+        # same process: the other node announces its process
         assert f"(pid {__import__('os').getpid()})" in found["writer", STATES, False].process
         assert mine.wait_matched(60)
         assert mine.matched == 1  # the reader of another type is not a match

@@ -1,7 +1,7 @@
 """dexkit's codec against CycloneDDS's own serialisation, byte for byte.
 
 Two references: the classes that dexkit makes for CycloneDDS from its layouts, and those of
-Unitree's SDK, which somebody else wrote.
+Unitree's SDK, which is independent code.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def test_two_threads_may_be_the_first_to_use_a_type() -> None:
 
 @pytest.mark.skipif("sdk" not in REFERENCES, reason="needs the unitree-sdk2 package")
 @pytest.mark.parametrize("name", NAMES)
-def test_the_sdk_describes_the_same_type(name: str) -> None:
+def test_unitree_sdk_announces_the_same_type(name: str) -> None:
     description = sdk_class(name).__idl__
     description.populate()
     description.fill_type_data()

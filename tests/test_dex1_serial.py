@@ -185,7 +185,7 @@ def test_missing_motor_error_lists_what_was_tried(tmp_path: Path) -> None:
         with pytest.raises(HandNotFound):
             Dex1Serial(Side.RIGHT, Dex1Settings(device=motors.path, id=7, timeout=0.02)).open()
         with Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, id=0, timeout=TIMEOUT)):
-            pass  # who says so knows better
+            pass  # the user may allow it
         motors.inject("stray:before=3")
         wait_for(lambda: motors.bus(Side.RIGHT).schedule.active)
         with Dex1Serial(Side.RIGHT, Dex1Settings(device=motors.path, timeout=TIMEOUT)) as hand:
@@ -408,7 +408,7 @@ def test_motor_stops_after_the_driver_is_killed() -> None:
         driver.communicate()
         wait_for(lambda: motors.motor.tripped, 3.0)
         wait_for(lambda: motors.motor.mechanics.joint.dq == 0.0)
-        with opened(motors) as hand:  # and whoever comes next can drive
+        with opened(motors) as hand:  # and the next driver works
             drive(hand, OPEN, moving)
 
 
@@ -458,14 +458,14 @@ def test_both_hands_recover_a_lost_shared_line() -> None:
 
 
 def test_close_of_a_lost_hand_reports_it(caplog: pytest.LogCaptureFixture) -> None:
-    for protect, says in ((True, "stops by itself"), (False, "cut its power")):
+    for protect, expected in ((True, "stops by itself"), (False, "cut its power")):
         with Dex1Motors() as motors:
             hand = Dex1Serial(
                 Side.LEFT, Dex1Settings(device=motors.path, timeout=TIMEOUT, protect=protect)
             )
             hand.open()
         hand.close()
-        assert says in caplog.text
+        assert expected in caplog.text
 
 
 # --- calibrating
@@ -484,7 +484,7 @@ def test_calibration_makes_closed_the_zero_once() -> None:
 
 
 def test_calibration_without_an_answer_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The vendor's library says "successful" (docs/sources/unitree-dex.md#g)."""
+    """The vendor's library reports "successful" (docs/sources/unitree-dex.md#g)."""
     monkeypatch.setattr("dexkit.drivers.dex1_serial.hand._FLASH_TIME", 0.05)
     with Dex1Motors() as motors, opened(motors) as hand:
         motors.inject("silent:for=100ms")
@@ -606,14 +606,14 @@ def test_calibration_on_the_command_line() -> None:
 
 
 @each(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
-        (["dex1-serial"], "say which hand"),
+        (["dex1-serial"], "no hand is given"),
         (["dex1-serial", "--side", "left", "--speed"], "--speed means nothing for dex1-serial"),
         (["ezgripper", "--side", "left"], "--side means nothing for ezgripper"),
     ],
 )
-def test_options_of_the_other_gripper_are_refused(arguments: list[str], says: str) -> None:
+def test_options_of_the_other_gripper_are_refused(arguments: list[str], expected: str) -> None:
     error, said = calibrate(*arguments)
     assert isinstance(error, UsageError)
-    assert says in said
+    assert expected in said

@@ -117,7 +117,7 @@ class TestAddress:
 
     @given(st.text(max_size=30))
     @settings(max_examples=100, deadline=None)
-    def test_any_text_is_an_address_or_refused(self, text: str) -> None:
+    def test_any_text_is_parsed_as_an_address_or_refused(self, text: str) -> None:
         for attempt in (text, "usbip://" + text):
             try:
                 server, _ = parse_server(attempt)
@@ -201,15 +201,17 @@ class TestSettings:
             backend.create(self.options(device, **settings))
 
     @each(
-        ("name", "text", "says"),
+        ("name", "text", "expected"),
         [
             ("motors", "0.0", "motors: the hand has 7, here are 1"),
             ("sensors", "0.0,0.1", "sensors: the hand has 9, here are 2"),
             ("head", "fe", "head is two bytes"),
         ],
     )
-    def test_refused_setting_is_named_with_a_hint(self, name: str, text: str, says: str) -> None:
-        with pytest.raises(UsageError, match=says) as caught:
+    def test_refused_setting_is_named_with_a_hint(
+        self, name: str, text: str, expected: str
+    ) -> None:
+        with pytest.raises(UsageError, match=expected) as caught:
             backend.create(self.options(**{name: text}))
         assert caught.value.hint
 
@@ -272,7 +274,7 @@ class TestDiscovery:
         with serving(right) as server:
             with pytest.raises(HandNotFound, match=r"34b7:1010.*there is the right"):
                 hand_on(server).open()
-            assert not right.attachments  # somebody may be about to take it
+            assert not right.attachments  # another program may be about to open it
             with pytest.raises(HandNotFound, match=r"X9.*there is the right hand R7"):
                 hand_on(server, serial="X9").open()
 
@@ -456,7 +458,9 @@ class TestOpening:
             hand_on(server).open()
 
     @pytest.mark.parametrize("number", [errno.ENODEV, errno.EIO, errno.ENOENT])
-    def test_gone_while_it_is_opened(self, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_device_lost_during_open_is_reported(
+        self, number: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fake = FakeBackend(FakeHand())
         fake.fail["claim_interface"] = usb_error(number)
         with pytest.raises(HandLost):
@@ -469,7 +473,7 @@ class TestOpening:
         with fake_hand(fake, monkeypatch) as hand:
             hand.exchange(GO)
 
-    def test_no_serial_number_is_no_obstacle(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_serial_number_is_accepted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         fake.fail["ctrl_transfer"] = usb_error(errno.EPIPE)
         with fake_hand(fake, monkeypatch) as hand:
@@ -872,12 +876,12 @@ class TestTroubleOnTheWay:
         assert {m.status for _, m in parse_command(received[-1]).motors} == {0}
 
     @pytest.mark.parametrize(
-        ("protect", "says"), [(True, "within a second"), (False, "cut their power")]
+        ("protect", "expected"), [(True, "within a second"), (False, "cut their power")]
     )
-    def test_motors_that_could_not_be_braked_are_said(
+    def test_motors_that_could_not_be_braked_are_reported(
         self,
         protect: bool,
-        says: str,
+        expected: str,
         monkeypatch: pytest.MonkeyPatch,
         caplog: pytest.LogCaptureFixture,
     ) -> None:
@@ -888,7 +892,7 @@ class TestTroubleOnTheWay:
         fake.fail["bulk_write"] = usb_error(errno.ENODEV)
         hand.close()
         assert "could not brake" in caplog.text
-        assert says in caplog.text
+        assert expected in caplog.text
 
     def test_closing_a_hand_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
@@ -1008,7 +1012,7 @@ class TestUsbIpClient:
         server.sendall(self.reply(1) + self.reply(2, b"late") + self.reply(3, command=4))
         server.sendall(self.reply(4, command=4) + self.reply(5) + self.reply(6, b"right"))
         assert self.exchange(connection, 2000) == (0, 0, b"right")
-        assert connection.passed_over == 1  # the link behind it is told
+        assert connection.passed_over == 1  # the link behind it is informed
         connection.close()
         server.close()
 

@@ -86,7 +86,7 @@ def test_both_hands_reach_their_goals(process: bool) -> None:
 
 
 def test_the_units_are_right_on_both_ends() -> None:
-    """What the motors are told and what the driver reads are the mechanics's own values."""
+    """Commands to the motors and states that the driver reads are the mechanics's own values."""
     with emulated_dex3() as emulated:
         assert isinstance(emulated, Dex3Hands)
         mechanics = emulated.device().mechanics
@@ -146,7 +146,7 @@ class TestFaults:
             assert not (state.fault & ~np.uint32(LOST | TRIPPED)).any()
 
     @pytest.mark.parametrize("fault", ["stall", "stall-out"])
-    def test_a_stall_is_cleared(self, fault: str) -> None:
+    def test_stalled_endpoint_is_cleared_by_the_driver(self, fault: str) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject(fault)
             drive(hand, go(GOAL[Side.LEFT]), lambda s: hand.statistics.link.stalls == 1)
@@ -208,7 +208,7 @@ for count in range(10**9):
             process.stdout.close()
             wait_until(lambda: all(device.tripped), what="the motors to stop")
             assert time.monotonic() - killed > 0.9
-            # whoever comes next finds a hand that works
+            # the next driver works
             with hand_at(emulated.url) as hand:
                 assert not hand.exchange(HandCommand.brake(7)).fault.any()
 
@@ -306,7 +306,7 @@ class TestService:
                 wait_until(lambda: core.driving)
                 assert core.counters.reconnects == 1
 
-    def test_attempts_to_reopen_keep_coming(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_attempts_to_reopen_continue(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """After a long absence too, a hand is looked for every half second."""
         pauses: list[float] = []
 

@@ -126,7 +126,7 @@ def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
         client.goal = 0.5 * GOAL
         client.until(lambda s: np.abs(q_of(s) - 0.5 * GOAL).max() < 0.05)  # a new one does
 
-        # what USB does not tell, an attitude for one, is 0, with the hand and without; never NaN
+        # what USB does not carry, an attitude for one, is 0, with the hand and without; never NaN
         for state in (rest, gone, still):
             assert all(map(math.isfinite, numbers(state)))
             assert tuple(state.imu_state.quaternion) == (0.0,) * 4

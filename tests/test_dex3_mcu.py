@@ -163,7 +163,7 @@ def test_hand_at_rest_reports_its_initial_state() -> None:
     assert np.nanmax(state.pressure) == 0.0
 
 
-def test_sensors_feel_an_object() -> None:
+def test_sensors_measure_an_object() -> None:
     bench = Bench(object_at=40.0)
     closed = [j.q_max if j.closing > 0 else j.q_min for j in DEX3_1.joints[Side.LEFT]]
     closed[0] = 0.0
@@ -310,7 +310,7 @@ _GOOD = HandCodec(DEX3_1.joints[Side.LEFT]).encode(
         st.integers(0, 1233).map(lambda n: _GOOD[:n]),
     )
 )
-def test_any_input_is_survived_and_bad_input_moves_no_motor(data: bytes) -> None:
+def test_invalid_input_moves_no_motor(data: bytes) -> None:
     bench = Bench()
     assert bench.mcu.exchange(data) is not None
     bench.clock.advance(0.02)
@@ -512,7 +512,7 @@ def test_corrupted_answers_have_one_bit_flipped() -> None:
     assert bench.mcu.counters.corrupted == 1
 
 
-def test_delayed_answers_say_by_how_much() -> None:
+def test_delayed_answers_carry_their_delay() -> None:
     bench = Bench(faults=["delay:ms=30,for=1s"], firmware=Firmware(answer_time=0.001))
     bench.mcu.exchange(empty())
     assert bench.mcu.late == pytest.approx(0.031)

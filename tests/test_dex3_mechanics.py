@@ -267,7 +267,7 @@ def elements(mechanics: Dex3Mechanics) -> dict[str, bool]:
     }
 
 
-def test_33_elements_feel_nothing_without_an_object() -> None:
+def test_no_pressure_without_an_object() -> None:
     mechanics = Dex3Mechanics(Side.RIGHT)
     close_to(mechanics, 90)
     live(mechanics, 1.0)
@@ -294,7 +294,7 @@ def test_33_elements_feel_nothing_without_an_object() -> None:
         (INDEX_1, "index tip"),
     ],
 )
-def test_only_the_link_that_touches_feels_it(side: Side, joint: int, place: str) -> None:
+def test_only_the_touching_link_has_pressure(side: Side, joint: int, place: str) -> None:
     mechanics = Dex3Mechanics(side, object_at=50)
     mechanics.command(joint, 1, goal(mechanics, joint, 70), kp=KP, kd=KD)
     live(mechanics, 1.0)
@@ -319,7 +319,7 @@ def test_a_strong_grip_presses_the_object_into_the_palm() -> None:
     )
 
 
-def test_no_more_than_2500_g_is_felt_on_an_element() -> None:
+def test_pressure_is_limited_to_2500_g_an_element() -> None:
     mechanics = Dex3Mechanics(Side.LEFT, object_at=50)
     mechanics.joints[THUMB_2].locked = True
     mechanics.joints[THUMB_2].q = 1.7  # squeezed far beyond what the motor can do
@@ -371,7 +371,7 @@ def test_supply_current() -> None:
     assert mechanics.supply.power_a == mechanics.current
 
 
-def test_the_imu_feels_gravity() -> None:
+def test_imu_measures_gravity() -> None:
     assert Dex3Mechanics(Side.LEFT).imu.accelerometer == (0.0, 0.0, 9.81)
 
 

@@ -77,7 +77,7 @@ MOTOR = d.MotorState(0, 1, False, 30, 40, 48, 0, 0, 11000)
 SENSOR = d.SensorState(1, 0, tuple(range(1000, 1012)), (25,) * 12)
 
 
-def test_packets_of_the_fact_sheet() -> None:
+def test_packets_equal_the_documented_ones() -> None:
     # docs/sources/unitree-dex.md#c10
     motor = bytes.fromhex("fcee101e283000000000f82a0000000000000000000044998d9c")
     sensor = bytes.fromhex(
@@ -258,7 +258,7 @@ def test_one_damaged_packet_is_lost_alone(packets: list[Any], data: st.DataObjec
     assert problems[0].offset == sum(map(len, parts[:which]))
 
 
-def test_a_wrong_crc_is_one_problem_and_says_where() -> None:
+def test_wrong_crc_is_one_problem_with_its_place() -> None:
     bad = bytearray(MOTOR.pack())
     bad[12] ^= 0x80
     found, problems = d.parse_bus(SENSOR.pack() + bytes(bad) + bytes(bad) + MOTOR.pack())

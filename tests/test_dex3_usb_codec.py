@@ -43,7 +43,7 @@ scales = st.sampled_from(d.SCALES)
 # --- units
 
 
-def test_factors_of_the_fact_sheet() -> None:
+def test_factors_equal_the_documented_ones() -> None:
     # docs/sources/unitree-dex.md#c9, "Combined"
     for scale, direct, geared in (
         (units.POSITION, 563240.4, 1116050.5),
@@ -56,7 +56,7 @@ def test_factors_of_the_fact_sheet() -> None:
         assert scale.factor(214) == pytest.approx(geared, rel=2e-5)
 
 
-def test_figures_of_the_fact_sheet() -> None:
+def test_figures_equal_the_documented_ones() -> None:
     # docs/sources/unitree-dex.md#c6, docs/sources/unitree-dex.md#c9: 24 V and 58 V, full scales;
     # 0.76 N m of a joint
     assert round(24 * units.VOLTAGE.factor()) == 22696
@@ -349,7 +349,7 @@ def test_a_tripped_motor() -> None:
         data = codec.encode_state(a_state(fault=fault))
         assert [m.timeout for _, m in d.parse_state(data).motors] == [bool(f) for f in fault]
         assert codec.decode(data, 0.0).fault.tolist() == fault.tolist()
-    # the bit alone says it, too
+    # the bit alone shows it, too
     frame = d.parse_state(codec.encode_state(a_state(fault=np.zeros(7, np.uint32))))
     frame.motors[0][1].timeout = True
     assert codec.decode(d.pack_state(frame), 0.0).fault[0] == MotorError.MOTOR_SAW_HOST_TIMEOUT
@@ -466,7 +466,7 @@ def test_packets_that_are_not_this_hand_s() -> None:
 
 
 def test_motors_are_matched_by_id_and_not_by_order() -> None:
-    """Same sizes, same heads: only the ids tell that two motors stand the other way round."""
+    """Same sizes, same heads: only the ids show that two motors are exchanged."""
     codec = d.HandCodec(JOINTS)
     data = codec.encode_state(a_state())
     codec.decode(data, 0.0)

@@ -310,7 +310,7 @@ def test_a_stall_ends_a_read_that_waits() -> None:
         assert caught.value.errno == errno.EPIPE
 
 
-def test_unplug_cuts_the_client_off_and_hides_the_hand() -> None:
+def test_unplug_disconnects_the_client_and_removes_the_hand() -> None:
     with emulated_dex3(BOTH) as hands:
         port = inside(hands).port
         with host(port) as computer, host(port) as later:
@@ -451,7 +451,7 @@ def held(hands: Dex3Hands) -> int:
     return sum(len(c.parked) for c in hands._server._connections.values())
 
 
-def test_reads_that_wait_are_bounded_and_a_polite_client_is_served() -> None:
+def test_pending_reads_are_limited() -> None:
     with emulated_dex3(BOTH) as hands:
         port = inside(hands).port
         with imported(port) as hog:
@@ -461,7 +461,7 @@ def test_reads_that_wait_are_bounded_and_a_polite_client_is_served() -> None:
             for seqnum in range(MOST_PARKED + 1, many + 1):
                 assert reply(hog) == (protocol.RET_SUBMIT, seqnum, -errno.ENOMEM, 0)
             assert held(inside(hands)) == MOST_PARKED
-            # control transfers and writes are served all the same, and an answer makes room
+            # control transfers and writes are served all the same, and an answer frees a place
             submit(hog, many + 1, OUT, 2, brake())
             assert {reply(hog)[1] for _ in range(1)} == {1}
             protocol._recvall(hog, STATE.size)
@@ -474,7 +474,7 @@ def test_reads_that_wait_are_bounded_and_a_polite_client_is_served() -> None:
             exchange(computer.find())
 
 
-def test_setting_the_configuration_ends_what_waits() -> None:
+def test_set_configuration_cancels_pending_reads() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
         for seqnum in (1, 2):
             submit(sock, seqnum, IN, 1, b"")
@@ -495,7 +495,7 @@ def test_duplicate_sequence_number_ends_the_connection() -> None:
 
 def test_a_reply_never_claims_more_than_it_carries() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
-        # a read whose setup packet says write: 255 bytes wanted, none there
+        # a read whose setup packet has direction write: 255 bytes wanted, none there
         setup = bytes((0x00, 5, 1, 0, 0, 0, 255, 0))
         sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 1, 0x10002, IN, 0, 0, 255, 0, 0, 0, setup))
         assert reply(sock) == (protocol.RET_SUBMIT, 1, 0, 0)
@@ -638,7 +638,7 @@ def keep_asking(sock: socket.socket) -> None:
         submit(sock, seqnum, IN, 0, b"")  # a control transfer without a request: refused
 
 
-def test_a_client_that_reads_nothing_is_cut_off() -> None:
+def test_client_that_reads_nothing_is_disconnected() -> None:
     with emulated_dex3(BOTH) as hands, socket.socket() as deaf:
         port = inside(hands).port
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -672,7 +672,7 @@ def test_an_address_that_is_not_this_machines() -> None:
         Server([], host="203.0.113.1", port=0)
 
 
-def test_closing_cuts_clients_off_and_frees_the_port() -> None:
+def test_close_disconnects_clients_and_frees_the_port() -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
         with host(port) as computer:

@@ -25,7 +25,7 @@ from click.testing import CliRunner
 from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.dds import DdsNode, Qos, Writer, type_hash
-from dexkit.doctor import Finding, Observations, Wish, diagnose, readiness
+from dexkit.doctor import Finding, Observations, Scope, diagnose, readiness
 from dexkit.doctor import dds as doctor_dds
 from dexkit.doctor.rtps import parse_message, unicast_port
 from dexkit.messages import unitree_go as go
@@ -160,8 +160,8 @@ class _Looked:
     def findings(self, situation: str, *dialects: str) -> dict[str, Finding]:
         number = self.domains[situation]
         views = [v for v in self.seen.domains if v.number == number]
-        wish = Wish(number, tuple(DIALECTS[name] for name in dialects))
-        return {f.id: f for f in diagnose(Observations(domains=tuple(views)), wish)}
+        scope = Scope(number, tuple(DIALECTS[name] for name in dialects))
+        return {f.id: f for f in diagnose(Observations(domains=tuple(views)), scope)}
 
     def ready(self, situation: str) -> dict[str, str]:
         views = [v for v in self.seen.domains if v.number == self.domains[situation]]
@@ -206,7 +206,7 @@ def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> Non
 
 
 @pytest.mark.parametrize(
-    ("situation", "name", "says"),
+    ("situation", "name", "expected"),
     [
         ("nobody", "DDS-NOBODY", "no hand on any domain"),
         ("one side", "DDS-ONE-SIDE", "not rt/dex1/right/state"),
@@ -223,11 +223,11 @@ def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> Non
     ],
 )
 def test_each_fault_gets_its_diagnosis(
-    looked: _Looked, situation: str, name: str, says: str
+    looked: _Looked, situation: str, name: str, expected: str
 ) -> None:
     found = looked.findings(situation)
     assert name in found, sorted(found)
-    assert says in found[name].seen
+    assert expected in found[name].seen
     assert found[name].fix
     if situation not in ("two publishers", "frozen"):
         assert all(looked.ready(situation).values())
@@ -242,13 +242,13 @@ def test_a_hand_on_another_domain(looked: _Looked) -> None:
     hand, client = looked.domains["good"], looked.domains["nobody"]
     views = tuple(v for v in looked.seen.domains if v.number in (hand, client))
     seen = Observations(domains=views)
-    for wish in (Wish(), Wish(domain=client)):
-        (found,) = [f for f in diagnose(seen, wish) if f.id == "DDS-OTHER-DOMAIN"]
+    for scope in (Scope(), Scope(domain=client)):
+        (found,) = [f for f in diagnose(seen, scope) if f.id == "DDS-OTHER-DOMAIN"]
         assert f"on domain {hand}" in found.seen
-        assert "DDS-NOBODY" not in {f.id for f in diagnose(seen, wish)}
+        assert "DDS-NOBODY" not in {f.id for f in diagnose(seen, scope)}
 
 
-def test_the_dialect_that_was_asked_for_counts(looked: _Looked) -> None:
+def test_only_the_requested_dialect_is_judged(looked: _Looked) -> None:
     assert "DDS-TYPE" in looked.findings("good", "unitree_hg")
     assert "DDS-OTHER-STACK" in looked.findings("good", "unitree_actuator")
     assert "DDS-OTHER-STACK" in looked.findings("other stack", "unitree_go")

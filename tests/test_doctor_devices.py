@@ -47,21 +47,21 @@ def _line(
 
 def test_healthy_servo_has_no_finding() -> None:
     with _line(1_000_000) as path:
-        port = doctor_devices.look_at(path)
+        port = doctor_devices.inspect_port(path)
     assert [(s.id, s.baudrate, s.protocol) for s in port.servos] == [(1, 1_000_000, 2)]
     assert _ids(port) == set()
 
 
 def test_a_servo_at_another_baud_rate() -> None:
     with _line(57_600) as path:
-        port = doctor_devices.look_at(path)
+        port = doctor_devices.inspect_port(path)
     assert [s.baudrate for s in port.servos] == [57_600]
     assert _ids(port) == {"SERIAL-BAUD"}
 
 
 def test_a_servo_of_protocol_1() -> None:
     with _line(old=(Protocol1Servo(1, baudrate=57_600),)) as path:
-        port = doctor_devices.look_at(path)
+        port = doctor_devices.inspect_port(path)
     assert _ids(port) == {"SERIAL-PROTOCOL-1"}
 
 
@@ -69,11 +69,11 @@ def test_silent_port_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     # every baud rate takes half a second in vain
     monkeypatch.setattr(doctor_devices, "SCAN_BAUD_RATES", (1_000_000, 57_600))
     with _line(57_600, servo_id=200) as path:  # none of the ids that are asked for
-        port = doctor_devices.look_at(path, thorough=False)
+        port = doctor_devices.inspect_port(path, thorough=False)
     assert _ids(port) == {"SERIAL-NO-ANSWER"}
 
 
-def test_a_port_that_is_in_use_is_left_alone() -> None:
+def test_port_in_use_is_not_opened() -> None:
     hold = (
         "import serial, sys; p = serial.Serial(sys.argv[1], exclusive=True); "
         "print('open', flush=True); sys.stdin.read()"
@@ -88,7 +88,7 @@ def test_a_port_that_is_in_use_is_left_alone() -> None:
             assert other.stdin is not None
             assert other.stdout is not None
             assert other.stdout.readline() == "open\n"
-            port = doctor_devices.look_at(path)
+            port = doctor_devices.inspect_port(path)
             assert not port.asked
             assert f"(pid {other.pid})" in port.holders[0]
             assert _ids(port) == {"SERIAL-BUSY"}
@@ -97,9 +97,9 @@ def test_a_port_that_is_in_use_is_left_alone() -> None:
 
 
 def test_no_port_and_no_serial_port(tmp_path: Path) -> None:
-    assert _ids(doctor_devices.look_at(str(tmp_path / "ttyUSB0"))) == {"SERIAL-MISSING"}
+    assert _ids(doctor_devices.inspect_port(str(tmp_path / "ttyUSB0"))) == {"SERIAL-MISSING"}
     (tmp_path / "file").touch()
-    assert _ids(doctor_devices.look_at(str(tmp_path / "file"))) == {"SERIAL-NOT-A-PORT"}
+    assert _ids(doctor_devices.inspect_port(str(tmp_path / "file"))) == {"SERIAL-NOT-A-PORT"}
 
 
 def test_the_latency_timer(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_the_latency_timer(tmp_path: Path) -> None:
         folder = tmp_path / "bus/usb-serial/devices" / Path(path).resolve().name
         folder.mkdir(parents=True)
         (folder / "latency_timer").write_text("16\n")
-        port = doctor_devices.look_at(path, sysfs=tmp_path)
+        port = doctor_devices.inspect_port(path, sysfs=tmp_path)
     assert port.latency_timer == 16
     assert _ids(port) == {"SERIAL-LATENCY"}
 
@@ -164,7 +164,7 @@ def test_a_usbip_server() -> None:
 # --- surroundings
 
 
-def test_a_configuration_that_can_be_read(tmp_path: Path) -> None:
+def test_readable_cyclonedds_uri_has_no_finding(tmp_path: Path) -> None:
     good = "<CycloneDDS><Domain/></CycloneDDS>"
     file = tmp_path / "dds.xml"
     file.write_text('<?xml version="1.0"?>\n' + good)

@@ -62,7 +62,7 @@ def test_a_captured_writer() -> None:
     assert found.type_hash == "2ea87a3ac222ec386596036ece43"
 
 
-def test_the_two_versions_describe_one_type_differently() -> None:
+def test_cyclonedds_versions_have_different_type_hashes() -> None:
     hashes = {
         rtps.parse_endpoint(_only(p, Data).payload, writer=True).type_hash
         for p in (packets.CYCLONE_0_10_PUBLICATION, packets.CYCLONE_11_PUBLICATION)
@@ -85,12 +85,12 @@ def test_observer_requests_missing_discovery_data() -> None:
     assert {a.writer for a in asked} == {rtps.SEDP_PUBLICATIONS, rtps.SEDP_SUBSCRIPTIONS}
     assert not any(a.final for a in asked)
     assert not observer.settled
-    told = observer.receive(_addressed(packets.CYCLONE_0_10_PUBLICATION), 0.1)
+    sent = observer.receive(_addressed(packets.CYCLONE_0_10_PUBLICATION), 0.1)
     assert wanted == [("rt/dex1/left/cmd", GO)]
     # it announces a reader of that topic, best-effort and without a type object
     readers = [
         rtps.parse_endpoint(i.payload, writer=False)
-        for p, _ in told
+        for p, _ in sent
         for _, i in rtps.parse_message(p)[1]
         if isinstance(i, Data)
     ]
@@ -116,7 +116,7 @@ def test_submessages_for_other_participants_are_ignored() -> None:
     assert not observer.participants
 
 
-def test_an_observer_does_not_answer_a_heartbeat_that_wants_no_answer() -> None:
+def test_final_heartbeat_is_not_answered() -> None:
     """Two that acknowledge each other's acknowledgements never stop."""
     observer = Observer(ME, PLACE)
     prefix = packets.CYCLONE_0_10_PARTICIPANT[8:20]
@@ -136,7 +136,7 @@ def test_an_observer_does_not_answer_a_heartbeat_that_wants_no_answer() -> None:
 
 @given(st.integers(1, 2**40), st.sets(st.integers(0, 255), max_size=40))
 @settings(max_examples=60)
-def test_an_acknowledgement_says_what_is_missing(base: int, offsets: set[int]) -> None:
+def test_acknack_lists_missing_samples(base: int, offsets: set[int]) -> None:
     missing = sorted(base + o for o in offsets)
     packet = rtps.message(
         ME, rtps.build_acknack(b"\0\0\3\xc2", base, missing, 1, destination=ME, final=False)
@@ -313,7 +313,7 @@ def test_observer_sends_only_valid_packets_for_any_input(
 
 
 @each(("first", "last"), [(0, 0), (5, 3), (5, -9), (-1, -1), (1, 2**63 - 1)])
-def test_a_wrong_heartbeat_is_counted_and_not_answered(first: int, last: int) -> None:
+def test_invalid_heartbeat_is_counted_and_not_answered(first: int, last: int) -> None:
     observer = Observer(ME, PLACE)
     observer.receive(_addressed(packets.CYCLONE_0_10_PARTICIPANT), 0.0)
     prefix = packets.CYCLONE_0_10_PARTICIPANT[8:20]

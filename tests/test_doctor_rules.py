@@ -7,7 +7,7 @@ import io
 
 from rich.console import Console
 
-from dexkit.doctor import DIAGNOSES, Observations, Severity, Wish, diagnose, readiness, verdict
+from dexkit.doctor import DIAGNOSES, Observations, Scope, Severity, diagnose, readiness, verdict
 from dexkit.doctor.observations import (
     DdsSocket,
     DomainView,
@@ -197,8 +197,8 @@ CASES: dict[str, Observations] = {
 }
 
 
-def _ids(seen: Observations, wish: Wish | None = None) -> set[str]:
-    return {f.id for f in diagnose(seen, wish)}
+def _ids(seen: Observations, scope: Scope | None = None) -> set[str]:
+    return {f.id for f in diagnose(seen, scope)}
 
 
 def test_every_diagnosis_has_a_test() -> None:
@@ -248,7 +248,7 @@ def test_missing_multicast_is_no_fault_with_dexkit_or_static_peers() -> None:
     assert _ids(Observations(domains=(view,), interfaces=(DEAF,))) == set()
 
 
-def test_a_process_that_does_not_answer_is_on_another_interface() -> None:
+def test_silent_process_is_reported_on_another_interface() -> None:
     eth = dataclasses.replace(ETH, discovery=True)
     seen = Observations(
         domains=(_without(GOOD, "hand"),),
@@ -273,10 +273,10 @@ def test_port_in_use_by_a_service_is_no_finding() -> None:
     assert (found.id, found.severity) == ("SERIAL-BUSY", Severity.NOTE)
 
 
-def test_a_device_that_is_asked_about_is_not_a_client_that_waits() -> None:
+def test_device_check_reports_no_waiting_client() -> None:
     (found,) = [
         f
-        for f in diagnose(Observations(domains=(DomainView(0),)), Wish(devices_only=True))
+        for f in diagnose(Observations(domains=(DomainView(0),)), Scope(devices_only=True))
         if f.id == "DDS-NOBODY"
     ]
     assert found.severity is Severity.NOTE
@@ -307,10 +307,10 @@ def test_unrelated_topic_name_is_no_misspelling(topic: str) -> None:
     assert nearly(topic) is None
 
 
-def test_topics_are_whole_in_a_narrow_terminal() -> None:
+def test_topics_are_not_cut_in_a_narrow_terminal() -> None:
     seen = _seen(_legacy())
     text = io.StringIO()
     console = Console(file=text, width=80)
-    print_report(console, seen, [], verdict(seen, [], Wish()), [])
+    print_report(console, seen, [], verdict(seen, [], Scope()), [])
     assert "…" not in text.getvalue()
     assert all(e.topic in text.getvalue() for view in seen.domains for e in view.endpoints)

@@ -44,12 +44,12 @@ def refused(read: Callable[[Path], Any], path: Path, what: str) -> bool:
     try:
         read(path)
     except DexkitError as error:
-        told = str(error)
+        printed = str(error)
     else:
         return False
-    assert path.name in told or "force table" in told, f"{what}: {told}"
-    assert len(told) < 1000
-    assert not hostile.raw(told)
+    assert path.name in printed or "force table" in printed, f"{what}: {printed}"
+    assert len(printed) < 1000
+    assert not hostile.raw(printed)
     return True
 
 
@@ -109,7 +109,7 @@ def test_duplicate_key_and_non_finite_number_are_refused() -> None:
             documents.parse_toml(text, "it")
 
 
-def test_what_is_valid_renders_and_the_rest_is_refused_by_its_place(tmp_path: Path) -> None:
+def test_valid_result_renders_and_invalid_one_is_refused_with_its_place(tmp_path: Path) -> None:
     """Every node of a result replaced by every kind of value; a fuzzer's part of it."""
     result = result_of_every_kind()
     result.write_json(tmp_path / "good.json")
@@ -145,11 +145,11 @@ def test_every_kind_of_value_at_every_place_of_a_result(tmp_path: Path) -> None:
                 hostile.render_all(path, tmp_path)
 
 
-def test_an_error_says_where_and_what_was_expected(tmp_path: Path) -> None:
+def test_error_names_the_place_and_the_expected_value(tmp_path: Path) -> None:
     result = result_of_every_kind()
     result.write_json(tmp_path / "r.json")
     good = json.loads((tmp_path / "r.json").read_text())
-    for place, value, told in (
+    for place, value, printed in (
         (("results", 2, "evidence", 0, "time_s"), "soon", 'time_s must be a number, not "soon"'),
         (("results", 2, "verdict"), "good", "results[2].verdict must be one of"),
         (("results", 2, "side"), hostile.MISSING, "results[2] has no side"),
@@ -163,7 +163,7 @@ def test_an_error_says_where_and_what_was_expected(tmp_path: Path) -> None:
         (tmp_path / "r.json").write_text(json.dumps(hostile.replaced(good, place, value)))
         with pytest.raises(UsageError) as caught:
             read_json(tmp_path / "r.json")
-        assert told in str(caught.value)
+        assert printed in str(caught.value)
 
 
 def test_records_in_a_recording_are_read_or_refused() -> None:
@@ -188,7 +188,7 @@ def left_behind(folder: Path) -> list[str]:
     return [p.name for p in folder.iterdir() if p.name.startswith(".dexkit-")]
 
 
-def test_a_file_is_written_with_the_usual_rights_and_keeps_those_it_has(tmp_path: Path) -> None:
+def test_written_file_has_default_or_existing_permissions(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         documents.write_file(tmp_path / "new", "手\n")
@@ -223,7 +223,7 @@ def test_failed_write_keeps_the_old_file(
     assert [p.name for p in tmp_path.iterdir()] == ["report"]
 
 
-def test_places_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+def test_unwritable_paths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     for name, why in (
         ("/dev/full", "No space left"),

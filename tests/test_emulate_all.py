@@ -134,7 +134,7 @@ def test_no_process_outlives_the_program() -> None:
         wait_until(lambda: all(gone(pid) for pid in parts), 10.0)
 
 
-def test_topics_that_are_taken_are_refused(dds_domain: int, dds_node: DdsNode) -> None:
+def test_topics_with_another_publisher_are_refused(dds_domain: int, dds_node: DdsNode) -> None:
     topic = "rt/dex1/right/state"
     with (
         dds_node.writer(topic, dialect("unitree_go").state_type),
@@ -166,12 +166,14 @@ class TestArguments:
             (1, "dex5", "321"),
         ],
     )
-    def test_the_command_for_xr_teleoperate(self, domain: int, hands: str, text: str) -> None:
-        from dexkit.cli.emulate.all import _next
+    def test_command_for_xr_teleoperate_is_printed(
+        self, domain: int, hands: str, text: str
+    ) -> None:
+        from dexkit.cli.emulate.all import _next_steps
 
-        assert text in "\n".join(_next("g1", hands, domain, "lo"))
+        assert text in "\n".join(_next_steps("g1", hands, domain, "lo"))
 
-    def test_settings_without_hands_make_no_sense(self) -> None:
+    def test_hand_settings_without_hands_are_refused(self) -> None:
         result = CliRunner().invoke(cli, ["emulate", "all", "--hands", "none", "--set", "a=b"])
         assert result.exit_code == 2
         assert "there are none" in result.output

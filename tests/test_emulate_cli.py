@@ -162,7 +162,7 @@ def test_stale_link_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
         pass
 
 
-def test_a_link_to_something_that_exists_is_not_taken(tmp_path: Path) -> None:
+def test_link_to_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
     link = tmp_path / "gripper"
     with emulated_ezgripper(link=link) as gripper:
         with pytest.raises(EmulatorError) as caught, emulated_ezgripper(link=link):
@@ -195,7 +195,7 @@ def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
 
 
 @each(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "expected"),
     [
         ([], 2, "--link"),
         (["--id", "253"], 2, "253"),
@@ -206,13 +206,13 @@ def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
         (["--latency-timer", "-1"], 2, "-1"),
     ],
 )
-def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, says: str) -> None:
+def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, expected: str) -> None:
     if arguments:
         arguments = ["--link", str(tmp_path / "g"), *arguments]
     process = emulate(*arguments)
     _, err = process.communicate(timeout=60)
     assert process.returncode == code
-    assert says in err.decode()
+    assert expected in err.decode()
     assert "Traceback" not in err.decode()
     assert list(tmp_path.iterdir()) == []
 
@@ -312,7 +312,7 @@ def test_client_must_have_the_servos_baud_rate(speed: int, answers: bool) -> Non
         assert gripper.bus.counters.garbled == (0 if answers else len(PING))
 
 
-def test_any_baud_rate_when_told_so() -> None:
+def test_any_baud_rate_option_accepts_all_rates() -> None:
     with (
         emulated_ezgripper(check_baudrate=False) as gripper,
         client(gripper.path, termios.B9600) as opened,
@@ -424,7 +424,7 @@ def emulate_dex3(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_hand_says_where_it_is_how_to_attach_it_and_what_passed(signum: signal.Signals) -> None:
+def test_hand_prints_its_address_commands_and_counters(signum: signal.Signals) -> None:
     process = emulate_dex3("--side", "both", "--serial", "A1", "--serial", "B2")
     assert process.stdout is not None
     lines = [process.stdout.readline().decode().rstrip() for _ in range(7)]
@@ -474,7 +474,7 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
 
 
 @each(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (["--serial", "a", "--serial", "b"], "2 serial numbers for 1 hand"),
         (["--out-endpoint", "0x81"], "an OUT endpoint is 0x01 to 0x0f, not 0x81"),
@@ -484,9 +484,9 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
         (["--side", "middle"], "middle"),
     ],
 )
-def test_invalid_hand_options_are_refused(arguments: list[str], says: str) -> None:
+def test_invalid_hand_options_are_refused(arguments: list[str], expected: str) -> None:
     _, err = emulate_dex3(*arguments).communicate(timeout=60)
-    assert says in err.decode()
+    assert expected in err.decode()
     assert "Traceback" not in err.decode()
 
 
@@ -500,7 +500,7 @@ def test_help_lists_the_devices_and_their_options() -> None:
     assert CliRunner().invoke(command, ["dex9"]).exit_code == 2
 
 
-def test_a_hand_on_every_address_is_attached_by_the_machines_name() -> None:
+def test_hand_on_every_address_prints_the_host_name() -> None:
     from dexkit.cli.emulate.dex3_usb import _how_to
 
     name = socket.gethostname()

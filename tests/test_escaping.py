@@ -79,7 +79,7 @@ def test_unencodable_characters_are_replaced(monkeypatch: pytest.MonkeyPatch) ->
     assert raw.getvalue() == b"\\u624b \\x1b[31m\\udc80\n\\u624b\n\\u624b\n"
 
 
-def test_a_console_has_its_own_colours_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_console_prints_no_colours_of_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(sys, "stdout", out)
     with guarded():
@@ -156,7 +156,7 @@ def nasty_recording(path: Path) -> Path:
     return path
 
 
-def test_a_recording_full_of_escapes_prints_none(
+def test_recording_with_escape_sequences_prints_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class NoNode:
@@ -165,7 +165,7 @@ def test_a_recording_full_of_escapes_prints_none(
 
     monkeypatch.setattr("dexkit.dds.DdsNode", NoNode)
     path = str(nasty_recording(tmp_path / "nasty.mcap"))
-    told = 0
+    printed = 0
     for arguments in (
         ["info", path],
         ["info", path, "--json"],
@@ -179,13 +179,13 @@ def test_a_recording_full_of_escapes_prints_none(
         code, out, err = hostile.run_command(arguments)
         assert code in (0, 1, 2), arguments
         clean(out + err, data="--json" in arguments)
-        told += len(out + err)
+        printed += len(out + err)
         assert all(len(line) < 15_000 for line in (out + err).splitlines()) or "--json" in arguments
-    assert told > 1000
+    assert printed > 1000
     assert STATE_TYPE
 
 
-def test_a_result_full_of_escapes_shows_none(tmp_path: Path) -> None:
+def test_result_with_escape_sequences_shows_none(tmp_path: Path) -> None:
     from tests.report_helpers import result_of_every_kind
 
     result = result_of_every_kind(NASTY)
@@ -208,8 +208,8 @@ def test_a_result_full_of_escapes_shows_none(tmp_path: Path) -> None:
     ElementTree.parse(tmp_path / "j.xml")
 
 
-def test_the_doctor_shows_names_of_peers_clean() -> None:
-    from dexkit.doctor import Observations, Wish, diagnose, readiness, verdict
+def test_doctor_escapes_names_of_peers() -> None:
+    from dexkit.doctor import Observations, Scope, diagnose, readiness, verdict
     from dexkit.doctor.observations import DomainView, Endpoint, Participant
     from dexkit.doctor.report import print_report
 
@@ -225,12 +225,12 @@ def test_the_doctor_shows_names_of_peers_clean() -> None:
     )
     views = (DomainView(1, peers, ends), DomainView(2, peers))
     seen = Observations(domains=views, looked_at=("lo",), seconds=1.0)
-    wish = Wish()
-    findings = diagnose(seen, wish)
+    scope = Scope()
+    findings = diagnose(seen, scope)
     assert findings
     out = io.StringIO()
     console = Console(file=out, width=120)
-    print_report(console, seen, findings, verdict(seen, findings, wish), readiness(seen, wish))
+    print_report(console, seen, findings, verdict(seen, findings, scope), readiness(seen, scope))
     clean(out.getvalue())
     assert all(len(line) < 3000 for line in out.getvalue().splitlines())
 

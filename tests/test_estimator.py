@@ -54,7 +54,7 @@ speeds = st.tuples(st.floats(0.5, 30.0), st.floats(0.5, 30.0))
 
 @given(speeds, st.floats(0.0, STROKE), events)
 @settings(max_examples=300, deadline=None)
-def test_never_teleports_overshoots_or_reverses(
+def test_estimate_never_jumps_overshoots_or_reverses(
     speed: tuple[float, float], start: float, script: list[Advance | Command | Measure]
 ) -> None:
     e = JointEstimator(JOINT, speed)
@@ -249,7 +249,7 @@ def test_without_a_command_there_is_no_prediction() -> None:
 
 
 @given(st.lists(st.floats(0.0, STROKE), min_size=5, max_size=5))
-def test_it_converges_on_a_hand_at_rest(start: list[float]) -> None:
+def test_estimate_converges_on_a_hand_at_rest(start: list[float]) -> None:
     assume(abs(start[0] - start[1]) > 0.01)
     e = JointEstimator(JOINT, (5.0, 5.0))
     e.measure(start[0], 0.0)
@@ -264,7 +264,7 @@ def test_it_converges_on_a_hand_at_rest(start: list[float]) -> None:
     assert min(abs(q - x) for x in expected) < 0.01
 
 
-def test_before_the_first_measurement_there_is_nothing() -> None:
+def test_estimate_is_unknown_before_the_first_measurement() -> None:
     e = JointEstimator(JOINT)
     e.follow(1.0, 0.0)
     assert math.isnan(e.predict(1.0))

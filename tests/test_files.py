@@ -122,7 +122,7 @@ def test_link_permissions_and_new_files(tmp_path: Path) -> None:
     assert stat.S_IMODE(made.stat().st_mode) == 0o640
 
 
-def test_what_cannot_be_locked_or_read_is_said(
+def test_unlockable_or_unreadable_file_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "f.json"

@@ -47,7 +47,7 @@ def ask(bus: Bus, data: bytes) -> list[dxl.Packet]:
 PING = dxl.encode(1, Instruction.PING)
 
 
-def test_a_fast_read_that_no_packet_can_hold_is_not_answered() -> None:
+def test_oversized_fast_read_is_not_answered() -> None:
     for asked in (
         bytes.fromhex("fffffd00fe08008a0000f50301c034"),  # 1013 bytes of servo 1
         packet(254, Instruction.FAST_SYNC_READ, b"\0\0\xff\xff\1"),
@@ -132,7 +132,7 @@ def test_flood_is_limited_by_the_line_speed() -> None:
             os.close(fd)
 
 
-def test_answers_that_are_held_back_are_bounded() -> None:
+def test_delayed_answers_are_limited_in_number() -> None:
     clock = ManualClock()
     mcu = Dex3Mcu(Side.LEFT, clock=clock)
     usb = Dex3Usb(mcu, clock)

@@ -145,9 +145,7 @@ def test_no_value_of_an_option_ends_in_a_traceback(
 
 @pytest.mark.soak
 @pytest.mark.usefixtures("nothing_starts")
-def test_no_hostile_text_at_all_ends_in_a_traceback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_text_ends_in_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "here").mkdir()
     # no argument of a program can hold a zero
@@ -165,7 +163,7 @@ _WORDS = (
 
 
 def fault_text(rng: random.Random) -> str:
-    """A fault specification, or what somebody may write for one."""
+    """A fault specification, or a text that looks like one."""
     if rng.random() < 0.5:
         return "".join(rng.choice(_WORDS + hostile.NUMBERS) for _ in range(rng.randint(0, 8)))
     keys = [
@@ -177,7 +175,7 @@ def fault_text(rng: random.Random) -> str:
     return f"{kind}{time}:{','.join(keys)}"
 
 
-def test_a_fault_is_understood_or_refused() -> None:
+def test_fault_is_parsed_or_refused() -> None:
     rng = random.Random(11)
     understood = 0
     families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS)
@@ -197,7 +195,7 @@ def test_a_fault_is_understood_or_refused() -> None:
     assert understood > 50
 
 
-def test_the_settings_of_every_backend_are_understood_or_refused() -> None:
+def test_backend_settings_are_parsed_or_refused() -> None:
     from dexkit.backends import BackendOptions, list_backends
     from dexkit.errors import DexkitError
     from dexkit.hand import Side

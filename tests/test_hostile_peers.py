@@ -83,7 +83,7 @@ def _random_policies(rng: random.Random) -> bytes:
     """Policies, user data and type information of random content, some of them valid.
 
     Type information keeps its form: CycloneDDS 0.10.5 itself aborts at an identifier of a kind
-    that it does not expect (``ddsi_typeid_kind_impl``), which nobody above it can prevent.
+    that it does not expect (``ddsi_typeid_kind_impl``), which no code above it can prevent.
     """
     described = CYCLONE_0_10_PUBLICATION.index(struct.pack("<HH", _TYPE_INFORMATION, 0x94))
     information = bytearray(CYCLONE_0_10_PUBLICATION[described + 4 : described + 4 + 0x94])
@@ -137,13 +137,13 @@ def fuzz(domain: int, seed: int, peers: int) -> None:
         assert len(node.discovery.participants()) > peers // 6
 
 
-def test_random_announcements_harm_nothing() -> None:
+def test_random_announcements_do_not_stop_discovery() -> None:
     for seed in range(3):
         fuzz(free_domain(), seed, 60)
 
 
 @pytest.mark.soak
-def test_many_random_announcements_harm_nothing() -> None:
+def test_many_random_announcements_do_not_stop_discovery() -> None:
     for seed in range(100, 200):
         fuzz(free_domain(), seed, 100)
 

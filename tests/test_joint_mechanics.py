@@ -124,7 +124,7 @@ def test_friction_never_adds_energy(coulomb: float, speed: float) -> None:
         before = abs(joint.dq)
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_parameters_are_refused() -> None:
     with pytest.raises(UsageError):
         Joint(inertia=0.0)
     with pytest.raises(UsageError):
@@ -138,7 +138,7 @@ def test_nonsense_is_refused() -> None:
 # -- under a motor ---------------------------------------------------------------------------
 
 
-def test_a_motor_is_a_torque_where_its_gains_are_soft() -> None:
+def test_motor_with_soft_gains_is_integrated_as_torque() -> None:
     driven, pushed = Joint(inertia=0.01, viscous=0.1), Joint(inertia=0.01, viscous=0.1)
     for _ in range(500):
         driven.drive(0.3, 0.0, 1.0, 1.0, DT)
@@ -160,7 +160,7 @@ def test_stiff_gains_are_stable(damping: float) -> None:
 
 
 @each("damping", [0.1, 1.0, 10.0])
-def test_a_blocked_motor_gives_its_whole_torque(damping: float) -> None:
+def test_blocked_motor_makes_its_full_torque(damping: float) -> None:
     joint = Joint(inertia=2e-4, coulomb=0.002, walls=(Wall(0.0, -1, 60.0, 0.1),))
     torque = 0.0
     for _ in range(5000):
@@ -169,7 +169,7 @@ def test_a_blocked_motor_gives_its_whole_torque(damping: float) -> None:
     assert joint.contact == pytest.approx(-0.4, abs=0.003)
 
 
-def test_a_motor_gives_no_more_than_it_has() -> None:
+def test_motor_torque_is_limited() -> None:
     joint = Joint(inertia=0.01)
     assert joint.drive(5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(0.7)  # from rest
     assert joint.drive(5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(0.3)  # along
@@ -179,7 +179,7 @@ def test_a_motor_gives_no_more_than_it_has() -> None:
     assert joint.dq == 0.0
 
 
-def test_gearing_takes_when_driving_and_helps_when_holding() -> None:
+def test_gear_friction_reduces_driving_and_adds_holding_torque() -> None:
     def at_rest(load: float) -> bool:
         joint = Joint(inertia=0.01, spring=1.0, spring_rest=-load)  # pulls with -load
         joint.drive(1.0, 0.0, 2.0, 2.0, DT, 0.4, 0.5)
@@ -212,7 +212,7 @@ def test_no_control_law_passes_the_hard_stops(
 # -- time ------------------------------------------------------------------------------------
 
 
-def test_steps_keep_up_with_a_clock_without_drift() -> None:
+def test_steps_follow_the_clock_without_drift() -> None:
     steps = FixedSteps(0.5e-3)
     steps.restart(100.0)
     lived = 0

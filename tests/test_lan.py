@@ -223,7 +223,7 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
 
 
 def test_unfiltered_socket_receives_from_the_other_network(hosts: dict[str, Host]) -> None:
-    """A socket on 127.0.0.1 without a filter hears the stranger: the tests here mean something."""
+    """Without a filter a socket on 127.0.0.1 receives from the network: the tests can fail."""
     with hosts["robot"].popen(sys.executable, "-c", _ECHO) as echo:
         assert echo.stdout is not None
         assert echo.stdout.readline() == "ready\n"
@@ -363,7 +363,7 @@ def _sending(program: Program) -> list[tuple[str, int]]:
 
 
 def _hears_this_machine_only(name: str, program: Program) -> None:
-    # some listen before they say anything, the doctor only while it looks
+    # some receive before they send anything, the doctor only while it looks
     deadline = time.monotonic() + 60
     while not (seen := _listening(program, [_LOOPBACK_INDEX])):
         assert time.monotonic() < deadline, (name, program.lines)
@@ -402,8 +402,8 @@ def test_every_program_on_loopback_filters_its_sockets(
         counters = bridge.wait_line("counters {")
         assert '"received": 0' in counters
         assert not re.search('"received": [1-9]', counters), counters
-        assert "the two fight" not in " ".join(bridge.lines)
-        # nothing to record, and nobody seen either
+        assert "their samples mix" not in " ".join(bridge.lines)
+        # nothing to record, and no participant discovered
         assert started["recorder"].end() == 1
         assert "no other participant was seen" in " ".join(started["recorder"].lines)
         assert not recording.exists()
@@ -449,7 +449,7 @@ for host in "127.0.0.1", "10.9.1.1":
 # --- without networks
 
 
-def test_the_filter_goes_by_the_interface_alone() -> None:
+def test_filter_depends_on_the_interface_only() -> None:
     with (
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock,
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender,
@@ -463,16 +463,19 @@ def test_the_filter_goes_by_the_interface_alone() -> None:
             ([7, 8, 9], False),
             ([], False),
             (interface_filter.accepted_indices("lo"), True),
-            (interface_filter.accepted_indices("nowhere0"), True),  # this machine is always heard
+            (
+                interface_filter.accepted_indices("nowhere0"),
+                True,
+            ),  # packets of this machine always pass
         ):
             interface_filter.accept_only(sock, indices)
             assert _filter_of(sock) == interface_filter.program(indices)
             sender.sendto(b"x", sock.getsockname())
             try:
-                heard = sock.recv(10) == b"x"
+                received = sock.recv(10) == b"x"
             except BlockingIOError:
-                heard = False
-            assert heard == expected, indices
+                received = False
+            assert received == expected, indices
 
 
 def _refuse(sock: socket.socket, indices: object) -> None:
@@ -514,7 +517,7 @@ def test_without_free_file_descriptors_nothing_starts(monkeypatch: pytest.Monkey
     DdsNode(free_domain()).close()
 
 
-def test_a_user_may_go_on_without_a_filter_and_is_warned(
+def test_running_without_a_filter_can_be_allowed_and_logs_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(interface_filter, "accept_only", _refuse)

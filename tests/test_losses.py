@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode
-from dexkit.socket_losses import DdsSockets
+from dexkit.socket_losses import ReceiveBuffers
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.losses import PAUSE, Losses
@@ -156,13 +156,13 @@ CHILD = textwrap.dedent(
     """
     import socket, sys
     from dexkit.cli import main
-    from dexkit.socket_losses import DdsSockets
+    from dexkit.socket_losses import ReceiveBuffers
     def shrink(self, size):
         for sock in self._sockets():
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         return 65536
     if sys.argv.pop(1) == "small":
-        DdsSockets.enlarge = shrink
+        ReceiveBuffers.enlarge = shrink
     main(sys.argv[1:])
     """
 )
@@ -282,11 +282,11 @@ def test_deleted_file_is_reported(tmp_path: Path) -> None:
 
 def test_sockets_are_found_and_count_for_their_domain_only() -> None:
     domain, other = free_domain(), free_domain()
-    assert not DdsSockets(domain).known
+    assert not ReceiveBuffers(domain).known
     with DdsNode(domain):
-        sockets = DdsSockets(domain)
+        sockets = ReceiveBuffers(domain)
         assert sockets.known
         assert sockets.enlarge(100_000) >= 100_000
         assert sockets.count_new_drops() == 0
-        assert not DdsSockets(other).known
-        assert DdsSockets(other).enlarge(100_000) == 0
+        assert not ReceiveBuffers(other).known
+        assert ReceiveBuffers(other).enlarge(100_000) == 0

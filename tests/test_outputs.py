@@ -117,14 +117,14 @@ def test_full_or_closed_standard_output_is_an_error(
                     with pytest.raises(SystemExit) as ended:
                         main(arguments)
                 assert ended.value.code == code, (arguments, err.getvalue())
-                told = "error: cannot write standard output: No space left on device\n"
-                assert err.getvalue() == (told if code == 2 else "")
+                printed = "error: cannot write standard output: No space left on device\n"
+                assert err.getvalue() == (printed if code == 2 else "")
                 stream.close()  # what is left in it raises nothing
     os.close(pipe)
     os.close(full)
 
 
-def test_interpreter_prints_nothing_about_it_on_exit() -> None:
+def test_interpreter_prints_no_error_on_exit() -> None:
     no_reader, pipe = os.pipe()
     os.close(no_reader)
     for place, code in ((os.open("/dev/full", os.O_WRONLY), 2), (pipe, 141)):
@@ -140,7 +140,7 @@ def test_interpreter_prints_nothing_about_it_on_exit() -> None:
         assert done.stderr.count(b"\n") == (1 if code == 2 else 0), done.stderr
 
 
-def test_without_standard_streams_nothing_is_written_into_what_is_opened_next(
+def test_output_without_standard_streams_goes_into_no_other_file(
     tmp_path: Path,
 ) -> None:
     _, recording = hostile.judged_result(tmp_path)
@@ -210,7 +210,9 @@ def test_no_file_gets_the_number_of_a_standard_stream(tmp_path: Path, closed: st
 
 
 @pytest.mark.parametrize("gripper", [("ezgripper",), ("dex1-serial", "--side", "left")])
-def test_closed_standard_input_asks_no_question(tmp_path: Path, gripper: tuple[str, ...]) -> None:
+def test_question_without_standard_input_is_an_error(
+    tmp_path: Path, gripper: tuple[str, ...]
+) -> None:
     command = command_line("calibrate", *gripper, "--device", str(tmp_path))
     done = subprocess.run(
         ["sh", "-c", 'exec "$@" <&-', "sh", *command],
@@ -220,7 +222,7 @@ def test_closed_standard_input_asks_no_question(tmp_path: Path, gripper: tuple[s
         text=True,
     )
     assert done.returncode == 2
-    assert "nobody can be asked" in done.stderr
+    assert "cannot ask whether" in done.stderr
     assert "--yes" in done.stderr
 
 

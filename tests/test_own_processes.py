@@ -202,14 +202,14 @@ def test_folders_of_killed_programs_are_removed_and_those_of_others_stay(tempora
         living.communicate("")
 
 
-def test_a_folder_that_was_swept_before_its_lock_is_made_again(
+def test_folder_removed_before_its_lock_is_made_again(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     genuine = fcntl.flock
     removed: list[Path] = []
 
     def sweeping(descriptor: int, how: int) -> None:
-        if how == fcntl.LOCK_EX:  # of the new folder: somebody sweeps before it is locked
+        if how == fcntl.LOCK_EX:  # another process removes the new folder before it is locked
             monkeypatch.setattr(fcntl, "flock", genuine)
             removed.extend(sweep())
         genuine(descriptor, how)
@@ -244,10 +244,10 @@ def test_too_few_file_descriptors_are_refused_at_start() -> None:
         )
         for arguments in commands
     ]
-    for process, (arguments, told) in zip(started, commands.items(), strict=True):
+    for process, (arguments, printed) in zip(started, commands.items(), strict=True):
         err = process.communicate(timeout=60)[1]
         assert process.returncode == 2, (arguments, process.returncode, err)
-        assert told in err
+        assert printed in err
         assert "ulimit -n" in err
 
 

@@ -15,7 +15,7 @@ from tests import optional
 from tests.optional import UV
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("drivers", "emulators", "conformance", "traces")
+PACKAGES = ("drivers", "emulators", "conformance", "traces")
 SAMPLE = ROOT / "traces" / "samples" / "dex1_pick_place.mcap"
 
 
@@ -61,10 +61,10 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
 def test_wheel_holds_every_package_completely_and_once(wheel: Path) -> None:
     packed = [n for n in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in n]
     assert len(packed) == len(set(packed))
-    # resolved, because dexkit/ holds links to the rooms
+    # resolved, because dexkit/ holds links to these packages
     sources = {
         path.resolve().relative_to(ROOT)
-        for folder in ("dexkit", *ROOMS)
+        for folder in ("dexkit", *PACKAGES)
         for path in (ROOT / folder).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }

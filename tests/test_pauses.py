@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dexkit.bridge import Bridge, End
+from dexkit.bridge import Bridge, BridgeEnd
 from dexkit.bridge.core import PATIENCE, Commands, States
 from dexkit.clock import ManualClock, RealClock
 from dexkit.command_age import PAUSE
@@ -92,7 +92,7 @@ class Client:
 # -- the service ------------------------------------------------------------------------------
 
 
-def test_a_service_that_was_suspended_obeys_only_what_was_sent_later(
+def test_suspended_service_obeys_only_later_commands(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     hand, node, clock = ScriptedHand(), FakeNode(), Suspendable()
@@ -117,10 +117,10 @@ def test_a_service_that_was_suspended_obeys_only_what_was_sent_later(
                 client.until(lambda: core.driving, 2.0)
         assert core.counters.brakes >= 2
         assert service.snapshot()["pauses"] == counters.pauses
-    assert sum("stood still" in record.message for record in caplog.records) == 1
+    assert sum("was paused" in record.message for record in caplog.records) == 1
 
 
-def test_the_state_says_that_the_hand_brakes() -> None:
+def test_state_after_a_pause_reports_the_brake() -> None:
     hand, node, clock = SimHand(LEFT), FakeNode(), Suspendable()
     client = Client(node, clock)
 
@@ -156,7 +156,7 @@ def test_hanging_exchange_is_a_pause_of_that_hand_only() -> None:
         assert service.counters.pauses >= 1
 
 
-def test_an_exchange_that_may_take_long_by_itself_does_not_hide_a_stop() -> None:
+def test_slow_exchange_does_not_hide_a_pause() -> None:
     """The exchange thread goes on first: that the publishing loop has not looked is enough."""
     hand, node, clock = ScriptedHand(io_rate=2.0), FakeNode(), Suspendable()
     client = Client(node, clock)
@@ -167,7 +167,7 @@ def test_an_exchange_that_may_take_long_by_itself_does_not_hide_a_stop() -> None
         client.until(lambda: not core.driving, 2.0)
 
 
-def test_a_hand_and_a_state_that_are_slow_by_themselves_are_no_pause() -> None:
+def test_slow_hand_and_slow_state_are_no_pause() -> None:
     hand, node, clock = ScriptedHand(io_rate=3.0), FakeNode(), Suspendable()
     client = Client(node, clock)
     with HandService(hand, node=node, state_rate=3.0, clock=clock):
@@ -177,7 +177,7 @@ def test_a_hand_and_a_state_that_are_slow_by_themselves_are_no_pause() -> None:
 # -- drivers: what was stopped between a command and its bytes --------------------------------
 
 
-def test_a_held_goal_is_not_written_to_the_mx64() -> None:
+def test_goal_from_before_a_pause_is_not_written_to_the_mx64() -> None:
     clock = Slow()
     with emulated_ezgripper(start=20.0, closed_at=1510) as gripper:
         assert isinstance(gripper, EmulatedThread)
@@ -192,7 +192,7 @@ def test_a_held_goal_is_not_written_to_the_mx64() -> None:
             assert servo.get(mx64.GOAL_POSITION) != goal
 
 
-def test_a_brake_after_a_pause_does_not_go_back_to_where_the_pause_began() -> None:
+def test_brake_after_a_pause_holds_the_present_position() -> None:
     with emulated_ezgripper(start=10.0, closed_at=1510) as gripper:
         assert isinstance(gripper, EmulatedThread)
         servo = gripper.servo
@@ -204,7 +204,7 @@ def test_a_brake_after_a_pause_does_not_go_back_to_where_the_pause_began() -> No
             assert servo.get(mx64.GOAL_POSITION) >= here - 5
 
 
-def test_a_held_goal_does_not_switch_the_mx64_on() -> None:
+def test_goal_from_before_a_pause_does_not_enable_the_mx64() -> None:
     clock = Slow()
     with emulated_ezgripper(start=20.0, closed_at=1510) as gripper:
         assert isinstance(gripper, EmulatedThread)
@@ -213,7 +213,7 @@ def test_a_held_goal_does_not_switch_the_mx64_on() -> None:
             assert not gripper.servo.torque
 
 
-def test_a_held_command_is_not_written_to_the_m4010() -> None:
+def test_command_from_before_a_pause_is_not_written_to_the_m4010() -> None:
     clock = Slow()
     with Dex1Motors((LEFT,)) as motors:
         settings = Dex1Settings(device=motors.path, timeout=0.3)
@@ -225,7 +225,7 @@ def test_a_held_command_is_not_written_to_the_m4010() -> None:
             assert motors.motor.mechanics.mode is JointMode.FOC
 
 
-def test_a_held_command_is_not_sent_to_the_dex3() -> None:
+def test_command_from_before_a_pause_is_not_sent_to_the_dex3() -> None:
     clock = Slow()
     with Dex3Hands((LEFT,)) as hands:
         device = hands.device(LEFT)
@@ -241,7 +241,7 @@ def test_a_held_command_is_not_sent_to_the_dex3() -> None:
 def _refuses(hand: Hand, clock: Slow, command: HandCommand) -> None:
     clock.armed = True
     try:
-        with pytest.raises(HandTimeout, match="stood still"):
+        with pytest.raises(HandTimeout, match="was paused"):
             hand.exchange(command)
     finally:
         clock.armed = False
@@ -298,7 +298,7 @@ class TestBridge:
         both = unitree_go.MotorStates_([unitree_go.MotorState_(q=q)] * 2)
         states.receive(ACTUATOR.state_topic, encode(both), 0.0)
 
-    def test_a_bridge_that_was_suspended_forwards_only_what_was_sent_later(self) -> None:
+    def test_suspended_bridge_forwards_only_later_commands(self) -> None:
         clock = Suspendable()
         near, far = free_domain(), free_domain()
         with (
@@ -307,7 +307,10 @@ class TestBridge:
             DdsNode(near) as client,
             DdsNode(far) as gripper,
             Bridge(
-                End(client_node, GO), End(gripper_node, ACTUATOR), sides=(LEFT,), clock=clock
+                BridgeEnd(client_node, GO),
+                BridgeEnd(gripper_node, ACTUATOR),
+                sides=(LEFT,),
+                clock=clock,
             ) as bridge,
         ):
             writer = client.writer(CMD, GO.cmd_type)
@@ -354,7 +357,7 @@ def test_a_robot_damps_after_a_pause(model: RobotModel) -> None:
     assert robot.driven
 
 
-def test_an_emulated_robot_that_was_suspended_obeys_only_what_was_sent_later() -> None:
+def test_suspended_robot_obeys_only_later_commands() -> None:
     clock = Suspendable()
     domain = free_domain()
     with EmulatedRobot(G1, domain=domain, clock=clock) as robot, DdsNode(domain) as client:

@@ -140,7 +140,7 @@ def test_limits_of_torque_speed_and_travel(model: RobotModel) -> None:
 
 
 @both
-def test_off_is_limp(model: RobotModel) -> None:
+def test_motor_that_is_off_is_limp(model: RobotModel) -> None:
     slot, other = model.slot("left_knee"), model.slot("right_knee")
     mode = [0 if i == slot else m for i, m in enumerate(model.enable)]
     bench = Bench(model)
@@ -216,7 +216,7 @@ def test_non_finite_value_rejects_the_command(
 @both
 @settings(max_examples=100)
 @given(st.data())
-def test_no_flipped_bit_is_obeyed(model: RobotModel, data: Any) -> None:
+def test_command_with_a_flipped_bit_is_rejected(model: RobotModel, data: Any) -> None:
     bench = Bench(model)
     good = encode_with_crc(low_cmd(model))
     image = bytearray(struct_of_payload(model.cmd_type, good))
@@ -259,7 +259,7 @@ def test_mode_machine() -> None:
     assert other.send(low_cmd(G1, mode_machine=13))
 
 
-def test_mode_pr_is_told_back() -> None:
+def test_mode_pr_is_in_the_state() -> None:
     bench = Bench(G1)
     assert bench.run(0.01, low_cmd(G1, mode_pr=1)).mode_pr == 1
     assert "A and B" in bench.reports[0]
@@ -337,7 +337,7 @@ def test_arm_topic(model: RobotModel) -> None:
 
 
 @both
-def test_arm_topic_refuses_what_is_wrong(model: RobotModel) -> None:
+def test_arm_topic_rejects_invalid_commands(model: RobotModel) -> None:
     bench = Bench(model)
     order = encode_with_crc(low_cmd(model))
     wrong = order[:-4] + struct.pack("<I", 12345)

@@ -125,7 +125,7 @@ def test_clients_of_another_robot(node: DdsNode) -> None:
     assert robot.mismatches() == []
 
 
-def test_a_failure_is_told(node: DdsNode, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_is_reported(node: DdsNode, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = EmulatedRobot(H1, node=node)
 
     def fail(now: float) -> bytes:

@@ -172,7 +172,7 @@ class TestLink:
             wait_until(lambda: delays)
             assert delays[0] == 0.1
 
-    def test_lost_in_the_middle_of_a_stop(self) -> None:
+    def test_hand_lost_during_stop_ends_cleanly(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         service = serve(hand, node)
         service.start()
@@ -180,7 +180,9 @@ class TestLink:
         service.stop()
         assert not hand.is_open
 
-    def test_any_exception_of_a_backend_is_survived(self, caplog: pytest.LogCaptureFixture) -> None:
+    def test_service_goes_on_after_any_exception_of_a_backend(
+        self, caplog: pytest.LogCaptureFixture
+    ) -> None:
         hand, node = ScriptedHand(), FakeNode()
         with serve(hand, node) as service:
             hand.errors.append(ZeroDivisionError("a bug"))
@@ -210,14 +212,14 @@ class TestLink:
             wait_until(lambda: newest(node).lost == 0)
             assert service.cores[Side.LEFT].counters.losses == 0
 
-    def test_missing_at_the_start_fails_and_releases(self) -> None:
+    def test_missing_hand_at_start_fails_and_releases_resources(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         hand.plugged = False
         with pytest.raises(HandLost):
             serve(hand, node).start()
         assert node.open_entities == 0
 
-    def test_a_bug_at_the_start_is_named_with_its_place(self) -> None:
+    def test_error_in_a_backend_at_start_names_file_and_line(self) -> None:
         class Unfinished(ScriptedHand):
             def open(self) -> None:
                 raise OSError("no such port")
@@ -235,7 +237,7 @@ class TestLink:
             serve(Bare(), FakeNode()).start()
         assert "HandState.from_values" in raised.value.hint
 
-    def test_missing_at_the_start_can_be_waited_for(self) -> None:
+    def test_missing_hand_at_start_can_be_waited_for(self) -> None:
         hand, node = ScriptedHand(q=0.5), FakeNode()
         hand.plugged = False
         with serve(hand, node, wait_for_device=True):
@@ -312,7 +314,9 @@ class TestStop:
         hand.hang.set()
 
 
-def test_publishing_errors_are_counted_and_survived(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_publishing_errors_are_counted_and_the_service_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     hand, node = ScriptedHand(), FakeNode()
     with serve(hand, node) as service:
         wait_until(lambda: node.sent)
@@ -353,7 +357,7 @@ class TestTwoHands:
         with pytest.raises(UsageError, match="share one topic pair"):
             HandService([ScriptedHand(Side.LEFT), ScriptedHand(Side.RIGHT)], node=FakeNode())
 
-    def test_the_same_side_twice(self) -> None:
+    def test_two_hands_of_one_side_are_refused(self) -> None:
         hands = [ScriptedHand(Side.LEFT), ScriptedHand(Side.LEFT)]
         with pytest.raises(UsageError, match="share one topic pair"):
             HandService(hands, node=FakeNode(), dialect="unitree_actuator")
@@ -417,7 +421,7 @@ class TestExchangePacing:
         begins = [a for a, _ in self.run([0.0012] * 20)]
         assert begins == pytest.approx([i * self.PERIOD for i in range(20)])
 
-    def test_a_late_exchange_is_followed_at_once_and_periods_missed_are_skipped(self) -> None:
+    def test_late_exchange_is_followed_at_once_and_missed_periods_are_skipped(self) -> None:
         for late in (0.0021, 0.0039, 0.0041, 0.0075):
             spans = self.run([0.0012, late, *[0.0005] * 6])
             assert spans[2][0] == pytest.approx(spans[1][1]), late
@@ -441,7 +445,7 @@ class TestConflict:
             serve(hand, node).start()
         assert hand.opens == 0
 
-    def test_unless_forced(self) -> None:
+    def test_force_allows_another_publisher(self) -> None:
         node = FakeNode([FakeEndpoint(STATE, self.HG, "writer")])
         with serve(ScriptedHand(), node, force=True):
             wait_until(lambda: node.sent)
@@ -469,7 +473,7 @@ class TestDiagnose:
         assert "never match" in text
         assert "--dialect unitree_hg" in text
 
-    def test_the_legacy_topic(self) -> None:
+    def test_client_of_the_legacy_topic_is_reported(self) -> None:
         """xr_teleoperate issue 100: client and hand wait for each other on other topics."""
         peers = [FakeEndpoint("rt/unitree_actuator/cmd", self.LEGACY.cmd_type, "writer")]
         (text,) = diagnose(peers, self.GO, [Side.LEFT])
@@ -481,7 +485,7 @@ class TestDiagnose:
         (text,) = diagnose(peers, self.LEGACY, list(Side))
         assert "--dialect unitree_go" in text
 
-    def test_a_client_of_another_hand_that_nobody_serves(self) -> None:
+    def test_client_of_a_hand_that_is_not_served_is_reported(self) -> None:
         waiting = FakeEndpoint("rt/dex3/left/state", self.HG.state_type, "reader")
         (text,) = diagnose([waiting], self.GO, [Side.LEFT])
         assert "rt/dex3/left/state, the state of a dex3-1" in text
@@ -491,7 +495,7 @@ class TestDiagnose:
         (text,) = diagnose([example], self.GO, [Side.LEFT])
         assert "the state of a dex3-1" in text
 
-    def test_a_client_of_the_other_side_is_not_our_business(self) -> None:
+    def test_client_of_the_other_side_is_ignored(self) -> None:
         other = self.GO.topics(Side.RIGHT)[1]
         peers = [FakeEndpoint(other, self.GO.state_type, "reader")]
         assert diagnose(peers, self.GO, [Side.LEFT]) == []

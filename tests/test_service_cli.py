@@ -67,7 +67,7 @@ def test_sighup_under_nohup_is_ignored() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_started_in_the_background_under_nohup_it_outlives_the_terminal(dds_domain: int) -> None:
+def test_service_under_nohup_survives_the_terminal(dds_domain: int) -> None:
     """A hangup is ignored as it was asked for; an interrupt that is sent still ends it in order."""
     ignored = (signal.SIGHUP, signal.SIGINT)
     before = [signal.signal(number, signal.SIG_IGN) for number in ignored]
@@ -104,7 +104,7 @@ def test_both_sides_in_one_process(dds_domain: int, dds_node: DdsNode) -> None:
             take_until(reader, bool)
 
 
-def test_a_dex3_is_served_in_its_own_dialect(dds_domain: int, dds_node: DdsNode) -> None:
+def test_dex3_is_served_in_its_own_dialect(dds_domain: int, dds_node: DdsNode) -> None:
     d = dialect("dex3")
     topics = [d.topics(side)[1] for side in Side] + [
         d.low_rate_topic.format(side=side) for side in Side
@@ -237,7 +237,7 @@ class TestArguments:
         hint = getattr(result.exception, "hint", "")
         assert message in f"{result.output} {result.exception} {hint}"
 
-    def test_help_says_what_the_defaults_are(self) -> None:
+    def test_help_shows_the_defaults(self) -> None:
         result = CliRunner().invoke(cli, ["serve", "--help"])
         assert result.exit_code == 0
         for text in (

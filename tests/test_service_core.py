@@ -48,7 +48,7 @@ class Bench:
         return self.core.submit(HandCommand.position(q, **fields))
 
 
-def test_it_brakes_before_the_first_command() -> None:
+def test_hand_brakes_before_the_first_command() -> None:
     bench = Bench()
     assert bench.exchange().is_brake
     assert bench.core.counters.brakes == 0  # nothing was driven, so nothing stopped
@@ -91,7 +91,7 @@ def test_state_goes_on_while_braking() -> None:
 
 @each("field", ["q", "dq", "tau", "kp", "kd"])
 @each("value", [math.nan, math.inf, -math.inf])
-def test_a_rejected_command_leaves_the_last_one_in_force(field: str, value: float) -> None:
+def test_rejected_command_keeps_the_previous_one(field: str, value: float) -> None:
     bench = Bench()
     assert bench.command(2.0)
     bad = HandCommand.position(3.0)
@@ -101,7 +101,7 @@ def test_a_rejected_command_leaves_the_last_one_in_force(field: str, value: floa
     assert (bench.core.counters.accepted, bench.core.counters.rejected) == (1, 1)
 
 
-def test_rejected_commands_do_not_feed_the_watchdog() -> None:
+def test_rejected_commands_do_not_reset_the_watchdog() -> None:
     bench = Bench()
     bench.command(2.0)
     for _ in range(11):
@@ -118,7 +118,7 @@ def test_commands_outside_the_limits_are_clamped_and_counted() -> None:
 
 
 class TestPauses:
-    def test_after_a_pause_it_brakes_until_a_newer_command(self) -> None:
+    def test_hand_brakes_after_a_pause_until_a_newer_command(self) -> None:
         bench = Bench()
         bench.command(2.0)
         assert not bench.exchange().is_brake
@@ -135,7 +135,7 @@ class TestPauses:
         assert bench.core.submit(HandCommand.position(3.0), now + 0.05)
         assert bench.exchange().q[0] == 3.0
 
-    def test_a_command_is_as_old_as_when_it_was_sent(self) -> None:
+    def test_command_age_counts_from_when_it_was_sent(self) -> None:
         bench = Bench()
         now = bench.clock.now()
         bench.clock.advance(1.0)
@@ -146,7 +146,7 @@ class TestPauses:
         bench.clock.advance(0.01)
         assert bench.exchange().is_brake
 
-    def test_a_stale_command_does_not_feed_the_watchdog(self) -> None:
+    def test_stale_command_does_not_reset_the_watchdog(self) -> None:
         bench = Bench()
         bench.command(2.0)
         for _ in range(11):
@@ -196,7 +196,7 @@ class TestLostLink:
         bench.command(3.6)
         assert bench.exchange().q[0] == 3.6
 
-    def test_a_hang_shows_although_nothing_fails(self) -> None:
+    def test_hanging_exchange_is_reported_without_an_error(self) -> None:
         bench = Bench()
         bench.clock.advance(0.1)
         first = bench.core.view()
@@ -214,7 +214,7 @@ class TestLostLink:
 
 
 class TestFailedExchanges:
-    def test_single_timeouts_pass_and_show(self) -> None:
+    def test_single_timeouts_are_counted_and_keep_the_link(self) -> None:
         bench = Bench()
         bench.command(3.0)
         bench.clock.advance(0.01)
@@ -238,7 +238,7 @@ class TestFailedExchanges:
         assert view is not None
         assert view.missed == 1
 
-    def test_half_a_second_of_timeouts_is_a_loss(self) -> None:
+    def test_half_a_second_of_timeouts_closes_the_link(self) -> None:
         bench = Bench()
         for _ in range(5):
             bench.clock.advance(0.1)
@@ -246,7 +246,7 @@ class TestFailedExchanges:
         bench.clock.advance(0.1)
         assert bench.core.failed(HandTimeout("no answer"))
 
-    def test_a_fault_brakes_and_shows_its_bits(self) -> None:
+    def test_fault_brakes_and_is_published(self) -> None:
         bench = Bench()
         bench.command(3.0)
         bench.exchange()
@@ -280,7 +280,7 @@ class TestFailedExchanges:
         bench.command(3.2)
         assert bench.exchange().q[0] == 3.2
 
-    def test_a_fault_is_not_a_lost_link(self) -> None:
+    def test_fault_does_not_close_the_link(self) -> None:
         """The backend is still recovering, perhaps for minutes while a motor cools."""
         bench = Bench()
         for _ in range(100):
@@ -294,7 +294,7 @@ class TestFailedExchanges:
     def test_other_exceptions_close_the_link(self, error: Exception) -> None:
         assert Bench().core.failed(error)
 
-    def test_a_rejection_by_the_hand_is_not(self) -> None:
+    def test_command_rejected_by_the_hand_keeps_the_link(self) -> None:
         assert not Bench().core.failed(CommandRejected("it does not like it"))
 
     @each("q", [[math.nan], [math.inf], [0.0, 0.0]])
@@ -315,7 +315,7 @@ class TestFailedExchanges:
 
 
 class TestPrediction:
-    def test_auto_goes_by_what_clients_need(self) -> None:
+    def test_auto_estimation_depends_on_the_rate_that_clients_need(self) -> None:
         assert not Bench(io_rate=300.0).core.predicting
         assert Bench(io_rate=30.0).core.predicting
 
@@ -334,7 +334,7 @@ class TestPrediction:
             bench.exchange()
         assert not bench.core.predicting
 
-    def test_off_and_predict_force_the_prediction_mode(self) -> None:
+    def test_off_and_predict_set_the_estimation(self) -> None:
         assert not Bench(io_rate=5.0, estimation=Estimation.OFF).core.predicting
         assert Bench(io_rate=900.0, estimation=Estimation.PREDICT).core.predicting
 
@@ -357,7 +357,7 @@ class TestPrediction:
         assert view is not None
         assert (view.state.q[0], view.state.measured) == (1.0, True)
 
-    def test_the_watchdog_stops_the_prediction_too(self) -> None:
+    def test_watchdog_stops_the_prediction(self) -> None:
         bench = Bench(io_rate=5.0, speeds=[(0.1, 0.1)])
         bench.command(5.0)
         bench.clock.advance(TIMEOUT)
@@ -382,7 +382,7 @@ class TestSoftStart:
             bench.q = float(sent)
         return fastest
 
-    def test_a_real_hand_starts_at_one_stroke_a_second(self) -> None:
+    def test_soft_start_limits_speed_to_one_stroke_a_second(self) -> None:
         bench = Bench(simulated=False)
         assert self.drive(bench, 5.4, 2.0) <= 5.4 + 1e-6
         assert bench.q == 5.4

@@ -137,7 +137,7 @@ def test_nan_and_out_of_range_commands_are_ignored(service: HandService, client:
     assert client.state().q < 5.62  # the vendor's hard stop
 
 
-def test_a_late_client_and_one_that_restarts(service: HandService) -> None:
+def test_late_and_restarted_clients_get_states(service: HandService) -> None:
     first = Client(service.domain)
     first.drive_to(2.0)
     late = Client(service.domain)
@@ -151,9 +151,7 @@ def test_a_late_client_and_one_that_restarts(service: HandService) -> None:
     late.close()
 
 
-def test_another_type_on_the_topic_is_not_understood(
-    service: HandService, dds_node: DdsNode
-) -> None:
+def test_other_type_on_the_topic_is_ignored(service: HandService, dds_node: DdsNode) -> None:
     writer = dds_node.writer(CMD, HG.cmd_type)
     assert not writer.wait_matched(0.5)
     writer.write(unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=6.0)]))
@@ -169,7 +167,7 @@ def test_a_second_service_on_the_topic_is_refused(service: HandService) -> None:
         pass
 
 
-def test_unplugged_in_mid_motion_and_back(dds_domain: int) -> None:
+def test_hand_unplugged_in_motion_is_reopened(dds_domain: int) -> None:
     hand = ScriptedHand(Side.LEFT)
     with HandService(hand, domain=dds_domain) as service:
         client = Client(dds_domain)

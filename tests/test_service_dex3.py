@@ -53,7 +53,7 @@ def mapping(fill: Fill = Fill.KNOWN, side: Side = LEFT) -> DialectMap:
 
 
 def message(modes: list[int] | None = None, **fields: float) -> unitree_hg.HandCmd_:
-    """As xr_teleoperate's controller sends it, unless told otherwise."""
+    """As xr_teleoperate's controller sends it, unless given otherwise."""
     values = {"kp": 1.5, "kd": 0.2, **fields}
     modes = modes if modes is not None else [0x10 | i for i in range(N)]
     return unitree_hg.HandCmd_([unitree_hg.MotorCmd_(mode=m, **values) for m in modes])  # type: ignore[arg-type]
@@ -67,7 +67,7 @@ def understood(modes: list[int]) -> HandCommand:
 
 class TestModeByte:
     @given(st.lists(st.integers(0, 255), min_size=N, max_size=N))
-    def test_every_byte_means_what_the_manual_says(self, modes: list[int]) -> None:
+    def test_every_mode_byte_is_decoded_as_in_the_manual(self, modes: list[int]) -> None:
         command = understood(modes)
         assert command.timeout is not None
         assert command.mode.tolist() == [
@@ -79,7 +79,7 @@ class TestModeByte:
         assert ("unknown_status" in counters) == any((m >> 4) & 7 > 1 for m in modes)
 
     @each("high", [0x00, 0x10, 0x80, 0x90])
-    def test_nothing_is_odd_about_the_right_ids(self, high: int) -> None:
+    def test_correct_motor_ids_give_no_remark(self, high: int) -> None:
         assert mapping().remarks(message([high | i for i in range(N)]), LEFT) == ()
 
     def test_mode_1_for_every_motor_locks_them_and_is_explained(self) -> None:
@@ -87,7 +87,7 @@ class TestModeByte:
         assert understood([1] * N).is_brake
         (remark,) = mapping().remarks(message([1] * N), LEFT)
         assert remark.counter == "wrong_ids"
-        assert "mode byte 0x01 of motor 0 says id 1, status 0" in remark.text
+        assert "mode byte 0x01 of motor 0 has id 1, status 0" in remark.text
         assert "locks it" in remark.text
         assert "send 0x10 (0x10 | index) to drive motor 0" in remark.text
 
@@ -98,7 +98,7 @@ class TestModeByte:
         assert understood(modes).mode.tolist() == [1, 1, 0, 1, 1, 1, 1]
         (remark,) = mapping().remarks(message(modes), LEFT)
         assert remark.counter == "unknown_status"
-        assert "motor 2 says id 2, status 6" in remark.text
+        assert "motor 2 has id 2, status 6" in remark.text
 
     def test_motors_go_by_index_whatever_their_id(self) -> None:
         commands = message([0x10 | (N - 1 - i) for i in range(N)])
@@ -173,7 +173,7 @@ class TestState:
         full_state(measured=False), (0, 1, 0, TRIPPED, 0, 0, LINK), 3, (True,) + (False,) * 6
     )
 
-    def test_every_field(self) -> None:
+    def test_every_field_is_published(self) -> None:
         m = sent(self.VIEW)
         s = self.VIEW.state
         assert [x.mode for x in m.motor_state] == [0x90, 0x01, 0x12, 0x83, 0x14, 0x05, 0x16]
@@ -203,7 +203,7 @@ class TestState:
         m = mapping()
         assert m.state({LEFT: self.VIEW}) == STATES.decode(m.encode({LEFT: self.VIEW}))
 
-    def test_vendor_fill_leaves_out_what_is_dexkits_own(self) -> None:
+    def test_vendor_fill_omits_fields_the_vendor_does_not_set(self) -> None:
         m = sent(self.VIEW, Fill.VENDOR)
         assert [x.ddq for x in m.motor_state] == [0.0] * N
         assert [tuple(x.reserve) for x in m.motor_state] == [(0,) * 4] * N
@@ -213,7 +213,7 @@ class TestState:
     def test_a_lost_link_is_in_the_hands_error(self) -> None:
         assert sent(StateView(full_state(), (LINK,) * N)).error[0] == LINK | 0x10
 
-    def test_what_is_not_known_is_zero_or_no_value(self) -> None:
+    def test_unknown_values_are_zero_or_no_value(self) -> None:
         m = sent(StateView(HandState.from_values([0.1] * N, stamp=0.0, dq=math.nan), (0,) * N))
         assert [x.dq for x in m.motor_state] == [0.0] * N
         assert [x.temperature for x in m.motor_state] == [(0, 0)] * N
@@ -222,13 +222,13 @@ class TestState:
         assert (m.power_v, m.power_a, m.system_v, m.device_v) == (0.0,) * 4
 
     @each("reading", [30000.0, 30000.0009, 29999.9995])
-    def test_a_reading_never_looks_like_no_value(self, reading: float) -> None:
+    def test_reading_is_never_encoded_as_no_value(self, reading: float) -> None:
         m = sent(StateView(full_state(pressure=np.full((SENSORS, 12), reading)), (0,) * N))
         for packet in m.press_sensor_state:
             assert all(p != 30000.0 for p in packet.pressure)
             assert packet.pressure[0] == pytest.approx(reading, abs=0.003)
 
-    def test_one_state_leaves_nothing_in_the_next(self) -> None:
+    def test_states_share_no_values(self) -> None:
         encoder = FingerStateEncoder(spec())
         fresh = FingerStateEncoder(spec()).encode(
             HandState.from_values([0.1] * N, stamp=0.0), (0,) * N
@@ -313,7 +313,7 @@ ON, OFF = [True] * N, [False] * N
 
 
 class TestTimeouts:
-    def test_a_protected_joint_brakes_and_says_so(self) -> None:
+    def test_protected_joint_brakes_and_reports_it(self) -> None:
         bench = Bench()
         bench.send(ON)
         assert not bench.after(TIMEOUT - 0.01).is_brake
@@ -345,7 +345,7 @@ class TestTimeouts:
         assert bench.core.tripped == tuple(range(N))
         assert bench.exchange().is_brake
 
-    def test_it_stays_braked_until_a_command_with_the_bit_clear(self) -> None:
+    def test_tripped_joint_brakes_until_a_command_with_bit_7_clear(self) -> None:
         bench = Bench()
         bench.send(ON)
         bench.after(TIMEOUT)
@@ -358,7 +358,7 @@ class TestTimeouts:
         bench.send(ON)  # cleared: the protection is armed again
         assert not bench.exchange().is_brake
 
-    def test_it_trips_although_nothing_was_exchanged_meanwhile(self) -> None:
+    def test_protection_trips_without_exchanges(self) -> None:
         bench = Bench()
         bench.send(ON)
         bench.exchange()
@@ -366,7 +366,7 @@ class TestTimeouts:
         bench.send(ON)  # comes before the exchange thread has seen the silence
         assert bench.exchange().is_brake
 
-    def test_an_unprotected_joint_keeps_its_grip_and_nothing_that_moves(self) -> None:
+    def test_unprotected_joint_keeps_position_but_no_velocity_or_torque(self) -> None:
         bench = Bench()
         bench.send(OFF)
         driven = bench.exchange()
@@ -385,7 +385,7 @@ class TestTimeouts:
         assert np.array_equal(bench.exchange().dq, driven.dq)
         assert not bench.core.holding
 
-    def test_each_joint_by_its_own_bit(self) -> None:
+    def test_timeout_bit_applies_to_each_joint(self) -> None:
         bench = Bench()
         bench.send([True, False, True, False, False, False, False])
         command = bench.after(TIMEOUT)
@@ -399,7 +399,7 @@ class TestTimeouts:
         bench.send(OFF, mode=[0, 1, 1, 1, 1, 1, 1])
         assert bench.after(TIMEOUT).mode.tolist() == [0, 1, 1, 1, 1, 1, 1]
 
-    def test_a_rejected_command_neither_feeds_nor_clears(self) -> None:
+    def test_rejected_command_neither_resets_nor_clears_the_protection(self) -> None:
         bench = Bench()
         bench.send(ON)
         bench.after(TIMEOUT)
@@ -419,7 +419,7 @@ class TestTimeouts:
         bench.send(OFF)
         assert not bench.exchange().is_brake
 
-    def test_a_trip_outlasts_a_lost_link(self) -> None:
+    def test_tripped_joint_stays_tripped_after_a_lost_link(self) -> None:
         bench = Bench()
         bench.send(ON)
         bench.after(TIMEOUT)
@@ -460,7 +460,7 @@ class TestTimeouts:
 
 
 class InstantDex3:
-    """Is where it is told to be."""
+    """A hand that is always at its goal."""
 
     def __init__(self, side: Side = LEFT) -> None:
         self.spec = spec(side)
@@ -510,7 +510,7 @@ class TestService:
         assert node.sent[at][1] == node.sent[at - 1][1]
         assert topics[at - 1] == STATE
 
-    def test_what_is_odd_is_counted_and_said_once(
+    def test_unusual_command_is_counted_and_logged_once(
         self, node: FakeNode, service: HandService, caplog: pytest.LogCaptureFixture
     ) -> None:
         hand = service.snapshot()["hands"]["left"]
@@ -539,7 +539,7 @@ class TestService:
         said = [r.getMessage() for r in caplog.records]
         assert len(said) == 5
         assert sum("q of middle_1 = 0.3 rad is outside -1.7453 .. 0" in text for text in said) == 1
-        assert sum("mode byte 0x01 of motor 0 says id 1" in text for text in said) == 1
+        assert sum("mode byte 0x01 of motor 0 has id 1" in text for text in said) == 1
 
     def test_a_joint_that_stays_tripped_is_explained(
         self, node: FakeNode, caplog: pytest.LogCaptureFixture
@@ -591,7 +591,7 @@ if find_spec("unitree_sdk2py") is not None:
                     return sample
             assert time.monotonic() < deadline, f"the state never got there: {sample.message}"
 
-    def test_unitrees_sdk_as_xr_teleoperate_uses_it(dds_domain: int) -> None:
+    def test_unitree_sdk_as_used_by_xr_teleoperate(dds_domain: int) -> None:
         """Both hands; waits for a q that is not 0; 100 Hz, mode 0x10 | i, kp 1.5, kd 0.2."""
         hands = {side: SimDex3(side, object_at=60.0) for side in Side}
         publisher = Publisher(200.0)  # two hands at 1000 Hz are too much for a busy test machine

@@ -42,7 +42,7 @@ def test_refused_priority_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> No
         assert policy() == before
 
 
-def test_the_thread_with_deadlines_goes_first_only_among_its_like() -> None:
+def test_publishing_thread_has_priority_only_within_the_service() -> None:
     go_first()
     assert policy() == os.SCHED_OTHER
     with real_time() as granted:

@@ -94,7 +94,7 @@ def test_moves_like_the_recorded_sessions() -> None:
     assert max(q for _, q, *_ in rows) < 5.5
 
 
-def test_blocked_feels_like_the_recorded_sessions() -> None:
+def test_blocked_hand_has_the_torque_of_the_recorded_sessions() -> None:
     """About -0.9 N m against an object, which gives way by torque over its stiffness."""
     hand, clock = opened(start_pct=100.0, object_pct=40.0)
     rows = teleoperate(hand, clock, 0.0)

@@ -19,7 +19,7 @@ from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.robots import G1
 from dexkit.service import HandService
-from dexkit.single_publisher import LOOK, SETTLE, Claim, Place, SolePublisher
+from dexkit.single_publisher import SEARCH, SETTLE, Claim, NodeTopics, SolePublisher
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.live import LiveClient
 from dexkit.traces import sample_path
@@ -70,7 +70,7 @@ class Network:
     def at(self, time: float, what: Callable[[], None]) -> None:
         heapq.heappush(self._events, (time, next(self._count), what))
 
-    def tell(self, sender: Program, news: Callable[[Program], None]) -> None:
+    def deliver(self, sender: Program, news: Callable[[Program], None]) -> None:
         for other in self.programs:
             if other is sender:
                 continue
@@ -92,7 +92,7 @@ class Program:
     def __init__(self, net: Network, name: str, start: float, skew: float, **options: bool) -> None:
         self.net, self.name, self.skew = net, name, skew
         self.node = FakeNode()
-        self.sole = SolePublisher([Place(self.node, {TOPIC})], hint="", **options)
+        self.sole = SolePublisher([NodeTopics(self.node, {TOPIC})], hint="", **options)
         self.started = self.gone = False
         net.programs.append(self)
         net.at(start, self._start)
@@ -100,7 +100,7 @@ class Program:
     def _start(self) -> None:
         self.started = True
         self._step()
-        self.net.at(self.net.now + LOOK, self._announce)
+        self.net.at(self.net.now + SEARCH, self._announce)
 
     def _announce(self) -> None:
         if not self._step():
@@ -109,7 +109,7 @@ class Program:
         self.sole._claim = Claim(since, self.net.random.getrandbits(64))
         self.sole._phase = type(self.sole._phase).SETTLE
         mine = Seen(self.name, self.sole.announce(), process=self.name)
-        self.net.tell(self, lambda other: other._hear(mine))
+        self.net.deliver(self, lambda other: other._discover(mine))
         self.net.at(self.net.now + SETTLE, self._begin)
 
     def _begin(self) -> None:
@@ -117,7 +117,7 @@ class Program:
             self.sole.begin()
             self._step()
 
-    def _hear(self, seen: Seen) -> None:
+    def _discover(self, seen: Seen) -> None:
         self.node.known[seen.key] = seen
         if self.started:
             self._step()
@@ -131,7 +131,7 @@ class Program:
                 self.sole.check()
             except TopicConflict:
                 self.gone = True
-                self.net.tell(self, lambda other: other._miss(self.name))
+                self.net.deliver(self, lambda other: other._miss(self.name))
         return not self.gone
 
 
@@ -169,17 +169,17 @@ def test_forced_publishers_stay_and_log_a_warning(caplog: pytest.LogCaptureFixtu
     assert first.sole.rivals == second.sole.rivals == 1
     said = sorted(r.getMessage() for r in caplog.records)
     assert said == [
-        f"first publishes {TOPIC} on domain 1, too; the two fight",
-        f"second publishes {TOPIC} on domain 1, too; the two fight",
+        f"first publishes {TOPIC} on domain 1, too; their samples mix",
+        f"second publishes {TOPIC} on domain 1, too; their samples mix",
     ]
 
 
-def test_publisher_without_a_claim_is_respected() -> None:
+def test_publisher_gives_way_to_one_without_a_claim() -> None:
     vendor = Seen("v", process="vendor")
 
     def sole(**options: bool) -> tuple[FakeNode, SolePublisher]:
         node = FakeNode()
-        return node, SolePublisher([Place(node, {TOPIC})], hint="stop it", **options)
+        return node, SolePublisher([NodeTopics(node, {TOPIC})], hint="stop it", **options)
 
     node, one = sole()
     node.known["v"] = vendor
@@ -208,7 +208,7 @@ def test_publisher_without_a_claim_is_respected() -> None:
             assert one.rivals == 1
             del node.known["v"]
             one.check()
-            assert one.company() is None
+            assert one.describe_rival() is None
 
 
 def test_invalid_claims_are_ignored() -> None:
@@ -226,15 +226,15 @@ def test_invalid_claims_are_ignored() -> None:
         assert Claim.decode(data) is None, data[:40]
 
 
-def test_a_flood_of_publishers_is_counted_and_not_kept(caplog: pytest.LogCaptureFixture) -> None:
+def test_many_publishers_are_counted_and_not_stored(caplog: pytest.LogCaptureFixture) -> None:
     node = FakeNode()
-    one = SolePublisher([Place(node, {TOPIC})], hint="")
+    one = SolePublisher([NodeTopics(node, {TOPIC})], hint="")
     one.begin()
     for i in range(1000):
         node.known = {f"k{i}": Seen(f"k{i}", process=f"p{i}")}
         one.check()
     assert one.rivals == 1000
-    assert len(one._told) == 1
+    assert len(one._known_rivals) == 1
     assert len(caplog.records) == 20
 
 
@@ -277,7 +277,7 @@ def test_one_of_two_simultaneous_services_remains() -> None:
             one.stop()
 
 
-def test_a_service_that_finds_an_earlier_one_late_brakes_and_ends() -> None:
+def test_service_that_discovers_an_earlier_one_late_brakes_and_ends() -> None:
     dds_domain = free_domain()
     with DdsNode(dds_domain) as near, DdsNode(dds_domain) as far:
         with service(near) as served:
@@ -292,7 +292,7 @@ def test_a_service_that_finds_an_earlier_one_late_brakes_and_ends() -> None:
         # it left without a last state, which would be the other one's
         with service(near) as served, far.writer(TOPIC, GO.state_type):
             wait_until(lambda: served.snapshot()["rivals"] == 1)
-            assert served.failure is None  # the vendor's came later: told, and no more
+            assert served.failure is None  # the vendor's came later: only logged
 
 
 def test_replay_gives_way_to_a_new_publisher() -> None:

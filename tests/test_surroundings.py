@@ -33,7 +33,7 @@ print(json.dumps({
     "stdin": os.fstat(0).st_rdev == os.stat(os.devnull).st_rdev,
 }))
 '''], stdout=subprocess.PIPE, check=True).stdout
-with open(os.environ["HOME"] + "/text", "w") as file:  # what a test would write and not say how
+with open(os.environ["HOME"] + "/text", "w") as file:  # as a test would write, without an encoding
     file.write("\\u011f")
 encoded = open(os.environ["HOME"] + "/text", "rb").read()
 os.kill(os.getpid(), signal.SIGHUP)  # the terminal goes; the run under nohup does not
@@ -116,7 +116,7 @@ def test_the_files_in_the_list_exist(optional: Optional) -> None:
 
 
 def test_no_test_asserts_an_upper_bound_of_wall_time() -> None:
-    """How fast it is depends on the machine: benchmarks say that, with what they compare to."""
+    """How fast it is depends on the machine: benchmarks measure it, with a comparison."""
     clock = r"time\.(monotonic|perf_counter|time)\(\) - \w+(\[\d+\])?"
     bound = re.compile(rf"\s*assert (.*{clock}|took|elapsed) <")
     for path in sorted(HERE.glob("*.py")):

@@ -26,10 +26,10 @@ from dexkit.teleop import (
     StateReceiver,
     StickyFilter,
     client_for,
-    feel,
     profile,
     profiles_for,
     recorded,
+    tracking_figures,
 )
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
 from dexkit.teleop.client_codec import ClientWire
@@ -64,7 +64,7 @@ def test_states_are_read_left_then_right_and_kept_until_both_are_there() -> None
     assert receiver.wakes_at == 0.5 + POLL_PAUSE
 
 
-def test_it_pauses_after_both_and_then_takes_the_newest() -> None:
+def test_receiver_pauses_after_both_sides_and_takes_the_newest() -> None:
     receiver = StateReceiver([(LEFT,), (RIGHT,)])
     receiver.receive(0.0, {LEFT: (0.0,)})
     receiver.receive(0.0, {RIGHT: (0.0,)})
@@ -76,7 +76,7 @@ def test_it_pauses_after_both_and_then_takes_the_newest() -> None:
     assert receiver.latest == {LEFT: (3.0,), RIGHT: (30.0,)}
 
 
-def test_a_silent_side_freezes_the_other_one() -> None:
+def test_silent_side_freezes_the_other_side() -> None:
     receiver = StateReceiver([(LEFT,), (RIGHT,)])
     receiver.receive(0.0, {LEFT: (1.0,)})
     receiver.receive(0.0, {RIGHT: (1.0,)})
@@ -87,7 +87,7 @@ def test_a_silent_side_freezes_the_other_one() -> None:
     assert receiver.latest == {LEFT: (2.0,), RIGHT: (100.0,)}
 
 
-def test_after_a_silence_of_the_right_side_the_left_state_is_an_old_one() -> None:
+def test_left_state_is_old_after_silence_of_the_right_side() -> None:
     receiver = StateReceiver([(LEFT,), (RIGHT,)])
     receiver.receive(0.0, {LEFT: (1.0,)})
     receiver.receive(0.0, {RIGHT: (1.0,)})
@@ -101,7 +101,7 @@ def test_after_a_silence_of_the_right_side_the_left_state_is_an_old_one() -> Non
 @given(
     st.lists(st.tuples(st.floats(0.0, 0.004), st.sampled_from([LEFT, RIGHT]), angles), max_size=60)
 )
-def test_what_is_read_was_published_and_never_older_than_what_was_read_before(
+def test_states_read_were_published_and_are_in_order(
     arrivals: list[tuple[float, Side, float]],
 ) -> None:
     receiver = StateReceiver([(LEFT,), (RIGHT,)])
@@ -120,20 +120,20 @@ def test_what_is_read_was_published_and_never_older_than_what_was_read_before(
 # ----------------------------------------------------------------------------------- the filter
 
 
-def test_the_filter_weights_the_newest_most() -> None:
+def test_filter_weights_the_newest_value_most() -> None:
     smooth = StickyFilter()
     assert smooth((1.0,)) == (1.0,)
     assert smooth((2.0,)) == (2.0,)
     assert smooth((3.0,)) == pytest.approx((0.5 * 3 + 0.3 * 2 + 0.2 * 1,))
 
 
-def test_the_filter_sticks_at_a_value_that_no_longer_changes() -> None:
+def test_filter_ignores_repeated_values() -> None:
     smooth = StickyFilter()
     values = [smooth((x,)) for x in (2.4, 2.6, 2.7, 2.7, 2.7, 2.7)]
     assert values[-1] == values[2] != (2.7,)
 
 
-def test_one_hand_that_moves_makes_the_filter_count_the_other_too() -> None:
+def test_filter_is_updated_for_both_hands_when_one_moves() -> None:
     smooth = StickyFilter()
     for x in (0.0, 1.0, 2.0, 3.0, 4.0):
         out = smooth((min(x, 2.0), x))
@@ -173,7 +173,7 @@ def test_no_command_before_both_states_arrived() -> None:
     assert client.missing == {}
 
 
-def test_before_any_input_it_goes_to_mid_stroke() -> None:
+def test_target_is_mid_stroke_before_any_input() -> None:
     client = Dex1Client()
     ready(client, 2.6, 0.0)
     commands = client.step(0.01, {}, {})
@@ -189,14 +189,14 @@ def test_only_q_and_the_gains_are_set() -> None:
     assert (command.kp, command.kd) == (5.0, 0.05)
 
 
-def test_with_input_of_one_hand_the_other_closes() -> None:
+def test_input_of_one_hand_closes_the_other() -> None:
     client = Dex1Client()
     ready(client)
     client.step(0.01, {}, {LEFT: (PINCH_MAX,)})
     assert client.targets == {LEFT: 5.4, RIGHT: 0.0}
 
 
-def test_input_that_ends_leaves_the_target() -> None:
+def test_target_is_kept_when_input_ends() -> None:
     client = Dex1Client()
     ready(client)
     client.step(0.01, {}, {LEFT: (6.5,), RIGHT: (6.0,)})
@@ -205,7 +205,7 @@ def test_input_that_ends_leaves_the_target() -> None:
     assert client.targets == before == {LEFT: pytest.approx(4.05), RIGHT: pytest.approx(2.7)}
 
 
-def test_the_newest_release_holds_where_it_is_without_input() -> None:
+def test_newest_release_holds_position_without_input() -> None:
     client = Dex1Client(release=Release.NEWEST)
     ready(client, 4.0, 0.5)
     commands = client.step(0.01, {}, {})
@@ -221,14 +221,14 @@ def test_release_1_1_waits_for_a_position_that_is_not_zero() -> None:
     assert client.ready
 
 
-def test_simulated_it_neither_clips_nor_smooths() -> None:
+def test_simulation_mode_neither_clips_nor_filters() -> None:
     client = Dex1Client(simulated=True)
     ready(client)
     commands = client.step(0.01, {}, {LEFT: (PINCH_MAX,), RIGHT: (PINCH_MIN,)})
     assert (q_of(commands, LEFT), q_of(commands, RIGHT)) == (5.4, 0.0)
 
 
-def test_one_sided_it_waits_for_that_side_alone() -> None:
+def test_one_sided_client_waits_for_that_side_only() -> None:
     client = Dex1Client(sides=[RIGHT])
     assert set(client.step(0.0, {RIGHT: (0.3,)}, {})) == {RIGHT}
 
@@ -256,7 +256,7 @@ def test_a_command_is_within_the_lead_of_the_last_three_states(
 # --------------------------------------------------- value for value against the genuine client
 
 
-def test_it_sends_what_the_genuine_client_sent_before_any_input() -> None:
+def test_commands_equal_the_recorded_ones_before_any_input() -> None:
     """The first seven seconds of the startle recording, where the input is known to be 0.
 
     Which recorded state the genuine client had at each step is not in the recording, so it is any
@@ -289,7 +289,7 @@ def test_it_sends_what_the_genuine_client_sent_before_any_input() -> None:
     assert worst < 5e-7
 
 
-def test_it_sends_the_same_when_it_is_fed_the_recorded_states_in_time() -> None:
+def test_commands_equal_the_recorded_ones_for_the_recorded_states() -> None:
     """The same with the model's own receiving thread; one state earlier or later is 0.013 rad."""
     rec = recording("dex1_idle_then_startle")
     events: list[tuple[float, int, Side | int, float]] = []
@@ -370,7 +370,7 @@ def test_a_dex3_client_waits_for_a_position_that_is_not_zero_on_both_sides() -> 
     assert client.ready
 
 
-def test_its_commands_are_the_targets_with_mode_and_gains_whatever_the_state_is() -> None:
+def test_dex3_commands_are_the_targets_independent_of_the_state() -> None:
     client = client_for("dex3")
     client.receive(0.0, {LEFT: pose(0.1)})
     client.receive(0.0, {RIGHT: pose(0.1)})
@@ -414,7 +414,7 @@ def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
 
 
 @each("name", list(DIALECTS))
-def test_positions_come_back_from_the_wire(name: str) -> None:
+def test_positions_are_decoded(name: str) -> None:
     from dexkit.conformance.motor_messages import MotorCodec
 
     spoken = DIALECTS[name]
@@ -462,7 +462,7 @@ def test_the_client_gets_the_input_at_thirty_hertz() -> None:
     assert 29 <= len(values) <= 31
 
 
-def test_an_object_squeezes_the_profile() -> None:
+def test_object_limits_the_stroke_of_a_profile() -> None:
     operator = Operator(profile("full-stroke", "dex1-1"), GO, most={RIGHT: 0.5})
     assert operator.intent(0.6, LEFT) == (0.0,)
     assert operator.intent(0.6, RIGHT) == pytest.approx((2.7,))
@@ -480,7 +480,7 @@ def test_a_recording_is_a_profile() -> None:
         recorded("nothing", GO, {})
 
 
-def test_a_profile_of_the_other_model_is_refused_with_the_names_that_there_are() -> None:
+def test_profile_of_another_model_is_refused_and_names_are_listed() -> None:
     with pytest.raises(UsageError, match="no profile"):
         profile("fist", "dex1-1")
     with pytest.raises(UsageError) as caught:
@@ -509,11 +509,11 @@ def first_order(
     return t, q
 
 
-def test_the_time_of_a_stroke_is_what_a_first_order_hand_needs() -> None:
+def test_stroke_time_of_a_first_order_hand() -> None:
     def wanted(t: float) -> float:
         return 5.4 if t >= 1.0 else 0.0
 
-    found = feel(*first_order(wanted, delay=0.0, tau=0.1, end=3.0), wanted, 5.4)
+    found = tracking_figures(*first_order(wanted, delay=0.0, tau=0.1, end=3.0), wanted, 5.4)
     # from 5 to 95 % of the way: ln(0.95 / 0.05) time constants
     assert found.stroke_s == pytest.approx(0.1 * math.log(19), abs=0.01)
     assert found.overshoot == 0.0
@@ -521,27 +521,27 @@ def test_the_time_of_a_stroke_is_what_a_first_order_hand_needs() -> None:
     assert math.isnan(found.lag_s)
 
 
-def test_a_delay_is_found_as_lag_and_as_reaction() -> None:
+def test_delay_is_measured_as_lag_and_reaction() -> None:
     def slow(t: float) -> float:
         return 2.7 + 2.0 * math.sin(1.5 * t)
 
-    found = feel(*first_order(slow, delay=0.12, tau=0.0, end=6.0), slow, 5.4)
+    found = tracking_figures(*first_order(slow, delay=0.12, tau=0.0, end=6.0), slow, 5.4)
     assert found.lag_s == pytest.approx(0.12, abs=0.004)
 
     def step(t: float) -> float:
         return 4.0 if t >= 1.0 else 0.0
 
-    found = feel(*first_order(step, delay=0.12, tau=0.01, end=3.0), step, 5.4)
+    found = tracking_figures(*first_order(step, delay=0.12, tau=0.01, end=3.0), step, 5.4)
     assert found.reaction_s == pytest.approx(0.12, abs=0.01)
 
 
-def test_a_hand_that_stays_gives_an_infinite_stroke_and_no_lag() -> None:
+def test_hand_at_rest_has_infinite_stroke_time_and_no_lag() -> None:
     t: Floats = np.asarray(np.arange(0.0, 4.0, 0.002))
-    still = feel(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
+    still = tracking_figures(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
     assert still.stroke_s == math.inf
     assert math.isnan(still.reaction_s)
     assert still.stuck == pytest.approx(5.4)
-    moving = feel(t, np.zeros_like(t), lambda x: 2.7 + math.sin(3 * x), 5.4)
+    moving = tracking_figures(t, np.zeros_like(t), lambda x: 2.7 + math.sin(3 * x), 5.4)
     assert math.isnan(moving.lag_s)
 
 
@@ -549,7 +549,7 @@ def test_a_hand_that_stays_gives_an_infinite_stroke_and_no_lag() -> None:
 @given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))
 def test_figures_are_never_negative(values: list[float], goal: float) -> None:
     t: Floats = np.asarray(np.arange(len(values)) * 0.05)
-    found = feel(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
+    found = tracking_figures(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
     assert all(x >= 0.0 for x in found.figures().values())
 
 

@@ -124,11 +124,11 @@ def test_missing_side_is_named_with_a_hint() -> None:
         assert alone.exit_code == 0, alone.output
 
 
-def test_the_hint_comes_after_five_seconds_once(capsys: pytest.CaptureFixture[str]) -> None:
-    from dexkit.cli.teleop import _Waiting
+def test_hint_is_printed_once_after_five_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    from dexkit.cli.teleop import _WaitReport
 
     with DdsNode(domain=free_domain(), interface="lo") as node:
-        waiting = _Waiting(node, DIALECTS["unitree_go"], None)
+        waiting = _WaitReport(node, DIALECTS["unitree_go"], None)
         for seconds in (0.0, 1.0, 4.9):
             waiting({LEFT: "", RIGHT: "every q is exactly 0"}, seconds)
         assert capsys.readouterr().err == (
@@ -138,17 +138,17 @@ def test_the_hint_comes_after_five_seconds_once(capsys: pytest.CaptureFixture[st
         waiting({LEFT: ""}, 60.0)
         said = capsys.readouterr().err
         assert said.count("waiting for state of left ...") == 1
-        assert said.count(f"'dexkit doctor --domain {node.domain}' says what is wrong") == 1
+        assert said.count(f"'dexkit doctor --domain {node.domain}' reports what is wrong") == 1
 
 
-def test_hands_that_speak_another_dialect_are_named(dex3: int) -> None:
+def test_hands_of_another_dialect_are_named(dex3: int) -> None:
     result = teleop("full-stroke", "--domain", dex3, "--wait", 1.0)
     assert isinstance(result.exception, DexkitError)
     assert result.exception.exit_code == 1
-    assert result.exception.hint == "there are hands that speak dex3: --dialect dex3"
+    assert result.exception.hint == "there are hands with the dialect dex3: --dialect dex3"
 
 
-def test_when_interrupted_it_locks_a_dex3_where_it_is(dex3: int) -> None:
+def test_interrupt_locks_a_dex3_at_its_position(dex3: int) -> None:
     spoken = DIALECTS["dex3"]
     topic = spoken.topics(LEFT)[0]
     with DdsNode(domain=dex3, interface="lo") as node:
@@ -174,7 +174,9 @@ def test_when_interrupted_it_locks_a_dex3_where_it_is(dex3: int) -> None:
             assert "Traceback" not in process.stderr.read()
 
 
-def test_after_a_stop_it_begins_where_the_hand_is_now(dex1: int, tmp_path: Path) -> None:
+def test_after_a_pause_teleoperation_starts_at_the_present_position(
+    dex1: int, tmp_path: Path
+) -> None:
     spoken = DIALECTS["unitree_go"]
     cmd, state = spoken.topics(LEFT)
     with DdsNode(domain=dex1, interface="lo") as node:
@@ -207,7 +209,7 @@ def test_after_a_stop_it_begins_where_the_hand_is_now(dex1: int, tmp_path: Path)
             q, end = 0.0, time.monotonic() + 2 * PAUSE
             while (
                 q < 5.0 or time.monotonic() < end
-            ):  # somebody else moves the hand meanwhile, and goes again
+            ):  # another program moves the hand meanwhile, and goes again
                 writer.write(there)
                 newest = take_until(states, bool, 8)
                 q = newest[-1].message.states[0].q
@@ -219,10 +221,10 @@ def test_after_a_stop_it_begins_where_the_hand_is_now(dex1: int, tmp_path: Path)
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 130
             said.seek(0)
-            assert "stood still for" in said.read()
+            assert "was paused for" in said.read()
 
 
-def test_the_profiles_are_listed_without_any_hand() -> None:
+def test_profiles_are_listed_without_a_hand() -> None:
     result = teleop("--list")
     assert result.exit_code == 0
     for name in ("full-stroke", "pick-place", "startle", "pinch", "fist"):

@@ -40,16 +40,16 @@ def die(*args: object, **options: object) -> None:
 
 def test_dying_worker_raises_in_every_waiter(caplog: pytest.LogCaptureFixture) -> None:
     owner: list[Exception] = []
-    heard: list[Worker] = []
+    dead: list[Worker] = []
     threads.forget()
-    with threads.on_death(heard.append), threads.on_death(die), stop_on_signals() as stop:
+    with threads.on_death(dead.append), threads.on_death(die), stop_on_signals() as stop:
         worker = Worker("test", die, 1, 2, failed=owner.append)
         worker.start()
         assert stop.wait(10)
     worker.join()
     assert isinstance(worker.failure, Injected)
     assert owner == [worker.failure]
-    assert heard == [worker]
+    assert dead == [worker]
     assert "the test thread died" in caplog.text
     for check in (worker.check, threads.check):
         with pytest.raises(DexkitError, match="the test thread died: Injected: injected"):
@@ -59,7 +59,7 @@ def test_dying_worker_raises_in_every_waiter(caplog: pytest.LogCaptureFixture) -
     assert worker.daemon
 
 
-def test_a_foreseen_error_is_raised_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+def test_dexkit_error_of_a_worker_is_raised_unchanged(caplog: pytest.LogCaptureFixture) -> None:
     def lose() -> None:
         raise HandLost("it is gone", hint="look for it")
 
@@ -101,7 +101,7 @@ PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [
     (SERVE, HandService, "_exchange"),
     (SERVE, HandService, "_compose"),
     (SERVE, Publisher, "_run"),
-    (BRIDGE, bridge_module._Way, "_turn"),
+    (BRIDGE, bridge_module._DirectionLoop, "_run_once"),
     (BRIDGE, DdsNode, "_dispatch"),
     (ROBOT, Publisher, "_run"),
     (ROBOT, EmulatedRobot, "_live"),
@@ -138,7 +138,7 @@ def test_a_program_that_loses_a_thread_ends_with_an_error(
     assert "error: " in captured.err
 
 
-def test_what_was_recorded_before_is_kept(tmp_path: Path) -> None:
+def test_recording_before_the_failure_is_kept(tmp_path: Path) -> None:
     domain = free_domain()
     path = tmp_path / "a.mcap"
     with DdsNode(domain) as hand, DdsNode(domain) as node:
@@ -190,9 +190,9 @@ def test_a_node_whose_dispatcher_died_frees_its_waiters(monkeypatch: pytest.Monk
 
 def test_dying_thread_of_an_emulator_or_tool_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Tool, "_listen", die)
-    heard: list[Worker] = []
-    with threads.on_death(heard.append), Tool("--version"):
-        wait_until(lambda: heard)
+    dead: list[Worker] = []
+    with threads.on_death(dead.append), Tool("--version"):
+        wait_until(lambda: dead)
     monkeypatch.setattr(Port, "run", die)
     port = Port.__new__(Port)
     port.error = None

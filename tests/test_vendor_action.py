@@ -139,7 +139,7 @@ def test_every_input_is_in_the_document() -> None:
 
 @pytest.fixture
 def pretended(tmp_path: Path) -> Runner:
-    """A python that notes its arguments and exits as the file ``status`` says."""
+    """A python that notes its arguments and exits with the code in the file ``status``."""
     programs = tmp_path / "bin"
     programs.mkdir()
     note = f"""#!/bin/bash
@@ -285,7 +285,7 @@ class Half:
 """
 
 
-def test_a_half_written_hand_is_told_what_is_missing(tmp_path: Path) -> None:
+def test_incomplete_hand_class_error_names_missing_members(tmp_path: Path) -> None:
     runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     runner.workspace.mkdir()
     (runner.workspace / "mine.py").write_text(HALF)

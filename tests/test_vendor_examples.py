@@ -78,19 +78,19 @@ def drive(hand: Hand, command: HandCommand, until: float) -> float:
             return float(state.tau_est[0])
 
 
-def test_it_speaks_the_units_of_a_dex1(acme: ModuleType) -> None:
+def test_example_hand_uses_dex1_units(acme: ModuleType) -> None:
     with emulated(acme) as address:
         hand = opened(acme, address)
         state = hand.exchange(HandCommand.brake(1))
         assert state.q == pytest.approx([0.2 * 5.4])
         assert state.temperature == pytest.approx([31.2])
-        assert np.isnan(state.voltage).all()  # not known, so not told
+        assert np.isnan(state.voltage).all()  # not known, so not reported
         assert drive(hand, HandCommand.position([2.7]), 2.7) == 0.0
         hand.close()
         hand.close()
 
 
-def test_it_feels_an_object_with_the_force_that_was_set(acme: ModuleType) -> None:
+def test_example_hand_stops_at_an_object_with_the_set_force(acme: ModuleType) -> None:
     with emulated(acme, object_at=40.0) as address:
         hand = opened(acme, address, force="12")
         drive(hand, HandCommand.position([4.0]), 4.0)
@@ -231,7 +231,7 @@ def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
     assert "FAILED" not in run.stdout
 
 
-def test_each_failure_is_told_once_and_the_verdict_comes_last(tmp_path: Path) -> None:
+def test_each_failure_is_printed_once_before_the_verdict(tmp_path: Path) -> None:
     (tmp_path / "canned.py").write_text(
         "import dexkit.conformance.session as session\n"
         "from dexkit.conformance.judge import judge\n"
@@ -256,6 +256,6 @@ def test_each_failure_is_told_once_and_the_verdict_comes_last(tmp_path: Path) ->
         assert run.returncode == 1, run.stdout + run.stderr
         assert (run.stdout.count(advice) == 1) == (not more)
         assert ("FAILED" in run.stdout) == bool(more)
-        told = run.stdout.index("FAIL: a MUST is not met")
-        assert told > run.stdout.rindex(advice) > run.stdout.index("DEX1-RATE-03 ")
-        assert "(-v says why)" in " ".join(run.stdout.split())
+        verdict_at = run.stdout.index("FAIL: a MUST is not met")
+        assert verdict_at > run.stdout.rindex(advice) > run.stdout.index("DEX1-RATE-03 ")
+        assert "(-v shows why)" in " ".join(run.stdout.split())

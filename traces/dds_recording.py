@@ -19,7 +19,7 @@ from dexkit.errors import DdsError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS
-from dexkit.socket_losses import DdsSockets
+from dexkit.socket_losses import ReceiveBuffers
 from dexkit.threads import Worker
 from dexkit.topics import HAND_TOPICS
 from dexkit.traces.losses import Losses
@@ -79,7 +79,7 @@ class DdsRecording:
         self.node = node
         self.recorder = recorder
         self.losses = Losses()
-        self._sockets = DdsSockets(node.domain)
+        self._sockets = ReceiveBuffers(node.domain)
         self._max_topics = max_topics
         self._described = 0
         self._patterns = None if topics is None else [dds_topic(t) for t in topics]

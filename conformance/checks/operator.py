@@ -12,7 +12,7 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.hand import Side
 from dexkit.teleop import client_for
-from dexkit.teleop.feel import Feel, Step, feel
+from dexkit.teleop.tracking import Step, TrackingFigures, tracking_figures
 
 _PART = 0.75
 """Part of its rate that the modelled client must have reached; below it the hand is not blamed."""
@@ -29,7 +29,7 @@ class _Felt:
     begin: float
     end: float
     client_hz: float
-    joints: dict[int, Feel]
+    joints: dict[int, TrackingFigures]
 
 
 @lru_cache(maxsize=4)
@@ -52,7 +52,7 @@ def _felt(recording: Recording, side: Side) -> _Felt | str:
             pose = operator.intent(t - begin, side)
             return None if pose is None else pose[i]
 
-        figures = feel(
+        figures = tracking_figures(
             hand.states.t, hand.states.q[:, i], wanted, joint.stroke, begin=begin, end=end
         )
         if figures.steps or figures.figures():
@@ -64,7 +64,7 @@ def _judge(
     ctx: Context,
     name: str,
     limit: str,
-    value: Callable[[Feel], float],
+    value: Callable[[TrackingFigures], float],
     of_step: Callable[[Step], float] | None,
     text: Callable[[float], str],
     nothing: str,

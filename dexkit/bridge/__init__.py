@@ -7,8 +7,8 @@
 
 from __future__ import annotations
 
-from dexkit.bridge.bridge import Bridge, End
+from dexkit.bridge.bridge import Bridge, BridgeEnd
 from dexkit.bridge.core import Commands, Direction, States
-from dexkit.bridge.translate import Part, translator
+from dexkit.bridge.translate import PartCodec, translator
 
-__all__ = ["Bridge", "Commands", "Direction", "End", "Part", "States", "translator"]
+__all__ = ["Bridge", "BridgeEnd", "Commands", "Direction", "PartCodec", "States", "translator"]

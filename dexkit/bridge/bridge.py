@@ -1,4 +1,4 @@
-"""The bridge: threads and DDS around :mod:`dexkit.bridge.core`.
+"""Run the bridge: DDS endpoints and threads around :mod:`dexkit.bridge.core`.
 
 One thread for each direction, so that a client that reads slowly holds up no command.
 """
@@ -16,16 +16,16 @@ from typing import Any
 
 from dexkit.bridge.core import Commands, Direction, Outgoing, States
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import PAUSE, Ages, PauseWatch
+from dexkit.command_age import PAUSE, PauseWatch, SampleAges
 from dexkit.dds import DdsNode, Endpoint, Reader, Sample, Writer
 from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.service.realtime import precise_timers
-from dexkit.single_publisher import LOOK, Place, SolePublisher
+from dexkit.single_publisher import SEARCH, NodeTopics, SolePublisher
 from dexkit.threads import Worker
 
-__all__ = ["Bridge", "End"]
+__all__ = ["Bridge", "BridgeEnd"]
 
 _log = logging.getLogger("dexkit.bridge")
 _counters_log = logging.getLogger("dexkit.bridge.counters")
@@ -35,8 +35,8 @@ _JOIN = 2.0  # seconds that a stopping thread is given; a write blocks for 0.1 a
 
 
 @dataclass(frozen=True)
-class End:
-    """One end: a dialect on a domain. Both ends may be on one node."""
+class BridgeEnd:
+    """A dialect on a domain, one of the two that a bridge connects. Both may be on one node."""
 
     node: DdsNode
     dialect: Dialect
@@ -46,20 +46,20 @@ class End:
 
 
 class Bridge:
-    """Carry commands from ``client`` to ``gripper`` and states back, until :meth:`stop`.
+    """Forward commands from ``client`` to ``gripper`` and states back, until :meth:`stop`.
 
     :param client: the end that clients are on; :param gripper: that of the grippers.
     :param sides: which grippers.
-    :param force: start although somebody else publishes what is to be published here.
+    :param force: start although another program publishes on the topics that the bridge writes.
     :raises UsageError: the ends are the same, or their dialects are of different hands.
     """
 
-    COMPANY_HINT = "stop it, choose another domain for one end, or add --force"
+    CONFLICT_HINT = "stop it, choose another domain for one end, or add --force"
 
     def __init__(
         self,
-        client: End,
-        gripper: End,
+        client: BridgeEnd,
+        gripper: BridgeEnd,
         *,
         sides: Sequence[Side] = tuple(Side),
         force: bool = False,
@@ -84,16 +84,16 @@ class Bridge:
         self._force = force
         self._clock: Clock = clock if clock is not None else RealClock()
         self._stop = threading.Event()
-        self._ways: list[_Way] = []
+        self._loops: list[_DirectionLoop] = []
         self._sole = SolePublisher(
             [
-                Place(end.node, frozenset(topics), _of_type(kind))
+                NodeTopics(end.node, frozenset(topics), _of_type(kind))
                 for end, topics, kind in (
                     (client, self.states.outputs, client.dialect.state_type),
                     (gripper, self.commands.outputs, gripper.dialect.cmd_type),
                 )
             ],
-            hint=self.COMPANY_HINT,
+            hint=self.CONFLICT_HINT,
             force=force,
         )
 
@@ -107,10 +107,10 @@ class Bridge:
         self.stop()
 
     def start(self) -> None:
-        """Look for others, then bring the topics up.
+        """Look for other publishers, then create readers and writers.
 
-        :raises TopicConflict: somebody else publishes what is to be published here, or carries
-            the other way what this would carry (unless ``force``).
+        :raises TopicConflict: another program publishes on the topics that the bridge writes, or
+            bridges in the opposite direction (unless ``force``).
         :raises DdsSetupError: an endpoint cannot be made.
         """
         sole = self._sole
@@ -123,31 +123,31 @@ class Bridge:
                 (self.commands, self.client, self.gripper),
                 (self.states, self.gripper, self.client),
             ):
-                self._ways.append(_Way(self, direction, source.node, target.node, claim))
-            sole.settle(self._stirred)
-            for way in self._ways:
-                way.thread.start()
+                self._loops.append(_DirectionLoop(self, direction, source.node, target.node, claim))
+            sole.settle(self._wake_loops)
+            for loop in self._loops:
+                loop.thread.start()
         except BaseException:
             self.stop()
             raise
 
     def stop(self) -> None:
-        """Leave the topics. The grippers hear no more commands, and brake. May be called twice."""
+        """Leave the topics. The grippers get no more commands, and brake. May be called twice."""
         self._stop.set()
         self._sole.close()
-        for way in self._ways:
-            way.close()
+        for loop in self._loops:
+            loop.close()
 
-    def _stirred(self) -> None:
-        for way in self._ways:
-            way.wake()
+    def _wake_loops(self) -> None:
+        for loop in self._loops:
+            loop.wake()
 
-    # -- what it says of itself ---------------------------------------------------------------
+    # -- status and counters ------------------------------------------------------------------
 
     @property
     def failure(self) -> Exception | None:
-        """What ended a thread that the bridge needs, those of its nodes included; or None."""
-        needed = [way.thread.failure for way in self._ways]
+        """The error that ended a thread of the bridge or of its nodes; or None."""
+        needed = [loop.thread.failure for loop in self._loops]
         needed += [self.client.node.failure, self.gripper.node.failure]
         return next((error for error in needed if error is not None), None)
 
@@ -163,7 +163,7 @@ class Bridge:
 
     def _matched(self, direction: Direction) -> int:
         return sum(
-            w.matched for way in self._ways if way.direction is direction for w in way.writers
+            w.matched for loop in self._loops if loop.direction is direction for w in loop.writers
         )
 
     def snapshot(self) -> dict[str, dict[str, int]]:
@@ -182,14 +182,14 @@ class Bridge:
         """Log :meth:`snapshot` as one line of JSON."""
         _counters_log.info("counters %s", json.dumps(self.snapshot()))
 
-    # -- company ------------------------------------------------------------------------------
+    # -- rivals -------------------------------------------------------------------------------
 
-    def others(self) -> str | None:
-        """Who else publishes what this bridge publishes; None: nobody."""
-        return self._sole.company()
+    def rival(self) -> str | None:
+        """Another publisher of a topic that this bridge writes, as a sentence; or None."""
+        return self._sole.describe_rival()
 
-    def reverse(self) -> str | None:
-        """Who plays the client's role here and the gripper's there: a bridge back; or None."""
+    def reverse_bridge(self) -> str | None:
+        """A process that seems to bridge in the opposite direction, as a sentence; or None."""
         clients = _foreign_writers(
             self.client.node, self.commands.inputs, self.client.dialect.cmd_type
         )
@@ -208,13 +208,13 @@ class Bridge:
 
     def _refuse_loop(self) -> None:
         for node in {self.client.node, self.gripper.node}:
-            node.discovery.wait(lambda _: self.reverse() or self.others(), LOOK)
-        if found := self.reverse():
-            raise TopicConflict(found, hint=self.COMPANY_HINT)
+            node.discovery.wait(lambda _: self.reverse_bridge() or self.rival(), SEARCH)
+        if found := self.reverse_bridge():
+            raise TopicConflict(found, hint=self.CONFLICT_HINT)
 
 
-class _Way:
-    """One direction on DDS."""
+class _DirectionLoop:
+    """The thread of one direction, with its readers and writers."""
 
     def __init__(
         self,
@@ -235,10 +235,10 @@ class _Way:
             topic: source.reader(topic, direction.read, on_data=self._wake.set)
             for topic in direction.inputs
         }
-        self._ages = Ages()
+        self._ages = SampleAges()
         self._watch = PauseWatch(bridge._clock)
         self._watch.restart()  # from here on samples may wait to be received
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self.thread = Worker("bridge", self._run)
 
     @property
@@ -258,14 +258,14 @@ class _Way:
     def _run(self) -> None:
         precise_timers()
         while not self._bridge._stop.is_set():
-            self._turn()
+            self._run_once()
 
-    def _turn(self) -> None:
+    def _run_once(self) -> None:
         clock, direction = self._bridge._clock, self.direction
         due = direction.due
         self._wake.wait(_TICK if due is None else min(_TICK, max(0.0, due - clock.now())))
         self._wake.clear()
-        self._stood_still()
+        self._check_pause()
         self._bridge._sole.poll()
         for topic, reader in self._readers.items():
             for sample in reader.take():
@@ -273,10 +273,10 @@ class _Way:
         self._send(direction.flush(clock.now()))
 
     def _receive(self, topic: str, sample: Sample) -> None:
-        # in this order: if it stands still in between, the sample only looks older
+        # in this order: if there is a pause in between, the sample only looks older
         now = self._bridge._clock.now()
         received = self._bridge._clock.since_boot()
-        self._stood_still()
+        self._check_pause()
         age = self._ages.age(sample.writer, sample.source_timestamp_ns, received)
         if age <= PAUSE:
             self._send(self.direction.receive(topic, sample.data, now))
@@ -284,47 +284,49 @@ class _Way:
         self.direction.counts.received += 1
         self.direction.counts.stale += 1
         if math.isfinite(age):
-            self._say(
+            self._log_once(
                 "stale",
                 f"{topic}: a message came {age:.1f} s later than usual for its writer; what is "
-                f"more than {PAUSE:g} s old is not forwarded (counted, said once)",
+                f"more than {PAUSE:g} s old is not forwarded (counted, logged once)",
             )
 
-    def _stood_still(self) -> bool:
-        """Whether this thread did; then what came before counts no more."""
+    def _check_pause(self) -> bool:
+        """Whether this thread was paused; if so, what was sent before now is not forwarded."""
         away = self._watch.measure_pause()
         if not away:
             return False
         self._ages.resumed(self._bridge._clock.since_boot())
         self.direction.paused()
-        self._say(
+        self._log_once(
             "paused",
-            f"this program stood still for {away:.2f} s (stopped, suspended, or a machine that is "
+            f"this program was paused for {away:.2f} s (stopped, suspended, or a machine that is "
             f"too busy): only what was sent later is forwarded to {', '.join(self._writers)} "
-            "(counted, said once)",
+            "(counted, logged once)",
         )
         return True
 
     def _send(self, messages: Sequence[Outgoing]) -> None:
         for message in messages:
-            if self._bridge._stop.is_set() or self._stood_still():
+            if self._bridge._stop.is_set() or self._check_pause():
                 return
             try:
                 written = self._writers[message.topic].write_raw(message.payload)
             except DexkitError as error:
-                self._say("write", f"cannot publish {message.topic}: {error}")
+                self._log_once("write", f"cannot publish {message.topic}: {error}")
             else:
                 if not written:
-                    self._say("write", f"a reliable reader of {message.topic} does not keep up")
+                    self._log_once(
+                        "write", f"a reliable reader of {message.topic} does not keep up"
+                    )
 
-    def _say(self, kind: str, text: str) -> None:
-        if kind not in self._said:
-            self._said.add(kind)
+    def _log_once(self, kind: str, text: str) -> None:
+        if kind not in self._logged:
+            self._logged.add(kind)
             _log.warning("%s", text)
 
 
 def _of_type(name: str) -> Callable[[Any], bool]:
-    """A publisher of another type on a topic of that name never matches."""
+    """Select endpoints of a type; one of another type on the same topic never matches."""
     return lambda endpoint: bool(endpoint.type_name == name)
 
 

@@ -1,6 +1,6 @@
-"""Which message follows from which: forwarding, merging, and what is never forwarded.
+"""Translate the messages of a bridge: forward, merge two topics into one, and drop what is unsafe.
 
-No threads, no DDS: a :class:`Direction` is told what arrived and when, and returns what is to be
+No threads, no DDS: a :class:`Direction` gets each sample with its time, and returns what is to be
 sent. The rules, in both directions:
 
 * A message is sent only because one arrived. So a client that stops is silence for the gripper,
@@ -12,7 +12,7 @@ sent. The rules, in both directions:
 * Nothing from before a pause of the bridge (:meth:`Direction.paused`) is sent after it.
 
 That one message has a place for a side of which nothing new is known. :class:`Commands` and
-:class:`States` say what is put there.
+:class:`States` define what is put there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
-from dexkit.bridge.translate import Part, Reachable, loses_gains, translator
+from dexkit.bridge.translate import PartCodec, Reachable, loses_gains, translator
 from dexkit.errors import WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.messages import unitree_go
@@ -58,7 +58,7 @@ class Counts:
     :ivar short: samples with too few motors for a side that is bridged.
     :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
     :ivar stale: samples that were old, or may have been sent before a pause of the bridge ended.
-    :ivar pauses: times that the bridge stood still for more than a quarter of a second.
+    :ivar pauses: times that the bridge was paused for more than a quarter of a second.
     :ivar rejected: parts with NaN or infinity.
     :ivar blank: parts of a gripper that is not there: all 0, and never anything else before.
     :ivar sent: messages sent.
@@ -106,7 +106,7 @@ class Direction(ABC):
         self.parts = dict.fromkeys(self.sides, 0)  #: parts forwarded, by side
         self.inputs = _by_topic(source, which, self.sides)
         self.outputs = _by_topic(target, which, self.sides)
-        self._in, self._out = Part(source, kind), Part(target, kind)
+        self._in, self._out = PartCodec(source, kind), PartCodec(target, kind)
         self._translate = translator(source, target, kind)
         self.read, self.written = self._in.type.name, self._out.type.name
         # both sides share what is written, whether or not both are bridged
@@ -119,7 +119,7 @@ class Direction(ABC):
         self._waits_since: float | None = None
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Outgoing]:
-        """What follows from a sample.
+        """Take a sample; return the messages to be sent for it.
 
         :param now: seconds on the clock that :attr:`due` is on, too.
         """
@@ -130,7 +130,7 @@ class Direction(ABC):
             self.counts.undecodable += 1
             return []
         self.counts.overlong += self._in.count(message) > self._in.length
-        fresh = [side for side in self._heard(topic) if self._accept(message, side, now)]
+        fresh = [side for side in self._sides_in(topic) if self._accept(message, side, now)]
         return self._forward([side for side in fresh if side in self.sides], now)
 
     @property
@@ -139,12 +139,12 @@ class Direction(ABC):
         return None if self._waits_since is None else self._waits_since + PATIENCE
 
     def flush(self, now: float) -> list[Outgoing]:
-        """What has waited long enough for the other side."""
+        """Return the messages whose wait for the other side is over."""
         due = self.due
         return self._send_shared(now) if due is not None and now >= due else []
 
     def paused(self) -> None:
-        """The bridge stood still until now: nothing that came before counts any more."""
+        """A pause of the bridge has ended: drop all that came before."""
         self.counts.pauses += 1
         self._pending.clear()
         self._waits_since = None
@@ -152,25 +152,25 @@ class Direction(ABC):
 
     # -- what differs -----------------------------------------------------------------------
 
-    def _heard(self, topic: str) -> Sequence[Side]:
-        """The sides of which a topic tells something worth noting."""
+    def _sides_in(self, topic: str) -> Sequence[Side]:
+        """The sides whose parts are read from a topic."""
         return self.inputs[topic]
 
     def _is_blank(self, part: Any, side: Side) -> bool:
         """Whether a part is that of a gripper that is not there."""
         return False
 
-    def _translated(self, part: Any, side: Side, now: float) -> Any | None:
-        """A part in the target's dialect; None where that cannot be said."""
+    def _translate_part(self, part: Any, side: Side, now: float) -> Any | None:
+        """A part in the target's dialect; None where that dialect cannot express it."""
         return self._translate(part)
 
     @abstractmethod
-    def _live(self, side: Side, now: float) -> bool:
+    def _is_live(self, side: Side, now: float) -> bool:
         """Whether a side's newest part still holds."""
 
     @abstractmethod
-    def _filling(self, side: Side, now: float) -> Any | None:
-        """What is put in the place of a side that is not live; None holds the message back."""
+    def _fill_in(self, side: Side, now: float) -> Any | None:
+        """The part for a side that is not live; None holds the message back."""
 
     # -- the rest ---------------------------------------------------------------------------
 
@@ -185,7 +185,7 @@ class Direction(ABC):
         if side not in self._newest and self._is_blank(part, side):
             self.counts.blank += side in self.sides
             return False
-        translated = self._translated(part, side, now)
+        translated = self._translate_part(part, side, now)
         if translated is None:
             self.counts.held += 1
             return False
@@ -213,10 +213,10 @@ class Direction(ABC):
         self._absent = set(self.sides) - self._pending
         places, filled = {}, False
         for side in Side:
-            if self._live(side, now):
+            if self._is_live(side, now):
                 places[side] = self._newest[side].part
                 continue
-            part = self._filling(side, now)
+            part = self._fill_in(side, now)
             if part is None:
                 self.counts.held += 1
                 return []
@@ -237,9 +237,9 @@ class States(Direction):
     In a message for both sides (``unitree_actuator``), the place of a side that is
 
     * not bridged stays all 0, as a service of one gripper leaves it;
-    * bridged but never heard: no message is sent at all. The client of that generation starts at
-      any q that is not 0, takes the 0 of a gripper that is not there yet for its position, and
-      commands it there;
+    * bridged, but no state received yet: no message is sent at all. The client of that generation
+      starts at any q that is not 0, takes the 0 of a gripper that is not there yet for its
+      position, and commands it there;
     * silent for longer than ``SILENT``: its last state, marked as ``dexkit serve`` marks it:
       bit 31 of ``reserve[0]``, and ``lost`` counts the messages that have gone out without it.
 
@@ -259,24 +259,24 @@ class States(Direction):
         return [side for side in self.sides if side not in self._newest]
 
     def silent(self, now: float) -> list[Side]:
-        """The bridged sides that were heard once and have fallen silent."""
-        return [s for s in self.sides if s in self._newest and not self._live(s, now)]
+        """The bridged sides whose states came once and have stopped."""
+        return [s for s in self.sides if s in self._newest and not self._is_live(s, now)]
 
     def position(self, side: Side) -> float | None:
-        """Where a gripper was last seen, rad of its own dialect, bridged or not."""
+        """The last known position of a gripper, rad of its own dialect, bridged or not."""
         return self._positions.get(side)
 
     def forget_positions(self) -> None:
-        """Where the grippers are is not known until they are heard again."""
+        """Forget the positions of the grippers until their next state."""
         self._positions.clear()
 
     def paused(self) -> None:
-        """As of any direction; nor does anybody know where the grippers are now."""
+        """As of any direction; also forget the positions of the grippers."""
         super().paused()
         self.forget_positions()
 
-    def _heard(self, topic: str) -> Sequence[Side]:
-        return tuple(Side) if self._together else super()._heard(topic)
+    def _sides_in(self, topic: str) -> Sequence[Side]:
+        return tuple(Side) if self._together else super()._sides_in(topic)
 
     def _accept(self, message: Any, side: Side, now: float) -> bool:
         part = self._in.take(message, side)
@@ -288,11 +288,11 @@ class States(Direction):
     def _is_blank(self, part: Any, side: Side) -> bool:
         return self._together and part == self._blank
 
-    def _live(self, side: Side, now: float) -> bool:
+    def _is_live(self, side: Side, now: float) -> bool:
         newest = self._newest.get(side)
         return side in self.sides and newest is not None and now - newest.came <= SILENT
 
-    def _filling(self, side: Side, now: float) -> Any | None:
+    def _fill_in(self, side: Side, now: float) -> Any | None:
         if side not in self.sides:
             return self._out.blank()
         if side not in self._newest:
@@ -309,8 +309,8 @@ class Commands(Direction):
     In a message for both sides (``unitree_actuator``), a side that is not commanded cannot be
     left out. Its newest command is repeated with the other side's for as long as a gripper's
     watchdog would have let it hold; then, and for a side that was never commanded or is not
-    bridged, its place says *stay, without pulling*: q where the gripper was seen last when that
-    began, no gain on the position, xr_teleoperate's damping, mode 0. A gripper that obeys the
+    bridged, its place is filled with *stay, without torque*: q where the gripper was seen last when
+    that began, no gain on the position, xr_teleoperate's damping, mode 0. A gripper that obeys the
     gains goes limp but for the damping, a simulated one that looks at q only stays where it is.
     Where no position is known, nothing is sent.
 
@@ -336,20 +336,20 @@ class Commands(Direction):
         self._reachable = {side: Reachable() for side in self.sides}
 
     def paused(self) -> None:
-        """As of any direction; no gripper is told to stay where it was before."""
+        """As of any direction; also forget the positions at which grippers would be held."""
         super().paused()
         self._resting.clear()
         self._states.forget_positions()  # the other direction may not have noticed yet
 
-    def _translated(self, part: Any, side: Side, now: float) -> Any | None:
+    def _translate_part(self, part: Any, side: Side, now: float) -> Any | None:
         if not self._loses_gains:
-            return super()._translated(part, side, now)
+            return super()._translate_part(part, side, now)
         position = self._states.position(side)
         if part.kp <= 0:
             if position is None:
                 return None
             part = replace(part, q=position * self._scale)
-        message = super()._translated(part, side, now)
+        message = super()._translate_part(part, side, now)
         motor = self._out.motor(message)
         motor.q = self._reachable[side](motor.q, position, now)
         return message
@@ -360,11 +360,11 @@ class Commands(Direction):
             self._resting.pop(side, None)
         return accepted
 
-    def _live(self, side: Side, now: float) -> bool:
+    def _is_live(self, side: Side, now: float) -> bool:
         newest = self._newest.get(side)
         return newest is not None and now - newest.came < self._timeout
 
-    def _filling(self, side: Side, now: float) -> Any | None:
+    def _fill_in(self, side: Side, now: float) -> Any | None:
         if side not in self._resting:
             q = self._states.position(side)
             if q is None:

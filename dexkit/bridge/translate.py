@@ -1,4 +1,4 @@
-"""What one message says of one gripper, and the same in another dialect. Pure functions.
+"""Translate one gripper's command or state from one Dex1 dialect to another. Pure functions.
 
 A *part* is that: one motor of a ``MotorCmds_`` or ``MotorStates_``, or a whole ``HandCmd_`` or
 ``HandState_``, which is of one gripper anyway. Between dialects of the same types a part passes
@@ -11,7 +11,7 @@ what           to unitree_hg                          from unitree_hg
 q, dq, ddq     times s; see "near the ends"           by s; a command at or below 0.1 closes, at
                                                       or above 6.0 opens
 tau            as it is                               of a command: 0, it is unused
-kp, kd         by s                                   5.0 and 0.05, whatever the command says, as
+kp, kd         by s                                   5.0 and 0.05, whatever the command has, as
                                                       ``dexkit serve`` takes them
 tau_est        grip strength: without its sign        with the sign of closing
 temperature    0 (not filled) becomes 25              the first of the two, 0 .. 127
@@ -26,8 +26,8 @@ so 0 .. 0.086 and 5.157 .. 5.4 rad of the other scale cannot be commanded there,
 themselves. :class:`Reachable` chooses between both.
 
 **Without a gain.** unitree_hg knows no gains, so a command that does not pull towards its q
-(kp <= 0: limp, or driven by velocity or torque) cannot be said in it; obeyed as it is, q = 0 of
-a client that lets go would close the gripper. :class:`~dexkit.bridge.core.Commands` puts the
+(kp <= 0: limp, or driven by velocity or torque) cannot be expressed in it; obeyed as it is, q = 0
+of a client that lets go would close the gripper. :class:`~dexkit.bridge.core.Commands` puts the
 gripper's own position there instead.
 
 **Why gains shrink and torques do not.** Torques of both dialects are those of the joint that
@@ -47,7 +47,7 @@ from dexkit.messages import MessageType, message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect, dialect, model
 from dexkit.service.dialects import HG_CLOSED, HG_OPEN, StateView, dialect_map
 
-__all__ = ["Part", "Reachable", "Translator", "loses_gains", "translator"]
+__all__ = ["PartCodec", "Reachable", "Translator", "loses_gains", "translator"]
 
 _FLOAT_MAX = (2 - 2**-23) * 2.0**127
 # of the numbers of a motor, those that are acted upon
@@ -60,7 +60,7 @@ Translator = Callable[[Any], Any]
 """A part in one dialect to the same in another."""
 
 
-class Part:
+class PartCodec:
     """Takes a gripper's part out of a dialect's messages, and puts parts into one.
 
     :param kind: ``"cmd"`` or ``"state"``.
@@ -79,7 +79,7 @@ class Part:
         self.length = spoken.length
 
     def count(self, message: Any) -> int:
-        """How many motors a message has."""
+        """The number of motors in a message."""
         return len(getattr(message, self._sequence))
 
     def take(self, message: Any, side: Side) -> Any | None:
@@ -100,7 +100,7 @@ class Part:
         return self.type.cls(motors)
 
     def blank(self) -> Any:
-        """A motor of which nothing is said."""
+        """A motor with every field 0."""
         return self._motor()
 
     def is_finite(self, part: Any) -> bool:
@@ -116,7 +116,7 @@ class Part:
 def translator(source: Dialect, target: Dialect, kind: str) -> Translator:
     """The function that makes of a part in ``source`` the same in ``target``.
 
-    Parts must be finite (:meth:`Part.is_finite`).
+    Parts must be finite (:meth:`PartCodec.is_finite`).
     """
     if source.cmd_type == target.cmd_type:
         return lambda part: part
@@ -126,13 +126,13 @@ def translator(source: Dialect, target: Dialect, kind: str) -> Translator:
 
 
 class Reachable:
-    """Where a gripper of unitree_hg is sent for a position that it cannot be sent to.
+    """Replaces a goal that unitree_hg cannot express by the nearest one that it can.
 
     To the nearer end of the gap. But if it rests there, and for ``DWELL`` the command has been
     ``ELSEWHERE`` and not there, to the other end, until the command changes. xr_teleoperate needs
     that: it commands no more than 0.18 rad from where the gripper is, and its filter stops half
-    way while nothing moves (traces/samples/README.md). So at 5.4 it says "close" as 5.31, which
-    is nearest to 5.4, and would say so for ever.
+    way while nothing moves (traces/samples/README.md). So at 5.4 it commands "close" as 5.31, which
+    is nearest to 5.4, and would do so for ever.
     """
 
     GAPS = ((0.0, HG_CLOSED + 1e-3), (HG_OPEN - 1e-3, 2 * math.pi))
@@ -178,7 +178,7 @@ class Reachable:
 
 
 def loses_gains(source: Dialect, target: Dialect) -> bool:
-    """Whether a client of ``source`` sets gains that nobody in ``target`` obeys."""
+    """Whether a client of ``source`` sets gains that grippers of ``target`` ignore."""
     return source.cmd_type != target.cmd_type == _HG.cmd_type
 
 
@@ -193,8 +193,8 @@ def _command_to_hg(motor: unitree_go.MotorCmd_) -> unitree_hg.HandCmd_:
     return unitree_hg.HandCmd_(
         [
             unitree_hg.MotorCmd_(
-                q=_fits(motor.q * _SCALE),
-                dq=_fits(motor.dq * _SCALE),
+                q=_to_float32(motor.q * _SCALE),
+                dq=_to_float32(motor.dq * _SCALE),
                 tau=motor.tau,
                 kp=motor.kp / _SCALE,
                 kd=motor.kd / _SCALE,
@@ -205,7 +205,7 @@ def _command_to_hg(motor: unitree_go.MotorCmd_) -> unitree_hg.HandCmd_:
 
 def _command_from_hg(message: unitree_hg.HandCmd_) -> unitree_go.MotorCmd_:
     command = _MAP.command(message, Side.LEFT)
-    assert command is not None  # it has a motor: Part.take
+    assert command is not None  # it has a motor: PartCodec.take
     return unitree_go.MotorCmd_(
         mode=int(command.mode[0]),
         q=float(command.q[0]),
@@ -244,5 +244,5 @@ def _state_from_hg(message: unitree_hg.HandState_) -> unitree_go.MotorState_:
     )
 
 
-def _fits(value: float) -> float:
+def _to_float32(value: float) -> float:
     return min(max(value, -_FLOAT_MAX), _FLOAT_MAX)

@@ -24,8 +24,8 @@ from dexkit.documents import check_output_paths
 def command(result: Path, output: Path) -> None:
     """Draw a badge of a result: what it is a drop-in for, and how much of that was proved.
 
-    It says so when the hand was emulated, simulated or only recorded, and how many requirements
-    could not be judged.
+    The badge shows when the hand was emulated, simulated or only recorded, and how many
+    requirements could not be judged.
     """
     from dexkit.conformance.report.badge import badge_text, render_badge
     from dexkit.conformance.result_file import read_json

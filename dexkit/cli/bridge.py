@@ -83,7 +83,7 @@ def command(
     Prints "ready: ..." when the topics are up. No message is repeated: when the client stops, the
     gripper gets no commands and brakes (docs/bridge.md).
     """  # noqa: D301 - click wants the character, not a backslash
-    from dexkit.bridge import Bridge, End
+    from dexkit.bridge import Bridge, BridgeEnd
     from dexkit.dds import DdsNode
 
     status = sys.stderr.isatty() and not quiet
@@ -101,8 +101,8 @@ def command(
         if (far_domain, far_interface) != (domain, interface):
             far = nodes.enter_context(DdsNode(domain=far_domain, interface=far_interface))
         bridge = Bridge(
-            End(near, dialect(source)),
-            End(far, dialect(target)),
+            BridgeEnd(near, dialect(source)),
+            BridgeEnd(far, dialect(target)),
             sides=sides,
             force=force,
         )
@@ -120,19 +120,19 @@ def command(
     if bridge.failure is not None:
         raise DexkitError(f"the bridge died: {bridge.failure}")
     if trouble:
-        raise TopicConflict(trouble, hint=Bridge.COMPANY_HINT)
+        raise TopicConflict(trouble, hint=Bridge.CONFLICT_HINT)
     return 0
 
 
 def _watch(
     bridge: Bridge, stop: StopRequest, duration: float | None, status: bool, force: bool
 ) -> str | None:
-    """Until told to stop, or time is up: a status line, and hints.
+    """Print a status line and hints, until asked to stop or time is up.
 
-    :returns: who came and made the bridge a loop; then it ends, too.
+    :returns: the program that started and made the bridge a loop; then the bridge ends, too.
     """
     started = time.monotonic()
-    said: set[str] = set()
+    logged: set[str] = set()
     rates = _rates(bridge)
     while not stop:
         left = None if duration is None else started + duration - time.monotonic()
@@ -142,11 +142,11 @@ def _watch(
             break
         if bridge.failure is not None:
             break
-        if not force and (found := bridge.reverse()):
+        if not force and (found := bridge.reverse_bridge()):
             return found
         for text in _hints(bridge, time.monotonic() - started):
-            if text not in said and len(said) < MOST_REMARKS:
-                said.add(text)
+            if text not in logged and len(logged) < MOST_REMARKS:
+                logged.add(text)
                 _log.warning("%s", text)
         line = next(rates)
         if status:
@@ -166,7 +166,7 @@ def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
             (counts.short, "messages with too few motors"),
         ):
             if count:
-                yield f"{topics}: the {who} sends {what}; not forwarded (counted, said once)"
+                yield f"{topics}: the {who} sends {what}; not forwarded (counted, logged once)"
     for side in states.silent(time.monotonic()):
         yield f"the state of the {side} gripper has stopped"
     if elapsed < _LONELY:
@@ -180,7 +180,7 @@ def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
             + (
                 "; its place in the message is all 0, as where there is no gripper"
                 if states.counts.blank
-                else "; with one gripper only, say so: --side; 'dexkit doctor' looks around"
+                else "; with one gripper only, give --side; 'dexkit doctor' checks the domain"
             )
         )
     if not bridge.clients and not commands.counts.received:
@@ -188,7 +188,7 @@ def _hints(bridge: Bridge, elapsed: float) -> Iterator[str]:
 
 
 def _rates(bridge: Bridge) -> Iterator[str]:
-    """The status line, again and again."""
+    """Format the rates for the status line."""
     directions = {"cmd": bridge.commands, "state": bridge.states}
     before: dict[tuple[str, Side], int] = {}
     last = time.monotonic()

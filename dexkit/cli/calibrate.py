@@ -143,10 +143,10 @@ def command(
     _refuse_foreign(ctx, set(ctx.params) - {"side"}, gripper)
     store = Store(config)
     if show:
-        _show(store)
+        _print_store(store)
         return
     if device is None:
-        raise UsageError("say which gripper", hint="--device PATH or USB serial number")
+        raise UsageError("no gripper is given", hint="--device PATH or USB serial number")
     console = Console()
     configuration = GripperSettings(
         id=servo_id if isinstance(servo_id, int) else None,
@@ -158,7 +158,7 @@ def command(
         _print_servo(hand, console, store)
         return
     if not yes and not sys.stdin.isatty():
-        raise UsageError("nobody can be asked whether the gripper is empty", hint="give --yes")
+        raise UsageError("cannot ask whether the gripper is empty: no terminal", hint="give --yes")
     if not yes and not click.confirm(
         "The gripper will move. Put the gauge between the fingers. Ready?"
         if force
@@ -280,7 +280,9 @@ def _print_servo(hand: EZGripper, console: Console, store: Store) -> None:
         console.print(f"[yellow]{warning}[/yellow]")
     bus = ServoBus(device.path, configuration.baudrate or 1_000_000)
     try:
-        ping = discovery.find_servo(bus, configuration.id, configuration.baudrate, _dim(console))
+        ping = discovery.find_servo(
+            bus, configuration.id, configuration.baudrate, _print_dim(console)
+        )
         console.print(
             f"servo {ping.id} at {bus.baudrate} baud: MX-64(2.0), firmware {ping.firmware}"
         )
@@ -291,14 +293,14 @@ def _print_servo(hand: EZGripper, console: Console, store: Store) -> None:
             console.print("  its EEPROM holds what the driver needs")
     finally:
         bus.close()
-    _show(store)
+    _print_store(store)
 
 
-def _dim(console: Console) -> Callable[[str], None]:
+def _print_dim(console: Console) -> Callable[[str], None]:
     return lambda text: console.print(f"[dim]{text}[/dim]")
 
 
-def _show(store: Store) -> None:
+def _print_store(store: Store) -> None:
     console = Console()
     keys = store.keys()
     if not keys:

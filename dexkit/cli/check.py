@@ -32,7 +32,7 @@ from dexkit.robots import ROBOTS
     type=click.Choice(["auto", *DIALECTS, *ROBOTS]),
     default="auto",
     show_default=True,
-    help="How the hand speaks, or which robot it is; auto takes it from topics and types.",
+    help="Dialect of the hand, or model of the robot; auto takes it from topics and types.",
 )
 @require_option("DEX1-RATE")
 @click.option(
@@ -117,7 +117,7 @@ def command(
         view, requirements=requirements, claims=claims, subject={"recording": recording.name}
     )
     console = Console()
-    print_result(result, console, verbose=verbose, more="-v says why")
+    print_result(result, console, verbose=verbose, more="-v shows why")
     if also:
         console.print(also)
     if json_path:
@@ -134,7 +134,7 @@ def command(
     if result.judged == 0:
         raise ConformanceError(
             "nothing was judged, which is not a pass",
-            hint="dexkit check -v says what each requirement needs",
+            hint="dexkit check -v shows what each requirement needs",
         )
     if trace.damage:
         raise ConformanceError(

@@ -17,7 +17,7 @@ from dexkit.stop_signals import stop_on_signals
 __all__ = ["command"]
 
 _INTRO = (
-    "[bold]Can a gripper made by somebody else take the place of Unitree's Dex1-1?[/bold]\n",
+    "[bold]Can another vendor's gripper replace Unitree's Dex1-1?[/bold]\n",
     "Two EZGrippers are emulated, down to the servo at the end of a serial line; the right one "
     "has something between its fingers. dexkit drives them and puts them on the topics of a "
     "Dex1-1. Then a test program takes the robot's role: it moves them, provokes them, and "

@@ -108,12 +108,12 @@ def command(
     Exit codes: 0 healthy, 1 problems found, 2 the examination failed, 130 interrupted. Ctrl-C ends
     --watch with the code of the last complete examination.
     """
-    from dexkit.doctor import Wish, diagnose, readiness, verdict
+    from dexkit.doctor import Scope, diagnose, readiness, verdict
     from dexkit.doctor.environment import environment
 
     if domain is None and not scan:
         raise UsageError("no domain to examine", hint="give --domain or --scan")
-    wish = Wish(domain, _dialects(model, dialect), bool(devices) and domain is None)
+    scope = Scope(domain, _dialects(model, dialect), bool(devices) and domain is None)
     windows = len({*scan, *([] if domain is None else [domain])}) * len({"lo", *interfaces})
     require_open_files(windows + _FILES, f"examining {windows} domain(s)")
     with stop_on_signals() as stop, ThreadPoolExecutor(1) as beside:
@@ -132,22 +132,22 @@ def command(
             )
             if stop:
                 return 130 if last is None else last
-            findings = diagnose(seen, wish)
-            states = readiness(seen, wish)
-            said = verdict(seen, findings, wish)
+            findings = diagnose(seen, scope)
+            states = readiness(seen, scope)
+            result = verdict(seen, findings, scope)
             if as_json:
                 from dexkit.doctor.report import as_data
 
                 click.echo(
-                    json.dumps(as_data(seen, findings, said, states), indent=None if watch else 2)
+                    json.dumps(as_data(seen, findings, result, states), indent=None if watch else 2)
                 )
                 sys.stdout.flush()
             else:
                 key = json.dumps([[f.id, f.where] for f in findings] + [str(s) for s in states])
                 if key != before:
-                    _print(seen, findings, said, states, watch=watch, first=last is None)
+                    _print(seen, findings, result, states, watch=watch, first=last is None)
                 before = key
-            last = 0 if said.healthy else 1
+            last = 0 if result.healthy else 1
             if not watch:
                 return last
             stop.wait(_REFRESH)
@@ -184,7 +184,7 @@ def _observe(
         elif device.startswith("usbip:"):
             hands += doctor_devices.on_server(device)
         else:
-            ports.append(doctor_devices.look_at(device, progress=progress))
+            ports.append(doctor_devices.inspect_port(device, progress=progress))
     views = dds.observe_domains(
         domains, interfaces, seconds=seconds, stop=stop.event, progress=progress
     )
@@ -211,7 +211,7 @@ def _progress(*, quiet: bool) -> Callable[[str], object]:
 def _print(
     seen: Observations,
     findings: list[Finding],
-    said: Verdict,
+    result: Verdict,
     states: list[Readiness],
     *,
     watch: bool,
@@ -226,5 +226,5 @@ def _print(
             console.print()
         ready = any(s.ready for s in states)
         console.rule(time.strftime("%H:%M:%S") + (": a client would now start" if ready else ""))
-    print_report(console, seen, findings, said, states)
+    print_report(console, seen, findings, result, states)
     sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""What the doctor needs the drivers for: who answers on a serial port or a USB/IP server.
+"""Find servos on a serial port and hands on a USB/IP server, for the doctor.
 
 Serial ports are looked at from outside: who may use them, who does. Only a port that the user
 names is opened and asked.
@@ -20,7 +20,7 @@ from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.discovery import SCAN_BAUD_RATES, latency_timer
 from dexkit.errors import DexkitError, HandError, HandRefused, HandTimeout
 
-__all__ = ["look_at", "on_server", "ports"]
+__all__ = ["inspect_port", "on_server", "ports"]
 
 _IDS = range(1, 4)
 """Servo ids that are asked one by one, at every baud rate, before a broadcast: that takes a
@@ -31,30 +31,32 @@ _TIMEOUT = 0.05  # beyond the time of the bytes; an untuned adapter holds them b
 def ports() -> list[SerialPort]:
     """The USB serial ports of this machine, without opening any."""
     return [
-        _outside(port.device, named=False) for port in list_ports.comports() if port.vid is not None
+        _port_facts(port.device, named=False)
+        for port in list_ports.comports()
+        if port.vid is not None
     ]
 
 
-def look_at(
+def inspect_port(
     path: str,
     *,
     thorough: bool = True,
     progress: Callable[[str], object] = lambda text: None,
     sysfs: Path = Path("/sys"),
 ) -> SerialPort:
-    """Look at the port that the user names; if nobody else has it open, ask for servos on it.
+    """Inspect a serial port; if no other program has it open, ping the servos on it.
 
-    Servos are only asked who they are.
+    Servos are only pinged, never written to.
 
-    :param thorough: if nobody answers, call all ids at the usual baud rates.
+    :param thorough: if no servo answers, ping all ids at the usual baud rates.
     """
-    port = _outside(path, named=True, sysfs=sysfs)
+    port = _port_facts(path, named=True, sysfs=sysfs)
     if not port.exists or not port.readable or port.holders:
         return port
     error = ""
     servos: tuple[Servo, ...] = ()
     try:
-        servos = _ask(path, thorough, progress)
+        servos = _scan_servos(path, thorough, progress)
     except HandRefused as refused:  # locked by a process that may not be seen
         return dataclasses.replace(port, holders=("another program",), error=refused.message)
     except HandError as failed:
@@ -91,7 +93,7 @@ def on_server(url: str) -> tuple[UsbDevice, ...]:
     return (UsbDevice(where=url, error=f"the server offers no {what}"),)
 
 
-def _outside(path: str, *, named: bool, sysfs: Path = Path("/sys")) -> SerialPort:
+def _port_facts(path: str, *, named: bool, sysfs: Path = Path("/sys")) -> SerialPort:
     try:
         status = os.stat(path)
     except OSError as error:
@@ -105,20 +107,22 @@ def _outside(path: str, *, named: bool, sysfs: Path = Path("/sys")) -> SerialPor
         readable=os.access(path, os.R_OK | os.W_OK),
         group=group,
         latency_timer=latency_timer(path, sysfs),
-        holders=tuple(f"{command_line(pid) or 'a process'} (pid {pid})" for pid in _users(path)),
+        holders=tuple(
+            f"{command_line(pid) or 'a process'} (pid {pid})" for pid in _holders_of(path)
+        ),
         named=named,
     )
 
 
-def _users(path: str) -> list[int]:
-    """Who has it open; the emulator that makes a pseudo-terminal is not a user of it."""
+def _holders_of(path: str) -> list[int]:
+    """Processes that have it open, without the emulator that made a pseudo-terminal."""
     found = holders(path)
     if os.path.realpath(path).startswith("/dev/pts/"):
         found = [pid for pid in found if " emulate " not in f" {command_line(pid)} "]
     return found
 
 
-def _ask(path: str, thorough: bool, progress: Callable[[str], object]) -> tuple[Servo, ...]:
+def _scan_servos(path: str, thorough: bool, progress: Callable[[str], object]) -> tuple[Servo, ...]:
     bus = ServoBus(path, SCAN_BAUD_RATES[0], timeout=_TIMEOUT, retries=0)
     bus.open()
     try:

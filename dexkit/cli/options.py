@@ -96,7 +96,7 @@ def dds_options(
 ) -> Callable[[F], F]:
     """``--domain`` and ``--interface``; the interface defaults to loopback.
 
-    :param domain_default_text: what ``--help`` says where there is no fixed default.
+    :param domain_default_text: what ``--help`` prints where there is no fixed default.
     """
     suffix = f"  [default: {domain_default_text}]" if domain_default_text else ""
     domain = click.option(
@@ -317,4 +317,4 @@ def latency_timer_option(default: float) -> Callable[[F], F]:
 
 def any_baudrate_option() -> Callable[[F], F]:
     """``--any-baudrate``."""
-    return click.option("--any-baudrate", is_flag=True, help="Understand clients at any baud rate.")
+    return click.option("--any-baudrate", is_flag=True, help="Accept clients at any baud rate.")

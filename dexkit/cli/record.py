@@ -53,7 +53,7 @@ def command(
     them. Killing the recorder costs at most half a second.
 
     Exit codes: 0 a complete recording, as far as this machine can know; 1 nothing was received,
-    or something is missing (it is said what), or OUT was renamed meanwhile; 2 wrong usage, or OUT
+    or something is missing (it is reported), or OUT was renamed meanwhile; 2 wrong usage, or OUT
     cannot be written (any more).
     """
     from dexkit.dds import DdsNode
@@ -81,7 +81,7 @@ def command(
         status.clear()
         if not recorder.written:
             threads.check()  # why nothing came is known then
-            _nothing(node, recording, time.monotonic() - started)
+            _refuse_empty(node, recording, time.monotonic() - started)
     for topic, why in recording.unknown.items():
         click.echo(one_line(f"warning: {topic} was not recorded: {why}", REMARK), err=True)
     for text in (*recording.losses.sentences(), recorder.displaced):
@@ -91,11 +91,13 @@ def command(
     per_topic = ", ".join(
         f"{one_line(topic)} {count}" for topic, count in sorted(recorder.offered.items())
     )
-    click.echo(f"{out}: {recorder.written} messages ({per_topic}), {_missing(recorder, recording)}")
+    click.echo(
+        f"{out}: {recorder.written} messages ({per_topic}), {_describe_losses(recorder, recording)}"
+    )
     return 1 if dropped or recording.losses or recorder.displaced else 0
 
 
-def _missing(recorder: Recorder, recording: DdsRecording) -> str:
+def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:
     losses = recording.losses
     text = f"{recorder.dropped} dropped"
     if losses.datagrams:
@@ -105,8 +107,8 @@ def _missing(recorder: Recorder, recording: DdsRecording) -> str:
     return text
 
 
-def _nothing(node: DdsNode, recording: DdsRecording, waited: float) -> None:
-    """Say what was there instead.
+def _refuse_empty(node: DdsNode, recording: DdsRecording, waited: float) -> None:
+    """Report that nothing was received, and what was on the domain instead.
 
     :raises TraceError: always, with exit code 1.
     """
@@ -149,7 +151,7 @@ class _Status:
             return
         self._before, self._at, self._last_line = offered, now, now
         text = f"{now - self._started:6.1f} s  {sum(offered.values()):,} messages"
-        text += f"  {_missing(self._recorder, recording)}"
+        text += f"  {_describe_losses(self._recorder, recording)}"
         text += "".join(
             f"  {one_line(t.removeprefix('rt/'))} {hz:.0f} Hz" for t, hz in rates.items()
         )

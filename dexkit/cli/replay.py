@@ -15,7 +15,7 @@ import click
 from dexkit.cli.options import Number, dds_options, force_option, topic_option
 from dexkit.errors import DdsError, TraceUnsupported
 from dexkit.escaping import REMARK, one_line
-from dexkit.single_publisher import Place, SolePublisher
+from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.threads import Worker
 
@@ -75,8 +75,8 @@ def command(
 ) -> int:
     """Publish the commands in a recording on DDS, with their recorded timing.
 
-    Waits until each topic is subscribed, then plays. Refuses to play while somebody else
-    publishes on the same topics, and ends when somebody comes who does. After a pause of its own
+    Waits until each topic is subscribed, then plays. Refuses to play while another program
+    publishes on the same topics, and ends when one starts to. After a pause of its own
     (Ctrl-Z, suspend) it goes on where it was left. The default domain is 1, the simulation's:
     --domain 0 with a robot's interface moves real hands.
 
@@ -98,9 +98,9 @@ def command(
         f"{player.duration:.1f} s" + (", looped" if loop else "")
     )
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        # two sources of commands fight over the hand: a recording gives way to whoever comes
+        # a hand must have one source of commands: a recording gives way to any other
         sole = SolePublisher(
-            [Place(node, player.topics)],
+            [NodeTopics(node, player.topics)],
             hint="stop that publisher, choose another --domain, or play anyway with --force",
             force=force,
             yields=True,
@@ -118,7 +118,7 @@ def command(
         if stop:
             return 130
         click.echo(f"ready: playing on domain {domain}, {interface}")
-        with _smooth(), _status(player):
+        with _short_switch_interval(), _status(player):
 
             def send(message: TraceMessage) -> object:
                 # stamped first: a command that a stop holds back here is old, and is seen to be
@@ -128,11 +128,11 @@ def command(
 
             def paused(seconds: float) -> None:
                 click.echo(
-                    f"this program stood still for {seconds:.2f} s; the recording goes on where it "
+                    f"this program was paused for {seconds:.2f} s; the recording goes on where it "
                     "was left",
                     err=True,
                 )
-                stop.wait(_SETTLE)  # whoever has come meanwhile is discovered first
+                stop.wait(_SETTLE)  # publishers that started meanwhile are discovered first
 
             stats = player.play(send, stop=stop.event, paused=paused)
         time.sleep(_LINGER)
@@ -141,7 +141,7 @@ def command(
         + (f", {stats.passes} passes" if loop else "")
         + f"; late by {stats.error_p50 * 1e3:.3f} ms (p50), {stats.error_p99 * 1e3:.3f} ms (p99), "
         f"{stats.error_max * 1e3:.3f} ms (max)"
-        + (f"; stood still {stats.pauses} times" if stats.pauses else "")
+        + (f"; paused {stats.pauses} times" if stats.pauses else "")
     )
     # for a loop, being stopped is the ordinary end
     if stats.stopped and not loop:
@@ -170,13 +170,13 @@ def _wait_for_readers(
     missing = [t for t, w in writers.items() if not w.matched]
     if missing:
         names = ", ".join(map(one_line, missing))
-        click.echo(f"waiting for somebody to subscribe {names} ...", err=True)
+        click.echo(f"waiting for a subscriber of {names} ...", err=True)
     while missing and not stop and time.monotonic() < end:
         writers[missing[0]].wait_matched(timeout=0.1)
         missing = [t for t, w in writers.items() if not w.matched]
     if missing and not stop:
         raise DdsError(
-            f"nobody subscribes {', '.join(missing)} on domain {node.domain}, {node.interface} "
+            f"no process subscribes {', '.join(missing)} on domain {node.domain}, {node.interface} "
             f"(waited {patience:g} s)",
             hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
             "anyway with --no-wait",
@@ -184,7 +184,7 @@ def _wait_for_readers(
 
 
 @contextmanager
-def _smooth() -> Iterator[None]:
+def _short_switch_interval() -> Iterator[None]:
     """Let the playing thread have the interpreter within 0.5 ms instead of 5."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
@@ -196,7 +196,7 @@ def _smooth() -> Iterator[None]:
 
 @contextmanager
 def _status(player: Player) -> Iterator[None]:
-    """A line that tells how far it is, on a terminal."""
+    """Show the progress in one line, on a terminal."""
     if not sys.stderr.isatty():
         yield
         return

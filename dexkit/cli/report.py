@@ -63,25 +63,25 @@ def command(
     from dexkit.console import Console
 
     found = read_json(result)
-    file = recording or _beside(result, found.subject.get("recording", ""))
+    file = recording or _recording_beside(result, found.subject.get("recording", ""))
     check_output_paths([html_path, markdown_path, junit_path], [result, file])
     if html_path:
         view = None
         if file is not None:
-            view = _view(file, found, given=recording is not None)
+            view = _matching_recording(file, found, given=recording is not None)
         write_html(found, view, html_path, recording=file if view is not None else None)
     if markdown_path:
         write_text(markdown_path, render_markdown(found))
     if junit_path:
         write_junit(found, junit_path)
     if not (html_path or markdown_path or junit_path):
-        print_result(found, Console(), verbose=verbose, more="-v says why")
+        print_result(found, Console(), verbose=verbose, more="-v shows why")
     for path in (html_path, junit_path, markdown_path):
         if path and str(path) != "-":
             click.echo(f"report: {path}", err=True)
 
 
-def _beside(result: Path, name: str) -> Path | None:
+def _recording_beside(result: Path, name: str) -> Path | None:
     """The recording that the result names, where it lies in the same folder."""
     if not name or Path(name).name != name:
         return None
@@ -89,10 +89,10 @@ def _beside(result: Path, name: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def _view(path: Path, result: RunResult, *, given: bool) -> Recording | None:
-    """The recording as the result saw it; None if one that nobody named is another.
+def _matching_recording(path: Path, result: RunResult, *, given: bool) -> Recording | None:
+    """The recording that was judged; None if the one found beside the result is another.
 
-    :raises UsageError: the one that was named is not the one that was judged.
+    :raises UsageError: the recording that the user gave is not the one that was judged.
     """
     from dexkit.conformance.recording import Recording
     from dexkit.conformance.report.labels import utc_date

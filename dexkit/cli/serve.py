@@ -237,7 +237,7 @@ def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[st
 
 
 def _dialect(hands: Sequence[Hand], name: str | None) -> Dialect:
-    """The dialect called ``name``, or the first that the hands speak."""
+    """The dialect called ``name``, or the first of the hand model."""
     model = model_by_name(hands[0].spec.model)
     if name is None:
         return model.dialects[0]
@@ -267,9 +267,9 @@ def _on_sigusr1(running: ExitStack, services: Sequence[HandService]) -> None:
 
 
 def _watch(services: Sequence[HandService], stop: StopRequest, status: StatusLine) -> None:
-    """Until told to stop: a status line, and hints about clients that cannot find us."""
+    """Until asked to stop, show a status line, and log hints about clients that do not match."""
     started = time.monotonic()
-    said: set[str] = set()
+    logged: set[str] = set()
     rates = [_Rate(lambda s=service: s.counters.published) for service in services]  # type: ignore[misc]
     lonely = True
     while not stop.wait(_STATUS_PERIOD):
@@ -277,8 +277,8 @@ def _watch(services: Sequence[HandService], stop: StopRequest, status: StatusLin
             return
         for service in services:
             for text in _mismatches(service):
-                if text not in said and len(said) < MOST_REMARKS:
-                    said.add(text)
+                if text not in logged and len(logged) < MOST_REMARKS:
+                    logged.add(text)
                     log.warning("%s", text)
         lonely = lonely and not any(service.clients for service in services)
         if lonely and time.monotonic() - started > _LONELY:
@@ -311,7 +311,7 @@ class _Rate:
 
 
 def _line(service: HandService, rate: float) -> tuple[str, str]:
-    """How a service is doing, and the same in brief."""
+    """The status of a service, and its short form."""
     hands = []
     brief = []
     for side, core in service.cores.items():

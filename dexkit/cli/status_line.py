@@ -34,7 +34,7 @@ def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
 
     :param quiet: warnings only.
     :param status: a status line is kept at the bottom; log lines are written over it.
-    :param always: name of a logger that is heard however quiet: the counters at exit are wanted.
+    :param always: a logger whose records are printed at any verbosity: the counters at exit.
     """
     clear = "\r\x1b[K" if status else ""
     level = logging.WARNING if quiet else logging.INFO
@@ -45,7 +45,7 @@ def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
 
 
 class StatusLine:
-    """One line that says how a command is doing, renewed again and again.
+    """One line with the status of a command, renewed in place.
 
     At the bottom of a terminal; or, where :data:`STATUS_LINES` is set, lines ``status: ...`` of
     the standard output; or nowhere.
@@ -62,17 +62,17 @@ class StatusLine:
         return self._lines or self.on_terminal
 
     def show(self, text: str, brief: str = "") -> None:
-        """Say this now.
+        """Show a new text.
 
-        :param brief: what a command that shows several of these has room for.
+        :param brief: the short form, for a command that shows several.
         """
         if self._lines:
             print(f"status: {brief or text}", flush=True)
         elif self.on_terminal:
             # a line that is broken in two could not be written over
-            room = os.get_terminal_size(sys.stderr.fileno()).columns - 1
-            if 0 < room < len(text):
-                text = f"{text[: room - 1]}…"
+            width = os.get_terminal_size(sys.stderr.fileno()).columns - 1
+            if 0 < width < len(text):
+                text = f"{text[: width - 1]}…"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
     def clear(self) -> None:

@@ -120,9 +120,9 @@ def command(
     does. The default domain is 1, the simulation's:
     --domain 0 with a robot's interface moves real hands.
 
-    At the end, on Ctrl-C too, the hands are told to stay where they are.
+    At the end, on Ctrl-C too, the hands are commanded to hold their position.
 
-    Exit codes: 0 done, 1 the hand gave no state, fell silent, or is commanded by somebody else,
+    Exit codes: 0 done, 1 the hand gave no state, fell silent, or is commanded by another program,
     2 wrong usage, 130 interrupted.
     """
     if list_profiles:
@@ -149,7 +149,7 @@ def command(
             _record(stack, record_path, spoken, domain, interface)
         node = stack.enter_context(DdsNode(domain=domain, interface=interface))
         live = LiveClient(node, client, force=force)
-        waiting = _Waiting(node, spoken, patience)
+        waiting = _WaitReport(node, spoken, patience)
         if not live.wait_ready(stop.event, waiting):
             return 130
         _print_to_stderr(
@@ -164,11 +164,11 @@ def command(
         stopped = bool(stop)
     for at, seconds_away in session.pauses:
         _print_to_stderr(
-            f"this program stood still for {seconds_away:.2f} s, {at:.1f} s after the beginning; "
+            f"this program was paused for {seconds_away:.2f} s, {at:.1f} s after the beginning; "
             "figures of then are not the hand's"
         )
     _report(session, operator, 1 / client.period, as_json=as_json)
-    silent = [] if stopped else _silent(session, seconds)
+    silent = [] if stopped else _silent_sides(session, seconds)
     for side in silent:
         _print_to_stderr(
             f"{side}: no state in the end; the genuine client goes on with what it last read"
@@ -225,14 +225,14 @@ def _record(stack: ExitStack, path: Path, spoken: Dialect, domain: int, interfac
     stack.enter_context(DdsRecording(node, recorder, list(topics), types=topics))
 
 
-class _Waiting:
-    """Says what the client waits for, as the genuine one does, and where to look for help."""
+class _WaitReport:
+    """Prints what the client waits for, as xr_teleoperate does, and a hint after a while."""
 
     def __init__(self, node: DdsNode, spoken: Dialect, patience: float | None) -> None:
         self._node = node
         self._spoken = spoken
         self._patience = patience
-        self._said: Mapping[Side, str] | None = None
+        self._reported: Mapping[Side, str] | None = None
         self._helped = False
 
     def __call__(self, missing: Mapping[Side, str], seconds: float) -> None:
@@ -248,9 +248,9 @@ class _Waiting:
             )
             error.exit_code = 1
             raise error
-        if missing and missing != self._said:
+        if missing and missing != self._reported:
             _print_to_stderr(f"waiting for state of {what} ...")
-            self._said = dict(missing)
+            self._reported = dict(missing)
         if seconds >= _HINT_AFTER and not self._helped:
             self._helped = True
             _print_to_stderr(f"  {self._advice}")
@@ -264,13 +264,13 @@ class _Waiting:
             if d != self._spoken and any((d.topics(s)[1], d.state_type) in seen for s in Side)
         ]
         if others:
-            return f"there are hands that speak {', '.join(others)}: --dialect {others[0]}"
+            return f"there are hands with the dialect {', '.join(others)}: --dialect {others[0]}"
         where = "" if self._node.interface == "lo" else f" --interface {self._node.interface}"
-        return f"'dexkit doctor --domain {self._node.domain}{where}' says what is wrong"
+        return f"'dexkit doctor --domain {self._node.domain}{where}' reports what is wrong"
 
 
 class _Progress:
-    """One line that tells how far it is, on a terminal."""
+    """Shows the progress in one line, on a terminal."""
 
     def __init__(self, duration: float) -> None:
         self._duration = duration
@@ -289,7 +289,7 @@ class _Progress:
             click.echo("\r\033[K", nl=False, err=True)
 
 
-def _silent(session: Session, end: float) -> list[Side]:
+def _silent_sides(session: Session, end: float) -> list[Side]:
     last = {s: rows[-1][0] for s, rows in session.states.items() if rows}
     return [s for s in session.sides if last.get(s, -math.inf) < end - _SILENT]
 
@@ -298,7 +298,7 @@ def _report(session: Session, operator: Operator, nominal: float, *, as_json: bo
     model = model_by_name(operator.dialect.model)
     found: dict[str, Any] = {}
     for side in session.sides:
-        figures = session.feel(operator, side)
+        figures = session.tracking(operator, side)
         joints = {model.joints[side][i].name: f.figures() for i, f in figures.items()}
         found[str(side)] = {"client_hz": session.command_rate(side), "joints": joints}
     if as_json:
@@ -332,11 +332,13 @@ def _finite(value: Any) -> Any:
 
 def sentence(values: Mapping[str, float]) -> str:
     """The figures of a joint in a line."""
-    says: dict[str, Callable[[float], str]] = {
+    formats: dict[str, Callable[[float], str]] = {
         "stroke_s": lambda x: f"full stroke {x:.2f} s",
         "reaction_s": lambda x: f"reacts after {x * _MS:.0f} ms",
         "overshoot": lambda x: f"overshoots by {x:.3f} rad",
         "stuck": lambda x: f"rests {x:.3f} rad off",
         "lag_s": lambda x: f"lags {x * _MS:.0f} ms",
     }
-    return ", ".join(say(values[name]) for name, say in says.items() if name in values)
+    return ", ".join(
+        format_figure(values[name]) for name, format_figure in formats.items() if name in values
+    )

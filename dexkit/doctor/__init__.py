@@ -8,7 +8,7 @@ who it is) is done by the command line.
 
 from dexkit.doctor.catalogue import DIAGNOSES, Diagnosis, Finding, Severity
 from dexkit.doctor.observations import Observations
-from dexkit.doctor.rules import Readiness, Verdict, Wish, diagnose, readiness, verdict
+from dexkit.doctor.rules import Readiness, Scope, Verdict, diagnose, readiness, verdict
 
 __all__ = [
     "DIAGNOSES",
@@ -16,9 +16,9 @@ __all__ = [
     "Finding",
     "Observations",
     "Readiness",
+    "Scope",
     "Severity",
     "Verdict",
-    "Wish",
     "diagnose",
     "readiness",
     "verdict",

@@ -1,4 +1,4 @@
-"""Every diagnosis that the doctor knows: the source of the report, the table in the docs, --json.
+"""The diagnoses of the doctor: texts for the report, the page in the docs and --json.
 
 Ids are stable and never used again for something else.
 """
@@ -12,14 +12,14 @@ __all__ = ["DIAGNOSES", "Diagnosis", "Finding", "Severity"]
 
 
 class Severity(Enum):
-    """How bad it is."""
+    """Severity of a finding."""
 
     ERROR = "error"
     """A client or a hand cannot work like this."""
     WARNING = "warning"
-    """It works badly, or soon will not."""
+    """It works, but badly, or is about to fail."""
     NOTE = "note"
-    """Good to know."""
+    """Information."""
 
     def __str__(self) -> str:
         return str(self.value)
@@ -27,12 +27,12 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """A thing that can be wrong.
+    """An entry of the catalogue: a cause of failure, its symptom and its remedy.
 
-    :param title: what it is, in a sentence without a name or number.
+    :param title: the cause, in a sentence without a name or number.
     :param symptom: what the user sees of it.
     :param why: why it has that effect.
-    :param fix: what to do, where nothing more particular can be said.
+    :param fix: the remedy, where the finding has no more specific one.
     """
 
     id: str
@@ -45,7 +45,7 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Finding:
-    """A diagnosis that was made.
+    """A diagnosis that applies to this machine or domain.
 
     :param seen: what was seen, with names and numbers.
     :param fix: what to do about it.
@@ -67,7 +67,7 @@ class Finding:
 _WAITS = "the client prints 'Waiting to subscribe dds...' for ever"
 _E, _W, _N = Severity.ERROR, Severity.WARNING, Severity.NOTE
 
-# In the order in which they are told: what explains the others comes first.
+# In the order in which they are reported: causes before their effects.
 _ALL = (
     Diagnosis(
         "DDS-CYCLONE-11",
@@ -84,16 +84,17 @@ _ALL = (
         "loopback has no multicast, so two processes of Unitree's SDK do not find each other",
         _WAITS + ", though hand and client run on one machine",
         "Unitree's SDK finds peers by multicast; where 'lo' lacks the MULTICAST flag each process "
-        "of it waits for the other to call",
-        "sudo ip link set lo multicast on, then restart both; or let one of the two be "
-        "dexkit, which calls its peers on loopback by port and needs no multicast",
+        "of it waits for an announcement of the other",
+        "sudo ip link set lo multicast on, then restart both; or use dexkit for one of the two: on "
+        "loopback it finds its peers by unicast and needs no multicast",
     ),
     Diagnosis(
         "NET-INTERFACE",
         _E,
         "hand and client are on different network interfaces",
         _WAITS + "; discovery tools on either side show only their own half",
-        "DDS uses the interface it is told to; who is on another one is not seen",
+        "a participant uses the network interface in its configuration; participants on another "
+        "one are not discovered",
         "name the same interface on both sides: the robot's network is 192.168.123.x",
     ),
     Diagnosis(
@@ -107,7 +108,7 @@ _ALL = (
     Diagnosis(
         "DDS-NOBODY",
         _E,
-        "nobody publishes the state of a Dex hand",
+        "no process publishes the state of a Dex hand",
         _WAITS,
         "a client waits for the first state before it sends anything",
         "start the hand: the vendor's service, or 'dexkit serve BACKEND --side both'",
@@ -117,24 +118,25 @@ _ALL = (
         _E,
         "the hand is on another DDS domain than the client",
         _WAITS + ", though the hand runs",
-        "domains do not hear each other; xr_teleoperate uses 0, and 1 with --sim",
+        "DDS domains are separate; xr_teleoperate uses domain 0, and 1 with --sim",
         "put both on one domain: 'dexkit serve ... --domain N', xr_teleoperate with or without "
         "--sim",
     ),
     Diagnosis(
         "DDS-OTHER-STACK",
         _E,
-        "the hand speaks the topics of another generation of Unitree's stack",
+        "the hand uses the topics of another version of Unitree's software",
         _WAITS + ", though the hand runs on the right domain",
         "xr_teleoperate v1.1 and the simulator used rt/unitree_actuator/*, later versions use "
-        "rt/dex1/*; names that differ never match, and nobody is told",
+        "rt/dex1/*; topics with different names never match, and no error is "
+        "reported",
         "make both use the same: 'dexkit serve ... --dialect NAME', or another version of the "
         "client",
     ),
     Diagnosis(
         "DDS-NAME",
         _E,
-        "a topic's name is nearly that of a hand",
+        "a topic's name differs slightly from that of a hand",
         _WAITS + ", though the hand publishes something",
         "DDS matches names letter by letter; on DDS the topics begin with rt/",
         "use the exact name",
@@ -151,14 +153,14 @@ _ALL = (
         "DDS-LAYOUT",
         _E,
         "two processes use the same type name with different layouts",
-        _WAITS + ", or values are shifted and nonsensical",
+        _WAITS + ", or values are shifted and wrong",
         "Unitree changed the messages in December 2024 and February 2025 without renaming them",
         "install the same, newest version of unitree_sdk2 or unitree_ros2 on both sides",
     ),
     Diagnosis(
         "DDS-QOS",
         _E,
-        "a reader asks for more than the writer offers",
+        "a reader requests a QoS that the writer does not offer",
         "topic and type are right and still nothing arrives",
         "DDS matches only a writer that offers at least what the reader requests",
         "let the writer be reliable and volatile, and the reader best-effort and volatile, as "
@@ -170,22 +172,21 @@ _ALL = (
         "only one of the two hands publishes",
         _WAITS + ", though one hand runs",
         "xr_teleoperate waits for the first state of both hands",
-        "start the other hand too; 'dexkit serve sim-dex1 --side right' stands in for a "
-        "missing one",
+        "start the other hand too; 'dexkit serve sim-dex1 --side right' replaces a missing one",
     ),
     Diagnosis(
         "DDS-SILENT",
         _E,
-        "a state topic is announced but no state comes",
+        "a state topic has a writer but no samples",
         _WAITS + ", though the topic is listed",
         "a client needs samples, not only a topic",
-        "look at the hand's service: its log, its device; restart it",
+        "check the log of the hand's service and its device; restart it",
     ),
     Diagnosis(
         "DDS-UNREADABLE",
         _E,
-        "the samples of a topic are not what their type says",
-        "the client ignores them or shows nonsense",
+        "the samples of a topic do not decode as their type",
+        "the client ignores them or shows wrong values",
         "a sample that does not decode is dropped",
         "install the same version of the messages on both sides",
     ),
@@ -204,13 +205,13 @@ _ALL = (
         _E,
         "two processes publish the same topic",
         "the hand or the displayed hand jumps between two positions",
-        "a reader takes the samples of every writer as they come",
+        "a reader takes the samples of all writers",
         "stop one of them",
     ),
     Diagnosis(
         "DDS-HAND-DEAF",
         _E,
-        "a hand publishes its state but does not listen to commands",
+        "a hand publishes its state but does not read commands",
         "the client starts, the hand never moves",
         "no process reads the command topic",
         "restart the hand's service with commands enabled",
@@ -218,7 +219,7 @@ _ALL = (
     Diagnosis(
         "DDS-UNHEARD",
         _E,
-        "commands are published that nobody reads",
+        "commands are published that no process reads",
         "the client runs, the hand never moves",
         "no hand has a reader of that topic and type",
         "start the hand, on the same domain and topic",
@@ -228,32 +229,33 @@ _ALL = (
         _W,
         "the hand was started after the client of a Dex3-1",
         "the client shows the hand, the hand never moves",
-        "xr_teleoperate's Dex3-1 controller forks before it sends; the fork does not learn of "
-        "hands that appear later",
+        "xr_teleoperate's Dex3-1 controller forks before it sends; the fork does not discover "
+        "hands that start later",
         "restart the client, and always start the hand first",
     ),
     Diagnosis(
         "DDS-FROZEN",
         _E,
         "the state does not follow commands that change",
-        "the displayed hand stands still",
+        "the displayed hand does not move",
         "the state is published, but nothing new is measured",
-        "look at the hand's service: has it lost its device? 'dexkit doctor --device PATH' "
-        "looks at a serial port",
+        "check whether the hand's service has lost its device; 'dexkit doctor --device PATH' "
+        "checks a serial port",
     ),
     Diagnosis(
         "DDS-RATE",
         _W,
-        "states come too seldom",
+        "the rate of states is too low",
         "the hand lags and moves slowly",
-        "xr_teleoperate limits each command to a step from the last state, so that a slow state "
-        "is a slow hand",
-        "close what loads the machine; on a serial line set the adapter's latency timer to 1 ms",
+        "xr_teleoperate limits each command to a step from the last state, so at a low "
+        "state rate the hand is slow",
+        "stop other programs that use the processor; on a serial line set the adapter's latency "
+        "timer to 1 ms",
     ),
     Diagnosis(
         "DDS-NO-CLIENT",
         _N,
-        "nobody reads the hand's state",
+        "no process reads the hand's state",
         "-",
         "no client is up, or it is on another domain or interface",
         "start the client",
@@ -262,7 +264,7 @@ _ALL = (
         "ENV-CYCLONEDDS-11",
         _E,
         "a CycloneDDS other than 0.10 is installed in dexkit's Python",
-        "dexkit refuses to use it; other programs would crash the robot's",
+        "dexkit refuses to use it; other programs that use it would crash the robot's programs",
         "11.x participants with Unitree's types crash 0.10.x peers",
         "pip install 'cyclonedds>=0.10.2,<0.11'",
     ),
@@ -270,7 +272,7 @@ _ALL = (
         "ENV-CYCLONEDDS-MISSING",
         _W,
         "CycloneDDS is not installed in dexkit's Python",
-        "dexkit serve, record and replay say that DDS is not available",
+        "dexkit serve, record and replay report that DDS is not available",
         "they need CycloneDDS 0.10; its wheels are for CPython 3.8 to 3.10 on x86-64 Linux (the "
         "doctor itself does without)",
         "use Python 3.10 on x86-64: 'uv python install 3.10', or pip install "
@@ -280,14 +282,14 @@ _ALL = (
         "ENV-CYCLONEDDS-BROKEN",
         _E,
         "CycloneDDS is installed but does not load",
-        "dexkit serve, record and replay say that DDS is not available",
+        "dexkit serve, record and replay report that DDS is not available",
         "its library cannot be loaded",
         "pip install --force-reinstall 'cyclonedds>=0.10.2,<0.11'; unset CYCLONEDDS_HOME",
     ),
     Diagnosis(
         "ENV-URI",
         _E,
-        "CYCLONEDDS_URI is set and is of no use",
+        "CYCLONEDDS_URI is set to a configuration that cannot be used",
         "programs of the C++ SDK and ROS 2 do not start, or are on another interface",
         "CycloneDDS stops at a configuration that it cannot read",
         "unset CYCLONEDDS_URI, or repair it: file:///PATH or the XML itself",
@@ -297,7 +299,7 @@ _ALL = (
         _N,
         "unitree_sdk2py does not import in dexkit's Python",
         "clients started with this Python stop with an ImportError",
-        "the package on PyPI lacks a part of itself",
+        "the package on PyPI is incomplete",
         "install it from Unitree's repository unitree_sdk2_python; dexkit does not need it",
     ),
     Diagnosis(
@@ -313,21 +315,21 @@ _ALL = (
         _E,
         "this user may not use the serial port",
         "the hand's service does not start",
-        "serial ports belong to a group",
+        "only members of its group may open a serial port",
         "sudo usermod -a -G dialout $USER, then log in again",
     ),
     Diagnosis(
         "SERIAL-BUSY",
         _E,
-        "another program has the serial port",
+        "another program has the serial port open",
         "the hand's service does not start, or both programs get half of the answers",
-        "a servo has one master",
+        "only one program at a time can use a serial line",
         "stop the other program",
     ),
     Diagnosis(
         "SERIAL-NOT-A-PORT",
         _E,
-        "it is not a serial port that can be used",
+        "the path is not a usable serial port",
         "the hand's service does not start",
         "it does not take a baud rate, or cannot be opened",
         "give the port of the servo's adapter, e.g. /dev/ttyUSB0",
@@ -335,9 +337,9 @@ _ALL = (
     Diagnosis(
         "SERIAL-PROTOCOL-1",
         _E,
-        "the servo speaks Protocol 1.0",
+        "the servo uses Protocol 1.0",
         "dexkit refuses to drive it",
-        "its registers are others than those of Protocol 2.0",
+        "its registers differ from those of Protocol 2.0",
         "upgrade it with ROBOTIS DYNAMIXEL Wizard 2 (firmware recovery, model MX-64(2.0))",
     ),
     Diagnosis(
@@ -345,7 +347,7 @@ _ALL = (
         _E,
         "the servo that answers is not an MX-64",
         "dexkit refuses to drive it",
-        "another model has other registers and limits",
+        "other models have other registers and limits",
         "give the port of the EZGripper, e.g. its name under /dev/serial/by-id",
     ),
     Diagnosis(
@@ -354,7 +356,7 @@ _ALL = (
         "nothing answers on the serial port",
         "the hand's service finds no servo",
         "no servo answers at any baud rate, with either protocol",
-        "is the 12 V supply on? Is the cable in? Is it the right port?",
+        "check the 12 V supply, the cable and the port",
     ),
     Diagnosis(
         "SERIAL-BAUD",
@@ -368,9 +370,9 @@ _ALL = (
     Diagnosis(
         "SERIAL-LATENCY",
         _W,
-        "the adapter holds back what it receives",
+        "the adapter delays what it receives",
         "the hand lags: some 60 exchanges a second at best",
-        "an FTDI adapter waits for its latency timer before it hands over a short answer",
+        "an FTDI adapter waits for its latency timer before it passes on a short answer",
         "echo 1 | sudo tee /sys/bus/usb-serial/devices/NAME/latency_timer",
     ),
     Diagnosis(
@@ -378,15 +380,15 @@ _ALL = (
         _E,
         "no Dex3-1 is on USB",
         "the hand's service does not start",
-        "the hand's board is not seen",
-        "is the hand powered (24 to 58 V) and its cable in? 'lsusb' must list it",
+        "the hand's board is not on the USB bus",
+        "check the hand's supply (24 to 58 V) and its cable; 'lsusb' must list it",
     ),
     Diagnosis(
         "USB-PERMISSION",
         _E,
         "this user may not use the hand's USB device",
         "the hand's service does not start: access denied",
-        "USB devices belong to root unless a udev rule says otherwise",
+        "USB devices belong to root unless a udev rule changes it",
         "add a udev rule",
     ),
     Diagnosis(
@@ -411,7 +413,7 @@ _ALL = (
         "the USB device cannot be reached",
         "the hand's service does not start",
         "the server of the emulated device, or the device itself, does not answer",
-        "is 'dexkit emulate dex3-usb' running at that address?",
+        "check that 'dexkit emulate dex3-usb' runs at that address",
     ),
 )
 

@@ -1,4 +1,4 @@
-"""Looking at domains: the sockets of the observers, and what they saw as observations."""
+"""Observe DDS domains: sockets for the observers, and their results as observations."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ class _Window:
                 self.socket.sendto(packet, (place.address, place.port))
             except OSError as error:
                 # no multicast on this interface, an address of another network, a full buffer:
-                # whoever is not reached is not seen, which is what the look is about
+                # a participant that is not reached is not discovered, which is the result
                 if error.errno == errno.EBADF:
                     raise
 

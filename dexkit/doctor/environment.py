@@ -65,12 +65,12 @@ def _import_problem(module: str) -> str:
     if done.returncode < 0:
         return f"'{code}' dies of signal {-done.returncode}"
     lines = done.stderr.strip().splitlines()
-    # the path at the end says nothing more
+    # the path at the end has no more information
     return re.sub(r" \(/[^()]*\)$", "", lines[-1]) if lines else f"'{code}' fails"
 
 
 def uri_problem(uri: str) -> str:
-    """Why a CYCLONEDDS_URI is of no use, or empty: each of its parts is XML or a file of it."""
+    """Why a CYCLONEDDS_URI cannot be used, or empty: each of its parts is XML or a file of it."""
     for part in _parts(uri):
         text = part
         if not part.startswith("<"):

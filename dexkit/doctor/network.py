@@ -1,4 +1,4 @@
-"""Network interfaces of this machine, and who listens to DDS on them."""
+"""Network interfaces of this machine, and its processes with DDS sockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be seen, as plain data: what the rules judge and what ``--json`` prints."""
+"""Observations as plain data: input of the rules, and output of ``--json``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Participant:
 
     :param key: GUID prefix, hex.
     :param vendor: name of the DDS implementation.
-    :param version: of CycloneDDS, or empty where it is not told.
+    :param version: of CycloneDDS, or empty where it is not announced.
     :param process: name that it announces, or empty.
     :param pid: process id that it announces, or 0.
     :param host: machine that it announces, or empty.
@@ -55,7 +55,7 @@ class Participant:
 
     @property
     def name(self) -> str:
-        """How to call it in a sentence."""
+        """Its name in messages."""
         who = self.command or self.process or self.vendor
         if len(who) > 60:
             who = who[:57] + "..."
@@ -84,7 +84,7 @@ class Endpoint:
 
 @dataclass(frozen=True)
 class Stream:
-    """What one writer sent while it was looked at.
+    """Statistics of what one writer sent while it was observed.
 
     :param writer: key of the endpoint.
     :param seconds: how long was looked.
@@ -94,7 +94,7 @@ class Stream:
     :param q: positions of the last sample, rad; empty when none could be decoded.
     :param q_span: the furthest that any joint moved, rad.
     :param nonzero: some position of some sample was not exactly 0.
-    :param undecodable: samples that were not what their type says.
+    :param undecodable: samples that do not decode as their type.
     """
 
     topic: str
@@ -123,7 +123,7 @@ class DomainView:
         return next((p for p in self.participants if p.key == key), None)
 
     def stream(self, endpoint: Endpoint) -> Stream | None:
-        """What a writer sent, if it was looked at."""
+        """Statistics of a writer, if it was observed."""
         return next((s for s in self.streams if s.writer == endpoint.key), None)
 
     def owner(self, endpoint: Endpoint) -> str:
@@ -170,7 +170,7 @@ class Environment:
     :param sdk: version of unitree_sdk2py or unitree-sdk2 that is installed, or empty.
     :param sdk_error: why it does not import, or empty.
     :param uri: CYCLONEDDS_URI, or empty.
-    :param uri_error: why it is of no use, or empty.
+    :param uri_error: why it cannot be used, or empty.
     """
 
     python: str = "3.10.0"

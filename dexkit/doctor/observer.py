@@ -1,6 +1,6 @@
-"""An RTPS participant that only looks, sans IO: packets in, packets out, on an injected clock.
+"""Observe a DDS domain as an RTPS participant, sans IO: packets in and out, on an injected clock.
 
-It announces itself, so that the others tell it what they have; it reads topics best-effort, as
+It announces itself, so that others send it their announcements; it reads topics best-effort, as
 Unitree's clients do; it has no writer of its own. What it needs from the outside is that
 :meth:`Observer.receive` gets what comes to its address, that what the methods return is sent,
 and that :meth:`Observer.tick` is called some ten times a second.
@@ -24,9 +24,9 @@ SampleHandler = Callable[[rtps.EndpointData, int, bytes, float], object]
 """Takes a sample: its writer, sequence number, bytes, and when it came."""
 
 _SEDP = {rtps.SEDP_PUBLICATIONS: True, rtps.SEDP_SUBSCRIPTIONS: False}
-_REPEAT = 0.2  # seconds between tries to be told, or to tell, the rest
+_REPEAT = 0.2  # seconds between requests for announcements, or announcements of our readers
 _TRIES = 15
-_LEASE = 20  # seconds; a look is shorter, and ends with a farewell
+_LEASE = 20  # seconds; an observation is shorter, and ends with a farewell
 _MOST = 4096  # announcements of one writer
 _LAST = (1 << 63) - 1  # the largest sequence number
 _MAX_SAMPLE = 1 << 20
@@ -35,25 +35,25 @@ _PARTIAL = 4  # incomplete samples kept of a writer
 
 @dataclass
 class _History:
-    """What a reliable built-in writer has and what of it came."""
+    """The samples that a reliable built-in writer has, and those received."""
 
     seen: set[int] = field(default_factory=set)
     first: int = 1
     last: int = 0
-    told: bool = False  # it has said what it has
+    announced: bool = False  # a heartbeat has come: first and last are known
 
-    def missing(self) -> list[int]:
+    def missing_numbers(self) -> list[int]:
         return [n for n in range(self.first, self.last + 1) if n not in self.seen]
 
     @property
     def complete(self) -> bool:
-        return self.told and not self.missing()
+        return self.announced and not self.missing_numbers()
 
 
 @dataclass
 class _Peer:
     data: rtps.ParticipantData
-    places: Sequence[Locator]  # where it is spoken to: one, or none
+    places: Sequence[Locator]  # where packets are sent to: one, or none
     histories: dict[bytes, _History]
     acked: int = 0  # of our announcements of readers
     tries: int = 0
@@ -66,11 +66,11 @@ class _Partial:
 
 
 class Observer:
-    """Looks at one domain from one address.
+    """Observes one domain from one address.
 
     :param prefix: GUID prefix of its own, 12 bytes, unique.
     :param place: where it receives.
-    :param properties: what it says of its process.
+    :param properties: properties of its process to announce.
     :param wanted: whether to read a topic of a type.
     :param on_sample: takes each sample of the topics that are read.
 
@@ -104,22 +104,22 @@ class Observer:
 
     @property
     def settled(self) -> bool:
-        """Every participant found has told all its endpoints."""
+        """Every participant found has announced all its endpoints."""
         return all(h.complete for peer in self._peers.values() for h in peer.histories.values())
 
     def announcement(self) -> bytes:
-        """The packet that makes others answer; to be sent wherever they may be."""
+        """The packet that makes others answer; to be sent to all addresses where they may be."""
         return rtps.message(self.prefix, rtps.build_data(rtps.SPDP_WRITER, 1, self._announcement))
 
     def farewell(self) -> bytes:
-        """The packet that makes others forget it at once."""
+        """The packet that withdraws the announcement, so that others forget this participant."""
         return rtps.message(
             self.prefix, rtps.build_data(rtps.SPDP_WRITER, 2, self._announcement, gone=True)
         )
 
     @property
     def addresses(self) -> list[Locator]:
-        """Where the participants found take discovery messages."""
+        """Locators at which the discovered participants take discovery messages."""
         return [place for peer in self._peers.values() for place in peer.places]
 
     def receive(self, packet: bytes, now: float, address: str = "") -> list[Send]:
@@ -137,46 +137,46 @@ class Observer:
                 if destination not in (self.prefix, bytes(12)):
                     continue
                 if isinstance(item, Data):
-                    self._data(item, now, address, out)
+                    self._take_data(item, now, address, out)
                 elif isinstance(item, DataFrag):
-                    self._fragment(item, now)
+                    self._take_fragment(item, now)
                 else:
-                    self._protocol(item, out)
+                    self._take_protocol_message(item, out)
         except WireError:
             self.damaged += 1
         return out
 
     def tick(self, now: float) -> list[Send]:
-        """What is to be sent again, because an answer is missing."""
+        """Return what is to be sent again, because an answer is missing."""
         out: list[Send] = []
         for peer in self._peers.values():
             waiting = [w for w, history in peer.histories.items() if not history.complete]
-            telling = peer.acked < len(self._readers)
-            if not (waiting or telling) or now < peer.next_try or peer.tries >= _TRIES:
+            announcing = peer.acked < len(self._readers)
+            if not (waiting or announcing) or now < peer.next_try or peer.tries >= _TRIES:
                 continue
             peer.next_try = now + _REPEAT
             peer.tries += 1
             for writer in waiting:
-                self._ask(peer, writer, out)
-            if telling:
-                self._tell(peer, out)
+                self._request_missing(peer, writer, out)
+            if announcing:
+                self._announce_readers(peer, out)
         return out
 
     # --- discovery
 
-    def _data(self, item: Data, now: float, address: str, out: list[Send]) -> None:
+    def _take_data(self, item: Data, now: float, address: str, out: list[Send]) -> None:
         if item.writer == rtps.SPDP_WRITER:
-            self._participant(item, now, address, out)
+            self._take_participant(item, now, address, out)
             return
         peer = self._peers.get(item.source)
         if item.writer in _SEDP:
             if peer is not None:
                 peer.histories[item.writer].seen.add(item.sequence)
-                self._endpoint(item, peer, out)
+                self._take_endpoint(item, peer, out)
         else:
-            self._sample(item.source + item.writer, item.sequence, item.payload, now)
+            self._take_sample(item.source + item.writer, item.sequence, item.payload, now)
 
-    def _participant(self, item: Data, now: float, address: str, out: list[Send]) -> None:
+    def _take_participant(self, item: Data, now: float, address: str, out: list[Send]) -> None:
         if item.gone:
             self._forget(item.source)
             return
@@ -193,9 +193,9 @@ class Observer:
         # it may have been found by an announcement of its own: it must know us to answer
         self._send(peer, rtps.build_data(rtps.SPDP_WRITER, 1, self._announcement), out)
         for writer in _SEDP:
-            self._ask(peer, writer, out)
+            self._request_missing(peer, writer, out)
         if self._readers:
-            self._tell(peer, out)
+            self._announce_readers(peer, out)
 
     def _forget(self, prefix: bytes) -> None:
         self._peers.pop(prefix, None)
@@ -203,7 +203,7 @@ class Observer:
         for guid in [guid for guid in self.endpoints if guid[:12] == prefix]:
             del self.endpoints[guid]
 
-    def _endpoint(self, item: Data, peer: _Peer, out: list[Send]) -> None:
+    def _take_endpoint(self, item: Data, peer: _Peer, out: list[Send]) -> None:
         if not item.payload:
             return
         is_writer = _SEDP[item.writer]
@@ -218,9 +218,9 @@ class Observer:
             self._readers[reader] = rtps.build_endpoint(self.prefix + entity, *reader)
             for other in self._peers.values():
                 other.tries = 0
-                self._tell(other, out)
+                self._announce_readers(other, out)
 
-    def _protocol(self, item: Heartbeat | Gap | AckNack, out: list[Send]) -> None:
+    def _take_protocol_message(self, item: Heartbeat | Gap | AckNack, out: list[Send]) -> None:
         peer = self._peers.get(item.source)
         if peer is None:
             return
@@ -228,7 +228,7 @@ class Observer:
             if item.writer == rtps.SEDP_SUBSCRIPTIONS:
                 peer.acked = max(peer.acked, min(item.base - 1, len(self._readers)))
                 if any(1 <= n <= len(self._readers) for n in item.missing):
-                    self._tell(peer, out)
+                    self._announce_readers(peer, out)
             return
         history = peer.histories.get(item.writer)
         if history is None:
@@ -242,14 +242,14 @@ class Observer:
         if not 1 <= item.first <= item.last + 1 <= min(item.first + _MOST, _LAST):
             raise WireError(f"a heartbeat of {item.first} to {item.last}")
         history.first, history.last = item.first, item.last
-        history.told = True
-        if history.missing() or not item.final:
-            self._ask(peer, item.writer, out)
+        history.announced = True
+        if history.missing_numbers() or not item.final:
+            self._request_missing(peer, item.writer, out)
 
-    def _ask(self, peer: _Peer, writer: bytes, out: list[Send]) -> None:
-        """Ask a peer for what it has not told, or say that it has told everything."""
+    def _request_missing(self, peer: _Peer, writer: bytes, out: list[Send]) -> None:
+        """Request the announcements that are missing from a peer, or acknowledge all of them."""
         history = peer.histories[writer]
-        missing = history.missing()
+        missing = history.missing_numbers()
         base = missing[0] if missing else history.last + 1
         self._count += 1
         ack = rtps.build_acknack(
@@ -262,8 +262,8 @@ class Observer:
         )
         self._send(peer, ack, out)
 
-    def _tell(self, peer: _Peer, out: list[Send]) -> None:
-        """Tell a peer which topics are read here."""
+    def _announce_readers(self, peer: _Peer, out: list[Send]) -> None:
+        """Announce to a peer the topics that are read here."""
         writer, to = rtps.SEDP_SUBSCRIPTIONS, peer.data.prefix
         parts = [
             rtps.build_data(writer, number, payload, destination=to)
@@ -283,12 +283,12 @@ class Observer:
 
     # --- samples
 
-    def _sample(self, guid: bytes, sequence: int, data: bytes, now: float) -> None:
+    def _take_sample(self, guid: bytes, sequence: int, data: bytes, now: float) -> None:
         found = self.endpoints.get(guid)
         if found is not None and found[1] and data:
             self._on_sample(found[0], sequence, data, now)
 
-    def _fragment(self, item: DataFrag, now: float) -> None:
+    def _take_fragment(self, item: DataFrag, now: float) -> None:
         guid = item.source + item.writer
         if guid not in self.endpoints:
             return
@@ -303,6 +303,6 @@ class Observer:
         if len(partial.fragments) == count:
             del partials[item.sequence]
             data = b"".join(partial.fragments[i + 1] for i in range(count))[: item.total]
-            self._sample(guid, item.sequence, data, now)
+            self._take_sample(guid, item.sequence, data, now)
         while len(partials) > _PARTIAL:
             del partials[min(partials)]

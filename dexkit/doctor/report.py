@@ -32,13 +32,13 @@ _COLOUR = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "di
 
 
 def as_data(
-    seen: Observations, findings: list[Finding], said: Verdict, states: list[Readiness]
+    seen: Observations, findings: list[Finding], result: Verdict, states: list[Readiness]
 ) -> dict[str, Any]:
     """The report as JSON data; docs/doctor.md describes it."""
     return {
         "version": SCHEMA_VERSION,
-        "healthy": said.healthy,
-        "verdict": said.text,
+        "healthy": result.healthy,
+        "verdict": result.text,
         "ready": [dataclasses.asdict(state) for state in states],
         "findings": [
             {
@@ -69,12 +69,12 @@ def print_report(
     console: Console,
     seen: Observations,
     findings: list[Finding],
-    said: Verdict,
+    result: Verdict,
     states: list[Readiness],
 ) -> None:
     """Verdict, findings with remedies, then what is where."""
-    colour = "green" if said.healthy else "red"
-    console.print(f"[bold {colour}]{escape(said.text)}[/]")
+    colour = "green" if result.healthy else "red"
+    console.print(f"[bold {colour}]{escape(result.text)}[/]")
     for finding in findings:
         colour = _COLOUR[finding.severity]
         console.print(f"\n[{colour}]{finding.severity}[/] [bold]{finding.id}[/]")

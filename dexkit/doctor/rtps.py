@@ -1,4 +1,4 @@
-"""As much of the RTPS wire protocol as it takes to look at a domain, sans IO.
+"""Parse and build the RTPS messages that the observer of a domain needs, sans IO.
 
 An observer speaks RTPS itself instead of joining with CycloneDDS, for three reasons. It sees
 peers that CycloneDDS 0.10 does not survive: what kills a 0.10 process is the type object that an
@@ -107,7 +107,7 @@ _MAX_BITS = 256  # of a sequence number set
 
 
 def spdp_multicast_port(domain: int) -> int:
-    """UDP port on which participants of a domain hear of each other by multicast."""
+    """UDP port on which participants of a domain discover each other by multicast."""
     return 7400 + 250 * domain
 
 
@@ -136,7 +136,7 @@ class Data:
     :param source: GUID prefix of the sender, 12 bytes.
     :param writer: entity id, 4 bytes.
     :param payload: serialised, encapsulation header included; empty when there is none.
-    :param gone: it says that the instance was disposed of or unregistered.
+    :param gone: the instance was disposed of or unregistered.
     """
 
     source: bytes
@@ -166,7 +166,7 @@ class DataFrag:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """A reliable writer says which samples it holds.
+    """A reliable writer announces which samples it holds.
 
     :param final: it wants no answer.
     """
@@ -180,7 +180,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A writer says that these samples will not come."""
+    """A writer announces that these samples will not come."""
 
     source: bytes
     writer: bytes
@@ -191,7 +191,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class AckNack:
-    """A reader says that it has everything before ``base``, and lacks ``missing``."""
+    """A reader acknowledges everything before ``base``, and requests ``missing``."""
 
     source: bytes
     writer: bytes
@@ -205,7 +205,7 @@ Submessage = Data | DataFrag | Heartbeat | Gap | AckNack
 
 @dataclass(frozen=True)
 class ParticipantData:
-    """What a participant announces of itself.
+    """The announcement of a participant.
 
     :param prefix: GUID prefix, 12 bytes.
     :param version: of CycloneDDS, e.g. ``"0.10.5"``, or empty.
@@ -245,7 +245,7 @@ class Policies:
 
 @dataclass(frozen=True)
 class EndpointData:
-    """What a reader or writer announces of itself.
+    """The announcement of a reader or writer.
 
     :param guid: 16 bytes.
     :param type_hash: of the complete type, hex, as :attr:`dexkit.dds.Endpoint.type_hash`; empty

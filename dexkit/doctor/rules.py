@@ -1,4 +1,4 @@
-"""From what was seen to what is wrong: pure functions, no IO."""
+"""Derive findings from observations: pure functions, no IO."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.topics import Role, roles
 from dexkit.wire import dex3_usb, mx64
 
-__all__ = ["Readiness", "Verdict", "Wish", "diagnose", "readiness", "verdict"]
+__all__ = ["Readiness", "Scope", "Verdict", "diagnose", "readiness", "verdict"]
 
-_FROZEN_COMMANDS = 0.1  # rad that commands move while an honest state could not stand still
+_FROZEN_COMMANDS = 0.1  # rad that commands move while a measured state must change
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
 _DRIVER_BAUD = 1_000_000
 _DURABILITY = ("volatile", "transient_local", "transient", "persistent")
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What the user asked about.
+class Scope:
+    """The domain and dialects that are judged.
 
-    :param domain: None for whatever domain has a hand or a client.
-    :param dialects: those that count; empty for whatever is found.
+    :param domain: None for all domains with a hand or a client.
+    :param dialects: those that count; empty for all that are found.
     :param devices_only: a device was asked about and nothing on DDS.
     """
 
@@ -78,10 +78,10 @@ def _finding(
     return Finding(known, seen, fix or known.fix, severity or known.severity, where)
 
 
-def diagnose(seen: Observations, wish: Wish | None = None) -> list[Finding]:
-    """Everything that is wrong with what was seen, what explains the rest first."""
-    wish = wish or Wish()
-    found = [*_domains(seen, wish), *_network(seen, wish)]
+def diagnose(seen: Observations, scope: Scope | None = None) -> list[Finding]:
+    """All findings of the observations, causes before their effects."""
+    scope = scope or Scope()
+    found = [*_domains(seen, scope), *_network(seen, scope)]
     if seen.environment is not None:
         found += _environment(seen.environment)
     for port in seen.serial:
@@ -92,11 +92,11 @@ def diagnose(seen: Observations, wish: Wish | None = None) -> list[Finding]:
     return sorted(found, key=lambda f: (rank.index(f.severity), order[f.id]))
 
 
-def verdict(seen: Observations, findings: list[Finding], wish: Wish | None = None) -> Verdict:
-    """What to say first."""
-    wish = wish or Wish()
+def verdict(seen: Observations, findings: list[Finding], scope: Scope | None = None) -> Verdict:
+    """The result in one sentence: healthy, or the most important finding."""
+    scope = scope or Scope()
     problems = [f for f in findings if f.severity is not Severity.NOTE]
-    states = readiness(seen, wish)
+    states = readiness(seen, scope)
     ready = [r for r in states if r.ready]
     good = " and ".join(
         f"{_title(DIALECTS[r.dialect])} on domain {r.domain} ({r.dialect})" for r in ready
@@ -117,12 +117,12 @@ def _title(dialect: Dialect) -> str:
     return MODELS[dialect.model].title
 
 
-# --- who is what
+# --- endpoints by role
 
 
 @dataclass(frozen=True)
 class _Part:
-    """An endpoint in its role."""
+    """An endpoint and the role that its topic has."""
 
     view: DomainView
     endpoint: Endpoint
@@ -133,55 +133,55 @@ class _Part:
         return self.view.owner(self.endpoint)
 
 
-def _parts(view: DomainView, kind: str, role: str, wish: Wish) -> list[_Part]:
+def _parts(view: DomainView, kind: str, role: str, scope: Scope) -> list[_Part]:
     """Endpoints of a kind whose topic and type have a role in a dialect that counts."""
     return [
         _Part(view, endpoint, found)
         for endpoint in view.endpoints
         if endpoint.kind == kind
         for found in roles(endpoint.topic, endpoint.type_name)
-        if found.kind == role and (not wish.dialects or found.dialect in wish.dialects)
+        if found.kind == role and (not scope.dialects or found.dialect in scope.dialects)
     ]
 
 
-def _hands(view: DomainView, wish: Wish) -> list[_Part]:
-    return _parts(view, "writer", "state", wish)
+def _hands(view: DomainView, scope: Scope) -> list[_Part]:
+    return _parts(view, "writer", "state", scope)
 
 
-def _clients(view: DomainView, wish: Wish) -> list[_Part]:
-    """What a client has: readers of states, and writers of commands."""
-    return _parts(view, "reader", "state", wish) + _parts(view, "writer", "cmd", wish)
+def _clients(view: DomainView, scope: Scope) -> list[_Part]:
+    """Endpoints of clients: readers of states, and writers of commands."""
+    return _parts(view, "reader", "state", scope) + _parts(view, "writer", "cmd", scope)
 
 
-def _focus(seen: Observations, wish: Wish) -> list[DomainView]:
+def _focus(seen: Observations, scope: Scope) -> list[DomainView]:
     """The domains that are judged."""
-    if wish.domain is not None:
-        return [v for v in seen.domains if v.number == wish.domain]
-    return [v for v in seen.domains if _hands(v, wish) or _clients(v, wish)] or [
+    if scope.domain is not None:
+        return [v for v in seen.domains if v.number == scope.domain]
+    return [v for v in seen.domains if _hands(v, scope) or _clients(v, scope)] or [
         v for v in seen.domains if v.number in (0, 1)
     ]
 
 
-def _wanted(views: Iterable[DomainView], wish: Wish) -> list[Dialect]:
+def _wanted(views: Iterable[DomainView], scope: Scope) -> list[Dialect]:
     """The dialects in question: asked for, or a client's, or a hand's."""
-    if wish.dialects:
-        return list(wish.dialects)
+    if scope.dialects:
+        return list(scope.dialects)
     views = list(views)
     for parts in (_clients, _hands):
-        found = {p.role.dialect.name for v in views for p in parts(v, wish)}
+        found = {p.role.dialect.name for v in views for p in parts(v, scope)}
         if found:
             return [d for d in DIALECTS.values() if d.name in found]
     return []
 
 
-def readiness(seen: Observations, wish: Wish | None = None) -> list[Readiness]:
+def readiness(seen: Observations, scope: Scope | None = None) -> list[Readiness]:
     """Whether a client would get past 'Waiting to subscribe dds...'
     (docs/sources/unitree-dex.md#b1).
     """
-    wish = wish or Wish()
+    scope = scope or Scope()
     out = []
-    for view in _focus(seen, wish):
-        names = {p.role.dialect.name for p in _hands(view, wish) + _clients(view, wish)}
+    for view in _focus(seen, scope):
+        names = {p.role.dialect.name for p in _hands(view, scope) + _clients(view, scope)}
         for dialect in DIALECTS.values():
             if dialect.name in names:
                 missing = _missing(view, dialect) or _unmet(seen, view, dialect)
@@ -190,23 +190,23 @@ def readiness(seen: Observations, wish: Wish | None = None) -> list[Readiness]:
 
 
 def _unmet(seen: Observations, view: DomainView, dialect: Dialect) -> str:
-    """Why hand and client do not find each other although both are there, or empty."""
-    wish = Wish(dialects=(dialect,))
-    hands, clients = _hands(view, wish), _clients(view, wish)
+    """Why hand and client do not discover each other although both run, or empty."""
+    scope = Scope(dialects=(dialect,))
+    hands, clients = _hands(view, scope), _clients(view, scope)
     found = [*_apart(view, hands, clients), *_deaf_loopback(seen, view, hands, clients)]
     return found[0].diagnosis.title if found else ""
 
 
 def _missing(view: DomainView, dialect: Dialect) -> str:
-    wish = Wish(dialects=(dialect,))
+    scope = Scope(dialects=(dialect,))
     for side in Side:
-        parts = [p for p in _hands(view, wish) if side in p.role.sides]
+        parts = [p for p in _hands(view, scope) if side in p.role.sides]
         who = "both hands" if dialect.topics(Side.LEFT) == dialect.topics(Side.RIGHT) else side
         if not parts:
-            return f"nobody publishes the state of the {side} hand"
+            return f"no process publishes the state of the {side} hand"
         readers = [
             p.endpoint
-            for p in _parts(view, "reader", "state", wish)
+            for p in _parts(view, "reader", "state", scope)
             if p.endpoint.topic == parts[0].endpoint.topic
         ]
         if any(all(_qos_problem(p.endpoint.qos, r.qos) for p in parts) for r in readers):
@@ -222,17 +222,17 @@ def _missing(view: DomainView, dialect: Dialect) -> str:
 # --- DDS
 
 
-def _domains(seen: Observations, wish: Wish) -> Iterator[Finding]:
-    focus = _focus(seen, wish)
+def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
+    focus = _focus(seen, scope)
     for view in seen.domains:
         yield from _versions(view)
-    found = [f for view in focus for f in _names_and_types(view, wish)]
+    found = [f for view in focus for f in _names_and_types(view, scope)]
     yield from found
     for view in focus:
         yield from _matches(view)
-        yield from _listeners(view, wish)
-        yield from _streams(view, wish)
-    yield from _absent(seen, focus, wish, explained=bool(found))
+        yield from _listeners(view, scope)
+        yield from _streams(view, scope)
+    yield from _absent(seen, focus, scope, explained=bool(found))
 
 
 def _versions(view: DomainView) -> Iterator[Finding]:
@@ -259,14 +259,14 @@ def _versions(view: DomainView) -> Iterator[Finding]:
         )
 
 
-def _names_and_types(view: DomainView, wish: Wish) -> Iterator[Finding]:
-    told: set[tuple[str, str]] = set()
+def _names_and_types(view: DomainView, scope: Scope) -> Iterator[Finding]:
+    reported: set[tuple[str, str]] = set()
     for endpoint in view.endpoints:
         key = (endpoint.topic, endpoint.kind)
         verb = "publishes" if endpoint.kind == "writer" else "reads"
         near = nearly(endpoint.topic)
-        if near is not None and key not in told:
-            told.add(key)
+        if near is not None and key not in reported:
+            reported.add(key)
             yield _finding(
                 "DDS-NAME",
                 f"{view.owner(endpoint)} {verb} {endpoint.topic!r} on domain {view.number}; "
@@ -281,13 +281,13 @@ def _names_and_types(view: DomainView, wish: Wish) -> Iterator[Finding]:
         types = sorted({e.type_name for e in here})
         right = {r.type_name for r in roles(topic)}
         if len(types) < 2 and set(types) <= right:
-            if not wish.dialects:
+            if not scope.dialects:
                 continue
-            wanted = [r for r in roles(topic) if r.dialect in wish.dialects]
+            wanted = [r for r in roles(topic) if r.dialect in scope.dialects]
             if not wanted or types[0] in {r.type_name for r in wanted}:
                 continue
             served = roles(topic, types[0])[0].dialect.name
-            asked = ", ".join(d.name for d in wish.dialects)
+            asked = ", ".join(d.name for d in scope.dialects)
             detail = f"that is the dialect {served}, not {asked}"
             fix = f"'dexkit serve ... --dialect {asked}', or a client of {served}"
         else:
@@ -310,7 +310,7 @@ def _names_and_types(view: DomainView, wish: Wish) -> Iterator[Finding]:
 
 def _matches(view: DomainView) -> Iterator[Finding]:
     """Readers and writers of one topic and type that do not match."""
-    told: set[tuple[str, str, str]] = set()
+    reported: set[tuple[str, str, str]] = set()
     writers = [e for e in view.endpoints if e.kind == "writer" and roles(e.topic)]
     readers = [e for e in view.endpoints if e.kind == "reader"]
     for writer, reader in product(writers, readers):
@@ -318,8 +318,8 @@ def _matches(view: DomainView) -> Iterator[Finding]:
             continue
         problem = _qos_problem(writer.qos, reader.qos)
         pair = f"{view.owner(reader)} reads {reader.topic} of {view.owner(writer)}"
-        if problem and (key := ("qos", writer.key, reader.participant)) not in told:
-            told.add(key)
+        if problem and (key := ("qos", writer.key, reader.participant)) not in reported:
+            reported.add(key)
             yield _finding(
                 "DDS-QOS",
                 f"{pair} on domain {view.number}, but {problem}",
@@ -332,12 +332,12 @@ def _matches(view: DomainView) -> Iterator[Finding]:
         hashes = writer.type_hash, reader.type_hash
         if alike and all(hashes) and hashes[0] != hashes[1]:
             key = ("layout", writer.topic, reader.participant)
-            if key not in told:
-                told.add(key)
+            if key not in reported:
+                reported.add(key)
                 yield _finding(
                     "DDS-LAYOUT",
-                    f"{pair} on domain {view.number}; both say {short(writer.type_name)} and "
-                    "describe it differently",
+                    f"{pair} on domain {view.number}; both use {short(writer.type_name)} with "
+                    "different layouts",
                     domain=view.number,
                     topic=writer.topic,
                 )
@@ -348,13 +348,15 @@ def _series(participant: Participant) -> str:
 
 
 def _qos_problem(offered: Policies, requested: Policies) -> str:
-    """Why a writer's offer does not do for a reader, or empty."""
+    """Why a writer's QoS does not match a reader's, or empty."""
     if requested.reliability == "reliable" and offered.reliability != "reliable":
         return "the reader asks for reliable and the writer is best-effort"
     if _DURABILITY.index(requested.durability) > _DURABILITY.index(offered.durability):
         return f"the reader asks for {requested.durability} and the writer is {offered.durability}"
     if requested.deadline < offered.deadline:
-        return f"the reader asks for a sample every {requested.deadline:g} s, which is not promised"
+        return (
+            f"the reader asks for a sample every {requested.deadline:g} s; the writer offers less"
+        )
     if requested.liveliness > offered.liveliness:
         return "the reader asks for a stronger liveliness than the writer offers"
     if requested.exclusive != offered.exclusive:
@@ -365,8 +367,8 @@ def _qos_problem(offered: Policies, requested: Policies) -> str:
     return ""
 
 
-def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
-    for part in _first(_hands(view, wish)):
+def _listeners(view: DomainView, scope: Scope) -> Iterator[Finding]:
+    for part in _first(_hands(view, scope)):
         dialect = part.role.dialect
         cmd = dialect.topics(part.role.sides[0])[0]
         if not any(
@@ -375,12 +377,12 @@ def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
         ):
             yield _finding(
                 "DDS-HAND-DEAF",
-                f"{part.who} publishes {part.endpoint.topic} on domain {view.number}, and nobody "
-                f"reads {cmd}",
+                f"{part.who} publishes {part.endpoint.topic} on domain {view.number}, and no "
+                f"process reads {cmd}",
                 domain=view.number,
                 topic=cmd,
             )
-    for part in _first(_parts(view, "writer", "cmd", wish)):
+    for part in _first(_parts(view, "writer", "cmd", scope)):
         topic, type_name = part.endpoint.topic, part.endpoint.type_name
         readers = [
             e
@@ -392,7 +394,7 @@ def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
             rate = f" {stream.rate:.0f} times a second" if stream and stream.rate else ""
             yield _finding(
                 "DDS-UNHEARD",
-                f"{part.who} publishes {topic}{rate} on domain {view.number}, and nobody reads it",
+                f"{part.who} publishes {topic}{rate} on domain {view.number}; no process reads it",
                 domain=view.number,
                 topic=topic,
             )
@@ -406,18 +408,18 @@ def _listeners(view: DomainView, wish: Wish) -> Iterator[Finding]:
                     domain=view.number,
                     topic=topic,
                 )
-    for state in _first(_hands(view, wish)):
+    for state in _first(_hands(view, scope)):
         topic = state.endpoint.topic
         if not any(e.kind == "reader" and e.topic == topic for e in view.endpoints):
             yield _finding(
                 "DDS-NO-CLIENT",
-                f"nobody reads {topic} on domain {view.number}",
+                f"no process reads {topic} on domain {view.number}",
                 domain=view.number,
                 topic=topic,
             )
     for role in ("state", "cmd"):
         by_topic: dict[tuple[str, str], dict[str, _Part]] = {}
-        for part in _parts(view, "writer", role, wish):
+        for part in _parts(view, "writer", role, scope):
             key = (part.endpoint.topic, part.endpoint.type_name)
             by_topic.setdefault(key, {})[part.endpoint.participant] = part
         for (topic, _), parts in sorted(by_topic.items()):
@@ -448,8 +450,8 @@ def _late(view: DomainView, writer: Endpoint, readers: Iterable[Endpoint]) -> st
     return ""
 
 
-def _streams(view: DomainView, wish: Wish) -> Iterator[Finding]:
-    for part in _hands(view, wish):
+def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
+    for part in _hands(view, scope):
         stream = view.stream(part.endpoint)
         if stream is None or stream.seconds <= 0:
             continue
@@ -483,7 +485,7 @@ def _streams(view: DomainView, wish: Wish) -> Iterator[Finding]:
                 domain=view.number,
                 topic=topic,
             )
-        command = _command(view, part, wish)
+        command = _command(view, part, scope)
         if stream.identical and command is not None and command.q_span >= _FROZEN_COMMANDS:
             yield _finding(
                 "DDS-FROZEN",
@@ -494,9 +496,9 @@ def _streams(view: DomainView, wish: Wish) -> Iterator[Finding]:
             )
 
 
-def _command(view: DomainView, hand: _Part, wish: Wish) -> Stream | None:
-    """What a client sends to a hand."""
-    for part in _parts(view, "writer", "cmd", wish):
+def _command(view: DomainView, hand: _Part, scope: Scope) -> Stream | None:
+    """The commands that a client sends to a hand."""
+    for part in _parts(view, "writer", "cmd", scope):
         if part.role.dialect is hand.role.dialect and part.role.sides == hand.role.sides:
             stream = view.stream(part.endpoint)
             if stream is not None and stream.samples:
@@ -505,37 +507,37 @@ def _command(view: DomainView, hand: _Part, wish: Wish) -> Stream | None:
 
 
 def _absent(
-    seen: Observations, focus: list[DomainView], wish: Wish, *, explained: bool
+    seen: Observations, focus: list[DomainView], scope: Scope, *, explained: bool
 ) -> Iterator[Finding]:
-    """States that should be there and are not."""
-    everything = Wish()
-    wanted = _wanted(focus, wish)
-    # a hand and a client that do not meet because of the domain
-    elsewhere = [p for v in seen.domains if v not in focus for p in _hands(v, wish)]
+    """State topics that a client needs and that are missing."""
+    everything = Scope()
+    wanted = _wanted(focus, scope)
+    # a hand and a client on different domains
+    elsewhere = [p for v in seen.domains if v not in focus for p in _hands(v, scope)]
     apart = False
-    if wish.domain is None:
+    if scope.domain is None:
         for view in focus:
-            clients = [p for p in _clients(view, wish) if p.endpoint.kind == "reader"]
+            clients = [p for p in _clients(view, scope) if p.endpoint.kind == "reader"]
             needed = {p.role.dialect.name for p in clients}
             served = {p.role.dialect.name for p in _hands(view, everything)}
             others = [
                 p
                 for v in focus
                 if v is not view
-                for p in _hands(v, wish)
+                for p in _hands(v, scope)
                 if p.role.dialect.name in needed - served
             ]
             if others:
                 apart = True
                 yield _other_domain(others, f"{clients[0].who} waits on domain {view.number}")
-    hands = [p for v in focus for p in _hands(v, wish)]
+    hands = [p for v in focus for p in _hands(v, scope)]
     if not hands and elsewhere:
         apart = True
         asked = " and ".join(str(v.number) for v in focus)
-        yield _other_domain(elsewhere, f"nobody publishes a hand's state on domain {asked}")
-    if wish.domain is None and hands and not apart:
+        yield _other_domain(elsewhere, f"no process publishes a hand's state on domain {asked}")
+    if scope.domain is None and hands and not apart:
         odd = [p for p in _first(hands) if p.view.number > 1]
-        if odd and not any(_clients(v, wish) for v in focus):
+        if odd and not any(_clients(v, scope) for v in focus):
             yield _other_domain(
                 odd, "xr_teleoperate looks at domain 0, or 1 with --sim", Severity.WARNING
             )
@@ -544,10 +546,10 @@ def _absent(
         names = {p.role.dialect.name for p in here}
         needed_dialects = [
             d
-            for d in (wish.dialects or wanted)
-            if wish.dialects
+            for d in (scope.dialects or wanted)
+            if scope.dialects
             or any(
-                p.role.dialect is d and p.endpoint.kind == "reader" for p in _clients(view, wish)
+                p.role.dialect is d and p.endpoint.kind == "reader" for p in _clients(view, scope)
             )
         ]
         for dialect in needed_dialects:
@@ -555,7 +557,7 @@ def _absent(
                 continue
             others = [p for p in here if p.role.dialect.model == dialect.model]
             same_topic = [p for p in others if p.endpoint.topic in dialect.topics(p.role.sides[0])]
-            if others and not same_topic:  # a type that differs is told as that
+            if others and not same_topic:  # a type that differs is reported as that
                 explained = True
                 other = others[0]
                 yield _finding(
@@ -569,7 +571,7 @@ def _absent(
                     topic=other.endpoint.topic,
                 )
         for dialect in wanted:
-            parts = [p for p in _hands(view, wish) if p.role.dialect is dialect]
+            parts = [p for p in _hands(view, scope) if p.role.dialect is dialect]
             sides = {side for p in parts for side in p.role.sides}
             if len(sides) == 1:
                 (there,) = sides
@@ -591,7 +593,7 @@ def _absent(
             f"there {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
             f"on {', '.join(seen.looked_at)}",
             fix=_elsewhere(seen),
-            severity=Severity.NOTE if wish.devices_only else None,
+            severity=Severity.NOTE if scope.devices_only else None,
         )
 
 
@@ -608,7 +610,7 @@ def _other_domain(parts: list[_Part], instead: str, severity: Severity | None = 
 
 
 def _elsewhere(seen: Observations) -> str:
-    """What to do when nobody is seen: start a hand, or look elsewhere."""
+    """The remedy when no hand is found: start one, or use another interface."""
     text = DIAGNOSES["DDS-NOBODY"].fix
     others = [
         f"{i.name} ({', '.join(i.addresses)})"
@@ -627,7 +629,7 @@ def _robot(addresses: Iterable[str]) -> bool:
 # --- network
 
 
-def _network(seen: Observations, wish: Wish) -> Iterator[Finding]:
+def _network(seen: Observations, scope: Scope) -> Iterator[Finding]:
     by_name = {i.name: i for i in seen.interfaces}
     for name in seen.looked_at:
         known = by_name.get(name)
@@ -638,9 +640,9 @@ def _network(seen: Observations, wish: Wish) -> Iterator[Finding]:
                 fix=DIAGNOSES["NET-MULTICAST"].fix.replace("INTERFACE", name),
                 interface=name,
             )
-    focus = _focus(seen, wish)
+    focus = _focus(seen, scope)
     for view in focus:
-        hands, clients = _hands(view, wish), _clients(view, wish)
+        hands, clients = _hands(view, scope), _clients(view, scope)
         yield from _apart(view, hands, clients)
         yield from _deaf_loopback(seen, view, hands, clients)
     yield from _hidden(seen, focus)
@@ -648,12 +650,12 @@ def _network(seen: Observations, wish: Wish) -> Iterator[Finding]:
 
 def _pairs(hands: list[_Part], clients: list[_Part]) -> Iterator[tuple[Participant, Participant]]:
     """Participants of a hand and a client that should talk to each other, each pair once."""
-    told = set()
+    reported = set()
     for hand, client in product(hands, clients):
         keys = (hand.endpoint.participant, client.endpoint.participant)
-        if hand.role.dialect is not client.role.dialect or keys in told:
+        if hand.role.dialect is not client.role.dialect or keys in reported:
             continue
-        told.add(keys)
+        reported.add(keys)
         ends = [hand.view.participant(key) for key in keys]
         if ends[0] and ends[1] and keys[0] != keys[1]:
             yield ends[0], ends[1]
@@ -684,7 +686,7 @@ def _deaf_loopback(
             yield _finding(
                 "NET-LO-MULTICAST",
                 f"{name} has no MULTICAST flag, and on domain {view.number} neither "
-                f"{ends[0].name} nor {ends[1].name} calls its peers by port",
+                f"{ends[0].name} nor {ends[1].name} finds its peers by unicast",
                 fix=DIAGNOSES["NET-LO-MULTICAST"].fix.replace("set lo", f"set {name}"),
                 domain=view.number,
                 interface=name,
@@ -692,7 +694,7 @@ def _deaf_loopback(
 
 
 def _hidden(seen: Observations, focus: list[DomainView]) -> Iterator[Finding]:
-    """Processes of this machine on a domain that did not answer where it was looked."""
+    """Processes of this machine on a domain that did not answer on the observed interface."""
     for view in focus:
         known = {p.pid for p in view.participants}
         # one of another user has no pid here; it is probably one of those that answered
@@ -752,7 +754,7 @@ def _serial(port: SerialPort) -> Iterator[Finding]:
         yield _finding(
             "SERIAL-BUSY",
             f"{path} is open in {', '.join(port.holders)}"
-            + ("; that is a service, as it should be; nothing was sent" if served else ""),
+            + ("; that is a dexkit service, as expected; nothing was sent" if served else ""),
             severity=Severity.NOTE if served and len(port.holders) == 1 else None,
             path=path,
         )

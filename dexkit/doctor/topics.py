@@ -1,4 +1,4 @@
-"""Hand topics as people write them: names that are nearly one, and types in short."""
+"""Recognise misspelt hand topics, and shorten type names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Looking at Dex3-1 hands on USB from outside, in /sys."""
+"""Find Dex3-1 hands on USB in /sys, without opening them."""
 
 from __future__ import annotations
 

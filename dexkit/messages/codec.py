@@ -1,4 +1,4 @@
-"""What the generated codecs share: encapsulation, the checks on hostile input, and good errors.
+"""Common code of the generated codecs: encapsulation, checks of input, and errors.
 
 A sample is a 4-byte encapsulation header (two bytes representation identifier, two bytes
 options) followed by the data (XTypes 1.3, 7.6.3.1). ``00 01`` is plain CDR (XCDR1) little
@@ -90,7 +90,7 @@ def check_end(name: str, data: Buffer, end: int) -> None:
 
 
 def explain(message: object, kind: Struct, error: Exception) -> EncodeError:
-    """Find the member that cannot be encoded and say what is wrong with it."""
+    """Find the member that cannot be encoded, and raise an error that names it."""
     problem = _find(message, kind, kind.name)
     return EncodeError(problem or f"{kind.name}: {type(error).__name__}: {error}")
 

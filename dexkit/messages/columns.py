@@ -1,4 +1,4 @@
-"""Many samples of one type at once, as numpy columns.
+"""Decode many samples of one type at once, as numpy columns.
 
 Samples of equal shape (byte order, sequence lengths) are looked at as one structured array, so a
 recording is read at memory speed instead of object by object.
@@ -247,7 +247,7 @@ class _Group:
         self.moved = False
         self.words = Words(first)
         self._dtype = _dtype(kind, self.counts, ">" if big else "<", size)
-        # the header's first two bytes tell the byte order, the others are free
+        # the header's first two bytes define the byte order, the others are free
         self._fixed = np.array([0, *_count_words(kind, self.counts)])
         self._mask = np.full(len(self._fixed), 0xFFFFFFFF, dtype=np.uint32)
         self._mask[:1].view(np.uint8)[2:] = 0

@@ -1,4 +1,4 @@
-"""What the ``.idl`` files say: structs, members, and where each member lies in plain CDR.
+"""Parse the ``.idl`` files: structs, members, and the offset of each member in plain CDR.
 
 The generator, the schema texts, the error messages, the bulk decoder and the CycloneDDS types
 are all made from :data:`STRUCTS`, so a layout is written down once, in ``idl/*.idl``.
@@ -93,7 +93,7 @@ class Field:
         return self.array is not None and isinstance(self.type, Struct)
 
     def places(self) -> list[str]:
-        """How its values are written in a path: ``q``, or ``motor_cmd[0]`` to ``motor_cmd[19]``."""
+        """The names of its values in a path: ``q``, or ``motor_cmd[0]`` to ``motor_cmd[19]``."""
         if not self.is_structs:
             return [self.name]
         return [f"{self.name}[{i}]" for i in range(self.array or 0)]
@@ -129,7 +129,7 @@ class Struct:
         )
 
     def end(self, offset: int) -> int:
-        """Where a fixed struct that starts at ``offset`` ends, in bytes of plain CDR."""
+        """The end of a fixed struct that starts at ``offset``, in bytes of plain CDR."""
         for leaf in self.leaves():
             offset = -(-offset // leaf.type.size) * leaf.type.size + leaf.count * leaf.type.size
         return offset
@@ -164,7 +164,7 @@ class Leaf:
 
     @property
     def count(self) -> int:
-        """How many numbers it holds."""
+        """The count of its numbers."""
         return 1 if self.array is None else self.array
 
 

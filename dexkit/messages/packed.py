@@ -1,4 +1,4 @@
-"""Payloads in buffers, and what of many of them changes: the ground under columns."""
+"""Payloads in shared buffers, and their words that change between samples; used by columns."""
 
 from __future__ import annotations
 

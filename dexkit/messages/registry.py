@@ -98,7 +98,7 @@ class MessageType:
         """Encapsulation header and plain CDR, little endian.
 
         :raises EncodeError: another class, a value that its type cannot hold, or a sequence or
-            array of the wrong length. Says which member.
+            array of the wrong length. The message names the member.
         """
         if not isinstance(message, self.cls):
             raise EncodeError(

@@ -61,7 +61,7 @@ DEX1_1 = HandModel(
             cmd_type="unitree_go::msg::dds_::MotorCmds_",
             state_type="unitree_go::msg::dds_::MotorStates_",
             # docs/sources/unitree-dex.md#a1: 0 is the right gripper, whatever the enum of
-            # xr_teleoperate v1.1 says
+            # as in xr_teleoperate v1.1
             index={Side.LEFT: 1, Side.RIGHT: 0},
             length=2,
             q_open=5.4,

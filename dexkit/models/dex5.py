@@ -83,7 +83,7 @@ DEX5_1 = HandModel(
             length=20,
             q_open=math.nan,
             summary="Dex5-1: 20 joints, fingers first, thumb last; mode 1 is position control",
-            # docs/sources/unitree-dex.md#b5: a comment in xr_teleoperate says that fingers report
+            # docs/sources/unitree-dex.md#b5: by a comment in xr_teleoperate, fingers report
             # in mN m, the thumb in N m. Uncertain; the only statement there is.
             torque_units=(0.001,) * 16 + (1.0,) * 4,
             codec=Lazy("dexkit.service.dialects:StatusModeMap"),

@@ -1,4 +1,4 @@
-"""The profile of a hand model: all that dexkit knows of it, or where that is.
+"""The profile of a hand model: joints, dialects, rates, and references to its other data.
 
 Facts are values: joints, topics, types, rates, poses. Code that works for one model only (codec,
 client, stimulus script, reference service, wrong hands) is named by a
@@ -37,7 +37,7 @@ __all__ = [
 
 
 class ModeByte(Enum):
-    """What the mode byte of a motor's command and state holds."""
+    """Contents of the mode byte of a motor's command and state."""
 
     UNUSED = "nothing"
     STATUS = "1 driven, 0 not"
@@ -46,7 +46,7 @@ class ModeByte(Enum):
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a hand model appears on DDS.
+    """A hand model on DDS: topics, types, motors and scale of q.
 
     :param model: name of the hand model.
     :param cmd_topic: command topic; ``{side}`` is replaced by ``left`` or ``right``.
@@ -160,7 +160,7 @@ class Finger:
 
 @dataclass(frozen=True)
 class HandLayout:
-    """How a hand of several joints is drawn; schematic, not to scale, lengths in px.
+    """Layout of the drawing of a hand with several joints; schematic, not to scale, lengths in px.
 
     :param centres: x of the left and of the right hand.
     :param top: y of the palm's centre on the sheet.

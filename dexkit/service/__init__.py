@@ -1,7 +1,7 @@
 """The service that puts a hand on Unitree's topics.
 
 :class:`HandService` is the thing to use. Its parts, each testable alone:
-:mod:`~dexkit.service.core` (watchdog, faults, what to send and what to say),
+:mod:`~dexkit.service.core` (watchdog, faults, commands to send and state to publish),
 :mod:`~dexkit.service.dialects` (values from and to messages),
 :mod:`~dexkit.service.estimator` (prediction between slow measurements).
 """

@@ -1,7 +1,7 @@
-"""What the service decides about one hand, without threads, DDS or devices.
+"""Decide commands and state of one hand: watchdog, limits, faults; no threads, DDS or devices.
 
-:class:`HandCore` is told what happened (a command came, an exchange succeeded or failed, the
-link was opened) and says what follows: the command for the next exchange and the state to
+:class:`HandCore` gets events (a command came, an exchange succeeded or failed, the
+link was opened) and returns what follows: the command for the next exchange and the state to
 publish. Its time is the injected clock's, so every rule here is tested on a manual clock.
 
 Who calls it: the receiving thread :meth:`HandCore.submit`, the exchange thread
@@ -121,7 +121,7 @@ class HandCore:
         self._connected = False
         self._faulted: tuple[int, ...] | None = None
         self._answered = clock.now()  # when the device last showed that it is there
-        self.measured_rate = spec.io_rate  #: measurements a second; at first what the hand says
+        self.measured_rate = spec.io_rate  #: measurements a second; at first as the hand declares
         self._slow = spec.io_rate < self._min_rate
         self._window = (clock.now(), 0)  # start, exchanges since
         self._missed = 0
@@ -160,7 +160,7 @@ class HandCore:
                 # a command without the bit clears it
                 still = np.array(self._tripped) & admitted.timeout
                 self._tripped = tuple(still.tolist()) if still.any() else ()
-                admitted = _braked(admitted, still)
+                admitted = _with_brakes(admitted, still)
             self._command = (admitted, sent)
             if self._connected and not self._starting and self._faulted is None:
                 self._follow(admitted, now)
@@ -169,7 +169,7 @@ class HandCore:
     def opened(self, spec: HandSpec, speeds: Sequence[tuple[float, float]] | None = None) -> None:
         """The link is open. Commands from before do not count any more.
 
-        :param spec: what the hand says now; its ``io_rate`` may have become exact.
+        :param spec: the spec of the opened hand; its ``io_rate`` may have become exact.
         :param speeds: calibrated speeds per joint, see
             :class:`~dexkit.service.estimator.StateEstimator`.
         """
@@ -236,7 +236,8 @@ class HandCore:
         if self._view is not None:
             previous = self._view.fault if self._faulted is not None else ()
             fault = tuple(
-                _at(bits, joint) | _at(previous, joint) for joint in range(self.spec.n_joints)
+                _bits_of(bits, joint) | _bits_of(previous, joint)
+                for joint in range(self.spec.n_joints)
             )
             if isinstance(error, HandFault):
                 self._faulted = fault
@@ -248,7 +249,7 @@ class HandCore:
         return not patient or self._clock.now() - since > _PATIENCE
 
     def paused(self) -> None:
-        """The program stood still until now. The hand brakes until a command comes that was sent
+        """A pause of the program has ended. The hand brakes until a command comes that was sent
         later.
         """
         self._resumed = self._clock.now()
@@ -304,7 +305,7 @@ class HandCore:
         return self._holding
 
     def next_command(self) -> HandCommand:
-        """What the next exchange sends: the newest command, or the brake.
+        """The command for the next exchange: the newest one, or the brake.
 
         The brake before the first command, during a fault, and after a (re)connection, a fault or
         a pause until a command comes that is newer.
@@ -317,7 +318,7 @@ class HandCore:
         """
         now = self._clock.now()
         with self._lock:
-            command = self._in_force(now)
+            command = self._command_in_force(now)
             if command is self._brake or command.is_brake:
                 if self._driving and command is self._brake:
                     self.counters.brakes += 1
@@ -332,7 +333,7 @@ class HandCore:
         return command
 
     def view(self) -> StateView | None:
-        """What is to be published now; None before the first exchange.
+        """The state to be published now; None before the first exchange.
 
         The same object is returned until something changes.
         """
@@ -341,7 +342,7 @@ class HandCore:
             return None
         now = self._clock.now()
         if not self._connected or now - self._answered > self._overdue():
-            return self._stale(view)
+            return self._mark_stale(view)
         if self.predicting:
             with self._lock:
                 state = self._estimator.predict(now)
@@ -352,11 +353,11 @@ class HandCore:
     # -- details ----------------------------------------------------------------------------
 
     def _only_newer(self, now: float) -> None:
-        """What was sent until now does not count any more."""
+        """Ignore all commands that were sent until now."""
         with self._lock:
             self._not_before = now
 
-    def _in_force(self, now: float) -> HandCommand:
+    def _command_in_force(self, now: float) -> HandCommand:
         late = self._time_out(now)
         newest = self._command
         if newest is None or newest[1] < self._not_before or self._faulted is not None:
@@ -368,7 +369,7 @@ class HandCore:
         if newest[0].timeout is None:
             return self._brake
         if self._held is None or self._held[0] is not newest:
-            self._held = (newest, _at_rest(_braked(newest[0], np.array(self._tripped))))
+            self._held = (newest, _at_rest(_with_brakes(newest[0], np.array(self._tripped))))
             self._follow(self._held[1], now)
         if not self._holding and not self._held[1].is_brake:
             self._holding = True
@@ -399,7 +400,7 @@ class HandCore:
         self._estimator = StateEstimator(self.spec, self._speeds)
         self._estimator.follow(self._following, now)
 
-    def _stale(self, view: StateView) -> StateView:
+    def _mark_stale(self, view: StateView) -> StateView:
         link = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
         if all(bits & link for bits in view.fault):
             return view
@@ -441,7 +442,7 @@ class HandCore:
         return replace(command, q=self._start_q)
 
 
-def _braked(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
+def _with_brakes(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
     if not joints.any():
         return command
     return replace(command, mode=np.where(joints, JointMode.BRAKE, command.mode).astype(np.uint8))
@@ -452,5 +453,5 @@ def _at_rest(command: HandCommand) -> HandCommand:
     return replace(command, dq=nothing, tau=nothing)
 
 
-def _at(bits: Sequence[int], joint: int) -> int:
+def _bits_of(bits: Sequence[int], joint: int) -> int:
     return bits[joint] if joint < len(bits) else 0

@@ -1,4 +1,4 @@
-"""What the service counts; logged at exit and on SIGUSR1."""
+"""Counters of the service, logged at exit and on SIGUSR1."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class TopicCounters:
     :ivar undecodable: of those, samples that are not the message they claim to be.
     :ivar short: samples with too few motors for a hand that is served here; ignored.
     :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
-    :ivar pauses: times that the service stood still for more than a quarter of a second (stopped,
+    :ivar pauses: times that the service was paused for more than a quarter of a second (stopped,
         suspended, starved); the hands brake then until a command comes that was sent later.
     :ivar published: state samples written.
     :ivar publish_misses: publish deadlines missed by a whole period.

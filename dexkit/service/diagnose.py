@@ -1,4 +1,4 @@
-"""Why a client and this service do not meet, from what discovery shows."""
+"""Find peers that do not match this service, from DDS discovery."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
                 f"{topic}: a peer uses {foreign_type}, this service {role.type_name}; "
                 "they never match" + _advice(roles(topic, foreign_type))
             )
-    # a client of the other side is somebody else's business, unless its dialect puts both sides
+    # a client of the other side belongs to another service, unless its dialect puts both sides
     # in one topic and this one does not, or the other way round
     together = any(len(role.sides) > 1 for _, role in ours)
     for topic in sorted(types):
@@ -62,7 +62,7 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
         models = [r.dialect.model for r in roles(topic) if r.kind != "cmd"]
         if models and dialect.model not in models:
             found.append(
-                f"a peer waits on {topic}, the state of a {models[0]}, which nobody publishes; "
+                f"a peer waits on {topic}, the state of a {models[0]}, which no process publishes; "
                 f"a {dialect.model} is served here"
             )
     return found

@@ -1,4 +1,4 @@
-"""Dialects: what a command message means to a hand, and how a hand's state is put in a message.
+"""Translate command messages to hand commands, and hand states to messages, by dialect.
 
 Pure functions of values; which topics and types a dialect uses is in :mod:`dexkit.models`.
 
@@ -105,7 +105,7 @@ class Fill(str, Enum):
 
 @dataclass(frozen=True)
 class StateView:
-    """What is to be said of one hand.
+    """The state of one hand as it is to be published.
 
     :param fault: :class:`~dexkit.hand.MotorError` bits per joint, the link's included.
     :param missed: exchanges missed since the last good one.
@@ -158,7 +158,7 @@ class DialectMap(ABC):
         )
 
     def motors(self, message: Any) -> int:
-        """How many motors a command message has; more or fewer than :attr:`length` is odd."""
+        """The number of motors in a command message, which should be :attr:`length`."""
         return len(self._motor_commands(message))
 
     @property
@@ -182,7 +182,7 @@ class DialectMap(ABC):
         )
 
     def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
-        """What is odd about a command that :meth:`command` understands."""
+        """Remarks on a command that :meth:`command` accepts."""
         return ()
 
     @abstractmethod
@@ -368,14 +368,14 @@ class RisModeMap(FingerMap):
             if mode & 0x6F == i:  # its own id, and status 0 or 1
                 continue
             status = (mode >> 4) & 7
-            says = f"mode byte {mode:#04x} of motor {i} says id {mode & 15}, status {status}"
+            decoded = f"mode byte {mode:#04x} of motor {i} has id {mode & 15}, status {status}"
             right = f"send {0x10 | i:#04x} (0x10 | index) to drive motor {i}, {i:#04x} to lock it"
             if mode & 15 != i:
                 does = "; status 0 locks it" if status == JointMode.BRAKE else ""
-                text = f"{says}: the id is not its index{does}. Motors go by index; {right}"
+                text = f"{decoded}: the id is not its index{does}. Motors go by index; {right}"
                 found.setdefault("wrong_ids", Remark("wrong_ids", text))
             if status not in (JointMode.BRAKE, JointMode.FOC):
-                text = f"{says}: neither 0 (lock) nor 1 (FOC), so it is locked; {right}"
+                text = f"{decoded}: neither 0 (lock) nor 1 (FOC), so it is locked; {right}"
                 found.setdefault("unknown_status", Remark("unknown_status", text))
         return tuple(found.values())
 
@@ -391,7 +391,7 @@ class StatusModeMap(FingerMap):
         if command is None:
             return None
         driven = np.array(self._modes(message, side)) == JointMode.FOC
-        # no source tells of another mode: nothing moves that was not understood
+        # no source documents another mode: a motor with an unknown one does not move
         return replace(
             command, mode=np.where(driven, JointMode.FOC, JointMode.BRAKE).astype(np.uint8)
         )

@@ -4,7 +4,7 @@ state).
 Unitree's clients steer by the newest reported position: xr_teleoperate clips each command to
 0.18 rad from it, so a gripper that reports at 5 Hz is driven at a crawl
 (docs/sources/mx64-ezgripper.md#d7). Where the link is slower than that, the service publishes what
-a velocity-limited model says and lets the measurements correct the model.
+a velocity-limited model predicts and lets the measurements correct the model.
 
 The note on predictive state states the model and three promises (never teleports, never overshoots,
 never reverses), and its correction step breaks the third: a measurement behind the prediction pulls
@@ -91,7 +91,7 @@ class JointEstimator:
         if target == self._target:
             return
         self._target = target
-        self._set_out()
+        self._choose_direction()
 
     def predict(self, now: float) -> float:
         """Advance to ``now`` and return the prediction, rad."""
@@ -102,12 +102,12 @@ class JointEstimator:
         before = self.q
         if self._travelling:
             assert self._target is not None
-            self._model = self._toward(self._model, self._target, dt)
+            self._model = self._step_toward(self._model, self._target, dt)
             if self._model == self._target:
                 self._travelling = False
         ahead = (self._model - self.q) * self._heading
         if not (self._travelling and ahead < 0):  # R: wait rather than reverse
-            self.q = self._toward(self.q, self._model, dt)
+            self.q = self._step_toward(self.q, self._model, dt)
         self.dq = (self.q - before) / dt
         return self.q
 
@@ -118,7 +118,7 @@ class JointEstimator:
         if math.isnan(self.q):
             self.q = self._model = q
             self._time = now
-            self._set_out()
+            self._choose_direction()
             return
         if self._blocked:
             if (q - previous) * self._blocked > self._moving:
@@ -141,9 +141,9 @@ class JointEstimator:
 
     def _resync(self, q: float) -> None:
         self.q = self._model = q
-        self._set_out()
+        self._choose_direction()
 
-    def _set_out(self) -> None:
+    def _choose_direction(self) -> None:
         """Decide whether, and which way, the model travels to the target."""
         self._travelling = False
         self._heading = 0
@@ -159,7 +159,7 @@ class JointEstimator:
             self._heading = direction
             self._travelling = True
 
-    def _toward(self, q: float, goal: float, dt: float) -> float:
+    def _step_toward(self, q: float, goal: float, dt: float) -> float:
         distance = goal - q
         step = self._speed[_sign(distance) or 1] * dt
         return goal if abs(distance) <= step else q + math.copysign(step, distance)

@@ -1,4 +1,4 @@
-"""The state of a hand of several joints as the bytes of a ``HandState_``, fast enough for 1000 Hz.
+"""Encode the state of a hand with several joints as a ``HandState_``, fast enough for 1000 Hz.
 
 The seven motors and nine sensor packets of a Dex3-1 are some 340 values, 1000 times a second for
 each hand. Here they are copied into the bytes of a message that was encoded once, array by array;
@@ -62,7 +62,7 @@ _REST = Struct("<13fh2x4f4I")
 class FingerStateEncoder:
     """Encodes states of one hand. May be called from several threads.
 
-    :param known: also what the vendor's service does not say: ddq, missed exchanges, whether q
+    :param known: also what the vendor's service does not publish: ddq, missed exchanges, whether q
         is predicted.
     :param ids: the mode byte is RIS_Mode, with id and time-out bit
         (docs/sources/unitree-dex.md#b4); else it is the bare status.
@@ -107,7 +107,7 @@ class FingerStateEncoder:
         # what the bytes hold now, because much of a state is often that of the one before
         self._flags: tuple[object, ...] = ()
         self._felt: tuple[object, ...] = ()
-        self._said: tuple[object, ...] = ()
+        self._last_rest: tuple[object, ...] = ()
 
     def encode(
         self,
@@ -188,10 +188,10 @@ class FingerStateEncoder:
 
     def _put_rest(self, s: HandState, fault: Sequence[int], missed: int) -> None:
         link = _LINK if all(bits & _LINK for bits in fault) else 0
-        said = (s.imu, s.supply, s.error | link, missed)
-        if said == self._said:
+        rest = (s.imu, s.supply, s.error | link, missed)
+        if rest == self._last_rest:
             return
-        self._said = said
+        self._last_rest = rest
         i = s.imu if s.imu is not None else _NO_IMU
         p = s.supply if s.supply is not None else _NO_SUPPLY
         inertial = (*i.quaternion, *i.gyroscope, *i.accelerometer, *i.rpy)

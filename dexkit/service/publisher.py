@@ -1,4 +1,4 @@
-"""The thread that keeps the deadlines of published state.
+"""The thread that publishes states at fixed deadlines.
 
 One for all the hands of a process: threads that compete for the interpreter lock at the same
 deadlines make each other late, and their waiting costs more than their work.
@@ -58,7 +58,7 @@ class Publisher:
             self._ticks.append(tick)
             if self._thread is None:
                 self._stop = threading.Event()
-                self._thread = Worker("publish", self._run, self._stop, failed=self._died)
+                self._thread = Worker("publish", self._run, self._stop, failed=self._record_failure)
                 self._thread.start()
 
     def remove(self, tick: Callable[[int], None]) -> None:
@@ -72,7 +72,7 @@ class Publisher:
             self._stop.set()
         thread.join()
 
-    def _died(self, error: Exception) -> None:
+    def _record_failure(self, error: Exception) -> None:
         self.failure = error
 
     def _run(self, stop: threading.Event) -> None:

@@ -1,4 +1,4 @@
-"""Keeping deadlines: what any process can do, and real-time priority where it is permitted."""
+"""Prepare a process for deadlines: timers, priorities, and real-time where permitted."""
 
 from __future__ import annotations
 

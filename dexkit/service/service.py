@@ -1,4 +1,4 @@
-"""The service: threads and DDS around :class:`~dexkit.service.core.HandCore`.
+"""Serve a hand on DDS: threads and endpoints around :class:`~dexkit.service.core.HandCore`.
 
 Three activities, each with its own clock:
 
@@ -11,8 +11,8 @@ Three activities, each with its own clock:
 All three share one interpreter lock, so the publishing thread does little: it writes bytes that
 were encoded once for each new state.
 
-Each of them notices when it stood still (:class:`~dexkit.command_age.PauseWatch`): whoever does
-tells the cores, which brake until a command comes that was sent later.
+Each of them detects its own pauses (:class:`~dexkit.command_age.PauseWatch`) and reports them to
+the cores, which brake until a command comes that was sent later.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from dexkit.clock import Clock, Rate, RealClock
-from dexkit.command_age import PAUSE, Ages, PauseWatch
+from dexkit.command_age import PAUSE, PauseWatch, SampleAges
 from dexkit.errors import (
     BackendBroken,
     DexkitError,
@@ -45,7 +45,7 @@ from dexkit.service.core import Backoff, Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
 from dexkit.service.publisher import Publisher, align
-from dexkit.single_publisher import Place, SolePublisher
+from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.threads import Worker
 
 __all__ = ["HandService", "Node"]
@@ -55,9 +55,9 @@ _counters_log = logging.getLogger("dexkit.service.counters")
 
 _CONFLICT_HINT = "stop the other service, choose another --domain, or add --force"
 _JOIN = 2.0  # seconds that a stopping thread is given beyond the exchange time-out
-# seconds between the last state and the good-bye: a busy reader that learns of the good-bye
-# first drops the state, as from nobody, and goes on believing that the hand is driven
-_LAST_WORDS = 0.05
+# seconds between the last state and the end of its writer: a busy reader that discovers the end
+# first drops the state, and goes on believing that the hand is driven
+_LAST_STATE_DELAY = 0.05
 _TICK = 0.05  # seconds after which the receiving thread looks at the clock when nothing comes
 
 
@@ -74,7 +74,7 @@ class _Reader(Protocol):
 
 
 class Node(Protocol):
-    """The part of :class:`dexkit.dds.DdsNode` that the service needs."""
+    """The methods of :class:`dexkit.dds.DdsNode` that the service uses."""
 
     def writer(  # noqa: D102
         self, topic: str, type_name: str, *, user_data: bytes = b""
@@ -86,7 +86,7 @@ class Node(Protocol):
     def close(self) -> None: ...  # noqa: D102
 
 
-class _Unit:
+class _ServedHand:
     """One served hand and its thread."""
 
     def __init__(self, hand: Hand, core: HandCore, clock: Clock) -> None:
@@ -109,7 +109,7 @@ class HandService:
     :param phase: when in a period the hand is exchanged with, 0 to 1; state is published at 0.
     :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
-    :param force: start, and go on, even if somebody else publishes the state topic.
+    :param force: start, and go on, even if another program publishes the state topic.
     :raises UsageError: hands and dialect do not fit.
 
     A service that is to give way to another one after its start (:mod:`dexkit.single_publisher`)
@@ -165,7 +165,7 @@ class HandService:
         self._wait_for_device, self._force = wait_for_device, force
         self._sole: SolePublisher | None = None
         self._units = [
-            _Unit(
+            _ServedHand(
                 hand,
                 HandCore(
                     hand.spec,
@@ -182,7 +182,7 @@ class HandService:
         self._cmd_type = message_type(self.dialect.cmd_type)
         self._stop = threading.Event()
         self._wake = threading.Event()
-        self._ages = Ages()
+        self._ages = SampleAges()
         self._receive_watch = PauseWatch(self._clock)
         self._publish_watch = PauseWatch(self._clock)
         self._publish_allowed = PAUSE + 1.0 / self.state_rate
@@ -194,12 +194,13 @@ class HandService:
         self._reader: _Reader | None = None
         self._writer: _Writer | None = None
         self._low_rate_writer: _Writer | None = None
-        self._said: set[str] = set()  # remarks logged, each kind only once
+        self._logged: set[str] = set()  # remarks logged, each kind only once
         self._encoded: tuple[tuple[StateView | None, ...], bytes | None] = ((), None)
         self._started = False
         self._failure: Exception | None = None
 
-    # -- life -------------------------------------------------------------------------------
+    # -- start and stop
+    # -------------------------------------------------------------------------------
 
     def __enter__(self) -> HandService:
         self.start()
@@ -209,11 +210,11 @@ class HandService:
         self.stop()
 
     def start(self) -> None:
-        """Open the hands, then bring the topics up.
+        """Open the hands, then create the reader and writers.
 
         :raises HandError: a hand cannot be opened (unless ``wait_for_device``).
         :raises DdsError: no CycloneDDS, no such interface, ...
-        :raises TopicConflict: somebody else publishes the state topic (unless ``force``).
+        :raises TopicConflict: another program publishes the state topic (unless ``force``).
         """
         if self._started:
             raise UsageError("a service starts once")
@@ -233,7 +234,7 @@ class HandService:
         # no hand is touched before it is certain that no other service has these topics
         topics = {self.state_topic, self.low_rate_topic} - {""}
         sole = self._sole = SolePublisher(
-            [Place(node, topics)], hint=_CONFLICT_HINT, force=self._force
+            [NodeTopics(node, topics)], hint=_CONFLICT_HINT, force=self._force
         )
         sole.search()
         claim = sole.announce()
@@ -284,7 +285,7 @@ class HandService:
         if self._writer is not None and self._receiving is not None and not gave_way:
             self._publish_now(low_rate=True)
             if self.clients:
-                time.sleep(_LAST_WORDS)
+                time.sleep(_LAST_STATE_DELAY)
         for entity in (self._reader, self._writer, self._low_rate_writer):
             if entity is not None:
                 entity.close()
@@ -293,17 +294,17 @@ class HandService:
             self._node = None
 
     def _thread(self, name: str, target: Callable[..., None], *args: object) -> Worker:
-        return Worker(name, target, *args, failed=self._died)
+        return Worker(name, target, *args, failed=self._record_failure)
 
-    def _died(self, error: Exception) -> None:
+    def _record_failure(self, error: Exception) -> None:
         self._failure = self._failure or error
 
     @property
     def failure(self) -> Exception | None:
-        """What ended a thread that the service needs, its node's and publisher's included."""
+        """The error that ended a thread of the service, its node or its publisher; or None."""
         return self._failure or self._publisher.failure or getattr(self._node, "failure", None)
 
-    # -- what it says of itself -------------------------------------------------------------
+    # -- status and counters ----------------------------------------------------------------
 
     @property
     def node(self) -> Node | None:
@@ -318,7 +319,7 @@ class HandService:
 
     @property
     def cores(self) -> dict[Side, HandCore]:
-        """What the service knows of each hand."""
+        """The core of each hand, by side."""
         return {unit.side: unit.core for unit in self._units}
 
     def snapshot(self) -> dict[str, Any]:
@@ -350,16 +351,16 @@ class HandService:
         while not self._stop.is_set():
             self._wake.wait(_TICK)
             self._wake.clear()
-            self._look_received()
+            self._check_receive_pause()
             self._sole.poll()
             for sample in self._reader.take():
                 self._receive(sample)
 
     def _receive(self, sample: Any) -> None:
-        # in this order: if it stands still in between, the sample only looks older
+        # in this order: if there is a pause in between, the sample only looks older
         now = self._clock.now()
         received = self._clock.since_boot()
-        self._look_received()
+        self._check_receive_pause()
         age = self._ages.age(sample.writer, sample.source_timestamp_ns, received)
         data: bytes = sample.data
         count = self.counters
@@ -374,51 +375,53 @@ class HandService:
         motors = self._map.motors(message)
         if motors > self._map.length:
             count.overlong += 1
-            self._say("overlong", f"{motors} motors, the first {self._map.length} are taken")
+            self._log_once("overlong", f"{motors} motors, the first {self._map.length} are taken")
         short = False
         for unit in self._units:
             command = self._map.command(message, unit.side)
             if command is None:
                 short = True
             else:
-                self._obey(unit, command, message, now - age)
+                self._submit(unit, command, message, now - age)
         if short:
             count.short += 1
-            self._say("short", f"ignored, {motors} motor(s) where {self._map.length} are needed")
+            self._log_once(
+                "short", f"ignored, {motors} motor(s) where {self._map.length} are needed"
+            )
 
-    def _obey(self, unit: _Unit, command: HandCommand, message: Any, sent: float) -> None:
+    def _submit(self, unit: _ServedHand, command: HandCommand, message: Any, sent: float) -> None:
         counters = unit.core.counters
         clamped, rejected = counters.clamped, counters.rejected
         if not unit.core.submit(command, sent):
             if counters.rejected != rejected:
-                self._say("rejected", "rejected, it is not finite")
+                self._log_once("rejected", "rejected, it is not finite")
             else:
-                self._say_stale(sent)
+                self._log_stale(sent)
             return
         if counters.clamped != clamped:
-            for name, text in _beyond(unit.core.spec, command):
-                self._say(name, f"{text}; brought within the limits")
+            for name, text in _values_beyond_limits(unit.core.spec, command):
+                self._log_once(name, f"{text}; brought within the limits")
         if stuck := unit.core.tripped:
             names = ", ".join(unit.core.spec.joints[i].name for i in stuck)
-            self._say(
+            self._log_once(
                 "tripped",
                 f"{names} stay braked, because their time-out protection has tripped and the mode "
                 "byte asks for it again; send it once with bit 7 = 0",
             )
         for remark in self._map.remarks(message, unit.side):
             setattr(counters, remark.counter, getattr(counters, remark.counter) + 1)
-            self._say(remark.counter, remark.text)
+            self._log_once(remark.counter, remark.text)
 
-    def _say(self, kind: str, text: str) -> None:
+    def _log_once(self, kind: str, text: str) -> None:
         """Log what is odd about a command, each kind only once."""
-        if kind not in self._said:
-            self._said.add(kind)
-            log.warning("%s: a command was odd (counted, said once): %s", self.cmd_topic, text)
+        if kind not in self._logged:
+            self._logged.add(kind)
+            log.warning("%s: a command was odd (counted, logged once): %s", self.cmd_topic, text)
 
-    def _say_stale(self, sent: float) -> None:
+    def _log_stale(self, sent: float) -> None:
         age = self._clock.now() - sent
         if age > PAUSE and math.isfinite(age):
-            self._say(
+            self._log_once(
                 "stale",
                 f"ignored, it came {age:.1f} s later than usual for its client; is the network "
                 f"slow? What is more than {PAUSE:g} s old never moves a hand",
@@ -426,8 +429,10 @@ class HandService:
 
     # -- pauses -----------------------------------------------------------------------------
 
-    def _look(self, watch: PauseWatch, units: Sequence[_Unit], allowed: float = PAUSE) -> bool:
-        """Whether a loop of this service stood still; then these hands brake until a command comes
+    def _check_pause(
+        self, watch: PauseWatch, units: Sequence[_ServedHand], allowed: float = PAUSE
+    ) -> bool:
+        """Whether a loop of this service was paused; if so, these hands brake until a command comes
         that was sent later.
         """
         away = watch.measure_pause(allowed)
@@ -435,35 +440,38 @@ class HandService:
             return False
         now = self._clock.since_boot()
         with self._pause_lock:
-            first = now - away > self._resumed  # another loop may have told of it already
+            first = now - away > self._resumed  # another loop may have reported it already
             self._resumed = now
             for unit in units:
                 unit.core.paused()
         if first:
             self.counters.pauses += 1
-            self._say_paused(away)
+            self._log_pause(away)
         return True
 
-    def _stood_still(self, unit: _Unit, allowed: float) -> bool:
-        """Whether a hand's exchanges did, or the publishing loop does: where exchanges may take
-        long, a stop of the process is seen there, and this thread may be the first to go on.
+    def _check_exchange_pause(self, unit: _ServedHand, allowed: float) -> bool:
+        """Whether a hand's exchanges or the publishing loop were paused.
+
+        Where exchanges may take long, the publishing loop shows a stop of the process, and this
+        thread may be the first to run again.
         """
-        stood = self._look(unit.watch, [unit], allowed)
+        stood = self._check_pause(unit.watch, [unit], allowed)
         if self._publish_watch.away() > self._publish_allowed:
             unit.core.paused()
             return True
         return stood
 
-    def _look_received(self) -> None:
-        if self._look(self._receive_watch, self._units):
+    def _check_receive_pause(self) -> None:
+        if self._check_pause(self._receive_watch, self._units):
             self._ages.resumed(self._clock.since_boot())
 
-    def _say_paused(self, away: float) -> None:
-        if "paused" not in self._said:
-            self._said.add("paused")
+    def _log_pause(self, away: float) -> None:
+        if "paused" not in self._logged:
+            self._logged.add("paused")
             log.warning(
-                "%s: this program stood still for %.2f s (stopped, suspended, or a machine that is "
-                "too busy): braking until a command comes that was sent later (counted, said once)",
+                "%s: this program was paused for %.2f s (stopped, suspended, or a machine that is "
+                "too busy): braking until a command comes that was sent later (counted, logged "
+                "once)",
                 self.state_topic,
                 away,
             )
@@ -472,13 +480,13 @@ class HandService:
 
     @property
     def _ending(self) -> bool:
-        """Whether the hands are to be braked and released: it stops, or a thread of it has died.
+        """Whether the hands are to be braked and released: the service stops, or a thread has died.
 
-        Nobody would hear of a hand that is driven on without its commands or its states.
+        Without its commands or its states a hand must not be driven on.
         """
         return self._stop.is_set() or self.failure is not None
 
-    def _open_first(self, unit: _Unit) -> None:
+    def _open_first(self, unit: _ServedHand) -> None:
         try:
             self._open(unit)
         except HandError as error:
@@ -491,10 +499,10 @@ class HandService:
         except Exception as error:  # a backend is other people's code
             raise BackendBroken(
                 f"the backend failed to open the {unit.side} hand: {type(error).__name__}: {error}",
-                hint=_in_backend(error),
+                hint=_backend_location(error),
             ) from error
 
-    def _open(self, unit: _Unit) -> None:
+    def _open(self, unit: _ServedHand) -> None:
         """Open the hand and do one exchange, so that there is a state from the first sample on."""
         unit.hand.open()
         speeds = getattr(unit.hand, "joint_speeds", None)
@@ -510,7 +518,7 @@ class HandService:
                 self._close_hand(unit)
                 raise
 
-    def _exchange_loop(self, unit: _Unit) -> None:
+    def _exchange_loop(self, unit: _ServedHand) -> None:
         core = unit.core
         longest = getattr(unit.hand, "reconnect_interval", None)
         backoff = Backoff() if longest is None else Backoff(maximum=longest)
@@ -529,7 +537,7 @@ class HandService:
                 self._exchange(unit, HandCommand.brake(core.spec.n_joints))
             self._close_hand(unit)
 
-    def _exchange(self, unit: _Unit, command: HandCommand | None = None) -> bool:
+    def _exchange(self, unit: _ServedHand, command: HandCommand | None = None) -> bool:
         core = unit.core
         # a hand that is slow by itself is no pause
         period = 1.0 / min(core.spec.io_rate, core.measured_rate)
@@ -537,12 +545,12 @@ class HandService:
         try:
             if command is None:
                 command = core.next_command()
-                if self._stood_still(unit, allowed):
+                if self._check_exchange_pause(unit, allowed):
                     command = core.next_command()
             core.measured(unit.hand.exchange(command))
         except Exception as error:  # a backend is other people's code
-            self._look(unit.watch, [unit], allowed)
-            self._report(unit, error)
+            self._check_pause(unit.watch, [unit], allowed)
+            self._log_hand_error(unit, error)
             if core.failed(error):
                 core.closed()
                 self._close_hand(unit)
@@ -554,25 +562,25 @@ class HandService:
             self._compose()
         return True
 
-    def _reconnect(self, unit: _Unit, backoff: Backoff) -> bool:
+    def _reconnect(self, unit: _ServedHand, backoff: Backoff) -> bool:
         if self._stop.wait(backoff.next()):
             return False
         try:
             self._open(unit)
         except Exception as error:  # a backend is other people's code
             unit.core.retry_failed()
-            self._report(unit, error)
+            self._log_hand_error(unit, error)
             return False
         unit.core.counters.reconnects += 1
         return True
 
-    def _close_hand(self, unit: _Unit) -> None:
+    def _close_hand(self, unit: _ServedHand) -> None:
         try:
             unit.hand.close()
         except Exception as error:  # it must not keep the rest from being released
             log.warning("%s: closing the hand: %s", unit.side, error)
 
-    def _report(self, unit: _Unit, error: Exception) -> None:
+    def _log_hand_error(self, unit: _ServedHand, error: Exception) -> None:
         text = f"{type(error).__name__}: {error}"
         if text == unit.problem:
             return
@@ -587,7 +595,7 @@ class HandService:
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
             return
-        self._look(self._publish_watch, self._units, self._publish_allowed)
+        self._check_pause(self._publish_watch, self._units, self._publish_allowed)
         self.counters.publish_misses += missed
         self._ticks += 1
         every = self._low_rate_every
@@ -596,9 +604,9 @@ class HandService:
     def _publish_now(self, *, low_rate: bool) -> None:
         try:
             self._publish(self._compose(), low_rate=low_rate)
-        except Exception as error:  # nothing may die in silence
+        except Exception as error:  # a failure must be reported
             log.exception("%s: publishing failed", self.state_topic)
-            self._died(error)
+            self._record_failure(error)
 
     def _compose(self) -> bytes | None:
         """The sample for now; None without a state.
@@ -647,7 +655,7 @@ class HandService:
             log.error("%s: cannot publish: %s", self.state_topic, error)
 
 
-def _beyond(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:
+def _values_beyond_limits(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:
     """(joint and field, sentence) of each value of ``command`` that is beyond the limits."""
     for i, joint in enumerate(spec.joints):
         ranges = {
@@ -673,8 +681,8 @@ def _one_model(hands: Sequence[Hand]) -> HandModel:
     return model(names.pop())
 
 
-def _in_backend(error: BaseException) -> str:
-    """Where the code that is not dexkit's began to fail."""
+def _backend_location(error: BaseException) -> str:
+    """File and line where the code that is not dexkit's began to fail."""
     package = os.path.dirname(os.path.dirname(__file__)) + os.sep
     frames = traceback.extract_tb(error.__traceback__)
     frame = next((f for f in frames if not f.filename.startswith(package)), frames[-1])

@@ -2,8 +2,8 @@
 
 It closes the loop that a recording cannot: what xr_teleoperate commands depends on what the hand
 reports. :mod:`~dexkit.teleop.client` is the client, :mod:`~dexkit.teleop.profiles` the operator,
-:mod:`~dexkit.teleop.feel` the figures, all sans-IO; :mod:`~dexkit.teleop.live` puts them on DDS.
-See docs/teleop.md.
+:mod:`~dexkit.teleop.tracking` the figures, all sans-IO; :mod:`~dexkit.teleop.live` puts them on
+DDS. See docs/teleop.md.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from dexkit.teleop.client import (
     TeleopClient,
     client_for,
 )
-from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator, Profile, profile, profiles_for, recorded
+from dexkit.teleop.tracking import TrackingFigures, tracking_figures
 
 __all__ = [
     "Dex1Client",
-    "Feel",
     "FingerClient",
     "Inputs",
     "JointCommand",
@@ -36,9 +35,10 @@ __all__ = [
     "StateReceiver",
     "StickyFilter",
     "TeleopClient",
+    "TrackingFigures",
     "client_for",
-    "feel",
     "profile",
     "profiles_for",
     "recorded",
+    "tracking_figures",
 ]

@@ -129,7 +129,7 @@ class StateReceiver:
         return self._time
 
     def forget(self) -> None:
-        """As if nothing had come yet."""
+        """Forget all states received."""
         self._kept, self._seen, self._held, self.latest = {}, {}, {}, {}
         self._at = 0
 
@@ -175,7 +175,7 @@ class StickyFilter:
         self.forget()
 
     def forget(self) -> None:
-        """As if no value had been put in yet."""
+        """Forget all values put in."""
         self._recent: deque[Pose] = deque(maxlen=len(self._weights))
         self._output: Pose = ()
 
@@ -273,7 +273,7 @@ class TeleopClient(ABC):
         return all(any(latest[s]) for s in self.sides)
 
     def parting(self, pose: Pose) -> tuple[JointCommand, ...]:
-        """A command to stay there, with motors locked where the dialect can say so."""
+        """A command to hold the pose, with motors locked where the dialect has a mode for it."""
         gains = model(self.dialect.model).gains
         return tuple(
             JointCommand(self._mode(i, JointMode.BRAKE), q, 0.0, 0.0, kp, kd)
@@ -336,7 +336,7 @@ class Dex1Client(TeleopClient):
 
     @property
     def targets(self) -> Mapping[Side, float]:
-        """Where the operator wants each gripper, before clipping and smoothing, rad."""
+        """The target of each gripper, before clipping and filter, rad."""
         return self._targets
 
     def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
@@ -345,7 +345,7 @@ class Dex1Client(TeleopClient):
         return True
 
     def target_of(self, pinch: float) -> float:
-        """Where a pinch value wants the gripper, rad."""
+        """The target for a pinch value, rad."""
         part = (pinch - PINCH_MIN) / (PINCH_MAX - PINCH_MIN)
         return self.dialect.q_open * min(max(part, 0.0), 1.0)
 
@@ -360,7 +360,7 @@ class Dex1Client(TeleopClient):
                 for s, value in given.items()
             }
         else:
-            # exactly 0 means no data, of both hands; with one alone the other is told to close
+            # exactly 0 means no data, of both hands; with one alone the other is commanded to close
             pinches = {s: value[0] if value else 0.0 for s, value in given.items()}
             if any(pinch != 0.0 for pinch in pinches.values()):
                 self._targets = {s: self.target_of(pinch) for s, pinch in pinches.items()}

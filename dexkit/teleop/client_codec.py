@@ -47,7 +47,7 @@ class ClientWire:
         return self._command.encode(message)
 
     def positions(self, topic: str, data: bytes) -> dict[Side, Pose]:
-        """Where the sides in a state message are, but for those that it is too short for.
+        """The positions of the sides in a state message, without those that it is too short for.
 
         :raises WireError: it is not of the dialect's state type.
         """

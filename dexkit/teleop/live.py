@@ -7,8 +7,8 @@ it leaves the hand at rest (:meth:`LiveClient.leave`).
 
 It differs after a pause of its own, too (stopped, suspended, starved; more than
 :data:`~dexkit.command_age.PAUSE`). The genuine client would go on by what it last read, or by where
-the operator is by now. This one is silent until each hand has told where it is *now*, forgets what
-it smoothed, and lets the operator go on where he was.
+the operator is by now. This one sends nothing until each hand has published its position *now*,
+forgets what it smoothed, and lets the operator go on where he was.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, model
-from dexkit.single_publisher import Place, SolePublisher
+from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
 from dexkit.teleop.client_codec import ClientWire
-from dexkit.teleop.feel import Feel, feel
 from dexkit.teleop.profiles import Operator
+from dexkit.teleop.tracking import TrackingFigures, tracking_figures
 
 __all__ = ["LiveClient", "Session"]
 
@@ -41,9 +41,9 @@ _NAP = 0.1
 
 @dataclass
 class Session:
-    """What was sent and seen, in seconds from the operator's beginning, without pauses.
+    """Commands and states of a session, in seconds from the operator's start, without pauses.
 
-    :ivar pauses: when the client stood still, and for how many seconds.
+    :ivar pauses: when the client was paused, and for how many seconds.
     """
 
     sides: tuple[Side, ...]
@@ -54,7 +54,7 @@ class Session:
     def note(
         self, kind: dict[Side, list[tuple[float, Pose]]], at: float, poses: Mapping[Side, Pose]
     ) -> None:
-        """Note poses of one moment."""
+        """Record poses of one time."""
         for side, pose in poses.items():
             kind.setdefault(side, []).append((at, pose))
 
@@ -69,7 +69,7 @@ class Session:
         rows = self.commands.get(side, [])
         return (len(rows) - 1) / (rows[-1][0] - rows[0][0]) if len(rows) > 1 else 0.0
 
-    def feel(self, operator: Operator, side: Side) -> dict[int, Feel]:
+    def tracking(self, operator: Operator, side: Side) -> dict[int, TrackingFigures]:
         """The figures of each joint that the operator moves."""
         rows = self.states.get(side, [])
         if len(rows) < 2:
@@ -80,13 +80,18 @@ class Session:
         found = {}
         for i, joint in enumerate(model(spoken.model).joints[side]):
             stroke = spoken.q_open if spoken.is_gripper else joint.stroke
-            figures = feel(t, q[:, i], lambda at, i=i: _of(operator.intent(at, side), i), stroke)  # type: ignore[misc]
+            figures = tracking_figures(
+                t,
+                q[:, i],
+                lambda at, i=i: _joint_value(operator.intent(at, side), i),  # type: ignore[misc]
+                stroke,
+            )
             if figures.figures():
                 found[i] = figures
         return found
 
 
-def _of(pose: Pose | None, joint: int) -> float | None:
+def _joint_value(pose: Pose | None, joint: int) -> float | None:
     return None if pose is None else pose[joint]
 
 
@@ -94,10 +99,10 @@ class LiveClient:
     """A client's endpoints on a node, and its loops.
 
     :param client: fresh, for the sides that it is to drive.
-    :param force: command beside others. Two clients on one hand would fight, and a real one may
-        carry something: this one gives way to whoever is there or comes.
-    :raises TopicConflict: somebody else commands one of these hands. So do :meth:`wait_ready` and
-        :meth:`perform`, when somebody comes.
+    :param force: command beside others. Two clients on one hand would alternate, and a real one may
+        carry something: this one gives way to other clients.
+    :raises TopicConflict: another program commands one of these hands. So do :meth:`wait_ready` and
+        :meth:`perform`, when one starts to.
     """
 
     def __init__(self, node: DdsNode, client: TeleopClient, *, force: bool = False) -> None:
@@ -110,7 +115,7 @@ class LiveClient:
         commands = dict.fromkeys(self._wire.command_topics[s] for s in client.sides)
         states = dict.fromkeys(self._wire.state_topics[s] for s in client.sides)
         self._sole = SolePublisher(
-            [Place(node, commands)],
+            [NodeTopics(node, commands)],
             verb="commands",
             hint="stop that client, choose another --domain, or go on with --force",
             force=force,
@@ -131,24 +136,24 @@ class LiveClient:
         }
 
     def wait_ready(
-        self, stop: threading.Event, say: Callable[[Mapping[Side, str], float], object]
+        self, stop: threading.Event, report: Callable[[Mapping[Side, str], float], object]
     ) -> bool:
         """Wait until the client has the states that it wants, and the hands listen.
 
-        :param say: told once a second what is missing of which side, and how long it has been.
+        :param report: called once a second with what is missing by side, and for how long.
         :returns: False when it was stopped.
         """
         begin = time.monotonic()
-        told = 0.0
+        reported = 0.0
         while not stop.is_set():
             now = time.monotonic()
             self._sole.poll()
             self._read(now)
             if self._client.ready and all(w.matched for w in self._writers.values()):
                 return True
-            if now - told >= 1.0:
-                told = now
-                say(self._missing(), now - begin)
+            if now - reported >= 1.0:
+                reported = now
+                report(self._missing(), now - begin)
             self._arrived.wait(_NAP)
             self._arrived.clear()
         return False
@@ -157,7 +162,7 @@ class LiveClient:
         found = self._client.missing
         for side in self._client.sides:
             if side not in found and not self._writers[self._wire.command_topics[side]].matched:
-                found[side] = "nobody listens for commands"
+                found[side] = "no process reads commands"
         return found
 
     def perform(
@@ -171,17 +176,17 @@ class LiveClient:
 
         After a pause of this program the operator goes on where he was.
 
-        :param progress: told about twice a second.
+        :param progress: called about twice a second.
         """
         session = Session(self._client.sides)
         period = self._client.period
-        start = told = seen = time.monotonic()
+        start = reported = seen = time.monotonic()
         self._watch.restart()
         while not stop.is_set():
             away = self._watch.measure_pause()
             if away:
                 session.pauses.append((seen - start, away))
-                self._come_back(stop)
+                self._restart_after_pause(stop)
                 start += time.monotonic() - seen
                 seen = time.monotonic()
                 continue
@@ -200,15 +205,15 @@ class LiveClient:
                 now - start,
                 {s: tuple(m.q for m in motors) for s, motors in commands.items()},
             )
-            if now - told >= 0.5:
-                told = now
+            if now - reported >= 0.5:
+                reported = now
                 progress(now - start, session)
             self._sleep(now + period, start, session)
         return session
 
-    def _come_back(self, stop: threading.Event) -> None:
-        """After a pause: what has waited is thrown away, then each hand must say where it is."""
-        stop.wait(SETTLE)  # for what has waited, and for whoever has come meanwhile
+    def _restart_after_pause(self, stop: threading.Event) -> None:
+        """After a pause: drop queued states, then wait for a state of each hand."""
+        stop.wait(SETTLE)  # for queued states, and for other clients that started meanwhile
         self._sole.poll()
         for reader in self._readers.values():
             reader.take()
@@ -224,8 +229,9 @@ class LiveClient:
         """Leave the hands at rest: what the genuine client does not do.
 
         The genuine one just stops sending. A Dex1-1's service then brakes within a second; a
-        Dex3-1 keeps its last position for ever. Here each hand is told for a quarter of a second
-        to stay where it is, with its motors locked where the dialect has a mode byte (status 0).
+        Dex3-1 keeps its last position for ever. Here each hand is commanded for a quarter of a
+        second to stay where it is, with its motors locked where the dialect has a mode byte (status
+        0).
         """
         if self._watch.away() > PAUSE:  # ended in a pause: the hands may be elsewhere by now
             time.sleep(SETTLE)
@@ -234,7 +240,7 @@ class LiveClient:
             self._client.begin_again()
             time.sleep(SETTLE)
             self._read(time.monotonic())
-        if self._sole.lost:  # somebody else commands them now
+        if self._sole.lost:  # another program commands them now
             return
         poses = self._client.receiver.seen
         stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
@@ -250,7 +256,7 @@ class LiveClient:
             self._writers[topic].write_raw(payload, now_ns)
 
     def _read(self, now: float) -> dict[Side, Pose]:
-        """What has come; it is handed to the client."""
+        """Read the states, and hand them to the client."""
         found: dict[Side, Pose] = {}
         for topic, reader in self._readers.items():
             for sample in reader.take()[-1:]:

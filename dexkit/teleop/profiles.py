@@ -1,7 +1,7 @@
-"""What an operator does: profiles, and the operator who performs one.
+"""Teleoperation profiles, and the modelled operator who performs one.
 
-A profile says how far each joint is closed (0 open, 1 closed) as a function of time, the same for
-both hands. :class:`Operator` makes of it what hand tracking would give the client, at the main
+A profile defines how far each joint is closed (0 open, 1 closed) as a function of time, the same
+for both hands. :class:`Operator` makes of it what hand tracking would give the client, at the main
 loop's 30 Hz, and what the operator's hand really did, which is what the robot's should do.
 """
 
@@ -90,7 +90,7 @@ class Operator:
         self._joints = model(spoken.model).joints
 
     def intent(self, t: float, side: Side) -> Pose | None:
-        """Where the operator wants a hand at ``t`` seconds, rad; None without tracking data."""
+        """The operator's target for a hand at ``t`` seconds, rad; None without tracking data."""
         since = t - self.profile.lead_in
         if since < -1e-9:
             return None
@@ -120,7 +120,7 @@ class Operator:
         return math.floor(t * self.rate + 1e-6) / self.rate
 
     def inputs(self, t: float, sides: Iterable[Side]) -> dict[Side, Pose | None]:
-        """What the client is given at ``t``, as :data:`dexkit.teleop.client.Inputs`."""
+        """The input of the client at ``t``, as :data:`dexkit.teleop.client.Inputs`."""
         at = self.sampled_at(t)
         return {s: self._input(self.intent(at, s)) for s in sides}
 
@@ -330,7 +330,7 @@ def recorded(
     """The commands of a recording as what an operator wants.
 
     A recorded Dex1-1 command is a short lead on the recorded hand, not what its operator wanted,
-    so this operator is as slow as the recorded hand was; it says whether another one keeps up.
+    so this operator is as slow as the recorded hand was; it shows whether another hand keeps up.
 
     :param series: per side, seconds from 0 and commanded poses in the radians of ``spoken``.
     :raises UsageError: there is nothing in it.

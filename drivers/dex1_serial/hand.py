@@ -11,7 +11,7 @@ import numpy as np
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import Promptly
+from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex1_serial.discovery import find_motor
 from dexkit.drivers.dex1_serial.line import LATE, LineStatistics, MotorLine
 from dexkit.drivers.dex1_serial.settings import SETTINGS, Dex1Settings, from_options
@@ -170,12 +170,12 @@ class Dex1Serial:
         :raises HandTimeout: no intact answer in time, or this program stood still before the
             command was written.
         """
-        promptly = Promptly(self._clock)
+        deadline = WriteDeadline(self._clock)
         line = self._line
         if line is None:
             raise HandLost("the gripper is not open", hint="call open() first")
         frame = self._frame(command)
-        data = line.exchange(frame, self.id, self.configuration.timeout, promptly)
+        data = line.exchange(frame, self.id, self.configuration.timeout, deadline)
         stamp = self._clock.now()
         self._look_at(data)
         return _state(data, stamp)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import serial
 
-from dexkit.command_age import Promptly
+from dexkit.command_age import WriteDeadline
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
 from dexkit.wire.m4010 import DATA, FrameParser, MotorData
@@ -93,7 +93,7 @@ class MotorLine:
         return self._port is None
 
     def exchange(
-        self, command: bytes, number: int, timeout: float, before: Promptly | None = None
+        self, command: bytes, number: int, timeout: float, before: WriteDeadline | None = None
     ) -> MotorData:
         """Send a command, return the data of that motor.
 
@@ -120,7 +120,7 @@ class MotorLine:
                 raise
 
     def _exchange(
-        self, fd: int, command: bytes, number: int, timeout: float, before: Promptly | None
+        self, fd: int, command: bytes, number: int, timeout: float, before: WriteDeadline | None
     ) -> MotorData:
         statistics, parser = self.statistics, self._parser
         if self._owed:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import Promptly
+from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
 from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options
@@ -249,7 +249,7 @@ class Dex3Usb:
         :raises HandTimeout: no answer in time, none that is intact, a stalled endpoint, or this
             program stood still before the command was sent.
         """
-        promptly = Promptly(self._clock)
+        deadline = WriteDeadline(self._clock)
         link = self._link
         if link is None:
             raise HandLost("the hand is not open", hint="call open() first")
@@ -257,7 +257,7 @@ class Dex3Usb:
         if tripped is not None:
             # one lock frame with bit 7 = 0 clears a motor that stopped by itself
             command, protect = _locked(command, tripped), protect & ~tripped
-        _, state = self._transfer(link, self._codec.encode(command, protect), promptly)
+        _, state = self._transfer(link, self._codec.encode(command, protect), deadline)
         if self._codec.missing_motors or self._some_missed:
             self._fill_in(state)
         self._look_for_trips(state)
@@ -265,7 +265,7 @@ class Dex3Usb:
         return state
 
     def _transfer(
-        self, link: UsbLink, frame: bytes, before: Promptly | None = None
+        self, link: UsbLink, frame: bytes, before: WriteDeadline | None = None
     ) -> tuple[bytes, HandState]:
         configuration = self.configuration
         answer = link.exchange(frame, configuration.send_timeout, configuration.timeout, before)

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from dexkit.command_age import Promptly
+from dexkit.command_age import WriteDeadline
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
 
 __all__ = ["Backend", "Endpoints", "LinkStatistics", "UsbLink", "hand_error", "read_serial"]
@@ -189,7 +189,7 @@ class UsbLink:
         data: bytes,
         send_timeout: float,
         timeout: float,
-        before: Promptly | None = None,
+        before: WriteDeadline | None = None,
     ) -> bytes:
         """Send one buffer, return the one that answers it.
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import serial
 
-from dexkit.command_age import Promptly
+from dexkit.command_age import WriteDeadline
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.wire import dynamixel, mx64
@@ -177,7 +177,7 @@ class ServoBus:
         self._port = DevicePort(path, timeout)
         self._parser = PacketParser(keep_bad=True)
         self._held = b""  # leaves together with the next packet
-        self._before: Promptly | None = None
+        self._before: WriteDeadline | None = None
 
     @property
     def is_open(self) -> bool:
@@ -302,7 +302,7 @@ class ServoBus:
         data: bytes,
         *,
         with_next: bool = False,
-        before: Promptly | None = None,
+        before: WriteDeadline | None = None,
     ) -> None:
         """Write without a status packet (a Sync Write to one servo): half the time, no reply.
 

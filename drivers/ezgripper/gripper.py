@@ -14,7 +14,7 @@ import numpy as np
 from dexkit import documents
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import PAUSE, Promptly
+from dexkit.command_age import PAUSE, WriteDeadline
 from dexkit.drivers.ezgripper import calibration, settings
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BusStatistics, Ping, ServoBus
@@ -377,7 +377,7 @@ class EZGripper:
         :raises HandTimeout: no intact answer to any of the attempts, or this program stood still
             before the goal was written.
         """
-        promptly = Promptly(self._clock)
+        deadline = WriteDeadline(self._clock)
         servo, control, last = self._servo, self._control, self._last
         if servo is None or control is None or last is None:
             raise HandLost("the gripper is not open", hint="call open() first")
@@ -387,8 +387,8 @@ class EZGripper:
             last = self._last = servo.sample()  # the fingers went on; a brake must not go back
         goal = control.plan(command, last)
         if goal.current and not last.torque:
-            servo.engage(Goal(last.position, goal.current, goal.profile_velocity), promptly)
-        sample = servo.exchange(goal, promptly)
+            servo.engage(Goal(last.position, goal.current, goal.profile_velocity), deadline)
+        sample = servo.exchange(goal, deadline)
         self._examine(servo, control, command, sample, engaged=goal.current > 0)
         self._commanded = command
         self._last = sample

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import Promptly
+from dexkit.command_age import WriteDeadline
 from dexkit.drivers.ezgripper import block
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BITS_PER_BYTE, ServoBus
@@ -84,7 +84,7 @@ class Servo:
         """Set and verify all registers. Raises as :func:`settings.apply_settings`."""
         return apply_settings(self.bus, self.id)
 
-    def exchange(self, goal: Goal, before: Promptly | None = None) -> Sample:
+    def exchange(self, goal: Goal, before: WriteDeadline | None = None) -> Sample:
         """One write, one read.
 
         :param before: asked right before the goal is written.
@@ -119,7 +119,7 @@ class Servo:
         """Switch the motor; raises as the bus, and ServoError in a shutdown."""
         self.bus.write_item(self.id, mx64.TORQUE_ENABLE, int(on))
 
-    def engage(self, goal: Goal, before: Promptly | None = None) -> None:
+    def engage(self, goal: Goal, before: WriteDeadline | None = None) -> None:
         """Switch the motor on with ``goal`` already in its registers."""
         data = block.encode(goal)
         self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, data, before=before)

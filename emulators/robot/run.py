@@ -14,14 +14,14 @@ import logging
 import threading
 
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import PAUSE, Ages, PauseWatch
+from dexkit.command_age import PAUSE, PauseWatch, SampleAges
 from dexkit.dds import DdsNode, Endpoint, Reader, Writer
 from dexkit.emulators.robot.mechanics import RobotMechanics
 from dexkit.emulators.robot.settings import Settings
 from dexkit.errors import DdsError, EmulatorError, TopicConflict
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.service import Publisher
-from dexkit.single_publisher import Place, SolePublisher
+from dexkit.single_publisher import NodeTopics, SolePublisher
 
 __all__ = ["EmulatedRobot", "run_robot"]
 
@@ -67,7 +67,7 @@ class EmulatedRobot:
         self._own_node: DdsNode | None = None
         self._publisher = publisher or Publisher(model.state_rate, self._clock)
         self._force = force
-        self._ages = Ages()
+        self._ages = SampleAges()
         self._watch = PauseWatch(self._clock)
         self._heard = False  # a state of somebody else
         self._sole: SolePublisher | None = None
@@ -125,7 +125,7 @@ class EmulatedRobot:
         try:
             model = self.model
             sole = self._sole = SolePublisher(
-                [Place(node, {model.state_topic}, self._counts)],
+                [NodeTopics(node, {model.state_topic}, self._counts)],
                 hint="stop the other robot, choose another --domain, or add --force",
                 force=self._force,
             )

@@ -1,5 +1,5 @@
 """A robustness campaign: fuzzers, unplugs, kills, hostile peers, full disks and a soak.
 
-``python -m tools.campaign --minutes 30``; docs/campaign.md says what it does and how a finding is
-repeated.
+``python -m tools.campaign --minutes 30``; docs/campaign.md describes what it does and how a finding
+is repeated.
 """

@@ -1,4 +1,4 @@
-"""What a case of the campaign is, and what it reports."""
+"""Cases of the campaign, their batches and their findings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from typing import Any, ClassVar
 __all__ = ["Batch", "Case", "Finding", "Lane", "Skip", "place_of"]
 
 ROOT = Path(__file__).resolve().parents[2]
-_ROOMS = tuple(f"{ROOT}/{n}/" for n in ("dexkit", "drivers", "emulators", "conformance", "traces"))
+_PACKAGES = tuple(
+    f"{ROOT}/{n}/" for n in ("dexkit", "drivers", "emulators", "conformance", "traces")
+)
 
 
 class Lane(str, Enum):
@@ -33,7 +35,7 @@ class Lane(str, Enum):
 
 
 class Skip(Exception):
-    """The case cannot be run on this machine; the text says why."""
+    """The case cannot be run on this machine; the text gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Batch:
     :param sample: do it in miniature.
     :param seconds: how long a case that has no natural end shall go on.
     :param scratch: an empty folder, removed afterwards.
-    :param domain: first of ten DDS domains that nobody else uses.
+    :param domain: first of ten DDS domains that no other program uses.
     :param trace: a file into which the number of each input is written before it is tried.
     """
 
@@ -127,7 +129,7 @@ class Case(ABC):
     :cvar unit: what is counted.
     :cvar aim: how many of them an hour on two cores should reach.
     :cvar weight: share of the time of its lane, against the other cases of it.
-    :cvar limit: seconds after which a batch is said to hang.
+    :cvar limit: seconds after which a batch counts as hanging.
     """
 
     name: str
@@ -156,7 +158,7 @@ def place_of(trace: TracebackType | None) -> str:
     A line number would make two findings of one whenever the file is edited.
     """
     frames = list(traceback.extract_tb(trace))
-    ours = [f for f in frames if os.path.normpath(f.filename).startswith(_ROOMS)]
+    ours = [f for f in frames if os.path.normpath(f.filename).startswith(_PACKAGES)]
     if not ours:
         ours = [f for f in frames if "/tools/campaign/" not in f.filename] or frames
     if not ours:

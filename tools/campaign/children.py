@@ -1,4 +1,4 @@
-"""What a batch has below it: processes, found, waited for and ended; scratch folders."""
+"""Find, await and end the child processes of a batch; make scratch folders."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def command_of(pid: int) -> str:
 
 
 def reap() -> None:
-    """Collect children that have ended and that nobody waits for."""
+    """Collect children that have ended and are not awaited."""
     with contextlib.suppress(ChildProcessError):
         while os.waitpid(-1, os.WNOHANG)[0]:
             pass

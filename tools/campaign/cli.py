@@ -1,4 +1,4 @@
-"""The command line."""
+"""Command line of the campaign: ``python -m tools.campaign``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ FINDING, OWN_FAILURE = 1, 2
 )
 @click.option("--fresh", is_flag=True, help="Forget what was done before.")
 @click.option("--sample", is_flag=True, help="Each case once, in miniature, with a fixed seed.")
-@click.option("--list", "list_only", is_flag=True, help="Say which cases there are.")
+@click.option("--list", "list_only", is_flag=True, help="List the cases.")
 @click.option(
     "--repeat",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
@@ -114,7 +114,7 @@ def _campaign(
         batches=batches,
         sample=sample,
         own_network=own.network,
-        tell=line.tell,
+        report=line.report,
     )
 
     def stop(signum: int, frame: object) -> None:
@@ -143,7 +143,7 @@ def _campaign(
 
 
 def _done(state: State, chosen: Case) -> bool:
-    progress = state.of(chosen.name)
+    progress = state.progress_of(chosen.name)
     return bool(progress.units or progress.skipped)
 
 
@@ -193,7 +193,7 @@ def _result(cases: Sequence[Case], state: State) -> dict[str, Any]:
                 "what": c.what,
                 "unit": c.unit,
                 "aim": c.aim,
-                **vars(state.of(c.name)),
+                **vars(state.progress_of(c.name)),
                 "findings": [f.id for f in state.findings.values() if f.case == c.name],
             }
             for c in cases
@@ -209,7 +209,7 @@ def _table(cases: Sequence[Case], state: State) -> str:
     rows = [("case", "done", "unit", "aim", "per s", "findings", "")]
     totals: dict[str, int] = {}
     for chosen in cases:
-        progress = state.of(chosen.name)
+        progress = state.progress_of(chosen.name)
         totals[chosen.unit] = totals.get(chosen.unit, 0) + progress.units
         found = sum(f.case == chosen.name for f in state.findings.values())
         note = "; ".join(progress.notes[-2:])
@@ -260,7 +260,7 @@ class _Line:
         self._calls = 0
         self._width = 0
 
-    def tell(self, text: str) -> None:
+    def report(self, text: str) -> None:
         if text.endswith("\n"):
             self.end()
             sys.stderr.write(text)

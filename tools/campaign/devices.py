@@ -2,7 +2,7 @@
 
 Driver and device run in one process on a real pseudo-terminal or over USB/IP, without DDS, so
 that a hundred of them cost a minute of one core. The emulated device is the witness: its own
-position says whether the hand moved when nobody asked.
+position shows whether the hand moved without a command.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dexkit.models import dialect
 from dexkit.service import HandService
 from dexkit.service.core import HandCore
 from tools.campaign.case import Batch, Case, Lane
-from tools.campaign.rig import LocalNode, NotYet, open_files, until
+from tools.campaign.rig import LocalNode, WaitTimeout, open_files, until
 
 __all__ = ["Bench", "bench_of", "cases"]
 
@@ -147,7 +147,7 @@ class _Dex3(Bench):
 
 
 class _Dex5(Bench):
-    """Without a device: only what a client says."""
+    """Without a device: only the commands of a client."""
 
     dialect_name = "dex5"
     low, high = 0.2, 0.8
@@ -197,12 +197,12 @@ class DeviceCase(Case):
             count = 1 if batch.sample else (2 if turn == 0 else 10)
             try:
                 self._rounds(batch, bench, count)
-            except NotYet as error:
+            except WaitTimeout as error:
                 batch.found("not recovered", self.name, str(error))
                 return
             if batch.sample:
                 return
-        with contextlib.suppress(NotYet):
+        with contextlib.suppress(WaitTimeout):
             until(lambda: open_files() <= files, "descriptors", 5.0)
             until(lambda: threading.active_count() <= threads, "threads", 5.0)
         if (now := open_files()) > files:

@@ -2,8 +2,8 @@
 
 ``record``, ``check``, ``report``, ``badge`` and ``compare`` write to ``/dev/full``, to a file
 system of 64 KiB, under a limit of the file's size, to a folder that is read-only or missing, and
-to a file that is deleted meanwhile. What could not be written is said and gives an exit code that
-is not 0; a traceback is a finding, and so is a claim that does not hold.
+to a file that is deleted meanwhile. What could not be written is reported and gives an exit
+code that is not 0; a traceback is a finding, and so is a claim that does not hold.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dexkit.errors import DexkitError
 from tools.campaign.case import Batch, Case, Skip
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.programs import Scene, _talk
-from tools.campaign.rig import NotYet, until
+from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["cases"]
 
@@ -68,13 +68,13 @@ class WriteCase(Case):
             program = Program(batch, ["dexkit", *words], limits=limits)
             code = program.wait(120.0)
             batch.units += 1
-            told = traceback_in(program.output)
-            if told is not None:
-                batch.found("traceback", told[0], f"{way}: {told[1]}\n{program!r}")
+            traceback = traceback_in(program.output)
+            if traceback is not None:
+                batch.found("traceback", traceback[0], f"{way}: {traceback[1]}\n{program!r}")
             elif code is None or code < 0:
                 batch.found("exit code", f"{self.name} {way}", f"{code}: {program.output[-1000:]}")
             elif (code == 0 and way != "small") or (code == 0 and not Path(place).stat().st_size):
-                batch.found("said to be done", f"{self.name} {way}", program.output[-1000:])
+                batch.found("reported as done", f"{self.name} {way}", program.output[-1000:])
             program.end()
             if way == "small":
                 _release(batch.scratch / "small")
@@ -114,7 +114,7 @@ class RecordCase(Case):
             for way in ways[:1] if batch.sample else ways:
                 try:
                     self._one(batch, scene, way)
-                except NotYet as error:
+                except WaitTimeout as error:
                     batch.found("not ready", f"{self.name} {way}", str(error))
                 finally:
                     if way == "small":
@@ -142,18 +142,22 @@ class RecordCase(Case):
             if way == "deleted" and program.running:
                 until(lambda: path.exists() and path.stat().st_size > 5000, "something recorded")
                 path.unlink()
-            # it ends by itself when it cannot write, or goes on and says so at the end
-            with contextlib.suppress(NotYet):
+            # it ends by itself when it cannot write, or goes on and reports it at the end
+            with contextlib.suppress(WaitTimeout):
                 until(lambda: not program.running, "its end", 5.0)
             program.signal(signal.SIGTERM)
             code = program.wait()
             batch.units += 1
-            told = traceback_in(program.output)
-            if told is not None:
-                batch.found("traceback", told[0], f"{way}: {told[1]}\n{program.output[-2000:]}")
+            traceback = traceback_in(program.output)
+            if traceback is not None:
+                batch.found(
+                    "traceback", traceback[0], f"{way}: {traceback[1]}\n{program.output[-2000:]}"
+                )
             elif code in (0, None) or (code < 0 and "error:" not in program.output):
                 batch.found(
-                    "said to be done", f"{self.name} {way}", f"{code}: {program.output[-2000:]}"
+                    "reported as done",
+                    f"{self.name} {way}",
+                    f"{code}: {program.output[-2000:]}",
                 )
             if way != "deleted" or code == 0:
                 self._claims(batch, way, path, program.output)
@@ -161,7 +165,7 @@ class RecordCase(Case):
             program.end()
 
     def _claims(self, batch: Batch, way: str, path: Path, output: str) -> None:
-        """It does not say that more was recorded than can be read."""
+        """Check that it does not report more messages than can be read."""
         from dexkit.traces import open_trace
 
         claimed = re.search(r"([\d,]+) messages", output)
@@ -173,10 +177,12 @@ class RecordCase(Case):
                 readable = len(list(open_trace(path).messages()))
             except DexkitError:
                 readable = 0
-        said = int(claimed[1].replace(",", ""))
-        if said > readable:
+        claimed_count = int(claimed[1].replace(",", ""))
+        if claimed_count > readable:
             batch.found(
-                "claims too much", f"{self.name} {way}", f"{said} said, {readable} readable"
+                "claims too much",
+                f"{self.name} {way}",
+                f"{claimed_count} claimed, {readable} readable",
             )
 
     def _force(self, batch: Batch, scene: Scene, path: Path) -> None:
@@ -192,9 +198,11 @@ class RecordCase(Case):
             code = first.wait()
             batch.units += 1
             for program in (first, second):
-                told = traceback_in(program.output)
-                if told is not None:
-                    batch.found("traceback", told[0], f"{told[1]}\n{program.output[-2000:]}")
+                traceback = traceback_in(program.output)
+                if traceback is not None:
+                    batch.found(
+                        "traceback", traceback[0], f"{traceback[1]}\n{program.output[-2000:]}"
+                    )
             if code == 0:
                 self._claims(batch, "force", path, first.output)
         finally:

@@ -117,7 +117,7 @@ class Engine:
     :param seconds: how long.
     :param batches: of each case; None for as many as the time allows.
     :param sample: each case once, in miniature.
-    :param tell: is given a line of progress now and then.
+    :param report: is called about once a second with a line of progress.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Engine:
         batches: int | None = None,
         sample: bool = False,
         own_network: bool = False,
-        tell: Callable[[str], object] = lambda line: None,
+        report: Callable[[str], object] = lambda line: None,
     ) -> None:
         self.cases = list(cases)
         self.state = state
@@ -140,7 +140,7 @@ class Engine:
         self._batches = 1 if sample else batches
         self._sample = sample
         self._own_network = own_network
-        self._tell = tell
+        self._report_progress = report
         self._selector = selectors.DefaultSelector()
         self._workers: list[Worker] = []
         self._suspects: list[dict[str, Any]] = []
@@ -170,16 +170,16 @@ class Engine:
         """Run until the time is over, everything is done (a sample), or :meth:`stop`."""
         try:
             self._open_workers()
-            said = saved = time.monotonic()
+            reported = saved = time.monotonic()
             while not self.stopping and self._left > 0:
                 self._feed()
                 if not any(w.case for w in self._workers):
                     break
                 self._collect(0.2)
                 now = time.monotonic()
-                if now - said >= 1.0:
-                    said = now
-                    self._tell(self.progress())
+                if now - reported >= 1.0:
+                    reported = now
+                    self._report_progress(self.progress())
                 if now - saved >= 10.0:
                     saved = now
                     self._save()
@@ -224,27 +224,29 @@ class Engine:
         for chosen in self.cases:
             if chosen.lane is not lane or self._tries.get(chosen.name, 0) >= _TRIES:
                 continue
-            progress = self.state.of(chosen.name)
+            progress = self.state.progress_of(chosen.name)
             given = self._given.get(chosen.name, 0)
             most = 1 if lane is Lane.LONG else self._batches
             if progress.skipped or (most is not None and given >= most):
                 continue
-            candidates.append((self._behind(chosen, progress), len(candidates), chosen))
-        if not candidates or (lane is Lane.LIVE and not self._sample and self._enough()):
+            candidates.append((self._share_done(chosen, progress), len(candidates), chosen))
+        if not candidates or (
+            lane is Lane.LIVE and not self._sample and self._live_cases_are_done()
+        ):
             return None
         return min(candidates)[2]
 
-    def _enough(self) -> bool:
+    def _live_cases_are_done(self) -> bool:
         """Every live case has reached its aim, and the fuzzers have not: they get the cores."""
 
         def short(chosen: Case) -> bool:
-            progress = self.state.of(chosen.name)
+            progress = self.state.progress_of(chosen.name)
             return not progress.skipped and progress.units < chosen.aim
 
         live = any(short(c) for c in self.cases if c.lane is Lane.LIVE)
         return not live and any(short(c) for c in self.cases if c.lane is Lane.COMPUTE)
 
-    def _behind(self, chosen: Case, progress: Progress) -> float:
+    def _share_done(self, chosen: Case, progress: Progress) -> float:
         under_way = sum(w.case is chosen for w in self._workers)
         if chosen.lane is Lane.COMPUTE:
             typical = progress.seconds / max(progress.batches, 1) or 0.5
@@ -253,7 +255,7 @@ class Engine:
         return (progress.units + under_way * typical) / chosen.aim
 
     def _task(self, chosen: Case) -> dict[str, Any]:
-        progress = self.state.of(chosen.name)
+        progress = self.state.progress_of(chosen.name)
         if progress.again:
             number = progress.again.pop()
         else:
@@ -286,7 +288,7 @@ class Engine:
 
     def _take(self, worker: Worker, answer: dict[str, Any]) -> None:
         assert worker.case is not None
-        progress = self.state.of(worker.case.name)
+        progress = self.state.progress_of(worker.case.name)
         worker.case, task = None, worker.task
         progress.seconds += answer["seconds"]
         progress.units += answer["units"]
@@ -301,7 +303,7 @@ class Engine:
 
     def _found(self, finding: Finding) -> None:
         if self.state.add(finding):
-            self._tell(f"FINDING {finding.case}: {finding.kind} in {finding.place}\n")
+            self._report_progress(f"FINDING {finding.case}: {finding.kind} in {finding.place}\n")
 
     def _died(self, worker: Worker) -> None:
         chosen, task = worker.case, worker.task
@@ -360,7 +362,7 @@ class Engine:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 worker.process.wait(max(0.1, patience - time.monotonic()))
             if worker.case is not None and worker in busy:
-                self.state.of(worker.case.name).again.append(worker.task["batch"])
+                self.state.progress_of(worker.case.name).again.append(worker.task["batch"])
             worker.kill()
         self._workers.clear()
         self._selector.close()
@@ -372,14 +374,14 @@ class Engine:
     def _save(self) -> None:
         self.state.save()
 
-    # --- what to say
+    # --- progress
 
     def progress(self) -> str:
         """One line."""
         took = time.monotonic() - self._began
         units: dict[str, list[int]] = {}
         for chosen in self.cases:
-            done = self.state.of(chosen.name).units
+            done = self.state.progress_of(chosen.name).units
             entry = units.setdefault(chosen.unit, [0, 0])
             entry[0] += done
             entry[1] += done - self._first.get(chosen.name, 0)
@@ -398,9 +400,9 @@ class Engine:
     def failures(self) -> list[tuple[str, str]]:
         """Cases that failed by the campaign's own fault, and how."""
         return [
-            (c.name, self.state.of(c.name).failed)
+            (c.name, self.state.progress_of(c.name).failed)
             for c in self.cases
-            if self.state.of(c.name).failed
+            if self.state.progress_of(c.name).failed
         ]
 
 

@@ -1,8 +1,8 @@
-"""Namespaces of the campaign's own, so that nothing it does meets anything else on the machine.
+"""Namespaces of the campaign's own, so that it does not affect other programs on the machine.
 
 Network: ports, DDS domains. Mounts: small file systems that fill up. Processes: whatever happens,
 the kernel ends every process of the campaign with its first one. As root, or where users may make
-namespaces; elsewhere the campaign runs without and says so.
+namespaces; elsewhere the campaign runs without and reports it.
 """
 
 from __future__ import annotations

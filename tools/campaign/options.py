@@ -1,4 +1,4 @@
-"""Command lines that nobody should write: odd values for every option of every command.
+"""Run commands with invalid and extreme values for every option.
 
 The commands are asked what options they have, so that a new one is tried without being named
 here. A traceback is a finding, and an exit code that is none of dexkit's.
@@ -149,15 +149,17 @@ class OptionsCase(Case):
         try:
             until(lambda: "ready:" in program.output or not program.running, "a word", 10.0)
         except Exception:
-            pass  # some say nothing while they wait
+            pass  # some print nothing while they wait
         if program.running and "ready:" in program.output:
             program.wait(1.0)
         program.signal(signal.SIGINT)
         code = program.wait(30.0)
-        told = traceback_in(program.output)
+        traceback = traceback_in(program.output)
         shown = " ".join(line)[:400]
-        if told is not None:
-            batch.found("traceback", told[0], f"{told[1]}\n{shown}\n{program.output[-2000:]}")
+        if traceback is not None:
+            batch.found(
+                "traceback", traceback[0], f"{traceback[1]}\n{shown}\n{program.output[-2000:]}"
+            )
         elif code is None:
             batch.found("does not end", " ".join(path), f"{shown}\n{program.output[-2000:]}")
         elif code not in _CODES and code != -signal.SIGINT:

@@ -1,4 +1,4 @@
-"""Hostile peers: what a stranger on the domain may send while a program works.
+"""Hostile peers: send invalid data to a program on its domain while it works.
 
 Malformed RTPS datagrams, NaN, giant, empty and foreign messages, participants with properties
 that are no text. The program stays, its states go on, no traceback; afterwards a good client is
@@ -24,12 +24,12 @@ from tools.campaign.fuzz.messages import announcements, filled
 from tools.campaign.mutate import mutator
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.programs import SIDE, Client, Scene, Spec, robots_and_hands
-from tools.campaign.rig import NotYet, until
+from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["cases"]
 
 
-class Stranger:
+class HostilePeer:
     """Sends datagrams to every participant of a domain on loopback."""
 
     def __init__(self, domain: int, rng: random.Random) -> None:
@@ -139,12 +139,14 @@ class PeerCase(Case):
             program = Program(batch, self._spec.command(scene))
             try:
                 self._among(batch, scene, program)
-            except NotYet as error:
+            except WaitTimeout as error:
                 batch.found("not working", self.name, f"{error}\n{program.output[-2000:]}")
             finally:
-                told = traceback_in(program.output)
-                if told is not None:
-                    batch.found("traceback", told[0], f"{told[1]}\n{program.output[-3000:]}")
+                traceback = traceback_in(program.output)
+                if traceback is not None:
+                    batch.found(
+                        "traceback", traceback[0], f"{traceback[1]}\n{program.output[-3000:]}"
+                    )
                 if program.running:
                     import signal
 
@@ -175,7 +177,7 @@ class PeerCase(Case):
 
     @staticmethod
     def _obeys(scene: Scene) -> None:
-        """A good client moves the hand; its state says so."""
+        """Check that a good client moves the hand, by its state."""
         client, bench = scene.client, scene.bench
         assert client is not None
         assert bench is not None
@@ -191,20 +193,24 @@ class PeerCase(Case):
         start = q()
         for goal in (bench.low, bench.high):
             client.goal = goal
-            with contextlib.suppress(NotYet):
+            with contextlib.suppress(WaitTimeout):
                 until(lambda: abs(q() - start) > 0.05, "motion", 10.0)
                 client.goal = None
                 return
         client.goal = None
-        raise NotYet("a good client is not obeyed afterwards")
+        raise WaitTimeout("a good client is not obeyed afterwards")
 
 
 @contextlib.contextmanager
 def _open(batch: Batch, spoken: str) -> Iterator[list[Callable[[], Any]]]:
-    stranger = Stranger(batch.domain, batch.random)
-    ways: list[Callable[[], Any]] = [stranger.malformed, stranger.malformed, stranger.property]
+    hostile_peer = HostilePeer(batch.domain, batch.random)
+    ways: list[Callable[[], Any]] = [
+        hostile_peer.malformed,
+        hostile_peer.malformed,
+        hostile_peer.property,
+    ]
     with contextlib.ExitStack() as stack:
-        stack.callback(stranger.close)
+        stack.callback(hostile_peer.close)
         if spoken:
             messages = _Messages(batch.domain, spoken, batch.random)
             stack.callback(messages.close)

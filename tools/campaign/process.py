@@ -15,7 +15,7 @@ from pathlib import Path
 from tools.campaign import isolation
 from tools.campaign.case import ROOT, Batch
 from tools.campaign.children import command_of, descendants, wait_gone
-from tools.campaign.rig import NotYet, until
+from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["Program", "traceback_in"]
 
@@ -117,11 +117,13 @@ class Program:
     def wait_for(self, text: str, timeout: float = 60.0) -> None:
         """Wait until it has printed ``text``.
 
-        :raises NotYet: it has not, or has ended.
+        :raises WaitTimeout: it has not, or has ended.
         """
         until(lambda: text in self.output or not self.running, f"{text!r} of {self!r}", timeout)
         if text not in self.output:
-            raise NotYet(f"{self!r} ended with {self.process.returncode}: {self.output[-1500:]}")
+            raise WaitTimeout(
+                f"{self!r} ended with {self.process.returncode}: {self.output[-1500:]}"
+            )
 
     def note_children(self) -> None:
         """Remember what is below it now."""

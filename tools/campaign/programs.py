@@ -26,7 +26,7 @@ from dexkit.temporary_folder import sweep
 from tools.campaign.case import Batch, Case
 from tools.campaign.devices import Bench, bench_of
 from tools.campaign.process import Program, traceback_in
-from tools.campaign.rig import NotYet, until
+from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["Client", "Scene", "Spec", "cases", "robots_and_hands", "specs"]
 
@@ -36,7 +36,7 @@ _SETTLED = 0.2
 
 
 class Client:
-    """A client on DDS in this process: commands at 100 Hz while it is told a goal, hears states.
+    """A client on DDS in this process: commands at 100 Hz while it has a goal; reads states.
 
     :param spoken: name of its dialect.
     """
@@ -71,7 +71,7 @@ class Client:
     def wait_states(self, timeout: float = 60.0) -> None:
         """Wait for new states.
 
-        :raises NotYet: none came.
+        :raises WaitTimeout: none came.
         """
         before = self.states
         until(lambda: self.states > before + 2, "states", timeout)
@@ -169,7 +169,7 @@ _BENCH = {"unitree_go": "m4010", "dex3": "dex3", "dex5": "dex5"}
 
 @contextlib.contextmanager
 def _talk(scene: Scene, client: str = "unitree_go", *, states: bool = True) -> Iterator[None]:
-    """Somebody who publishes commands in a dialect, and states in today's."""
+    """A program that publishes commands in one dialect, and states in the present one."""
     from dexkit.dds import DdsNode
 
     stop = threading.Event()
@@ -217,7 +217,7 @@ def _topic_flows(
             end = time.monotonic() + 60.0
             while seen < 3:
                 if time.monotonic() > end or not program.running:
-                    raise NotYet(f"no {topic} from {program!r}")
+                    raise WaitTimeout(f"no {topic} from {program!r}")
                 if reader.wait(0.5):
                     seen += len(reader.take())
 
@@ -293,7 +293,7 @@ def _readable(scene: Scene, killed: bool) -> None:
         scene.batch.found("recording not finished", "record", f"{trace.warnings}")
 
 
-def _says_more(scene: Scene, program: Program) -> None:
+def _output_grows(scene: Scene, program: Program) -> None:
     if scene.extra.get("heard") == program.process.pid:
         return  # it speaks when something has changed
     size = len(program.output)
@@ -327,7 +327,7 @@ def _sample() -> str:
 
 
 def specs() -> list[Spec]:
-    """Every program that runs until it is told to end."""
+    """Every program that runs until it is asked to end."""
 
     def emulate(*words: str) -> Callable[[Scene], list[str]]:
         return lambda scene: [
@@ -408,7 +408,7 @@ def specs() -> list[Spec]:
             _talk,
             ready="",
             codes=(0, 1, 130, 143, -2, -15),
-            works=_says_more,
+            works=_output_grows,
         ),
         Spec(
             "conformance",
@@ -420,7 +420,7 @@ def specs() -> list[Spec]:
             _nothing,
             ready="",
             codes=(0, 1, 2, 130, 143, -2, -15),
-            works=_says_more,
+            works=_output_grows,
         ),
     ]  # fmt: skip
     return found
@@ -461,7 +461,7 @@ class _Runs(Case):
         with self.spec.stage(scene):
             try:
                 self.runs(batch, scene)
-            except NotYet as error:
+            except WaitTimeout as error:
                 batch.found("not ready", self.name, str(error))
         temporary = batch.scratch / "tmp"
         if temporary.exists():
@@ -483,20 +483,22 @@ class _Runs(Case):
             if self.spec.ready:
                 program.wait_for(self.spec.ready)
             self.spec.works(scene, program)
-        except NotYet as error:
+        except WaitTimeout as error:
             program.end()
-            self.look(batch, program)
-            raise NotYet(f"{error}; it printed: {program.output[-1500:]}") from None
+            self.check_output(batch, program)
+            raise WaitTimeout(f"{error}; it printed: {program.output[-1500:]}") from None
         except BaseException:
             program.end()
             raise
         return program
 
-    def look(self, batch: Batch, program: Program) -> None:
+    def check_output(self, batch: Batch, program: Program) -> None:
         """A traceback is a finding, whatever else happens."""
-        told = traceback_in(program.output)
-        if told is not None:
-            batch.found("traceback", told[0], f"{told[1]}\n{program!r}\n{program.output[-3000:]}")
+        traceback = traceback_in(program.output)
+        if traceback is not None:
+            batch.found(
+                "traceback", traceback[0], f"{traceback[1]}\n{program!r}\n{program.output[-3000:]}"
+            )
 
     def ended(self, batch: Batch, scene: Scene, program: Program, number: int) -> None:
         """Wait for its end and look at everything that it must not leave."""
@@ -510,7 +512,7 @@ class _Runs(Case):
                 batch.found("ended by itself", self.name, f"{code}: {program.output[-2000:]}")
         elif code not in self.spec.codes:
             batch.found("exit code", f"{self.name} {how}", f"{code}: {program.output[-2000:]}")
-        self.look(batch, program)
+        self.check_output(batch, program)
         left = program.left_behind()
         if left:
             batch.found("child left behind", f"{self.name} {how}", "\n".join(left))
@@ -555,7 +557,7 @@ class KillCase(_Runs):
             return
         try:
             _wait_still(scene, 5.0)
-        except NotYet:
+        except WaitTimeout:
             batch.found("moves afterwards", f"{self.name} {signal.Signals(number).name}", "for 5 s")
 
 
@@ -582,7 +584,7 @@ class StopCase(_Runs):
             if program.running or self.spec.ready:
                 self.ended(batch, scene, program, signal.SIGTERM)
             else:
-                self.look(batch, program)
+                self.check_output(batch, program)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 program.process.send_signal(signal.SIGCONT)
@@ -608,7 +610,7 @@ class StopCase(_Runs):
         time.sleep(max(0.0, stopped + seconds - time.monotonic()))
         before = None
         if scene.device is not None:
-            with contextlib.suppress(NotYet):
+            with contextlib.suppress(WaitTimeout):
                 before = _wait_still(scene, 3.0)
         program.signal(signal.SIGCONT)
         if before is not None and client is not None and bench is not None:
@@ -630,7 +632,7 @@ class StopCase(_Runs):
             client.goal = None
 
     def _set_off(self, scene: Scene, client: Client, bench: Bench) -> None:
-        """Wait until the device moves by what the client says."""
+        """Wait until the device moves by the client's commands."""
         start, began = scene.position(), time.monotonic()
         assert start is not None
         turned = False
@@ -648,7 +650,7 @@ class StopCase(_Runs):
 def _wait_still(scene: Scene, timeout: float) -> float:
     """Wait until the device has stood still for a moment; where.
 
-    :raises NotYet: it goes on moving.
+    :raises WaitTimeout: it goes on moving.
     """
     assert scene.bench is not None
     last, since = scene.position() or 0.0, time.monotonic()
@@ -674,7 +676,7 @@ def cases() -> list[Case]:
 
 
 def robots_and_hands() -> list[Spec]:
-    """The programs that listen to whoever is on a domain."""
+    """The programs that read from any peer on a domain."""
     names: tuple[str, ...] = (
         "serve-sim-dex1",
         "serve-sim-dex3",

@@ -11,20 +11,20 @@ from typing import Any
 from dexkit.dds import Sample
 from dexkit.messages import message_type
 
-__all__ = ["LocalNode", "NotYet", "open_files", "until"]
+__all__ = ["LocalNode", "WaitTimeout", "open_files", "until"]
 
 PATIENCE = 60.0
 """Seconds that something may take which takes one on an idle machine."""
 
 
-class NotYet(Exception):
-    """What was waited for did not come."""
+class WaitTimeout(Exception):
+    """A condition was not true in time."""
 
 
 def until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> Any:
     """Poll ``condition`` until it is true; its value.
 
-    :raises NotYet: it was not within ``timeout`` seconds.
+    :raises WaitTimeout: it was not within ``timeout`` seconds.
     """
     end = time.monotonic() + timeout
     while True:
@@ -32,7 +32,7 @@ def until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) ->
         if found:
             return found
         if time.monotonic() > end:
-            raise NotYet(f"waited {timeout:g} s for {what}")
+            raise WaitTimeout(f"waited {timeout:g} s for {what}")
         time.sleep(0.01)
 
 
@@ -100,7 +100,7 @@ class LocalNode:
         return reader
 
     def endpoints(self) -> list[Any]:
-        """Nobody else."""
+        """No other endpoints."""
         return []
 
     def close(self) -> None:

@@ -18,9 +18,9 @@ from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.devices import bench_of
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.programs import Client
-from tools.campaign.rig import NotYet
+from tools.campaign.rig import WaitTimeout
 
-__all__ = ["GROWTH", "Watched", "cases", "slope"]
+__all__ = ["GROWTH", "WatchedProcess", "cases", "slope"]
 
 GROWTH = 4.0
 """MiB an hour that a program may grow; a slope below the noise of a short run does not count."""
@@ -32,7 +32,7 @@ _PERIOD = 10.0
 
 
 @dataclass
-class Watched:
+class WatchedProcess:
     """One process."""
 
     name: str
@@ -42,7 +42,7 @@ class Watched:
     files: list[int] = field(default_factory=list)
     threads: list[int] = field(default_factory=list)
 
-    def look(self, now: float) -> None:
+    def measure(self, now: float) -> None:
         """Take one sample; none when it is gone."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             with open(f"/proc/{self.pid}/statm") as file:
@@ -113,7 +113,7 @@ class SoakCase(Case):
             client = Client(batch.domain + 1, "unitree_actuator", bench.message)
             client.goal = bench.low
             client.wait_states()
-            watched = [Watched(name, p.process.pid) for name, p in programs.items()]
+            watched = [WatchedProcess(name, p.process.pid) for name, p in programs.items()]
             began = looked = time.monotonic()
             while batch.left > 0 and all(p.running for p in programs.values()):
                 time.sleep(0.5)
@@ -123,7 +123,7 @@ class SoakCase(Case):
                 if now - looked >= (1.0 if batch.sample else _PERIOD):
                     looked = now
                     for one in watched:
-                        one.look(now - began)
+                        one.measure(now - began)
             batch.units += int(time.monotonic() - began)
             for one in watched:
                 for kind, text in one.problems():
@@ -134,7 +134,7 @@ class SoakCase(Case):
                         f"{slope(one.times, one.memory) * 3600:+.1f} an hour"
                     )
             client.wait_states()
-        except NotYet as error:
+        except WaitTimeout as error:
             batch.found("not working", "soak", str(error))
         finally:
             if client is not None:
@@ -146,9 +146,11 @@ class SoakCase(Case):
                 program.signal(signal.SIGTERM)
                 if program.wait() is None:
                     batch.found("does not end", name, program.output[-2000:])
-                told = traceback_in(program.output)
-                if told is not None:
-                    batch.found("traceback", told[0], f"{told[1]}\n{program.output[-3000:]}")
+                traceback = traceback_in(program.output)
+                if traceback is not None:
+                    batch.found(
+                        "traceback", traceback[0], f"{traceback[1]}\n{program.output[-3000:]}"
+                    )
                 program.end()
 
 

@@ -53,7 +53,7 @@ class State:
         """The file."""
         return self.folder / "state.json"
 
-    def of(self, name: str) -> Progress:
+    def progress_of(self, name: str) -> Progress:
         """Progress of a case."""
         return self.cases.setdefault(name, Progress())
 

@@ -1,4 +1,4 @@
-"""A process that runs batches, one after the other, as its parent tells it.
+"""A process that runs batches, one after the other, as its parent sends them.
 
 A task is a line of JSON on standard input, its outcome a line on the file that was standard
 output; what the code under test prints goes to the log.

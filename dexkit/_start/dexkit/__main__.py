@@ -1,4 +1,4 @@
-"""How dexkit starts itself as a process: ``python .../dexkit/_start/dexkit ARGUMENTS``.
+"""Start dexkit as a child process: ``python .../dexkit/_start/dexkit ARGUMENTS``.
 
 ``python -m dexkit`` puts the working folder in front of the import path, and a ``click.py`` that
 lies there would be run. A folder that is run is in front itself, and nothing else is in this one

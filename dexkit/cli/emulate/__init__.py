@@ -1,4 +1,4 @@
-"""``dexkit emulate``: devices on the kind of port that the real ones have, robots, whole robots."""
+"""``dexkit emulate``: emulate devices on serial lines and USB, robots, and whole robots."""
 
 from __future__ import annotations
 

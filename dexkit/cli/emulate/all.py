@@ -1,4 +1,4 @@
-"""``dexkit emulate all``: a robot with two hands, for a teleoperation developer.
+"""``dexkit emulate all``: a robot with two hands, as processes.
 
 Robot and hands are processes of their own. In one process they would share an interpreter lock:
 with a G1 beside two Dex3-1 the hands fell from 1000 to 960 states a second, and the robot
@@ -92,13 +92,13 @@ def emulate_all(
             if hands != "none":
                 title += f" and two {_HANDS[hands].title}s"
             click.echo(f"ready: {title}, domain {domain}, {interface}")
-            click.echo("\n".join(_next(robot, hands, domain, interface)))
+            click.echo("\n".join(_next_steps(robot, hands, domain, interface)))
             sys.stdout.flush()
             processes.watch(stop, duration)
 
 
-def _next(robot: str, hands: str, domain: int, interface: str) -> list[str]:
-    """What to start now."""
+def _next_steps(robot: str, hands: str, domain: int, interface: str) -> list[str]:
+    """Return the commands that a user can run next."""
     end = "" if hands == "none" else f" --ee={hands}"
     lines = []
     if domain in (0, 1):
@@ -119,17 +119,17 @@ def _next(robot: str, hands: str, domain: int, interface: str) -> list[str]:
     ]
 
 
-class _Part:
-    """One process of the robot: what it said, and how it is doing."""
+class _Process:
+    """One process of the emulated robot, with its status line and last errors."""
 
     def __init__(self, name: str, arguments: tuple[str, ...], status: StatusLine) -> None:
         self.name = name
         self.status = ""
         self._line = status
         self._error: list[str] = []
-        self.tool = Tool(*arguments, on_line=self._hear, environment={STATUS_LINES: "1"})
+        self.tool = Tool(*arguments, on_line=self._take_line, environment={STATUS_LINES: "1"})
 
-    def _hear(self, line: str) -> None:
+    def _take_line(self, line: str) -> None:
         first, _, rest = line.partition(": ")
         if first == "status":
             self.status = rest
@@ -146,8 +146,8 @@ class _Part:
         return bool(self.tool.place)
 
     def failure(self) -> DexkitError:
-        """Why it ended although it was not asked to."""
-        self.tool.stop()  # all that it said is heard
+        """The error for a process that ended by itself."""
+        self.tool.stop()  # so that all its output is read
         code = self.tool.exit_code or 0
         if self._error:
             message, *hint = self._error
@@ -156,7 +156,7 @@ class _Part:
             error = DexkitError(f"{self.name}: killed by signal {-code}")
         else:
             error = DexkitError(
-                f"{self.name}: ended by itself, exit code {code}", hint=self.tool.last_words
+                f"{self.name}: ended by itself, exit code {code}", hint=self.tool.last_lines
             )
         error.exit_code = code if code > 0 else 1
         return error
@@ -168,12 +168,12 @@ class _Processes:
     def __init__(self, parts: dict[str, tuple[str, ...]], quiet: bool) -> None:
         self._commands = parts
         self._status = StatusLine(quiet)
-        self.parts: list[_Part] = []
+        self.parts: list[_Process] = []
 
     def __enter__(self) -> _Processes:
         try:
             for name, arguments in self._commands.items():
-                self.parts.append(_Part(name, arguments, self._status))
+                self.parts.append(_Process(name, arguments, self._status))
         except BaseException:
             self._stop()
             raise
@@ -190,7 +190,7 @@ class _Processes:
             polite = list(pool.map(lambda part: part.tool.stop(), self.parts))
         for part, was in zip(self.parts, polite, strict=True):
             if not was:
-                click.echo(f"{part.name}: did not end when told to, and was killed", err=True)
+                click.echo(f"{part.name}: did not end when asked to, and was killed", err=True)
 
     def _check(self) -> None:
         """Whether all live.
@@ -214,7 +214,7 @@ class _Processes:
                 raise EmulatorError(f"{late}: not ready after {READY_TIMEOUT:g} s")
 
     def watch(self, stop: StopRequest, duration: float | None) -> None:
-        """Until told to stop, or time is up: one status line for all.
+        """Show one status line for all processes, until asked to stop or time is up.
 
         :raises DexkitError: a part ended.
         """

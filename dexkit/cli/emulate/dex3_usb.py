@@ -53,7 +53,7 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     "--host",
     default="127.0.0.1",
     metavar="ADDRESS",
-    help="Address to serve on. Whoever reaches it can move the hand: there is no password.",
+    help="Address to serve on. Any client that reaches it can move the hand: there is no password.",
 )
 @object_option("Percent of closing at which the fingers touch an object")
 @start_option("Percent of closing at first.  [default: at rest, about 20]")

@@ -68,7 +68,7 @@ __all__ = ["emulate_mx64"]
 @any_baudrate_option()
 @click.option("--fast-reads", is_flag=True, help="Firmware with Fast Sync and Fast Bulk Read.")
 @click.option("--backup", is_flag=True, help="Firmware with Control Table Backup.")
-@click.option("--protocol-1", is_flag=True, help="Old firmware that speaks Protocol 1.0 only.")
+@click.option("--protocol-1", is_flag=True, help="Old firmware with Protocol 1.0 only.")
 def emulate_mx64(
     link: str,
     ids: tuple[int, ...],

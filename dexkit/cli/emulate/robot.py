@@ -121,7 +121,7 @@ def _command(model: RobotModel) -> click.Command:
             type=click.IntRange(1, 255),
             default=model.mode_machine,
             show_default=True,
-            help="Kind of machine that it says it is (the table is in unitree_ros).",
+            help="mode_machine of the state, the kind of robot (the table is in unitree_ros).",
         )(decorated)
     return click.command(model.name)(dds_options()(decorated))
 
@@ -168,19 +168,19 @@ def _watch(
     status: StatusLine,
     as_json: bool,
 ) -> None:
-    """Until told to stop: tell how it is doing."""
+    """Print the status until asked to stop or time is up."""
     period = _JSON_PERIOD if as_json else _STATUS_PERIOD
     end = None if duration is None else time.monotonic() + duration
     counters = robot.robot.counters
     then, states, orders = time.monotonic(), counters.states, counters.commands
     state_rate = command_rate = 0.0
-    said: set[str] = set()
+    logged: set[str] = set()
     over = False
     while not over:
         left = float("inf") if end is None else end - time.monotonic()
         over = stop.wait(max(0.0, min(period, left))) or left <= period or bool(robot.failure)
-        for text in sorted(set(robot.mismatches()) - said)[: MOST_REMARKS - len(said)]:
-            said.add(text)
+        for text in sorted(set(robot.mismatches()) - logged)[: MOST_REMARKS - len(logged)]:
+            logged.add(text)
             log.warning("%s", text)
         now = time.monotonic()
         if (span := now - then) > 0.5 * period:  # the last one may be too short

@@ -1,4 +1,4 @@
-"""Faults as lines of standard input, while an emulator runs."""
+"""Read faults as lines of standard input, while an emulator runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_faults(inject: Callable[[str], None], request: StopRequest) -> None:
 def _read(inject: Callable[[str], None], request: StopRequest) -> None:
     # not sys.stdin: a daemon thread inside a buffered reader can crash the interpreter's exit
     pending = b""
-    while data := _more():
+    while data := _read_chunk():
         *lines, pending = (pending + data).split(b"\n")
         for line in lines:
             if not line.strip():
@@ -44,7 +44,7 @@ def _read(inject: Callable[[str], None], request: StopRequest) -> None:
     request.set()
 
 
-def _more() -> bytes:
+def _read_chunk() -> bytes:
     try:
         return os.read(0, 4096)
     except OSError:  # a terminal that went away is an end of input, too

@@ -41,7 +41,7 @@ class Target:
 
     :param make: the next input.
     :param run: parses one; raises what is a finding, or one of ``allowed``.
-    :param allowed: errors that say that the input is not what it should be.
+    :param allowed: errors that reject an invalid input.
     """
 
     make: Callable[[], Any]

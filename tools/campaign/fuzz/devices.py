@@ -182,7 +182,7 @@ def _answer_a_broadcast_ping(bus: Bus, now: float) -> None:
     bus.receive(packet(dxl.BROADCAST_ID, Instruction.PING, b""), now)
     answers = bus.due(now + 1.0)
     found = dxl.PacketParser().feed(answers)
-    assert any(p.is_status for p in found), "nobody answers a broadcast ping"
+    assert any(p.is_status for p in found), "no servo answers a broadcast ping"
 
 
 # --- M4010
@@ -211,7 +211,7 @@ def _motor_frame(case: Inputs) -> bytes:
     number = rnd.choice((0, 1, 2, 15))
     mode = number | rnd.choice((0, 1, 1, 1, 2, 5, 6, 7)) << 4 | rnd.choice((0, 0x80))
     body = b"\xfe\xee" + bytes((mode, rnd.randrange(256)))
-    if rnd.random() < 0.1:  # a calibration is told by these
+    if rnd.random() < 0.1:  # these select a calibration
         body += struct.pack("<h", -0x400)
     else:
         body += case.number_of(2).to_bytes(2, "little")

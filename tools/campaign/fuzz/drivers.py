@@ -250,7 +250,9 @@ class _HostileBackend:
         self._case, self._mcu = case, mcu
         self.honest = True
 
-    def exchange(self, handle: Any, out: int, data: bytes, into: int, room: int, *ms: int) -> bytes:
+    def exchange(
+        self, handle: Any, out: int, data: bytes, into: int, limit: int, *ms: int
+    ) -> bytes:
         rnd = self._case.random
         answer = self._mcu.exchange(data)
         if not self.honest and rnd.random() < 0.1:
@@ -259,7 +261,7 @@ class _HostileBackend:
             )
         if answer is None:
             raise USBError("fuzz", errno=errno.ETIMEDOUT)
-        return answer if self.honest else _spoilt(rnd, answer, _sealed_state)[:room]
+        return answer if self.honest else _spoilt(rnd, answer, _sealed_state)[:limit]
 
     def bulk_read(self, *arguments: Any) -> int:
         raise USBError("fuzz", errno=errno.ETIMEDOUT)

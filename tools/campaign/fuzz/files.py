@@ -125,7 +125,7 @@ def _greedy(rng: random.Random, scratch: Path) -> Target:
 
 
 def _flips(rng: random.Random, scratch: Path) -> Target:
-    """One byte of a recording of dexkit's own changed: read as it was, or told."""
+    """One byte of a recording of dexkit's own changed: read as it was, or reported as damage."""
     kind = rng.choice(("none", "zstd"))
     good = _own(scratch / "own.mcap", kind, rng)
     path = scratch / "x.mcap"
@@ -140,10 +140,12 @@ def _flips(rng: random.Random, scratch: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        found, told = content(path)
-        if found != wanted and not told:
+        found, damage = content(path)
+        if found != wanted and not damage:
             at = next(i for i, (a, b) in enumerate(zip(data, good, strict=True)) if a != b)
-            raise Difference(f"byte {at} of {len(good)} ({kind}) changes what is read, untold")
+            raise Difference(
+                f"byte {at} of {len(good)} ({kind}) changes what is read without a report"
+            )
 
     return Target(make, run)
 

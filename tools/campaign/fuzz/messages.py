@@ -82,7 +82,7 @@ def _cdr(name: str) -> Callable[[random.Random, Path], Target]:
 
 
 def _columns(rng: random.Random, scratch: Path) -> Target:
-    """Columns of ten samples must say what decoding one by one says."""
+    """Columns of ten samples must equal decoding one by one."""
     name = rng.choice([m.name for m in message_types()])
     kind = message_type(name)
     good = _samples(name, rng)
@@ -266,7 +266,7 @@ def _rtps_packet(rng: random.Random, scratch: Path) -> Target:
 
 
 def _rtps_announcement(rng: random.Random, scratch: Path) -> Target:
-    """As far as the doctor takes it: who the participant says that it is."""
+    """Parse an announcement as the doctor does, with the name of the participant."""
 
     def run(data: bytes) -> None:
         found = rtps.parse_participant(data)
@@ -381,7 +381,7 @@ def cases() -> list[FuzzCase]:
         FuzzCase("robot.g1", "a command to the emulated G1", _robot("g1"), size=15_000, aim=slow),
         FuzzCase("rtps.packet", "RTPS packets as the doctor reads them", _rtps_packet,
                  size=40_000, aim=4_000_000, weight=2.0),
-        FuzzCase("rtps.announcement", "an announcement, and who it says it is",
+        FuzzCase("rtps.announcement", "an announcement, and the name in it",
                  _rtps_announcement, size=15_000, aim=1_000_000),
         FuzzCase("rtps.observer", "the doctor's observer", _observer, size=15_000, aim=1_000_000),
         FuzzCase("schema.ros2msg", "schemas of recordings", _schema("ros2msg"), size=1_500,

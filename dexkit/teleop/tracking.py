@@ -1,4 +1,4 @@
-"""What an operator would feel: figures from where a hand was and where it was wanted.
+"""Compute how a hand follows its goal: stroke time, reaction, lag, overshoot and error.
 
 - *stroke*: seconds from 5 to 95 % of the whole stroke, from steps over two fifths of it or more;
   of a step that goes less far, what the whole would take at the same mean speed.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 
-__all__ = ["FROM", "TO", "Feel", "Step", "feel", "steps_of"]
+__all__ = ["FROM", "TO", "Step", "TrackingFigures", "steps_of", "tracking_figures"]
 
 FROM, TO = 0.05, 0.95
 """Parts of a stroke between which its time is taken."""
@@ -65,7 +65,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Feel:
+class TrackingFigures:
     """The figures of one joint: the worst of its steps. NaN where there was no occasion.
 
     :param stroke_s: the slowest stroke, seconds; ``stroke_mean_s`` the mean of all.
@@ -87,7 +87,7 @@ class Feel:
         return {name: float(v) for name, v in found.items() if not math.isnan(v)}
 
 
-def feel(
+def tracking_figures(
     t: Floats,
     q: Floats,
     wanted: Callable[[float], float | None],
@@ -95,7 +95,7 @@ def feel(
     *,
     begin: float | None = None,
     end: float | None = None,
-) -> Feel:
+) -> TrackingFigures:
     """The figures of one joint.
 
     :param t: seconds of each state, ascending, shape (n,).
@@ -107,30 +107,30 @@ def feel(
     good = np.isfinite(q)
     t, q = t[good], q[good]
     if len(t) < 2:
-        return Feel()
+        return TrackingFigures()
     first = float(t[0]) if begin is None else max(begin, float(t[0]))
     last = float(t[-1]) if end is None else min(end, float(t[-1]))
     grid: Floats = np.asarray(np.arange(first, last, GRID))
     if len(grid) < 2:
-        return Feel()
+        return TrackingFigures()
     goal: Floats = np.array([math.nan if (x := wanted(float(g))) is None else x for g in grid])
     position: Floats = q[np.searchsorted(t, grid, "right") - 1]
     steps = steps_of(grid, position, goal, stroke)
     strokes = [s.stroke_s for s in steps if not math.isnan(s.stroke_s)]
     lag, rms = _lag(grid, position, goal, stroke)
-    return Feel(
+    return TrackingFigures(
         stroke_s=max(strokes, default=math.nan),
         stroke_mean_s=sum(strokes) / len(strokes) if strokes else math.nan,
-        reaction_s=_worst([s.reaction_s for s in steps]),
-        overshoot=_worst([s.overshoot for s in steps]),
-        stuck=_worst([s.stuck for s in steps]),
+        reaction_s=_maximum([s.reaction_s for s in steps]),
+        overshoot=_maximum([s.overshoot for s in steps]),
+        stuck=_maximum([s.stuck for s in steps]),
         lag_s=lag,
         lag_rms=rms,
         steps=tuple(steps),
     )
 
 
-def _worst(values: Sequence[float]) -> float:
+def _maximum(values: Sequence[float]) -> float:
     return max((v for v in values if not math.isnan(v)), default=math.nan)
 
 
@@ -205,7 +205,7 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
     jumps = ~(change <= _STEADY * GRID * stroke)
     moves = change > 1e-6 * stroke
     # only what depends on a steady motion whatever the lag is: its past, as far back as the search
-    use = np.flatnonzero(~_lately(jumps, back) & _lately(moves, back))
+    use = np.flatnonzero(~_any_of_last(jumps, back) & _any_of_last(moves, back))
     use = use[use >= back]
     if len(use) * GRID < _LAG_LEAST:
         return math.nan, math.nan
@@ -219,7 +219,7 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
     return best
 
 
-def _lately(where: NDArray[np.bool_], points: int) -> NDArray[np.bool_]:
+def _any_of_last(where: NDArray[np.bool_], points: int) -> NDArray[np.bool_]:
     """Whether it was so at any of the last points, this one included."""
     count = np.concatenate(([0], np.cumsum(where)))
     at = np.arange(1, len(count))
