@@ -400,8 +400,8 @@ def test_a_hand_that_somebody_has_is_said_and_nothing_stays_open(
     connections = []
     connect = socket.create_connection
 
-    def noting(*arguments: Any) -> socket.socket:
-        connections.append(connect(*arguments))
+    def noting(*arguments: Any, **more: Any) -> socket.socket:
+        connections.append(connect(*arguments, **more))
         return connections[-1]
 
     monkeypatch.setattr(socket, "create_connection", noting)
