@@ -26,7 +26,7 @@ import stat
 import struct
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from mcap.records import ChunkIndex
@@ -40,10 +40,11 @@ __all__ = ["ChunkIndexes", "RecordingFile"]
 _PART = ".part"
 _CREATE = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
 _BESIDE = _CREATE | os.O_NOFOLLOW | os.O_NONBLOCK
-# records of a recording that ended before its first message
+# Records of a recording that ended before its first message
 _BEFORE_MESSAGES = frozenset({Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA})
 _BLOCK = 1 << 20
 _RETRIES = (0.001, 0.01, 0.05)  # seconds; a look at a lock takes microseconds
+_LONGER = (0.1, 0.2)  # seconds, for a lock that another program gives up after _RETRIES
 
 
 class RecordingFile:
@@ -100,10 +101,7 @@ class RecordingFile:
             return
         self._refuse_company(self._part)
         if existing is None:
-            self._fd = os.open(
-                self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
-            )
-            self._lock(self._fd, fcntl.LOCK_EX)
+            self._fd = self._open_new()
             return
         self._refuse_company(self._target)
         fd = self._open_beside()
@@ -127,6 +125,21 @@ class RecordingFile:
             os.close(fd)
             raise
         self._fd, self._hidden = fd, True
+
+    def _open_new(self) -> int:
+        """Create the file. Another recorder may have seen it before it was locked."""
+        fd = os.open(self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            self._lock(fd, fcntl.LOCK_EX)
+            # Who is to replace this file locks its own before it looks at this one's lock. If it
+            # looked too early, it goes on; else it is refused, and gives up within _RETRIES.
+            self._refuse_company(self._part, (*_RETRIES, *_LONGER))
+        except BaseException:
+            if self._is_at(self._target, fd):
+                self._target.unlink()
+            os.close(fd)
+            raise
+        return fd
 
     def _open_device(self) -> int:
         """Open what is no file. A pipe that nobody reads is refused, not waited for."""
@@ -154,8 +167,8 @@ class RecordingFile:
                 raise
         raise UsageError(f"{self._part} is not a file", hint="rename it or delete it")
 
-    def _lock(self, fd: int, how: int) -> None:
-        for pause in (*_RETRIES, None):
+    def _lock(self, fd: int, how: int, pauses: Sequence[float] = _RETRIES) -> None:
+        for pause in (*pauses, None):
             try:
                 fcntl.flock(fd, how | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -167,12 +180,12 @@ class RecordingFile:
             else:
                 return
 
-    def _refuse_company(self, path: Path) -> None:
+    def _refuse_company(self, path: Path, pauses: Sequence[float] = _RETRIES) -> None:
         """Raise if another recorder writes to ``path``."""
         with contextlib.suppress(FileNotFoundError, PermissionError):
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
             try:
-                self._lock(fd, fcntl.LOCK_SH)
+                self._lock(fd, fcntl.LOCK_SH, pauses)
             finally:
                 os.close(fd)  # and with it the lock
 
