@@ -267,7 +267,7 @@ class RecordingFile:
         data, self._buffer, self._buffered = b"".join(self._buffer), [], 0
         if not data:
             return
-        self._look()
+        self._notice_changes()
         view = memoryview(data)
         done = 0
         try:
@@ -283,7 +283,7 @@ class RecordingFile:
         if self._regular:
             self._changed_ns = os.fstat(self._fd).st_mtime_ns
 
-    def _look(self) -> None:
+    def _notice_changes(self) -> None:
         """Remember whether another program has written to the file."""
         if self._regular and self._size and not self._touched:
             self._touched = os.fstat(self._fd).st_mtime_ns != self._changed_ns
@@ -317,7 +317,7 @@ class RecordingFile:
 
         :raises TraceError: another program has written into it.
         """
-        self._look()
+        self._notice_changes()
         if not self._touched:
             return
         crc = at = 0
