@@ -30,10 +30,10 @@ from benchmarks import Result
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import Server, parse_server
 from dexkit.drivers.dex3_usb.link import UsbLink
-from dexkit.drivers.dex3_usb.usbip import UsbIpBackend
 from dexkit.emulators.dex3_mcu import Server as UsbIpServer
 from dexkit.emulators.dex3_mcu import emulated_dex3
 from dexkit.hand import HandCommand, Side
+from dexkit.usbip import UsbIpBackend
 from dexkit.wire.dex3_usb import COMMAND_1234, PRODUCT_ID, STATE, VENDOR_ID
 
 _SECONDS = 3.0

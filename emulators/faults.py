@@ -319,6 +319,6 @@ class FaultSchedule:
                     self._ends.append((time + fault.duration, fault))
                     self._ends.sort(key=lambda entry: entry[0])
 
-    def of(self, kind: str) -> list[Fault]:
+    def active_of(self, kind: str) -> list[Fault]:
         """The active faults of a kind."""
         return [fault for fault in self.active if fault.kind == kind]

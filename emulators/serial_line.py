@@ -131,7 +131,7 @@ class SerialLine(ABC):
 
     def _plug(self) -> None:
         """Take note of an ``unplug`` that began or ended; what was on its way is lost."""
-        self.unplugged = bool(self.schedule.of("unplug"))
+        self.unplugged = bool(self.schedule.active_of("unplug"))
         self._out.clear()
 
     def _failed(self, error: Exception, message: object) -> None:
@@ -146,16 +146,16 @@ class SerialLine(ABC):
         chance = self._random.random
         end = begin + len(data) * BITS_PER_BYTE / rate if self.line_time else begin
         self._line_free = max(self._line_free, end)
-        if any(chance() < fault["p"] for fault in self.schedule.of("drop")):
+        if any(chance() < fault["p"] for fault in self.schedule.active_of("drop")):
             self.counters.dropped += 1
             return
-        if any(chance() < fault["p"] for fault in self.schedule.of("corrupt")):
+        if any(chance() < fault["p"] for fault in self.schedule.active_of("corrupt")):
             self.counters.corrupted += 1
             bit = self._random.randrange(8 * len(data))
             spoilt = bytearray(data)
             spoilt[bit // 8] ^= 1 << bit % 8
             data = bytes(spoilt)
-        late = sum(f["ms"] * 1e-3 for f in self.schedule.of("delay") if chance() < f["p"])
+        late = sum(f["ms"] * 1e-3 for f in self.schedule.active_of("delay") if chance() < f["p"])
         if late:
             self.counters.delayed += 1
         if not self.line_time:

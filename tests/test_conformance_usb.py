@@ -397,8 +397,8 @@ def test_device_in_use_is_an_error_and_connections_are_closed(
     connections = []
     connect = socket.create_connection
 
-    def noting(*arguments: Any) -> socket.socket:
-        connections.append(connect(*arguments))
+    def noting(*arguments: Any, **more: Any) -> socket.socket:
+        connections.append(connect(*arguments, **more))
         return connections[-1]
 
     monkeypatch.setattr(socket, "create_connection", noting)

@@ -26,7 +26,6 @@ from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb, Server, backend, disc
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.drivers.dex3_usb.link import UsbLink
 from dexkit.drivers.dex3_usb.settings import from_options, parse_places
-from dexkit.drivers.dex3_usb.usbip import _Connection
 from dexkit.errors import (
     HandError,
     HandLost,
@@ -37,6 +36,7 @@ from dexkit.errors import (
 )
 from dexkit.hand import HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
+from dexkit.usbip import Connection
 from dexkit.wire.dex3_usb import (
     COMMAND_734,
     COMMAND_1234,
@@ -90,7 +90,7 @@ def fake_hand(fake: FakeBackend, monkeypatch: pytest.MonkeyPatch) -> Dex3Usb:
     return Dex3Usb(Side.LEFT, QUICK)
 
 
-def _to_the_deadline(connection: _Connection, deadline: float) -> float:
+def _to_the_deadline(connection: Connection, deadline: float) -> float:
     return max(1e-3, deadline - time.monotonic())
 
 
@@ -498,7 +498,7 @@ class TestOpening:
         device = RawDevice(lambda data: [])
         with serving(device) as server:
             hand = hand_on(server, SHORT)
-            waits = waits_of(monkeypatch, _Connection, "_fill", _to_the_deadline)
+            waits = waits_of(monkeypatch, Connection, "_fill", _to_the_deadline)
             with pytest.raises(HandTimeout, match="does not answer") as caught:
                 hand.open()
             assert sum(waits) < 1.0
@@ -939,7 +939,7 @@ class TestTroubleOnTheWay:
             hand = hand_on(server, SHORT)
             hand.open()
             hand.exchange(GO)
-            waits = waits_of(monkeypatch, _Connection, "_fill", _to_the_deadline)
+            waits = waits_of(monkeypatch, Connection, "_fill", _to_the_deadline)
             for _ in range(3):
                 waits.clear()
                 with pytest.raises(HandTimeout):
@@ -969,12 +969,12 @@ class TestUsbIpClient:
             struct.pack(">IIIIIiiiii8x", command, seq, 0, 0, 0, status, len(data), 0, 0, 0) + data
         )
 
-    def connected(self) -> tuple[_Connection, socket.socket]:
+    def connected(self) -> tuple[Connection, socket.socket]:
         client, server = socket.socketpair()
         server.settimeout(PATIENCE)
-        return _Connection(client, 0x10002), server
+        return Connection(client, 0x10002), server
 
-    def exchange(self, connection: _Connection, timeout: int = 50) -> tuple[int, int, bytes]:
+    def exchange(self, connection: Connection, timeout: int = 50) -> tuple[int, int, bytes]:
         return connection.exchange(2, b"command", 1, 64, timeout, timeout)
 
     def test_replies_in_pieces_and_in_either_order(self) -> None:
@@ -1000,7 +1000,7 @@ class TestUsbIpClient:
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         connection, server = self.connected()
-        waits = waits_of(monkeypatch, _Connection, "_fill", _to_the_deadline)
+        waits = waits_of(monkeypatch, Connection, "_fill", _to_the_deadline)
         with pytest.raises(USBTimeoutError):
             self.exchange(connection, 20)
         assert sum(waits) < 0.05

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dexkit.backoff import Backoff
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.emulators.dex3_mcu import Dex3Hands, emulated_dex3
@@ -20,7 +21,7 @@ from dexkit.errors import HandError, HandLost, HandNotFound, HandTimeout
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
-from dexkit.service import Backoff, HandService
+from dexkit.service import HandService
 from tests.patience import PATIENCE
 from tests.service_helpers import FakeNode, wait_until
 

@@ -14,11 +14,11 @@ from types import SimpleNamespace
 import pytest
 from usb.core import USBError, USBTimeoutError
 
+from dexkit import usbip
 from dexkit.drivers.dex1_serial.line import acquire
-from dexkit.drivers.dex3_usb import usbip
-from dexkit.drivers.dex3_usb.usbip import UsbIpBackend, _Connection
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.errors import HandError, HandRefused, HandTimeout
+from dexkit.usbip import Connection, UsbIpBackend
 from dexkit.wire import m4010
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dynamixel import status
@@ -131,7 +131,7 @@ def test_usbip_client_times_out_under_a_flood() -> None:
                 pass
 
     threads = [threading.Thread(target=f, daemon=True) for f in (flood, drain)]
-    connection = _Connection(near, 2)
+    connection = Connection(near, 2)
     for thread in threads:
         thread.start()
     try:

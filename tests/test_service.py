@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import pytest
 
+from dexkit.backoff import Backoff
 from dexkit.clock import ManualClock
 from dexkit.errors import (
     BackendBroken,
@@ -23,7 +24,7 @@ from dexkit.errors import (
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go, unitree_hg
 from dexkit.models import dialect
-from dexkit.service import Backoff, HandService, diagnose
+from dexkit.service import HandService, diagnose
 from tests.service_helpers import FakeEndpoint, FakeNode, FakeWriter, ScriptedHand, wait_until
 
 CMD, STATE = dialect("unitree_go").topics(Side.LEFT)

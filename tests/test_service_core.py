@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dexkit.backoff import Backoff
 from dexkit.clock import ManualClock
 from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
-from dexkit.service.core import Backoff, Estimation, HandCore
+from dexkit.service.core import Estimation, HandCore
 from tests.each import each
 
 TIMEOUT = DEX1_1.command_timeout

@@ -15,6 +15,8 @@ import stat
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -27,7 +29,7 @@ from numpy.typing import NDArray
 from dexkit.errors import TraceUnreadable
 from dexkit.messages.packed import rows_at
 from dexkit.traces import records
-from dexkit.traces.records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema
+from dexkit.traces.records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema, walk
 from dexkit.traces.summary import Found, Summary, contradictions
 
 __all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "Segment"]
@@ -53,7 +55,7 @@ _MAX_RESUMED = 1000
 _MAX_ODD = 100
 _MAX_TOLD = 50
 
-_INDEX = struct.Struct("<BQHI")
+_INDEX = struct.Struct("<HI")  # channel, bytes of its entries
 HEADS = np.dtype(
     {
         "names": ["opcode", "length", "channel", "sequence", "log", "publish"],
@@ -196,11 +198,12 @@ class Container:
         if magic != MAGIC and not close:
             raise TraceUnreadable(f"{self.path} is not an mcap file", hint=_guess(magic))
         at = len(MAGIC)
-        opcode, length = self._head(file, at) or (0, 0)
-        end = at + HEAD.size + length
-        if opcode == Opcode.HEADER and length <= _MAX_RECORD and end <= self._size:
+        opcode, _, end = next(self._records(file, at), (0, at, at))
+        body = at + HEAD.size
+        if opcode == Opcode.HEADER and end - body <= _MAX_RECORD and end <= self._size:
             try:
-                self.profile, self.library = records.header(file.read(length))
+                file.seek(body)
+                self.profile, self.library = records.header(file.read(end - body))
                 if close:
                     self.hurt("the first 8 bytes are not quite those of an mcap file")
                 if end == self._size or self._is_record(file, end) or not self._closed(file):
@@ -221,14 +224,9 @@ class Container:
         file.seek(max(0, self._size - len(MAGIC)))
         return file.read() == MAGIC
 
-    def _head(self, file: BinaryIO, at: int) -> tuple[int, int] | None:
-        """Opcode and length of the record at ``at``."""
-        file.seek(at)
-        head = file.read(HEAD.size)
-        if len(head) < HEAD.size:
-            return None
-        opcode, length = HEAD.unpack(head)
-        return int(opcode), int(length)
+    def _records(self, file: BinaryIO, at: int) -> Iterator[tuple[int, int, int]]:
+        """The records from ``at`` on; see :func:`~dexkit.traces.records.walk`."""
+        return walk(partial(_read_at, file), at, self._size)
 
     def _walk(self, file: BinaryIO, at: int) -> None:
         size = self._size
@@ -236,22 +234,23 @@ class Container:
         finished = False
         sure = at  # from here on a record may begin that was missed
         resumed = 0
-        while (head := self._head(file, at)) is not None:
-            opcode, length = head
-            end = at + HEAD.size + length
-            odd = not _is_possible(opcode, length)
+        found = self._records(file, at)
+        while (record := next(found, None)) is not None:
+            opcode, at, end = record
+            odd = not _is_possible(opcode, end - at - HEAD.size)
             if odd or end > size:
                 if not odd and opcode == Opcode.CHUNK:
                     cut = self._add_chunk(file, at, end)
                     if cut > at:  # its own lengths say where it ends
                         at = sure = cut
+                        found = self._records(file, at)
                         continue
                     if cut == size or not self._closed(file):
                         break
-                found = None
+                behind = None
                 if resumed < _MAX_RESUMED and self._data_end is None:
-                    found = self._resume(file, max(sure, at + 1 if odd else at + HEAD.size))
-                if found is None:
+                    behind = self._resume(file, max(sure, at + 1 if odd else at + HEAD.size))
+                if behind is None:
                     if odd or self._closed(file):
                         # zeros are what a file system leaves after a power cut
                         self.hurt(
@@ -259,15 +258,18 @@ class Container:
                         )
                     break
                 resumed += 1
-                self.hurt(f"nonsense at byte {at}; {found - at} bytes are lost")
+                self.hurt(f"nonsense at byte {at}; {behind - at} bytes are lost")
                 self._run = None
-                at = sure = found
+                at = sure = behind
+                found = self._records(file, at)
                 continue
             if opcode == Opcode.FOOTER:
                 finished = self._read_footer(file, at, end)
                 at = end
                 break
-            at, sure = self._take(file, opcode, length, at)
+            at, sure = self._take(file, opcode, at, end)
+            if at != end:
+                found = self._records(file, at)
         if finished:
             return
         if self._closed(file):
@@ -277,13 +279,13 @@ class Container:
         lost = f"; {size - at} bytes after the last whole record" if size > at else ""
         self.warn(f"unfinished recording: read as far as it goes{lost}")
 
-    def _take(self, file: BinaryIO, opcode: int, length: int, at: int) -> tuple[int, int]:
+    def _take(self, file: BinaryIO, opcode: int, at: int, end: int) -> tuple[int, int]:
         """Read one record, or note where it lies.
 
         :returns: (where the next one begins, from where on records may have been missed).
         """
         body = at + HEAD.size
-        end = body + length
+        length = end - body
         if opcode == Opcode.MESSAGE:
             if self._run is None or self._run.length > _RUN:
                 self._run = Segment(at, at, 0)
@@ -306,6 +308,7 @@ class Container:
             elif length > _MAX_RECORD:
                 raise BadRecord(f"it has {length} bytes")
             else:
+                file.seek(body)
                 self._read_small(opcode, file.read(length), at, end)
         except BadRecord as error:
             self.hurt(f"the record at byte {at} cannot be read ({error}) and is left out")
@@ -360,39 +363,34 @@ class Container:
         return None
 
     def _follows(self, file: BinaryIO, at: int) -> bool:
-        for _ in range(3):
-            head = self._head(file, at)
-            if head is None or head[0] == Opcode.HEADER or not _is_possible(*head):
+        """Whether three whole records, or the file's last ones, follow each other from ``at``."""
+        whole = 0
+        for opcode, begin, end in islice(self._records(file, at), 3):
+            possible = opcode != Opcode.HEADER and _is_possible(opcode, end - begin - HEAD.size)
+            if not possible or end > self._size:
                 return False
-            at += HEAD.size + head[1]
-            if at > self._size:
-                return False
-            if head[0] == Opcode.FOOTER:
-                return at + len(MAGIC) == self._size
-            if at == self._size:
+            if opcode == Opcode.FOOTER:
+                return end + len(MAGIC) == self._size
+            if end == self._size:
                 return True
-        return True
+            whole += 1
+        return whole == 3
 
     def _add_chunk(self, file: BinaryIO, at: int, end: int) -> int:
         """Note a chunk; returns its end as its own lengths have it, or 0 if it is cut short."""
         size = self._size
         body = at + HEAD.size
         file.seek(body)
-        head = file.read(records.CHUNK_HEAD.size + 16 + 8)
         try:
-            start_ns, end_ns, unpacked, crc, named = records.CHUNK_HEAD.unpack_from(head)
-            name_at = records.CHUNK_HEAD.size
-            if named > 16:
-                raise ValueError("the name of its compression is too long")
-            compression = head[name_at : name_at + named].decode()
-            (length,) = struct.unpack_from("<Q", head, name_at + named)
-        except (struct.error, ValueError) as error:
+            head = records.chunk_head(file.read(records.CHUNK_START))
+        except BadRecord as error:
             if end <= size:
                 self.hurt(f"the chunk at byte {at} has no readable header ({error}); left out")
             return end if end <= size else 0
-        offset = body + name_at + named + 8
+        offset, length, unpacked = body + head.begin, head.packed, head.size
         segment = Segment(
-            at, offset, length, end - at, compression, unpacked, crc, start_ns, end_ns
+            *(at, offset, length, end - at, head.compression, unpacked, head.crc),
+            *(head.start_ns, head.end_ns),
         )
         inner = offset + length
         if inner != end:
@@ -429,8 +427,8 @@ class Container:
         """Whether a record, or the end of the file, is there."""
         if at == self._size:
             return True
-        head = self._head(file, at)
-        return head is not None and _is_possible(*head) and at + HEAD.size + head[1] <= self._size
+        opcode, begin, end = next(self._records(file, at), (0, at, at))
+        return _is_possible(opcode, end - begin - HEAD.size) and end <= self._size
 
     def _read_message_index(self, body: bytes, at: int, end: int) -> None:
         channel_id, length = struct.unpack_from("<HI", body)
@@ -457,6 +455,7 @@ class Container:
 
     def _read_attachment(self, file: BinaryIO, at: int, end: int) -> None:
         body = at + HEAD.size
+        file.seek(body)
         about, begin = records.attachment(file.read(min(end - body, _BLOCK)))
         stop = body + begin + about.size
         if stop + 4 > end:
@@ -471,6 +470,7 @@ class Container:
 
     def _read_footer(self, file: BinaryIO, at: int, end: int) -> bool:
         """Read the last record; False if the file ends before the 8 bytes behind it."""
+        file.seek(at + HEAD.size)
         self._summary.footer = records.footer(file.read(end - at - HEAD.size))
         self._summary.end = at
         if self._size < end + len(MAGIC):
@@ -624,7 +624,7 @@ class Container:
                         self._hurt_index(segment)
                     return data, starts, heads
         found: list[int] = []
-        self._scan(data, segment, found, -1)
+        self._scan(data, segment, found)
         begins = np.array(found, dtype=np.int64)
         heads = rows_at(data, begins, HEADS.itemsize).view(HEADS)[:, 0]
         whole = data or not segment.size
@@ -678,40 +678,46 @@ class Container:
             return b""
         return data
 
-    def _scan(self, data: bytes, segment: Segment, found: list[int], stop: int) -> int:
+    def _scan(
+        self, data: bytes, segment: Segment, found: list[int], stop: int | None = None
+    ) -> int:
         """Go from record to record; where messages begin goes to ``found``.
 
-        :param stop: where to end, or -1.
-        :returns: where it ended.
+        :param stop: where to end; None for the end of the data.
+        :returns: where the last record ended.
         """
-        at, end, odd = 0, len(data), 0
-        unpack, message = HEAD.unpack_from, int(Opcode.MESSAGE)
-        try:
-            while at < end and at != stop:
-                opcode, length = unpack(data, at)
-                after = at + 9 + length
-                if after > end:
-                    raise ValueError("a record is longer than what is left")
-                if opcode == message:
-                    if length < 22:
-                        raise ValueError("a message is shorter than its head")
-                    found.append(at)
-                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._define_if(opcode, data[at + 9 : after], segment.at)
+        odd = 0
+        bad = ""
+        at = after = 0
+        for opcode, at, after in walk(data, 0, stop, messages=found):
+            if after > len(data):
+                bad = "a record is longer than what is left"
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._define_if(opcode, data[at + HEAD.size : after], segment.at)
+            elif opcode == Opcode.MESSAGE:
+                if after - at < HEADS.itemsize:
+                    bad = "a message is shorter than its head"
+            else:
+                odd += 1
+                if odd > _MAX_ODD:
+                    bad = "too many records that do not belong there"
                 else:
-                    odd += 1
-                    if odd > _MAX_ODD:
-                        raise ValueError("too many records that do not belong there")
                     self.hurt(
                         f"the chunk at byte {segment.at} holds a record of kind {opcode:#x}, which "
                         f"does not belong there, after {at} bytes"
                     )
-                at = after
-        except (struct.error, ValueError) as error:
-            if not segment.cut:
-                self.hurt(
-                    f"records of the chunk at byte {segment.at} go wrong after {at} bytes ({error})"
-                )
+            if bad:
+                break
+        if not bad:
+            at = after
+            if found and found[-1] >= after:
+                at = found[-1] + HEAD.size + HEAD.unpack_from(data, found[-1])[1]
+            if stop is None and at != len(data):
+                bad = "a record ends within its first 9 bytes"
+        if bad and not segment.cut:
+            self.hurt(
+                f"records of the chunk at byte {segment.at} go wrong after {at} bytes ({bad})"
+            )
         return at
 
 
@@ -746,6 +752,11 @@ def _fits(segment: Segment) -> bool:
 def _is_possible(opcode: int, length: int) -> bool:
     """Whether a record of that kind can have that length, outside of chunks."""
     return opcode >= records.PRIVATE or (opcode in LEAST and length >= LEAST[Opcode(opcode)])
+
+
+def _read_at(file: BinaryIO, at: int, count: int) -> bytes:
+    file.seek(at)
+    return file.read(count)
 
 
 def _crc_of(file: BinaryIO, begin: int, end: int) -> int:
@@ -802,15 +813,16 @@ def _message_index(
     data = file.read(end - begin)
     channels = [np.empty(0, np.uint16)]
     parts: list[NDArray[np.uint64]] = [np.empty(0, np.uint64)]
-    at = 0
-    while at + 15 <= len(data):
-        _, length, channel, size = _INDEX.unpack_from(data, at)
-        if at + 15 + size > len(data):
+    for _, at, _ in walk(data):
+        entry = at + HEAD.size + _INDEX.size
+        if entry > len(data):
             break  # the file has become shorter
-        part = np.frombuffer(data, "<u8", size // 8, at + 15)
+        channel, size = _INDEX.unpack_from(data, at + HEAD.size)
+        if entry + size > len(data):
+            break
+        part = np.frombuffer(data, "<u8", size // 8, entry)
         channels.append(np.full(len(part) // 2, channel, np.uint16))
         parts.append(part)
-        at += 9 + length
     entries = np.concatenate(parts)
     starts = entries[1::2].view(np.int64)
     order = np.argsort(starts, kind="stable")

@@ -180,7 +180,7 @@ class DdsRecording:
             now = time.monotonic()
             if stopping or pause is not None or now - looked >= _LOOK_EVERY:
                 looked = now
-                news |= self._look(now) or pause is not None
+                news |= self._count_losses(now) or pause is not None
                 if stopping or (news and now - noted >= _NOTE_EVERY):
                     self.recorder.add_metadata("dexkit_recorder", self.losses.metadata())
                     noted, news = now, False
@@ -190,7 +190,7 @@ class DdsRecording:
             if stopping:
                 return
 
-    def _look(self, now: float) -> bool:
+    def _count_losses(self, now: float) -> bool:
         refused: dict[str, int] = {}
         for (topic, _), reader in self._readers.items():
             if count := reader.refused:

@@ -199,7 +199,7 @@ class _TimeLine:
         """Wait for a message's time; seconds by which it is late, None when stopped."""
         clock, stop = self._clock, self._stop
         while True:
-            self._look()
+            self._notice_pause()
             left = self.start + offset - clock.now()
             if stop.is_set():
                 return None
@@ -213,7 +213,7 @@ class _TimeLine:
             else:
                 wait_until(clock, self.start + offset, spin=SPIN)
 
-    def _look(self) -> None:
+    def _notice_pause(self) -> None:
         """Notice a pause, and move what is still to come behind it."""
         away = self._watch.measure_pause()
         if away:

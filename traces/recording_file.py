@@ -26,26 +26,25 @@ import stat
 import struct
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from mcap.records import ChunkIndex
 
 from dexkit.errors import TraceError, UsageError
+from dexkit.traces import records
+from dexkit.traces.records import HEAD, MAGIC, Opcode, walk
 
 __all__ = ["ChunkIndexes", "RecordingFile"]
 
 _PART = ".part"
 _CREATE = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
 _BESIDE = _CREATE | os.O_NOFOLLOW | os.O_NONBLOCK
-_MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")  # operation code, length
-_CHUNK, _MESSAGE_INDEX, _DATA_END = 0x06, 0x07, 0x0F
-_HEADER, _SCHEMA, _CHANNEL, _METADATA = 0x01, 0x03, 0x04, 0x0C
+# Records of a recording that ended before its first message
+_BEFORE_MESSAGES = frozenset({Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA})
 _BLOCK = 1 << 20
-_CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, size, CRC, length of a string
 _RETRIES = (0.001, 0.01, 0.05)  # seconds; a look at a lock takes microseconds
-_LEAST_CHUNK = _CHUNK_HEAD.size + 8
+_LONGER = (0.1, 0.2)  # seconds, for a lock that another program gives up after _RETRIES
 
 
 class RecordingFile:
@@ -102,7 +101,7 @@ class RecordingFile:
             return
         self._refuse_company(self._part)
         if existing is None:
-            self._fd = self._create()
+            self._fd = self._open_new()
             return
         self._refuse_company(self._target)
         fd = self._open_beside()
@@ -127,14 +126,14 @@ class RecordingFile:
             raise
         self._fd, self._hidden = fd, True
 
-    def _create(self) -> int:
-        """Create a file that is not there, and lock it."""
+    def _open_new(self) -> int:
+        """Create the file. Another recorder may have seen it before it was locked."""
         fd = os.open(self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
             self._lock(fd, fcntl.LOCK_EX)
-            # before the lock another recorder may have begun to replace the new file: each locks
-            # its own file first and then examines the other's, so one of them gives way
-            self._refuse_company(self._part)
+            # Who is to replace this file locks its own before it looks at this one's lock. If it
+            # looked too early, it goes on; else it is refused, and gives up within _RETRIES.
+            self._refuse_company(self._part, (*_RETRIES, *_LONGER))
         except BaseException:
             if self._is_at(self._target, fd):
                 self._target.unlink()
@@ -168,8 +167,8 @@ class RecordingFile:
                 raise
         raise UsageError(f"{self._part} is not a file", hint="rename it or delete it")
 
-    def _lock(self, fd: int, how: int) -> None:
-        for pause in (*_RETRIES, None):
+    def _lock(self, fd: int, how: int, pauses: Sequence[float] = _RETRIES) -> None:
+        for pause in (*pauses, None):
             try:
                 fcntl.flock(fd, how | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -181,12 +180,12 @@ class RecordingFile:
             else:
                 return
 
-    def _refuse_company(self, path: Path) -> None:
+    def _refuse_company(self, path: Path, pauses: Sequence[float] = _RETRIES) -> None:
         """Raise if another recorder writes to ``path``."""
         with contextlib.suppress(FileNotFoundError, PermissionError):
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
             try:
-                self._lock(fd, fcntl.LOCK_SH)
+                self._lock(fd, fcntl.LOCK_SH, pauses)
             finally:
                 os.close(fd)  # and with it the lock
 
@@ -268,7 +267,7 @@ class RecordingFile:
         data, self._buffer, self._buffered = b"".join(self._buffer), [], 0
         if not data:
             return
-        self._look()
+        self._notice_changes()
         view = memoryview(data)
         done = 0
         try:
@@ -284,7 +283,7 @@ class RecordingFile:
         if self._regular:
             self._changed_ns = os.fstat(self._fd).st_mtime_ns
 
-    def _look(self) -> None:
+    def _notice_changes(self) -> None:
         """Remember whether another program has written to the file."""
         if self._regular and self._size and not self._touched:
             self._touched = os.fstat(self._fd).st_mtime_ns != self._changed_ns
@@ -318,7 +317,7 @@ class RecordingFile:
 
         :raises TraceError: another program has written into it.
         """
-        self._look()
+        self._notice_changes()
         if not self._touched:
             return
         crc = at = 0
@@ -351,42 +350,39 @@ class RecordingFile:
 
     def chunk_indexes(self) -> Iterator[ChunkIndex]:
         """The index of each chunk committed, made from the file itself."""
-        at, size = len(_MAGIC), self._size
         index: ChunkIndex | None = None
-        while at + _RECORD.size <= size:
-            operation, length = _RECORD.unpack(os.pread(self._fd, _RECORD.size, at))
-            end = at + _RECORD.size + length
-            if operation == _MESSAGE_INDEX and index is not None:
-                (channel,) = struct.unpack("<H", os.pread(self._fd, 2, at + _RECORD.size))
+        for opcode, at, end in walk(self._read_at, len(MAGIC), self._size):
+            if opcode == Opcode.MESSAGE_INDEX and index is not None:
+                (channel,) = struct.unpack("<H", self._read_at(at + HEAD.size, 2))
                 index.message_index_offsets[channel] = at
                 index.message_index_length += end - at
-            elif index is not None:
+                continue
+            if index is not None:
                 yield index
                 index = None
-            if operation == _CHUNK:
+            if opcode == Opcode.CHUNK:
                 index = self._chunk_index(at, end)
-            elif operation == _DATA_END:
+            elif opcode == Opcode.DATA_END:
                 return
-            at = end
         if index is not None:
             yield index
 
     def _chunk_index(self, at: int, end: int) -> ChunkIndex:
-        head = os.pread(self._fd, _LEAST_CHUNK + 16, at + _RECORD.size)
-        first, last, size, _, name_length = _CHUNK_HEAD.unpack_from(head)
-        name = head[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length]
-        (packed,) = struct.unpack_from("<Q", head, _CHUNK_HEAD.size + name_length)
+        head = records.chunk_head(self._read_at(at + HEAD.size, records.CHUNK_START))
         return ChunkIndex(
             chunk_length=end - at,
             chunk_start_offset=at,
-            compression=name.decode(),
-            compressed_size=packed,
-            message_end_time=last,
+            compression=head.compression,
+            compressed_size=head.packed,
+            message_end_time=head.end_ns,
             message_index_length=0,
             message_index_offsets={},
-            message_start_time=first,
-            uncompressed_size=size,
+            message_start_time=head.start_ns,
+            uncompressed_size=head.size,
         )
+
+    def _read_at(self, at: int, count: int) -> bytes:
+        return os.pread(self._fd, count, at)
 
 
 class ChunkIndexes:
@@ -415,14 +411,8 @@ def _status(path: Path) -> os.stat_result | None:
 
 def _is_worth_keeping(fd: int) -> bool:
     """Whether it is anything but a recording that ended before its first message."""
-    size = os.fstat(fd).st_size
-    start = os.pread(fd, len(_MAGIC), 0)
-    if not _MAGIC.startswith(start):
+    if not MAGIC.startswith(os.pread(fd, len(MAGIC), 0)):
         return True
-    at = len(_MAGIC)
-    while at + _RECORD.size <= size:
-        operation, length = _RECORD.unpack(os.pread(fd, _RECORD.size, at))
-        if operation not in (_HEADER, _SCHEMA, _CHANNEL, _METADATA):
-            return True
-        at += _RECORD.size + length
-    return False
+    size = os.fstat(fd).st_size
+    found = walk(lambda at, count: os.pread(fd, count, at), len(MAGIC), size)
+    return any(opcode not in _BEFORE_MESSAGES for opcode, _, _ in found)

@@ -1,20 +1,17 @@
 """A minimal USB host for the kit, independent of the driver.
 
-It opens a device by serial number through PyUSB and the system's libusb, or by
-``usbip://host:port[/serial]`` over USB/IP. The USB/IP client is implemented here, because a
-transfer that times out must be unlinked (CMD_UNLINK) as a kernel does it, without losing the
-connection.
+Two ways lead to a device: the system's libusb through PyUSB, for a serial number, and USB/IP
+(``usbip://host:port[/serial]``) through :mod:`dexkit.usbip`, which cancels a transfer that times
+out (CMD_UNLINK) as a kernel does it, and keeps the connection.
 """
 
 from __future__ import annotations
 
 import errno
-import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
 from dexkit.conformance.usb.record import TIMED_OUT, Descriptors
@@ -22,6 +19,9 @@ from dexkit.conformance.usb.recording import Endpoint, parse_device
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
+
+if TYPE_CHECKING:
+    from dexkit.usbip import Connection
 
 __all__ = ["UsbHost", "bulk_pair", "open_device"]
 
@@ -174,38 +174,8 @@ class _LibUsb:
 
 # ------------------------------------------------------------------------------------- USB/IP
 
-# the kernel's Documentation/usb/usbip_protocol.rst; all big endian
-_VERSION = 0x0111
-_OP = struct.Struct("!HHI")
-_DEVICE = struct.Struct("!256s32sIIIHHHBBBBBB")
-_SUBMIT = struct.Struct("!IIIIIIiiii8s")
-_UNLINK = struct.Struct("!IIIIII24x")
-_REPLY = struct.Struct("!IIIIIiiiii8x")
-_REQ_DEVLIST, _REP_DEVLIST, _REQ_IMPORT, _REP_IMPORT = 0x8005, 5, 0x8003, 3
-_CMD_SUBMIT, _CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 1, 2, 3, 4
 _OUT, _IN = 0, 1
-_NOT_ISO = 0
-
-
-@dataclass(frozen=True)
-class _Exported:
-    """One device that a server offers."""
-
-    busid: bytes
-    id: int
-    speed: int
-    vendor: int
-    product: int
-
-    @classmethod
-    def of(cls, raw: bytes) -> tuple[_Exported, int]:
-        """Decode a device and the number of interface descriptions that follow."""
-        v = _DEVICE.unpack(raw)
-        return cls(v[1], v[2] << 16 | v[3], v[4], v[5], v[6]), v[13]
-
-
-class _Gone(Exception):
-    """The server has closed the connection."""
+_PORT = 3240  # registered for USB/IP
 
 
 class _UsbIp:
@@ -214,130 +184,71 @@ class _UsbIp:
     def __init__(self, url: str, side: Side) -> None:
         parts = urlsplit(url)
         try:
-            self._address = (parts.hostname or "127.0.0.1", parts.port or 3240)
+            self._address = (parts.hostname or "127.0.0.1", parts.port or _PORT)
         except ValueError as error:
             raise ConformanceError(f"{url}: {error}") from error
         self._url, self._side = url, side
         self._serial = parts.path.strip("/")
-        self._socket = socket.socket()  # until it is connected
+        self._connection: Connection | None = None
         self._open()
 
     def _open(self) -> None:
+        from dexkit.usbip import UsbIpBackend
+
+        backend = UsbIpBackend(*self._address, _TIMEOUT)
         try:
-            offered = list(self._offered())
-            mine = [
-                e for e in offered if (e.vendor, e.product) == (VENDOR_ID, PRODUCT_ID[self._side])
-            ]
+            offered = backend.enumerate_devices()
+            product = PRODUCT_ID[self._side]
+            mine = [d for d in offered if (d.id_vendor, d.id_product) == (VENDOR_ID, product)]
             if self._serial or not mine:
-                mine = [e for e in offered if e.vendor == VENDOR_ID]
-            offers = ", ".join(f"{e.vendor:04x}:{e.product:04x}" for e in offered)
-            for exported in mine:
-                self._attach(exported)
+                mine = [d for d in offered if d.id_vendor == VENDOR_ID]
+            offers = ", ".join(f"{d.id_vendor:04x}:{d.id_product:04x}" for d in offered)
+            for device in mine:
+                self._connection = backend.open_device(device)
+                self._describe(device.speed)
                 if not self._serial or parse_device(self.descriptors).serial == self._serial:
                     return
-                self._socket.close()
+                self.close()
             _first([], self._url, self._side, offers)
         except ConformanceError:
             self.close()
             raise
-        except (OSError, _Gone, struct.error) as error:
+        except OSError as error:
             self.close()
+            busy = error.errno == errno.EBUSY
+            why = "refused" if busy else error.__cause__ or error.strerror or error
             raise ConformanceError(
-                f"{self._url}: {error or 'the server has closed the connection'}",
-                hint="is the server running, and is the hand not attached elsewhere?",
+                f"{self._url}: {why}",
+                hint="somebody else may have attached it"
+                if busy
+                else "is the server running, and is the hand not attached elsewhere?",
             ) from error
 
-    def _connect(self, request: int, reply: int, data: bytes = b"") -> None:
-        self._socket = socket.create_connection(self._address, _TIMEOUT)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._buffer = bytearray()
-        self._socket.sendall(_OP.pack(_VERSION, request, 0) + data)
-        _, code, status = _OP.unpack(self._take(_OP.size, None))
-        if code != reply or status:
-            raise ConformanceError(
-                f"{self._url}: refused (status {status})",
-                hint="another program may have attached it",
-            )
-
-    def _offered(self) -> Iterator[_Exported]:
-        self._connect(_REQ_DEVLIST, _REP_DEVLIST)
-        try:
-            for _ in range(struct.unpack("!I", self._take(4, None))[0]):
-                exported, interfaces = _Exported.of(self._take(_DEVICE.size, None))
-                self._take(4 * interfaces, None)
-                yield exported
-        finally:
-            self._socket.close()
-
-    def _attach(self, exported: _Exported) -> None:
-        self._connect(_REQ_IMPORT, _REP_IMPORT, exported.busid)
-        self._device, _ = _Exported.of(self._take(_DEVICE.size, None))
-        self._sequence = 0
-
+    def _describe(self, speed: int) -> None:
         def get(value: int, index: int, length: int) -> bytes:
             setup = struct.pack("<BBHHH", 0x80, 6, value, index, length)
             return self._transfer(_IN, 0, b"", length, _TIMEOUT, setup)[1]
 
         self._transfer(_OUT, 0, b"", 0, _TIMEOUT, struct.pack("<BBHHH", 0, 9, 1, 0, 0))
-        self.descriptors = _describe(get, self._device.speed)
-
-    def _take(self, size: int, end: float | None) -> bytes:
-        """Receive a number of bytes; after ``TimeoutError`` the next call goes on from there.
-
-        :param end: monotonic time to wait until, None for the usual time-out.
-        """
-        end = time.monotonic() + _TIMEOUT if end is None else end
-        while len(self._buffer) < size:
-            self._socket.settimeout(max(1e-4, end - time.monotonic()))
-            data = self._socket.recv(65536)
-            if not data:
-                raise _Gone
-            self._buffer += data
-        taken = bytes(self._buffer[:size])
-        del self._buffer[:size]
-        return taken
-
-    def _receive(self, end: float | None) -> tuple[int, int, int, bytes]:
-        """One reply: command, sequence number, status, data."""
-        while len(self._buffer) < _REPLY.size:
-            head = self._take(_REPLY.size, end)
-            self._buffer[:0] = head
-        command, sequence, _, _, _, status, length, *_ = _REPLY.unpack_from(self._buffer)
-        coming = length if command == _RET_SUBMIT and sequence in self._inward else 0
-        whole = self._take(_REPLY.size + coming, end)
-        return command, sequence, status, whole[_REPLY.size :]
+        self.descriptors = _describe(get, speed)
 
     def _transfer(
         self, direction: int, endpoint: int, data: bytes, length: int, timeout: float, setup: bytes
     ) -> tuple[int, bytes]:
-        self._sequence += 1
-        mine = self._sequence
-        self._inward = {mine} if direction == _IN else set()
-        head = (_CMD_SUBMIT, mine, self._device.id, direction, endpoint)
-        try:
-            self._socket.settimeout(_TIMEOUT)
-            self._socket.sendall(_SUBMIT.pack(*head, 0, length, 0, _NOT_ISO, 0, setup) + data)
-            try:
-                _, _, status, came = self._receive(time.monotonic() + timeout)
-                return status, came
-            except TimeoutError:
-                return self._take_back(mine, endpoint)
-        except (_Gone, OSError):
+        if self._connection is None:
             return -errno.ENODEV, b""
-
-    def _take_back(self, mine: int, endpoint: int) -> tuple[int, bytes]:
-        """Unlink a transfer that has timed out; it may have ended meanwhile."""
-        self._sequence += 1
-        number = self._sequence
-        self._socket.settimeout(_TIMEOUT)
-        self._socket.sendall(_UNLINK.pack(_CMD_UNLINK, number, self._device.id, 0, endpoint, mine))
-        result: tuple[int, bytes] = (TIMED_OUT, b"")
-        while True:
-            command, sequence, status, data = self._receive(None)
-            if command == _RET_UNLINK and sequence == number:
-                return result
-            if command == _RET_SUBMIT and sequence == mine:
-                result = (status, data)
+        try:
+            return self._connection.submit(
+                direction=direction,
+                ep=endpoint,
+                setup=setup,
+                transfer_buffer_length=length,
+                out_payload=data,
+                timeout_ms=max(1, round(timeout * 1000)),
+                settle_ms=round(_TIMEOUT * 1000),
+            )
+        except OSError as error:
+            return (TIMED_OUT if error.errno == errno.ETIMEDOUT else -errno.ENODEV), b""
 
     def write(self, endpoint: int, data: bytes, timeout: float) -> int:
         return self._transfer(_OUT, endpoint & 15, data, len(data), timeout, bytes(8))[0]
@@ -357,7 +268,8 @@ class _UsbIp:
                 time.sleep(0.05)
 
     def close(self) -> None:
-        self._socket.close()
+        if self._connection is not None:
+            self._connection.close()
 
 
 def bulk_pair(descriptors: Descriptors) -> tuple[Endpoint, Endpoint] | None:

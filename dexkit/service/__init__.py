@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from dexkit.service.core import Backoff, Estimation, HandCore
+from dexkit.service.core import Estimation, HandCore
 from dexkit.service.counters import HandCounters, TopicCounters
 from dexkit.service.diagnose import diagnose
 from dexkit.service.dialects import DialectMap, Fill, Remark, StateView, dialect_map
@@ -18,7 +18,6 @@ from dexkit.service.realtime import prepare_process, real_time
 from dexkit.service.service import HandService
 
 __all__ = [
-    "Backoff",
     "DialectMap",
     "Estimation",
     "Fill",

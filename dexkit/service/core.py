@@ -36,7 +36,7 @@ from dexkit.service.counters import HandCounters
 from dexkit.service.dialects import StateView
 from dexkit.service.estimator import StateEstimator
 
-__all__ = ["Backoff", "Estimation", "HandCore"]
+__all__ = ["Estimation", "HandCore"]
 
 _PATIENCE = 0.5  # seconds of failed exchanges before the link is given up
 _STALE = 0.25  # seconds beyond the expected exchange before a state counts as stale
@@ -55,25 +55,6 @@ class Estimation(str, Enum):
     AUTO = "auto"
     OFF = "off"
     PREDICT = "predict"
-
-
-class Backoff:
-    """Growing delays between attempts: ``first``, twice that, ... up to ``maximum`` seconds."""
-
-    def __init__(self, first: float = 0.1, maximum: float = 2.0) -> None:
-        self._first = first
-        self._maximum = maximum
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin again with the shortest delay."""
-        self._next = self._first
-
-    def next(self) -> float:
-        """Seconds to wait before the next attempt."""
-        delay = self._next
-        self._next = min(2 * delay, self._maximum)
-        return delay
 
 
 class HandCore:

@@ -27,6 +27,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
+from dexkit.backoff import Backoff
 from dexkit.clock import Clock, Rate, RealClock
 from dexkit.command_age import PAUSE, PauseWatch, SampleAges
 from dexkit.errors import (
@@ -41,7 +42,7 @@ from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model
 from dexkit.models import dialect as dialect_by_name
-from dexkit.service.core import Backoff, Estimation, HandCore
+from dexkit.service.core import Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
 from dexkit.service.publisher import Publisher, align

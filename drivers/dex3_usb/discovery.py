@@ -170,7 +170,7 @@ def _on_system(seen: list[str], hints: list[str]) -> list[Candidate]:
 
 def _on_server(server: Server) -> list[Candidate]:
     # here, not above: it loads the mDNS code that comes with the package
-    from dexkit.drivers.dex3_usb.usbip import UsbIpBackend
+    from dexkit.usbip import UsbIpBackend
 
     return _candidates(UsbIpBackend(server.host, server.port), server)
 

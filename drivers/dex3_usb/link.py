@@ -265,18 +265,18 @@ class UsbLink:
     def _wait_for_late(self) -> None:
         self._drain = False
         deadline = time.monotonic() + _QUIET
-        while (self._look() is not None or self._owed) and time.monotonic() < deadline:
+        while (self._read_late() is not None or self._owed) and time.monotonic() < deadline:
             pass
 
     def _newest(self, answer: bytes) -> bytes:
         """``answer``, or the last one behind it: then ``answer`` was that to an old command."""
-        while self._owed and (following := self._look()) is not None:
+        while self._owed and (following := self._read_late()) is not None:
             answer = following
         if time.monotonic() > self._watch_until:
             self._owed = 0  # it was lost
         return answer
 
-    def _look(self) -> bytes | None:
+    def _read_late(self) -> bytes | None:
         try:
             data = self._read(_DRAIN_TIMEOUT)
         except OSError as error:

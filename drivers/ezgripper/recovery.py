@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from dexkit.backoff import Backoff
 from dexkit.hand import MotorError
 from dexkit.wire.mx64 import HardwareError
 
@@ -61,6 +62,10 @@ def describe(error: int) -> str:
 class RebootPolicy:
     """Whether a reboot is due.
 
+    It limits reboots and is not only a delay between attempts: it forgets old faults, and an
+    overheated servo must cool down first. The delays are those of a
+    :class:`~dexkit.backoff.Backoff`.
+
     :param first: seconds from a fault to its reboot.
     :param factor: how much longer each further fault waits.
     :param longest: bound of that, seconds.
@@ -75,6 +80,7 @@ class RebootPolicy:
     cool: float = 10.0
 
     def __post_init__(self) -> None:
+        self._backoff = Backoff(self.first, self.longest, self.factor)
         self._delay = self.first
         self._due = -math.inf
         self._last = -math.inf
@@ -87,9 +93,8 @@ class RebootPolicy:
     def fault(self, now: float) -> None:
         """A fault has appeared (or a reboot has not helped)."""
         if now - self._last > self.forget:
-            self._delay = self.first
-        elif self._last > -math.inf:
-            self._delay = min(self._delay * self.factor, self.longest)
+            self._backoff.reset()
+        self._delay = self._backoff.next()
         self._last = now
         self._due = now + self._delay
 

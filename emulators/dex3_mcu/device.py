@@ -173,12 +173,12 @@ class Dex3Mcu:
             self.on_stall("in" if kind == "stall" else "out")
             return
         if kind == "unplug":
-            self.plugged = not self.schedule.of("unplug")
+            self.plugged = not self.schedule.active_of("unplug")
             return
         silent, stuck, overcurrent = (
             {
                 index
-                for active in self.schedule.of(name)
+                for active in self.schedule.active_of(name)
                 for index in range(len(self._motors))
                 if active.device in (None, index)
             }
@@ -186,7 +186,7 @@ class Dex3Mcu:
         )
         hot = {
             index: active["c"]
-            for active in self.schedule.of("overheat")
+            for active in self.schedule.active_of("overheat")
             for index in range(len(self._motors))
             if active.device in (None, index)
         }
@@ -276,16 +276,16 @@ class Dex3Mcu:
     def _send(self, answer: bytes) -> bytes | None:
         chance = self._random.random
         counters = self.counters
-        if any(chance() < fault["p"] for fault in self.schedule.of("drop")):
+        if any(chance() < fault["p"] for fault in self.schedule.active_of("drop")):
             counters.dropped += 1
             return None
-        if any(chance() < fault["p"] for fault in self.schedule.of("corrupt")):
+        if any(chance() < fault["p"] for fault in self.schedule.active_of("corrupt")):
             counters.corrupted += 1
             bit = self._random.randrange(8 * len(answer))
             spoilt = bytearray(answer)
             spoilt[bit // 8] ^= 1 << bit % 8
             answer = bytes(spoilt)
-        late = sum(f["ms"] * 1e-3 for f in self.schedule.of("delay") if chance() < f["p"])
+        late = sum(f["ms"] * 1e-3 for f in self.schedule.active_of("delay") if chance() < f["p"])
         counters.delayed += late > 0
         counters.answers += 1
         self.late = late + self.firmware.answer_time

@@ -135,14 +135,14 @@ class Bus(SerialLine):
     def _answer(self, begin: float, data: bytes, rate: int) -> None:
         chance = self._random.random
         before = data
-        for fault in self.schedule.of("short"):
+        for fault in self.schedule.active_of("short"):
             if chance() < fault["p"]:
                 data = data[: int(fault["bytes"])]
-        for fault in self.schedule.of("stray"):
+        for fault in self.schedule.active_of("stray"):
             if chance() < fault["p"]:
                 noise = self._random.randbytes
                 data = noise(int(fault["before"])) + data + noise(int(fault["after"]))
-        pauses = [fault for fault in self.schedule.of("pause") if chance() < fault["p"]]
+        pauses = [fault for fault in self.schedule.active_of("pause") if chance() < fault["p"]]
         self.counters.spoilt += data != before or bool(pauses)
         for fault in pauses[:1]:
             first = data[: int(fault["bytes"])]

@@ -118,7 +118,7 @@ class RobotMechanics:
         self.supply = Supply(model, self.joints, settings)
         self.timeout = settings.command_timeout or model.command_timeout
         self._report = report
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._steps = FixedSteps(STEP, most=0.1)
         self._steps.restart(now)
         self._start = now
@@ -195,13 +195,13 @@ class RobotMechanics:
             self._cmd.read(data)
         except WireError as error:
             self.counters.malformed += 1
-            self._say("malformed", f"{topic}: no {self.model.cmd_type}: {error}; ignored")
+            self._report_once("malformed", f"{topic}: no {self.model.cmd_type}: {error}; ignored")
             return False
         crc, right = int(self._cmd.message["crc"][0]), self._cmd.crc()
         if crc == right or (crc_may_be_unset and crc == 0):
             return True
         self.counters.bad_crc += 1
-        self._say(
+        self._report_once(
             "crc",
             f"{topic}: the CRC is 0x{crc:08X} and should be 0x{right:08X}; such commands are "
             "ignored" + (" (it was never set)" if crc == 0 else ""),
@@ -213,14 +213,14 @@ class RobotMechanics:
         message, machine = self._cmd.message, self.model.mode_machine
         if machine is None:
             if (message["head"][0].tolist(), message["level_flag"][0]) != _LOW_LEVEL:
-                self._say(
+                self._report_once(
                     "head", f"{topic}: head and level_flag are not FE EF FF; obeyed all the same"
                 )
             return True
         sent = int(message["mode_machine"][0])
         if sent != machine and not self.settings.lenient:
             self.counters.bad_machine += 1
-            self._say(
+            self._report_once(
                 "machine",
                 f"{topic}: mode_machine is {sent} and should be {machine}, as in "
                 f"{self.model.state_topic}; such commands are ignored",
@@ -228,7 +228,7 @@ class RobotMechanics:
             return False
         self._mode_pr = int(message["mode_pr"][0])
         if self._mode_pr:
-            self._say(
+            self._report_once(
                 "mode_pr",
                 f"{topic}: mode_pr {self._mode_pr}: motors A and B are taken for pitch and roll",
             )
@@ -246,7 +246,7 @@ class RobotMechanics:
         if math.isfinite(number):
             return True
         self.counters.bad_number += 1
-        self._say("number", f"{topic}: NaN or infinity; such commands are ignored")
+        self._report_once("number", f"{topic}: NaN or infinity; such commands are ignored")
         return False
 
     def _known_modes(self, topic: str) -> NDArray[np.uint8]:
@@ -258,7 +258,7 @@ class RobotMechanics:
         self.counters.wrong_mode += 1
         first = int(np.argmax(~known & (mode != 0)))
         slot = self.model.used[first]
-        self._say(
+        self._report_once(
             "mode",
             f"{topic}: mode 0x{int(mode[first]):02X} for motor {slot} "
             f"({self.model.joint(slot).name}), which takes 0x{self.model.enable[slot]:02X}; "
@@ -274,9 +274,9 @@ class RobotMechanics:
             law = law.blend(self._arm_order.law, np.where(self._arm, self._arm_order.weight, 0.0))
         self._law = law
 
-    def _say(self, kind: str, text: str) -> None:
-        if kind not in self._said:
-            self._said.add(kind)
+    def _report_once(self, kind: str, text: str) -> None:
+        if kind not in self._reported:
+            self._reported.add(kind)
             self._report(text)
 
     # time
@@ -288,7 +288,7 @@ class RobotMechanics:
                 self.counters.timeouts += 1
                 topic = self._expire(order)
                 text = f"{topic}: no command for {self.timeout:g} s; its motors damp"
-                self._say(f"timeout {topic}", text)
+                self._report_once(f"timeout {topic}", text)
         for _ in range(self._steps.due(now)):
             self.joints.step(self._law)
             self._lived += 1
@@ -302,7 +302,7 @@ class RobotMechanics:
         for order in (self._order, self._arm_order):
             if order is not None:
                 self._expire(order)
-        self._say(
+        self._report_once(
             "paused",
             "this program stood still (stopped, suspended, or a machine that is too busy); the "
             "motors damp until a command comes that was sent later",

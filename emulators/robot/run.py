@@ -129,7 +129,7 @@ class EmulatedRobot:
                 hint="stop the other robot, choose another --domain, or add --force",
                 force=self._force,
             )
-            self._look(node, sole)
+            self._refuse_other_publisher(node, sole)
             claim = sole.announce()
             self._remote = node.writer(model.remote_topic, model.remote_type)
             self._writer = node.writer(model.state_topic, model.state_type, user_data=claim)
@@ -165,7 +165,7 @@ class EmulatedRobot:
             self._own_node.close()
             self._own_node = None
 
-    def _look(self, node: DdsNode, sole: SolePublisher) -> None:
+    def _refuse_other_publisher(self, node: DdsNode, sole: SolePublisher) -> None:
         """States must arrive: some clients have a writer for them, which they never use."""
         model = self.model
         with node.reader(model.state_topic, model.state_type) as reader:

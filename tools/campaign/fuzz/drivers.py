@@ -25,7 +25,6 @@ from dexkit.drivers.dex1_serial.line import MotorLine
 from dexkit.drivers.dex3_usb import hand as dex3_hand
 from dexkit.drivers.dex3_usb.discovery import Candidate
 from dexkit.drivers.dex3_usb.hand import Dex3Usb
-from dexkit.drivers.dex3_usb.usbip import UsbIpBackend, _Connection
 from dexkit.drivers.ezgripper import bus as ezgripper_bus
 from dexkit.drivers.ezgripper import gripper
 from dexkit.drivers.ezgripper.gripper import EZGripper, GripperSettings
@@ -33,6 +32,7 @@ from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.mx64 import Bus, Servo
 from dexkit.errors import DexkitError
 from dexkit.hand import HandCommand, Side
+from dexkit.usbip import Connection, UsbIpBackend
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import m4010
 from dexkit.wire.crc32 import crc32_words
@@ -329,9 +329,9 @@ def usbip_client(case: Inputs, count: int) -> None:
     for i in range(count):
         if i % 20 == 0:
             peer = _Peer(lambda data: _replies(case, data))
-            connection = _Connection(peer.near, 2)
+            connection = Connection(peer.near, 2)
 
-        def act(connection: _Connection = connection) -> None:
+        def act(connection: Connection = connection) -> None:
             with contextlib.suppress(USBError):
                 if rnd.random() < 0.5:
                     connection.exchange(2, bytes(10), 1, 1270, 2, 2)

@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from dexkit.cli.info import summary
 from dexkit.messages import message_type
 from dexkit.traces import open_trace
+from dexkit.traces.records import HEAD, walk
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
 from tools.campaign.mutate import mutator
@@ -40,7 +41,6 @@ TYPES = {
 # anything at all (types are compared with dexkit's own).
 _PER_BYTE, _PER_UNPACKED, _FIXED = 20, 2, 200_000
 
-_HEAD = struct.Struct("<BQ")
 _NUMBERS = (0, 1, 7, 8, 9, 21, 22, 255, 2**16 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**64 - 1)
 _TEXTS = (
     b"",
@@ -147,16 +147,11 @@ def content(path: Path) -> tuple[Any, bool]:
 
 
 def _records(data: bytes, at: int, end: int) -> list[tuple[int, bytes]]:
-    found = []
-    while at + 9 <= end:
-        opcode, length = _HEAD.unpack_from(data, at)
-        found.append((opcode, data[at + 9 : at + 9 + length]))
-        at += 9 + length
-    return found
+    return [(opcode, data[begin + 9 : after]) for opcode, begin, after in walk(data, at, end)]
 
 
 def _joined(found: list[tuple[int, bytes]]) -> bytes:
-    return b"".join(_HEAD.pack(opcode, len(body)) + body for opcode, body in found)
+    return b"".join(HEAD.pack(opcode, len(body)) + body for opcode, body in found)
 
 
 # -- damage without new checksums: the reader must report what is lost ----------------------------
@@ -200,11 +195,7 @@ def _move(rng: random.Random, data: bytes) -> bytes:
 def _field(rng: random.Random, data: bytes) -> bytes:
     """Another opcode, length, or eight other bytes of a record."""
     out = bytearray(data)
-    at, places = 8, []
-    while at + 9 <= len(out) - 8:
-        places.append(at)
-        at += 9 + _HEAD.unpack_from(out, at)[1]
-    at = rng.choice(places)
+    at = rng.choice([begin for _, begin, _ in walk(data, 8, len(data) - 8)])
     kind = rng.randrange(3)
     if kind == 0:
         out[at] = rng.choice((0, *range(1, 18), 0x80, 0xFF))
@@ -287,9 +278,9 @@ def _craft(rng: random.Random, data: bytes) -> bytes:
             body = struct.pack("<I", rng.choice((0, zlib.crc32(out))))
         elif opcode == 2:
             begin = summary_at if len(out) > summary_at else 0
-            head = _HEAD.pack(2, 20) + struct.pack("<QQ", begin, 0)
+            head = HEAD.pack(2, 20) + struct.pack("<QQ", begin, 0)
             body = head[9:] + struct.pack("<I", zlib.crc32(out[summary_at:] + head))
-        out += _HEAD.pack(opcode, len(body)) + body
+        out += HEAD.pack(opcode, len(body)) + body
         if opcode == 15:
             summary_at = len(out)
     return out + data[-8:]

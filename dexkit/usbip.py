@@ -1,8 +1,8 @@
-"""PyUSB over USB/IP, for a hand that is served by another process or machine.
+"""USB/IP client, a PyUSB backend: for a hand that is served by another process or machine.
 
-The client of the package ``pyusb-usbip-backend`` finds and imports devices and parses their
-descriptors; the transfers are done here, because a control loop needs of them what that client
-does not promise:
+The Dex3-1 driver and the USB conformance both use it. The package ``pyusb-usbip-backend`` lists and
+imports devices and parses their descriptors; the transfers are done here, because a control loop
+needs of them what that package does not promise:
 
 * a time-out is kept to the millisecond (there, two seconds are added to each);
 * a transfer that timed out is cancelled as the Linux client cancels it (CMD_UNLINK), and its
@@ -27,7 +27,7 @@ from typing import Any
 from usb.core import USBError, USBTimeoutError
 from usbip_backend.backend import USBIPBackend
 
-__all__ = ["UsbIpBackend"]
+__all__ = ["Connection", "UsbIpBackend"]
 
 # linux/Documentation/usb/usbip_protocol.rst; all fields big-endian
 _SUBMIT = struct.Struct(">IIIIIIiiii8s")
@@ -37,14 +37,14 @@ _TIMEVAL = struct.Struct("@ll")
 _CMD_SUBMIT, _CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 1, 2, 3, 4
 _OUT, _IN = 0, 1
 _NO_SETUP = bytes(8)
-_CONNECT_TIMEOUT = 1.0  # seconds to connect, and for each piece of a list or an import
+_CONNECT_TIMEOUT = 1.0  # seconds, unless the caller says otherwise
 _GREETING = 3.0  # seconds for all of a list, or all of an import
 _CONTROL_TIMEOUT = 1000  # milliseconds of a control transfer that names no time-out
 _LATE_LOOKS = 8  # chunks of the receive buffer
 _LARGEST = 1 << 16  # bytes of an answer; the largest descriptor that there can be
 
 
-class _Connection:
+class Connection:
     """One imported device: its socket and the transfers under way.
 
     The keyword arguments of :meth:`submit` are those of the package's own connection, whose
@@ -84,9 +84,13 @@ class _Connection:
         transfer_buffer_length: int,
         out_payload: bytes = b"",
         timeout_ms: int | None = None,
+        settle_ms: int = 0,
     ) -> tuple[int, bytes]:
         """One transfer: (status, data).
 
+        :param settle_ms: how long to wait for the server to confirm that it has cancelled the
+            transfer after a time-out. If the transfer was done meanwhile, its result is returned.
+            0 does not wait.
         :raises USBTimeoutError: no answer in time; the transfer is cancelled.
         :raises USBError: the connection broke (ENODEV).
         """
@@ -103,8 +107,11 @@ class _Connection:
                     return status, data
                 self.passed_over += bool(data)
         except USBTimeoutError:
-            self._cancel(seq, ep, direction)
-            raise
+            unlink = self._cancel(seq, ep, direction)
+            result = self._settle(seq, unlink, settle_ms) if settle_ms else None
+            if result is None:
+                raise
+            return result
 
     def exchange(
         self, out_ep: int, data: bytes, in_ep: int, length: int, send_ms: int, timeout_ms: int
@@ -151,12 +158,30 @@ class _Connection:
         self._reads[seq] = length
         return seq, _SUBMIT.pack(_CMD_SUBMIT, seq, self._devid, _IN, ep, 0, length, 0, 0, 0, setup)
 
-    def _cancel(self, seq: int, ep: int, direction: int) -> None:
-        """Ask for an end of a transfer; what still comes of it is passed over."""
+    def _cancel(self, seq: int, ep: int, direction: int) -> int:
+        """Cancel a transfer; what still comes of it is passed over. Returns the seqnum."""
         number = self._next()
         self._unlinks[number] = seq
         message = _UNLINK.pack(_CMD_UNLINK, number, self._devid, direction, ep, seq)
         self._send(message, _deadline(_CONTROL_TIMEOUT))
+        return number
+
+    def _settle(self, seq: int, unlink: int, timeout_ms: int) -> tuple[int, bytes] | None:
+        """Wait for the answer to a cancellation; the transfer's result, if it was done before."""
+        deadline = _deadline(timeout_ms)
+        result = None
+        try:
+            while True:
+                command, number, status, data = self._receive(deadline)
+                if command == _RET_SUBMIT:
+                    if number == seq:
+                        result = status, data
+                    continue
+                self._reads.pop(self._unlinks.pop(number, 0), None)
+                if number == unlink:
+                    return result
+        except USBTimeoutError as error:
+            raise self._break("the server does not cancel a transfer") from error
 
     def _reply(self, deadline: float) -> tuple[int, int, bytes]:
         """The next answer to a transfer, cancelled ones among them: seqnum, status, data."""
@@ -245,10 +270,12 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
 
     What cannot be reached or breaks raises :class:`OSError`, most of it as
     :class:`usb.core.USBError`.
+
+    :param timeout: seconds to connect, and for each piece of a list or an import.
     """
 
-    def __init__(self, host: str, port: int) -> None:
-        super().__init__(host, port, _CONNECT_TIMEOUT)
+    def __init__(self, host: str, port: int, timeout: float = _CONNECT_TIMEOUT) -> None:
+        super().__init__(host, port, timeout)
         self._deadline = math.inf  # of a list or an import
 
     def enumerate_devices(self) -> list[Any]:
@@ -277,7 +304,7 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
         except (ValueError, IndexError, struct.error) as error:
             raise USBError(f"a broken configuration: {error}", errno=errno.EPROTO) from error
 
-    def _import_device(self, dev: Any) -> _Connection:
+    def _import_device(self, dev: Any) -> Connection:
         self._deadline = time.monotonic() + _GREETING
         try:
             imported = super()._import_device(dev)
@@ -287,9 +314,9 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
             raise
         finally:
             self._deadline = math.inf
-        return _Connection(imported.sock, dev.devid)
+        return Connection(imported.sock, dev.devid)
 
-    def close_device(self, dev_handle: _Connection) -> None:
+    def close_device(self, dev_handle: Connection) -> None:
         """Close the connection; the server then has the device back."""
         for key, connection in list(self._conns.items()):
             if connection is dev_handle:
@@ -298,7 +325,7 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
 
     def exchange(
         self,
-        dev_handle: _Connection,
+        dev_handle: Connection,
         out_ep: int,
         data: bytes,
         in_ep: int,
