@@ -254,7 +254,7 @@ def pytest_terminal_summary(
         force_terminal=terminalreporter._tw.hasmarkup,
     )
     verbose = config.option.verbose > 0
-    print_result(result, console, verbose=verbose, more="-v says why")
+    print_result(result, console, verbose=verbose, more="-v shows why")
     for option, name in _FILES.items():
         path = config.getoption(f"dexkit_{option}")
         if path:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import socket
 import struct
+import threading
 from collections.abc import Iterable
 
 from dexkit.doctor import rtps
@@ -45,16 +46,34 @@ class HostilePeer:
         self._socket.bind(("127.0.0.1", 0))
         self._numbers = {rtps.SEDP_PUBLICATIONS: 0, rtps.SEDP_SUBSCRIPTIONS: 0}
         self._entities = 0
+        self._packets: list[bytes] = []
+        self._ended = threading.Event()
+        self._repeater = threading.Thread(target=self._repeat, daemon=True)
 
     def __enter__(self) -> HostilePeer:
+        self._repeater.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
+        self._ended.set()
+        self._repeater.join()
         self._socket.close()
 
     def send(self, *submessages: bytes) -> None:
-        """A packet to every participant of the domain that there may be."""
+        """Send a packet to every possible participant of the domain, and again from time to time.
+
+        A busy machine may drop one, and this peer does not answer requests for repair.
+        """
         packet = rtps.message(self.prefix, *submessages)
+        self._send(packet)
+        self._packets.append(packet)
+
+    def _repeat(self) -> None:
+        while not self._ended.wait(0.5):
+            for packet in tuple(self._packets):
+                self._send(packet)
+
+    def _send(self, packet: bytes) -> None:
         for index in range(_PARTICIPANTS):
             self._socket.sendto(packet, ("127.0.0.1", rtps.unicast_port(self.domain, index)))
 

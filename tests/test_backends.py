@@ -191,7 +191,7 @@ class TestByPath:
     def test_hand_class_is_a_backend(self) -> None:
         kind = backend("tests.service_helpers:ScriptedHand")
         assert kind.create(BackendOptions(Side.RIGHT)).spec.side is Side.RIGHT
-        assert kind.summary.startswith("Goes to where it is told")
+        assert kind.summary.startswith("A hand that reaches its goal at once")
 
     def test_function_is_a_backend(self) -> None:
         kind = backend(f"{__name__}:make_hand")
@@ -262,7 +262,7 @@ class TestByPath:
 
     def test_object_that_is_no_backend_is_refused(self) -> None:
         with pytest.raises(BackendBroken, match="is a tuple"):
-            backend("tests.test_package:ROOMS")
+            backend("tests.test_package:PACKAGES")
 
 
 class TestOptions:

@@ -14,7 +14,7 @@ import pytest
 
 from dexkit.cli import doctor_devices
 from dexkit.clock import RealClock
-from dexkit.doctor import Observations, diagnose
+from dexkit.doctor import Observations, diagnose, proc_files
 from dexkit.doctor import usb as doctor_usb
 from dexkit.doctor.environment import environment, uri_problem
 from dexkit.doctor.network import dds_sockets, interfaces
@@ -226,3 +226,14 @@ def test_a_process_of_this_machine() -> None:
     assert abs(began - os.stat(f"/proc/{os.getpid()}").st_ctime) < 5
     assert command_line(2**22 + 1) == ""
     assert start_time(2**22 + 1) is None
+
+
+def test_file_of_the_same_name_in_another_mount_namespace_is_not_this_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "theirs").touch()
+    ours = tmp_path / "ours"
+    ours.touch()
+    links = [(1, tmp_path / "theirs", str(ours)), (2, ours, str(ours))]
+    monkeypatch.setattr(proc_files, "_descriptors", lambda: iter(links))
+    assert proc_files.holders(str(ours)) == [2]

@@ -54,15 +54,15 @@ def start_time(pid: int) -> float | None:
         return None
 
 
-def _descriptors() -> Iterator[tuple[int, str]]:
-    """``(pid, target)`` of every open file that may be seen."""
+def _descriptors() -> Iterator[tuple[int, Path, str]]:
+    """``(pid, link, target)`` of every open file that this user may read."""
     for entry in _PROC.iterdir():
         if not entry.name.isdigit():
             continue
         try:
             for link in (entry / "fd").iterdir():
                 try:
-                    yield int(entry.name), os.readlink(link)
+                    yield int(entry.name), link, os.readlink(link)
                 except OSError:
                     continue
         except OSError:
@@ -70,11 +70,29 @@ def _descriptors() -> Iterator[tuple[int, str]]:
 
 
 def holders(path: str) -> list[int]:
-    """Processes that have a file open, other than this one."""
+    """Processes that have a file open, other than this one.
+
+    A name alone is not enough: in a container ``/dev/pts/3`` is another terminal.
+    """
     target = os.path.realpath(path)
-    return sorted({pid for pid, name in _descriptors() if name == target and pid != os.getpid()})
+    wanted = _identity(target)
+    found = {
+        pid
+        for pid, descriptor, name in _descriptors()
+        if name == target and pid != os.getpid() and _identity(descriptor) == wanted
+    }
+    return sorted(found)
+
+
+def _identity(path: str | Path) -> tuple[int, int] | None:
+    """Device and inode of a file, or None if that cannot be read."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def open_sockets() -> dict[str, int]:
     """Process id by socket inode, of the processes that may be seen."""
-    return {name[8:-1]: pid for pid, name in _descriptors() if name.startswith("socket:[")}
+    return {name[8:-1]: pid for pid, _, name in _descriptors() if name.startswith("socket:[")}
