@@ -15,15 +15,6 @@ settings.register_profile("dexkit", deadline=None, suppress_health_check=[Health
 settings.load_profile("dexkit")
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int | None:
-    """Workers of ``-n auto``: half of a test's time is waiting, which other tests can use."""
-    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
-        return None
-    cores = len(os.sched_getaffinity(0))
-    return cores + (cores + 1) // 2
-
-
 def pytest_configure(config: pytest.Config) -> None:
     config.add_cleanup(surroundings.settle())
 

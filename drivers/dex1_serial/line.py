@@ -186,8 +186,9 @@ class MotorLine:
             self.users -= 1
             if self.users > 0:
                 return
-            if _lines.get(_key(self.path)) is self:
-                del _lines[_key(self.path)]
+            # by the line, not by its path: a link that is gone leads nowhere
+            for key in [k for k, line in _lines.items() if line is self]:
+                del _lines[key]
         with self._lock:
             self._break()
 
