@@ -267,9 +267,13 @@ def test_emulated_hand_passes_and_faulty_hand_fails(hands: str, tmp_path: Path) 
     assert recording is not None
     assert set(recording.sides) == set(Side)
     results = judge_layer(USB, recording, usb())
-    # the rate on a test machine is not judged, nor what is integrated over times of arrival
-    timed = {r.requirement.id for r in results if r.requirement.realtime} | {"DEX3USB-UNIT-01"}
-    wrong = [r for r in results if r.verdict not in ACCEPTABLE and r.requirement.id not in timed]
+    # what a test machine may be too slow for is not judged, nor what is blocked by it
+    timed = {r.requirement.id for r in results if r.requirement.realtime}
+    wrong = [
+        r
+        for r in results
+        if r.verdict not in ACCEPTABLE and not timed & {r.requirement.id, r.blocked_by}
+    ]
     assert [r.explain() for r in wrong if r.side == "left"] == []
     blamed = {r.requirement.id for r in wrong if r.verdict is not Verdict.BLOCKED}
     assert blamed == {"DEX3USB-PACK-02"}
