@@ -15,8 +15,9 @@ from pathlib import Path
 
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
-from dexkit.conformance.backend_processes import EXTERNAL, Rig, RigOptions
+from dexkit.conformance.backend_processes import Rig, RigOptions
 from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.known_backends import EXTERNAL
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
 from dexkit.conformance.robot import codec_for

@@ -10,16 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dexkit.conformance.backend_processes import (
+from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.known_backends import (
     EMULATED,
     EXTERNAL,
     ON_USB,
     ROBOT_EMULATORS,
     SIMULATED,
-    RigOptions,
 )
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select

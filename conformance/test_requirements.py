@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 
-from dexkit.conformance.backend_processes import SIMULATED
+from dexkit.conformance.known_backends import SIMULATED
 from dexkit.conformance.plugin import OPTIONS_KEY, REPORTED_KEY
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.results import Verdict

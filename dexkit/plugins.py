@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import os
+import sys
 import traceback
-from importlib import metadata
+from importlib.machinery import PathFinder
+from typing import TYPE_CHECKING
 
 from dexkit.errors import DexkitError
+
+if TYPE_CHECKING:
+    from importlib import metadata
 
 __all__ = ["entry_points", "import_object", "is_own", "origin", "where"]
 
@@ -15,7 +21,41 @@ _OWN_DISTRIBUTION = "dexkit"
 
 def entry_points(group: str) -> list[metadata.EntryPoint]:
     """Every entry point of a group."""
+    if not _may_register(group):
+        return []
+    from importlib import metadata  # not above: it takes a dozen milliseconds to import
+
     return list(metadata.entry_points(group=group))
+
+
+def _may_register(group: str) -> bool:
+    """Whether an installed package may register something in a group.
+
+    The answer is yes as well where that cannot be told from ``entry_points.txt`` of the packages
+    in the folders of :data:`sys.path`: in archives and with other finders.
+    """
+    for finder in sys.meta_path:
+        if finder is not PathFinder and hasattr(finder, "find_distributions"):
+            return True
+    header = f"[{group}]".encode()
+    for folder in dict.fromkeys(path or os.curdir for path in sys.path):
+        try:
+            names = os.listdir(folder)
+        except NotADirectoryError:
+            return True
+        except OSError:
+            continue  # a folder that is not there registers nothing
+        for name in names:
+            if name.endswith((".dist-info", ".egg-info")):
+                try:
+                    with open(os.path.join(folder, name, "entry_points.txt"), "rb") as file:
+                        if header in file.read():
+                            return True
+                except OSError:
+                    continue
+            elif name.endswith(".egg"):
+                return True
+    return False
 
 
 def origin(entry: metadata.EntryPoint) -> str:

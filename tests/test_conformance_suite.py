@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.conformance.backend_processes import EXTERNAL, RigOptions
+from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.judge import judge
+from dexkit.conformance.known_backends import EXTERNAL
 from dexkit.conformance.live import LiveOptions, record_run
 from dexkit.conformance.mutants import any_model, plan_for
 from dexkit.conformance.mutants.registry import mix

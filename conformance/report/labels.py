@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
+from dexkit.conformance.known_backends import ROBOT_EMULATORS, SIMULATED
 from dexkit.conformance.results import Overall, RunResult, Verdict, worst
 from dexkit.hand import ROBOT
 from dexkit.models import MODELS
@@ -143,8 +144,6 @@ def part(result: RunResult) -> str:
 
 def nature(result: RunResult) -> str:
     """``emulated``, ``simulated``, ``recorded``, or empty for a real hand."""
-    from dexkit.conformance.backend_processes import ROBOT_EMULATORS, SIMULATED
-
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":
         return "emulated"
