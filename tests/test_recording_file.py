@@ -121,6 +121,12 @@ def test_a_second_recorder_is_refused_at_every_stage(tmp_path: Path, messages: i
     assert recorded(path) == [state(7.0)]
 
 
+def test_folder_is_no_file_to_record_to(tmp_path: Path) -> None:
+    for overwrite in (False, True):
+        with pytest.raises(TraceError, match="Is a directory"):
+            RecordingFile(tmp_path, overwrite=overwrite).open()
+
+
 def test_a_new_file_is_locked_too(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path), pytest.raises(UsageError, match="being recorded"):

@@ -84,18 +84,18 @@ class RecordingFile:
             self._open()
         except FileExistsError:
             raise UsageError(
-                f"{self.path} exists", hint="choose another name, or overwrite it (--force)"
+                f"{self.path} exists", hint="choose another name, or delete the file"
             ) from None
         except OSError as error:
             raise TraceError(f"cannot create {self.path}: {error.strerror}") from error
 
     def _open(self) -> None:
         existing = _status(self._target)
+        if existing is not None and stat.S_ISDIR(existing.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if existing is not None and not self._overwrite:
             raise FileExistsError
         if existing is not None and not stat.S_ISREG(existing.st_mode):
-            if stat.S_ISDIR(existing.st_mode):
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
             self._regular = False  # a device or a pipe: nothing to keep, cut back or lock
             self._fd = self._open_device()
             return

@@ -60,7 +60,7 @@ def command(
     from dexkit.traces import Recorder
     from dexkit.traces.dds_recording import record_topics
 
-    if out.exists() and not force:
+    if out.exists() and not out.is_dir() and not force:
         raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
     started = time.monotonic()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
