@@ -267,11 +267,14 @@ def _emulated(name: str) -> Stage:
 
 def _recording_grows(scene: Scene, program: Program) -> None:
     path = scene.scratch / "out.mcap"
-    size = path.stat().st_size if path.exists() else 0
-    until(
-        lambda: not program.running or (path.exists() and path.stat().st_size > size),
-        f"{path.name} to grow",
-    )
+
+    def size() -> int:
+        return path.stat().st_size if path.exists() else 0
+
+    # a recording begins with a header; messages, which it must keep, come after it
+    until(lambda: not program.running or size() > 0, f"{path.name} to exist")
+    before = size()
+    until(lambda: not program.running or size() > before, f"{path.name} to grow")
 
 
 def _readable(scene: Scene, killed: bool) -> None:
