@@ -79,7 +79,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "dialect",
         choices=[*DIALECTS, *ROBOTS],
-        help="how the hand speaks, or which robot it is (default: as its model does; unitree_go "
+        help="dialect of the hand, or the robot (default: the model's own; unitree_go "
         "with external)",
     )
     add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")
