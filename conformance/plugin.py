@@ -44,9 +44,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     Each also has a long name, ``--dexkit-NAME``. It is the only one where another plug-in of the
     environment has the short name, so that pytest does not fail there.
     """
-    from dexkit.models import DIALECTS
+    from dexkit.models import BUILT_IN, DIALECTS
     from dexkit.robots import ROBOTS
 
+    objects = "; ".join(
+        f"{model.name} {side}={percent:g}"
+        for model in BUILT_IN
+        for side, percent in model.objects.items()
+    )
     group = parser.getgroup("dexkit conformance", "judge a hand on Unitree's topics")
 
     def add(name: str, **attributes: Any) -> None:
@@ -79,7 +84,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "dialect",
         choices=[*DIALECTS, *ROBOTS],
-        help="how the hand speaks, or which robot it is (default: as its model does; unitree_go "
+        help="dialect of the hand, or the robot (default: the model's own; unitree_go "
         "with external)",
     )
     add("domain", type=int, help="DDS domain; default: a free one, or 0 with external or --device")
@@ -89,9 +94,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         metavar="PCT",
-        help="something to squeeze, felt at so many percent of opening (Dex3: of closing); "
-        "left=PCT or right=PCT. Default: 37 (Dex3: 60) in the right hand where the kit starts it; "
-        "'none' for none",
+        help="object between the fingers, touched at this percentage of opening (with several "
+        "joints: of closing); left=PCT or right=PCT. Default where the kit starts the hand: "
+        f"{objects}; 'none' for none",
     )
     add("set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the backend")
     group.addoption(

@@ -54,7 +54,7 @@ _DIGITS = 20
 
 LOCK_PATIENCE = 10.0
 """Seconds to wait for another writer, which needs some milliseconds."""
-_LOOK = 0.01  # seconds between attempts
+_POLL_INTERVAL = 0.01  # seconds between attempts
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS})
 
 
@@ -335,7 +335,7 @@ def _locked(target: Path) -> Iterator[None]:
                         f"{target} has been locked by another program for {LOCK_PATIENCE:g} s",
                         hint=f"which one? See: fuser -v {lock}",
                     ) from error
-                time.sleep(_LOOK)
+                time.sleep(_POLL_INTERVAL)
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise

@@ -1,1 +1,1 @@
-"""Room of dexkit: imported as dexkit.drivers."""
+"""Drivers of real devices, imported as ``dexkit.drivers``: M4010, Dex3-1 on USB, EZGripper."""

@@ -1,4 +1,4 @@
-"""What drivers on a serial port share: finding it, and one meaning for its many failures."""
+"""Find serial ports and translate pyserial's errors, for the drivers on a serial port."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ __all__ = [
 class Device:
     """A serial port.
 
-    :param path: as given, or as the system names it.
-    :param serial_number: of the USB adapter, or None where there is none (a pseudo-terminal).
+    :param path: path as given, or as the system lists it.
+    :param serial_number: serial number of the USB adapter; None without one (a pseudo-terminal).
     """
 
     path: str
@@ -39,25 +39,25 @@ class Device:
 
     @property
     def key(self) -> str:
-        """What names this device in the configuration file."""
+        """Key of this device in the calibration file."""
         return self.serial_number or self.path
 
 
 def find_device(name: str) -> Device:
-    """The port that is meant by a device path or a USB serial number.
+    """Find a port by its device path or USB serial number.
 
-    :raises HandNotFound: there is no such port; names those that there are.
+    :raises HandNotFound: there is no such port; the hint lists the ports.
     """
     ports = list_ports.comports()
     path = Path(name)
     if "/" in name or path.exists():
-        # /dev/serial/by-id/... and other links lead to the name that the system lists
+        # /dev/serial/by-id/... and other links resolve to the name that the system lists
         resolved = str(path.resolve())
         for port in ports:
             if port.device in (name, resolved):
                 return Device(name, port.serial_number)
         if not path.exists():
-            raise HandNotFound(f"there is no device {name}", hint=_known(ports))
+            raise HandNotFound(f"there is no device {name}", hint=_list_known_ports(ports))
         return Device(str(path.absolute()), None)
     matches = [port for port in ports if port.serial_number == name]
     if len(matches) == 1:
@@ -67,10 +67,10 @@ def find_device(name: str) -> Device:
         raise HandNotFound(
             f"serial number {name} is that of more than one port: {found}", hint="give the path"
         )
-    raise HandNotFound(f"no adapter has the serial number {name}", hint=_known(ports))
+    raise HandNotFound(f"no adapter has the serial number {name}", hint=_list_known_ports(ports))
 
 
-def _known(ports: list[list_ports.ListPortInfo]) -> str:  # type: ignore[name-defined]
+def _list_known_ports(ports: list[list_ports.ListPortInfo]) -> str:  # type: ignore[name-defined]
     if not ports:
         return "there are no serial ports at all: is the adapter plugged in?"
     listed = ", ".join(
@@ -80,7 +80,7 @@ def _known(ports: list[list_ports.ListPortInfo]) -> str:  # type: ignore[name-de
 
 
 def latency_timer(path: str, sysfs: Path = Path("/sys")) -> int | None:
-    """Milliseconds of the latency timer of a USB-serial adapter, or None where it has none."""
+    """Read the latency timer of a USB-serial adapter, ms; None if it has none."""
     name = Path(path).resolve().name
     try:
         return int((sysfs / "bus/usb-serial/devices" / name / "latency_timer").read_text())
@@ -89,44 +89,42 @@ def latency_timer(path: str, sysfs: Path = Path("/sys")) -> int | None:
 
 
 def exchange_period(line_time: float, latency_timer: float, turnaround: float = 0.0) -> float:
-    """Seconds from one exchange to the next of a host that asks again as soon as it can.
+    """Return the period of back-to-back exchanges through a USB-serial adapter, seconds.
 
-    The latency timer runs freely: the adapter hands over what has come at the ticks ``k * T`` of
-    its timer, whenever that came. So a host gets an answer at a tick; call it 0. The host sends
-    the next request at ``h`` (turnaround), the answer is complete at ``h + t`` (line time), and is
-    handed over at the first tick that is not earlier::
+    The latency timer runs freely: the adapter delivers received bytes at the ticks ``k * T`` of its
+    timer. So a host gets an answer at a tick; call it 0. The host sends the next request at ``h``
+    (turnaround), the answer is complete at ``h + t`` (line time), and the adapter delivers it at
+    the first tick that is not earlier::
 
         period = ceil((h + t) / T) * T          T > 0
         period = h + t                          no timer
 
-    That is a tick again, so every following period is the same. It grows with ``h``: with
-    ``h = 0`` it is the shortest that the line allows, and 1 / period an upper bound of the rate
-    whatever the host. It is shorter than ``h + t + T``, what an exchange takes at most that begins
-    at any moment. Of the first exchange nothing is known but ``t``, so ``n`` in a row take
-    ``t + (n - 1) * period`` at least.
+    That is a tick again, so all following periods are equal. The period grows with ``h``; with
+    ``h = 0``, 1 / period is an upper bound of the rate for any host. An exchange that begins at any
+    time takes at most ``h + t + T``. The first exchange takes at least ``t``, so ``n`` in a row
+    take at least ``t + (n - 1) * period``.
 
-    It holds for one answer in an exchange that fits into one USB packet (62 bytes of an FTDI
-    chip: a full packet leaves at once). ``tests/test_line_time.py`` compares it with the
-    emulated line.
+    This holds for one answer per exchange that fits into one USB packet (62 bytes of an FTDI chip,
+    which sends a full packet at once). ``tests/test_line_time.py`` compares it with the emulated
+    line.
 
-    :param line_time: seconds from the first bit of the request to the last of the answer: the
-        bytes at the baud rate, and what the device waits before it answers.
+    :param line_time: seconds from the first bit of the request to the last of the answer: the bytes
+        at the baud rate, and the device's return delay.
     :param latency_timer: seconds; 0 for an adapter without one.
-    :param turnaround: seconds that the host needs from an answer to the next request.
+    :param turnaround: seconds from an answer to the host's next request.
     """
     busy = line_time + turnaround
     if latency_timer <= 0:
         return busy
-    # a multiple of the timer may come out a rounding error above itself
+    # rounding must not turn an exact multiple of the timer into the next one
     return max(1, math.ceil(busy / latency_timer - 1e-9)) * latency_timer
 
 
 def latency_warning(path: str, sysfs: Path = Path("/sys")) -> str:
-    """What to tell the user of the latency timer, or an empty text when it is well set.
+    """Return a warning for a latency timer above 1 ms; empty if the timer is well set.
 
-    An FTDI chip holds a short answer back until the next tick of its timer; at the usual 16 ms
-    that leaves 62 exchanges a second at most (docs/sources/mx64-ezgripper.md#c2). Nothing is
-    changed here.
+    An FTDI chip delays a short answer until the next tick of its timer; the default of 16 ms allows
+    at most 62 exchanges a second (docs/sources/mx64-ezgripper.md#c2). The setting is not changed.
     """
     milliseconds = latency_timer(path, sysfs)
     if milliseconds is None or milliseconds <= 1:
@@ -143,7 +141,7 @@ def latency_warning(path: str, sysfs: Path = Path("/sys")) -> str:
 
 @contextmanager
 def port_errors(path: str) -> Iterator[None]:
-    """One exception for the many faces of an unplugged adapter."""
+    """Raise ``HandLost`` for each of the exceptions with which pyserial reports a lost adapter."""
     try:
         yield
     except (serial.SerialException, termios.error) as error:
@@ -159,7 +157,7 @@ def port_errors(path: str) -> Iterator[None]:
 
 
 def open_failed(path: str, error: Exception) -> Exception:
-    """What pyserial's failure to open a port means."""
+    """Translate pyserial's failure to open a port to an error of dexkit."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
         return HandNotFound(

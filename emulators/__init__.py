@@ -1,1 +1,1 @@
-"""Room of dexkit: imported as dexkit.emulators."""
+"""Emulators of devices and robots, and simulated hands; imported as ``dexkit.emulators``."""

@@ -1,13 +1,13 @@
-"""The mechanics of a Dex1-1: jaws, friction, stops, an object, and the motor's law. Pure mechanics.
+"""Simulate the mechanics of a Dex1-1: jaws, friction, stops, an object, and the motor's law.
 
-``sim-dex1`` is this behind the common interface, the emulated M4010 is this behind its protocol.
+``sim-dex1`` uses it without a protocol, the emulated M4010 behind its serial protocol.
 
-The motor obeys ``tau = kp (q_des - q) + kd (dq_des - dq) + tau_ff`` as Unitree's motors do,
+The motor applies ``tau = kp (q_des - q) + kd (dq_des - dq) + tau_ff``, as Unitree's motors do,
 within its torque and speed limits, and brakes (shorted windings) in mode BRAKE.
 
 Inertia and friction are tuned, not measured: with the genuine xr_teleoperate rule (0.18 rad lead,
-kp 5, kd 0.05, 500 Hz state) the gripper makes 6.5 rad/s and 10 to 90 % of the stroke in 0.68 s,
-and blocked by an object feels -0.9 N·m, as in the recordings.
+kp 5, kd 0.05, 500 Hz state) the gripper reaches 6.5 rad/s, moves from 10 to 90 % of the stroke in
+0.68 s, and reports -0.9 N·m when an object blocks it, as in the recordings.
 """
 
 from __future__ import annotations
@@ -36,14 +36,13 @@ class Dex1Mechanics:
 
     :param object_pct: opening at which the jaws touch an object, percent of 5.4 rad; None for
         no object.
-    :param start_pct: opening at first.
-    :param locking: friction that grows with what the jaws press against, as a part of it. From 1
-        on the mechanism is self-locking: jaws that hold something go on holding it without the
-        motor. 0 for none.
+    :param start_pct: initial opening, percent.
+    :param locking: friction as a fraction of the contact torque. At 1 and above the mechanism is
+        self-locking: the jaws hold an object without motor torque. 0 for none.
     :raises UsageError: a parameter is out of range.
 
     :ivar torque: of the motor in the last step, N·m.
-    :ivar mode: what the motor does.
+    :ivar mode: mode of the motor.
     """
 
     def __init__(
@@ -86,16 +85,16 @@ class Dex1Mechanics:
         self._kd = _BRAKE_DAMPING
 
     def drive(self, q: float, dq: float, tau: float, kp: float, kd: float) -> None:
-        """Obey the motor's law from here on; SI units."""
+        """Set the setpoint and gains of the control law; SI units."""
         self.mode = JointMode.FOC
         self._q, self._dq, self._tau, self._kp, self._kd = q, dq, tau, kp, kd
 
     def stop(self) -> None:
-        """Stand still at once."""
+        """Set the speed to 0."""
         self.joint.dq = 0.0
 
     def use(self, command: HandCommand) -> None:
-        """Obey a command for its one joint."""
+        """Apply a command for the one joint."""
         if not command.mode[0]:
             self.brake()
             return
@@ -108,7 +107,7 @@ class Dex1Mechanics:
         )
 
     def state(self, stamp: float) -> HandState:
-        """What can be seen, measured at ``stamp``; heat and voltage are not modelled: NaN."""
+        """Return the state at ``stamp``; temperature and voltage are not modelled: NaN."""
         return HandState.from_values(
             self.joint.q,
             dq=self.joint.dq,
@@ -118,7 +117,7 @@ class Dex1Mechanics:
         )
 
     def step(self, n: int = 1) -> None:
-        """Live ``n`` steps."""
+        """Advance by ``n`` steps."""
         joint = self.joint
         for _ in range(n):
             self.torque = self._motor()
@@ -131,10 +130,10 @@ class Dex1Mechanics:
         torque = stiffness * (self._q - joint.q) + damping * (self._dq - joint.dq) + self._tau
         implicit = (STEP * damping + STEP * STEP * stiffness) / _INERTIA
         if implicit > _STIFF:
-            # gains too stiff for the step: what they would give at its end keeps it stable
+            # stiff gains are evaluated at the end of the step, which keeps it stable
             torque = (torque - stiffness * STEP * joint.dq) / (1.0 + implicit)
         most = self.limits.tau_max
         if torque * joint.dq > 0.0:
-            # the faster it turns, the less it can push on: nothing is left at the top speed
+            # the available torque falls with speed, to 0 at the top speed
             most *= max(0.0, 1.0 - abs(joint.dq) / self.limits.dq_max)
         return max(-most, min(most, torque))

@@ -1,4 +1,4 @@
-"""The mechanics of a Dex3-1: its motors, its supply, and what it feels of what it runs into.
+"""Simulate the mechanics of a Dex3-1: motors, supply and pressure sensors.
 
 :mod:`dexkit.emulators.finger_mechanics` has the joints. Whoever owns a hand's mechanics calls
 ``step`` as time passes: ``sim-dex3`` directly, the emulated USB device behind its protocol.
@@ -122,8 +122,8 @@ class Dex3Mechanics(FingerMechanics):
         self._touched: list[float] = []
         self._felt = _NO_PRESSURE
 
-    def _slowly(self, dt: float) -> None:
-        super()._slowly(dt)
+    def _step_slowly(self, dt: float) -> None:
+        super()._step_slowly(dt)
         hottest = max(motor.case for motor in self._motors)
         if hottest > _FANS_ON:
             self.fans = True
@@ -137,7 +137,7 @@ class Dex3Mechanics(FingerMechanics):
 
     @property
     def current(self) -> float:
-        """Drawn from the supply, A: static, mechanical power and losses; at most 10 A."""
+        """Current from the supply, A: static, mechanical power and losses; at most 10 A."""
         power = _STATIC_POWER
         for motor in self._motors:
             part = motor.torque / motor.model.tau_max
@@ -185,7 +185,7 @@ class Dex3Mechanics(FingerMechanics):
         """°C, shape (9, 12), NaN where there is no element: always that of the air."""
         return _SENSOR_TEMPERATURE.copy()
 
-    def _rest(self) -> dict[str, Any]:
+    def _extra_state(self) -> dict[str, Any]:
         return {
             "pressure": self.pressure,
             "sensor_temperature": self.sensor_temperature,

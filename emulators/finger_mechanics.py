@@ -1,7 +1,7 @@
-"""The mechanics of a hand of several joints: a motor for each, and what it runs into.
+"""Simulate the mechanics of a hand with several joints: one motor per joint, stops and an object.
 
-Pure: no clock, no wire, no DDS. Whoever owns it calls :meth:`FingerMechanics.step` as time passes.
-The module of each hand (:mod:`dexkit.emulators.dex3_mechanics`) has its motors and the rest of it.
+No clock, protocol or DDS: the caller calls :meth:`FingerMechanics.step` as time passes.
+The module of each hand (:mod:`dexkit.emulators.dex3_mechanics`) defines its motors and sensors.
 
 Stops, objects and heat are assumed. Not modelled: gravity on the fingers, links and their
 collisions (every joint moves alone), the coupling of a finger's joints through an object,
@@ -45,8 +45,8 @@ SETTINGS = {
 class MotorModel:
     """A motor with its gearing, SI units at the joint.
 
-    Of three largest torques one is the motor's own; the others are what is left of it, or comes
-    on top of it, behind the friction of the gearing.
+    ``tau_max`` is the motor's own largest torque; at the joint, gear friction reduces it while the
+    motor drives and adds to it while the motor holds.
 
     :param gear_ratio: turns of the rotor for one of the joint.
     :param dq_max: rad/s, without load.
@@ -74,12 +74,12 @@ class MotorModel:
 
     @property
     def driving_loss(self) -> float:
-        """Part of the motor's torque that the gearing takes while it drives."""
+        """Fraction of the motor's torque lost in the gearing while it drives."""
         return 1.0 - self.tau_driving / self.tau_max
 
     @property
     def holding_loss(self) -> float:
-        """Part of the motor's torque that the gearing adds while it is driven back."""
+        """Fraction of the motor's torque that the gearing adds while it is driven back."""
         return self.tau_holding / self.tau_max - 1.0
 
 
@@ -97,7 +97,7 @@ _CASE_LIMIT, _WINDING_LIMIT = 85.0, 120.0  # °C where a motor reports an error
 _LIMIT_HYSTERESIS = 10.0
 
 
-# plain integers: an enum's attribute look-up costs more than what it guards
+# plain integers, because an enum's attribute look-up is slow
 _BRAKE, _FOC = int(JointMode.BRAKE), int(JointMode.FOC)
 
 
@@ -136,7 +136,7 @@ class _Motor:
         self.object_wall: Wall | None = None
         if object_at is not None and spec.closing:
             self.object_wall = Wall(
-                _closed_by(spec, object_at), -spec.closing, _OBJECT_STIFFNESS, _OBJECT_DAMPING
+                _closing_angle(spec, object_at), -spec.closing, _OBJECT_STIFFNESS, _OBJECT_DAMPING
             )
             walls.append(self.object_wall)
         self.joint = Joint(
@@ -156,13 +156,13 @@ class _Motor:
         self.brake()
 
     def power(self, on: bool) -> None:
-        """Give it torque, or none."""
+        """Switch the motor's power."""
         self.most = self.model.tau_max if on else 0.0
         self.droop = self.most / self.model.dq_max  # torque lost per rad/s
         self.rests_at = math.nan
 
     def follow(self, q: float, feedforward: float, kp: float, kd: float) -> None:
-        """Obey the motor's law."""
+        """Set the gains and the setpoint of the control law."""
         self.mode = _FOC
         self.q = q
         self.feedforward = feedforward
@@ -176,7 +176,7 @@ class _Motor:
         self.mode = _BRAKE
 
     def contact(self) -> float:
-        """Torque that the object takes, N·m."""
+        """Torque on the object, N·m."""
         wall = self.object_wall
         if wall is None:
             return 0.0
@@ -191,7 +191,7 @@ class _Motor:
         self.case += dt * (to_case - to_air) / _CASE_CAPACITY
 
 
-def _closed_by(spec: JointSpec, percent: float) -> float:
+def _closing_angle(spec: JointSpec, percent: float) -> float:
     """The angle of a joint that is ``percent`` of the way from straight (0) to closed."""
     return percent / 100.0 * (spec.q_max if spec.closing > 0 else spec.q_min)
 
@@ -230,7 +230,7 @@ class FingerMechanics:
         self.side = side
         self.specs = model.joints[side]
         self._motors = tuple(
-            _Motor(spec, motor, _start(spec, rest, start, object_at), object_at)
+            _Motor(spec, motor, _start_angle(spec, rest, start, object_at), object_at)
             for spec, motor, rest in zip(self.specs, motors, model.rest_q[side], strict=True)
         )
         self.joints = tuple(motor.joint for motor in self._motors)
@@ -249,7 +249,7 @@ class FingerMechanics:
         kp: float = 0.0,
         kd: float = 0.0,
     ) -> None:
-        """What one motor does from here on: ``tau = kp (q - q_now) + kd (dq - dq_now) + tau``.
+        """Command one motor: ``tau = kp (q - q_now) + kd (dq - dq_now) + tau``.
 
         :param mode: FOC (1) drives; everything else brakes.
         :param kp: gains below zero count as zero.
@@ -272,7 +272,7 @@ class FingerMechanics:
             motor.follow(q, feedforward, kp, kd)
 
     def use(self, command: HandCommand) -> None:
-        """Give every motor its part of ``command``."""
+        """Apply ``command`` to every motor."""
         for i, row in enumerate(
             zip(
                 command.mode.tolist(),
@@ -292,7 +292,7 @@ class FingerMechanics:
             motor.brake()
 
     def stop(self) -> None:
-        """Brake and stand still at once."""
+        """Brake and set all speeds to 0."""
         self.brake()
         for joint in self.joints:
             joint.dq = 0.0
@@ -300,7 +300,7 @@ class FingerMechanics:
     # -- time ----------------------------------------------------------------------------------
 
     def step(self, steps: int = 1) -> None:
-        """Live through ``steps`` times :data:`STEP`."""
+        """Advance by ``steps`` times :data:`STEP`."""
         if steps <= 0:
             return
         motors = self._motors
@@ -312,9 +312,9 @@ class FingerMechanics:
                 joint = motor.joint
                 speed = joint.dq
                 if speed == 0.0 and joint.q == motor.rests_at:
-                    continue  # nothing has changed: this step would end as the last one did
+                    continue  # at rest: this step would not change anything
                 most = motor.most
-                # the faster it turns, the less it can push on: nothing is left at the top speed
+                # the available torque falls with speed, to 0 at the top speed
                 along = most - motor.droop * (speed if speed > 0.0 else -speed)
                 motor.torque = joint.drive(
                     motor.kp * (motor.q - joint.q) + motor.feedforward,
@@ -329,14 +329,14 @@ class FingerMechanics:
             self._to_slow -= 1
             if self._to_slow == 0:
                 self._to_slow = _SLOW_STEPS
-                self._slowly(_SLOW_STEPS * STEP)
+                self._step_slowly(_SLOW_STEPS * STEP)
 
-    def _slowly(self, dt: float) -> None:
+    def _step_slowly(self, dt: float) -> None:
         for motor in self._motors:
             motor.heat(dt)
-            self._watch(motor)
+            self._check_temperature(motor)
 
-    def _watch(self, motor: _Motor) -> None:
+    def _check_temperature(self, motor: _Motor) -> None:
         for value, limit, bit in (
             (motor.case, _CASE_LIMIT, MotorError.CASE_TEMPERATURE),
             (motor.winding, _WINDING_LIMIT, MotorError.WINDING_OVERTEMPERATURE),
@@ -350,27 +350,27 @@ class FingerMechanics:
     # -- faults --------------------------------------------------------------------------------
 
     def power(self, joint: int, on: bool) -> None:
-        """Cut a motor's power (it is limp then, and would not answer), or give it back."""
+        """Switch a motor's power; without power it is limp and does not answer."""
         self._motors[joint].power(on)
         self._motors[joint].brake()
 
     def heat(self, joint: int, celsius: float) -> None:
-        """Have case and winding of a motor at a temperature; it cools from there."""
+        """Set the temperature of a motor's case and winding; it cools from there."""
         motor = self._motors[joint]
         motor.case = motor.winding = celsius
-        self._watch(motor)
+        self._check_temperature(motor)
 
     def fail(self, joint: int, error: MotorError) -> None:
-        """Raise an error of a motor: it brakes until :meth:`recover`."""
+        """Set an error of a motor: it brakes until :meth:`recover`."""
         self._motors[joint].error |= error
         self._motors[joint].brake()
 
     def recover(self, joint: int, error: MotorError) -> None:
-        """Take an error back; the motor brakes until its next command."""
+        """Clear an error; the motor brakes until its next command."""
         self._motors[joint].error &= ~error
 
     def jam(self, joint: int, stuck: bool) -> None:
-        """Have a joint stuck where it is, or free it."""
+        """Lock a joint where it is, or free it."""
         self.joints[joint].locked = stuck
         self._motors[joint].rests_at = math.nan
 
@@ -398,7 +398,7 @@ class FingerMechanics:
 
     @property
     def mode(self) -> list[int]:
-        """What each motor does: :class:`JointMode` values."""
+        """Mode of each motor: :class:`JointMode` values."""
         return [motor.mode for motor in self._motors]
 
     @property
@@ -423,15 +423,15 @@ class FingerMechanics:
 
     @property
     def motor_v(self) -> float:
-        """Voltage at the motors, V; NaN where nobody knows."""
+        """Voltage at the motors, V; NaN where it is not modelled."""
         return math.nan
 
-    def _rest(self) -> dict[str, Any]:
-        """What else there is in a state of this hand."""
+    def _extra_state(self) -> dict[str, Any]:
+        """Further fields of this hand's state."""
         return {}
 
     def state(self, stamp: float) -> HandState:
-        """All of it, measured at ``stamp``."""
+        """Return the state of the hand at ``stamp``."""
         lived = self._lived
         table = np.array(
             [
@@ -458,15 +458,17 @@ class FingerMechanics:
             mode=np.array(self.mode, dtype=np.uint8),
             fault=np.array(self.errors, dtype=np.uint32),
             stamp=stamp,
-            **self._rest(),
+            **self._extra_state(),
         )
 
 
-def _start(spec: JointSpec, rest: float, start: float | None, object_at: float | None) -> float:
+def _start_angle(
+    spec: JointSpec, rest: float, start: float | None, object_at: float | None
+) -> float:
     if not spec.closing:
         return rest
-    q = rest if start is None else _closed_by(spec, start)
+    q = rest if start is None else _closing_angle(spec, start)
     if object_at is not None:
-        touch = _closed_by(spec, object_at)
+        touch = _closing_angle(spec, object_at)
         q = min(q, touch) if spec.closing > 0 else max(q, touch)
     return q

@@ -1,4 +1,4 @@
-"""One joint and what it runs into: the mechanics of every emulated hand.
+"""Simulate one joint with its stops and objects; all emulated hands use it.
 
 A joint is an inertia with Coulomb and viscous friction, an optional spring, and walls: end
 stops and objects, each a stiff spring with damping that can push but not pull. It is driven by
@@ -24,7 +24,7 @@ class FixedSteps:
     """How many fixed steps of mechanics are due to catch up with a clock.
 
     :param step: seconds.
-    :param most: longest pause that is lived through, seconds; what was before it is skipped.
+    :param most: longest pause that is simulated, seconds; time before that is skipped.
     """
 
     def __init__(self, step: float, *, most: float = 0.5) -> None:
@@ -39,7 +39,7 @@ class FixedSteps:
         self.done = 0
 
     def due(self, now: float) -> int:
-        """Steps to live up to ``now``; they count as lived from here on."""
+        """Return the number of steps up to ``now`` and count them as done."""
         total = int((now - self._origin) / self.step + 1e-6)
         steps = min(total - self.done, self._most)
         if steps <= 0:
@@ -190,7 +190,7 @@ class Joint:
         slow = 1.0 + rate * (resist + damping)
         end = torque - damping * free / slow
         if not low <= end <= high:
-            # as much as it can, whatever the speed: nothing of its damping is left
+            # saturated: the torque is at its limit and has no damping
             torque = low if end < low else high
             damping = 0.0
             free = velocity + rate * (torque + load)
@@ -204,7 +204,7 @@ class Joint:
         else:
             velocity = 0.0
         if -_STILL < velocity < _STILL:
-            velocity = 0.0  # rounding must not keep it creeping for ever
+            velocity = 0.0  # rounding must not leave a residual speed
         self.dq = velocity
         self.q = q + dt * velocity
         end = torque - damping * velocity

@@ -1,4 +1,4 @@
-"""An emulator in a process of its own: ``dexkit emulate DEVICE``, started, told and stopped."""
+"""Run ``dexkit emulate DEVICE`` as a child process: start it, inject faults, stop it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies between the devices on a serial line and the host's program, sans-IO.
+"""Simulate a serial line and its USB-serial adapter between devices and host, without I/O.
 
 A byte takes its ten bits at the baud rate, both ways, and what the devices send goes through a
 USB-serial adapter, which is modelled as an FTDI chip (docs/sources/mx64-ezgripper.md#c2): bytes are
@@ -129,12 +129,12 @@ class SerialLine(ABC):
         self.counters.bytes_out += len(out)
         return out
 
-    def _plug(self) -> None:
+    def _apply_plug(self) -> None:
         """Take note of an ``unplug`` that began or ended; what was on its way is lost."""
         self.unplugged = bool(self.schedule.active_of("unplug"))
         self._out.clear()
 
-    def _failed(self, error: Exception, message: object) -> None:
+    def _record_failure(self, error: Exception, message: object) -> None:
         """A device failed inside on ``message``: say so, and go on without an answer."""
         self.counters.failures += 1
         if self.failure is None:

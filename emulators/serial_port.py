@@ -1,4 +1,4 @@
-"""A serial line on a pseudo-terminal: the thin, impure end of an emulator.
+"""Run an emulated serial line on a pseudo-terminal.
 
 A symbolic link names the terminal, because ``/dev/pts`` numbers change. The link is replaced
 atomically, never over anything but a dangling link, and removed at the end. While unplugged,
@@ -34,7 +34,7 @@ _CHUNK = 4096
 _SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
 _BUSY_TICK = 4e-3
 _IDLE_TICK = 20e-3
-_MOST_BEHIND = 0.1
+_MAX_BACKLOG = 0.1
 """Seconds of line time from which nothing more is read: a client that floods the line waits for
 it, as it waits for the buffers of an adapter, instead of filling this program's memory."""
 
@@ -94,7 +94,7 @@ class Port:
         self._master = self._slave = -1
         self._terminal = ""
         try:
-            self._plug()
+            self._apply_plug()
         except BaseException:
             self.close()
             raise
@@ -106,7 +106,7 @@ class Port:
 
     # --- plugging
 
-    def _plug(self) -> None:
+    def _apply_plug(self) -> None:
         try:
             self._master, self._slave = os.openpty()
         except OSError as error:
@@ -157,10 +157,10 @@ class Port:
 
     def start(self) -> None:
         """Serve in a background thread."""
-        self._thread = Worker("serial line", self.run, failed=self._died)
+        self._thread = Worker("serial line", self.run, failed=self._record_error)
         self._thread.start()
 
-    def _died(self, error: Exception) -> None:
+    def _record_error(self, error: Exception) -> None:
         self.error = error
 
     def stop(self) -> None:
@@ -191,7 +191,7 @@ class Port:
                 if line.unplugged:
                     self._unplug()
                 else:
-                    self._plug()
+                    self._apply_plug()
             out = line.due(now)
             if out:
                 self._write(out)
@@ -204,7 +204,7 @@ class Port:
         if sharp and next_time is not None:
             deadline = next_time
         fds = [self._wake_read]
-        if self._master >= 0 and self.line.behind(self._clock.now()) < _MOST_BEHIND:
+        if self._master >= 0 and self.line.behind(self._clock.now()) < _MAX_BACKLOG:
             fds.append(self._master)
         while True:
             left = deadline - self._clock.now()

@@ -1,4 +1,4 @@
-"""``sim-dex3``: a Dex3-1 as simulated mechanics, with no device or wire around it.
+"""``sim-dex3``: a simulated Dex3-1, mechanics only, without a device protocol.
 
 See :mod:`dexkit.emulators.dex3_mechanics` for what is modelled, tuned and not there.
 """

@@ -1,4 +1,4 @@
-"""``sim-dex1``: a Dex1-1 gripper that is only mechanics, with no device or wire under it.
+"""``sim-dex1``: a simulated Dex1-1 gripper, mechanics only, without a device protocol.
 
 The command in force stays in force until the next one, as in the real motor. Nothing is said about
 temperature, voltage or noise of the product; those stay NaN.

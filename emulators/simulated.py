@@ -1,4 +1,4 @@
-"""A hand that is simulated mechanics alone, with no device or wire around it.
+"""Implement :class:`dexkit.hand.Hand` on simulated mechanics, without a device protocol.
 
 The command in force stays in force until the next one, as in a real motor.
 """
@@ -73,7 +73,7 @@ class SimulatedHand:
         self._mechanics.stop()
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Live up to now under the command before, take this one, and say where the hand is.
+        """Advance to now under the last command, apply this one, and return the state.
 
         :raises HandLost: the hand is not open.
         """

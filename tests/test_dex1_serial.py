@@ -148,13 +148,13 @@ def test_without_protection_its_frames_are_those_of_the_vendors_service() -> Non
     drives.
     """
     right = Dex1Serial(Side.RIGHT, Dex1Settings(protect=False))
-    frame = right._frame(HandCommand.position(2.7))
+    frame = right._encode_command(HandCommand.position(2.7))
     assert frame.hex() == "feee100000000000195f05006600010099db492c"
     protected = Dex1Serial(Side.RIGHT)
-    assert MotorCmd.parse(protected._frame(HandCommand.position(2.7))) == replace(
+    assert MotorCmd.parse(protected._encode_command(HandCommand.position(2.7))) == replace(
         MotorCmd.parse(frame), timeout=True
     )
-    assert protected._frame(BRAKE).hex() == "feee8000000000000000000000000000" + "1d99fb6e"
+    assert protected._encode_command(BRAKE).hex() == "feee8000000000000000000000000000" + "1d99fb6e"
 
 
 # --- finding it

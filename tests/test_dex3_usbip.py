@@ -28,7 +28,7 @@ from dexkit.emulators.dex3_mcu import (
     emulated_dex3,
     server,
 )
-from dexkit.emulators.dex3_mcu.server import MOST_CONNECTIONS, MOST_PARKED
+from dexkit.emulators.dex3_mcu.server import MAX_CONNECTIONS, MAX_PARKED
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX3_1
@@ -455,12 +455,12 @@ def test_pending_reads_are_limited() -> None:
     with emulated_dex3(BOTH) as hands:
         port = inside(hands).port
         with imported(port) as hog:
-            many = MOST_PARKED + 500
+            many = MAX_PARKED + 500
             for seqnum in range(1, many + 1):
                 submit(hog, seqnum, IN, 1, b"")
-            for seqnum in range(MOST_PARKED + 1, many + 1):
+            for seqnum in range(MAX_PARKED + 1, many + 1):
                 assert reply(hog) == (protocol.RET_SUBMIT, seqnum, -errno.ENOMEM, 0)
-            assert held(inside(hands)) == MOST_PARKED
+            assert held(inside(hands)) == MAX_PARKED
             # control transfers and writes are served all the same, and an answer frees a place
             submit(hog, many + 1, OUT, 2, brake())
             assert {reply(hog)[1] for _ in range(1)} == {1}
@@ -509,18 +509,18 @@ def test_connections_are_bounded_and_the_newest_is_served() -> None:
     with emulated_dex3(BOTH) as hands, contextlib.ExitStack() as opened:
         port = inside(hands).port
         with imported(port, b"1-2") as other:
-            for _ in range(3 * MOST_CONNECTIONS):
+            for _ in range(3 * MAX_CONNECTIONS):
                 sock = opened.enter_context(socket.create_connection(("127.0.0.1", port), 5.0))
                 sock.sendall(b"\x01")  # half a header, for ever
             with host(port) as computer:
                 exchange(computer.find())
-            assert len(inside(hands)._server._connections) <= MOST_CONNECTIONS
+            assert len(inside(hands)._server._connections) <= MAX_CONNECTIONS
             submit(other, 1, OUT, 2, brake(Side.RIGHT))  # who has a hand keeps it
             assert reply(other)[:3] == (protocol.RET_SUBMIT, 1, 0)
 
 
 def test_client_that_sends_no_request_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "GREETING", 0.05)
+    monkeypatch.setattr(server, "IMPORT_TIMEOUT", 0.05)
     with emulated_dex3() as hands:
         port = inside(hands).port
         with imported(port) as quiet, socket.create_connection(("127.0.0.1", port), 5.0) as half:

@@ -134,13 +134,13 @@ def test_what_a_reader_refused_is_in_the_recording(
     ):
         writer = hand.writer(STATE, STATE_TYPE)
         assert writer.wait_matched(10)
-        take = recording._take
-        monkeypatch.setattr(recording, "_take", lambda: None)  # busy with something else
+        take = recording._read_samples
+        monkeypatch.setattr(recording, "_read_samples", lambda: None)  # busy with something else
         for n in range(40):
             writer.write_raw(state(float(n)))
         reader = recording._readers[STATE, STATE_TYPE]
         wait_until(lambda: reader.refused >= 20)
-        monkeypatch.setattr(recording, "_take", take)
+        monkeypatch.setattr(recording, "_read_samples", take)
         recording.stop()
         lost = recording.losses.refused[STATE]
         assert recording.losses

@@ -94,7 +94,7 @@ ROBOT = ("emulate", "g1", "--quiet", "--domain")
 # (command, whose method dies, method)
 PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [
     (RECORD, DdsNode, "_dispatch"),
-    (RECORD, DdsRecording, "_take"),
+    (RECORD, DdsRecording, "_read_samples"),
     (RECORD, Recorder, "_write_all"),
     (SERVE, DdsNode, "_dispatch"),
     (SERVE, HandService, "_receive_loop"),
@@ -104,7 +104,7 @@ PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [
     (BRIDGE, bridge_module._DirectionLoop, "_run_once"),
     (BRIDGE, DdsNode, "_dispatch"),
     (ROBOT, Publisher, "_run"),
-    (ROBOT, EmulatedRobot, "_live"),
+    (ROBOT, EmulatedRobot, "_advance_robot"),
     (ROBOT, DdsNode, "_dispatch"),
 ]
 

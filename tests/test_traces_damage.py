@@ -177,7 +177,7 @@ def test_records_after_garbage_are_read(tmp_path: Path) -> None:
                     assert trace.damage, (opcode, place, value)
                     assert len(got) >= len(rows()) - 12, (opcode, place - at, value)
                     wanted = {(t, log, p, d) for t, log, p, d in rows()}
-                    # a message outside of a chunk may itself be the one that is hurt
+                    # a message outside of a chunk may itself be the one that is report_damage
                     wrong = {(g[0], g[2], g[3], g[4]) for g in got} - wanted
                     assert len(wrong) <= (not shape.chunked)
 
@@ -195,9 +195,9 @@ def test_rest_is_read_after_a_damaged_beginning(tmp_path: Path) -> None:
 def test_an_attachment_is_checked(tmp_path: Path) -> None:
     body = struct.pack("<QQ", 1, 1) + text("notes") + text("text/plain")
     body += struct.pack("<Q", 4) + b"abcd"
-    for crc, hurt in ((zlib.crc32(body), False), (0, False), (1, True)):
+    for crc, report_damage in ((zlib.crc32(body), False), (0, False), (1, True)):
         data = HEADER + record(9, body + struct.pack("<I", crc)) + END
-        assert bool(open_trace(write(tmp_path / "a.mcap", data)).damage) is hurt
+        assert bool(open_trace(write(tmp_path / "a.mcap", data)).damage) is report_damage
 
 
 def test_a_foreign_recording_without_checksums_is_read(tmp_path: Path) -> None:
@@ -238,7 +238,7 @@ def hurt_sample(tmp_path: Path) -> Path:
     data = bytearray(sample_path("dex1_pick_place").read_bytes())
     at = places(bytes(data), 6)[1]
     data[at + 60] ^= 0x10
-    return write(tmp_path / "hurt.mcap", bytes(data))
+    return write(tmp_path / "report_damage.mcap", bytes(data))
 
 
 def test_info_and_check_answer_damage_with_an_exit_code(

@@ -1,11 +1,10 @@
-"""The container of a recording: where its chunks lie, what the file says of itself, and whether
-all of that agrees.
+"""Index and verify the records of an mcap file: chunks, indexes, checksums and summary.
 
-A file is walked from record to record, without unpacking its chunks. What it says more than once
-is compared: checksums, chunk headers, message indexes, and the summary with its counts. Every
-difference is told in :attr:`Container.damage`, with its place, and what can still be read is read:
-behind a record that goes wrong the walk continues at the next place from which whole records
-follow each other. Chunks are checked when they are read (:meth:`Container.read`).
+The file is read record by record, without decompressing its chunks. Redundant data are compared:
+checksums, chunk headers, message indexes, and the summary with its counts. Every difference goes
+into :attr:`Container.damage`, with its offset, and reading continues: after a damaged record, at
+the next offset at which whole records follow each other. Chunks are verified when they are read
+(:meth:`Container.read`).
 """
 
 from __future__ import annotations
@@ -37,23 +36,23 @@ __all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "Se
 MAX_CHUNK = 256 * 2**20
 """Largest chunk that is unpacked, bytes. Writers default to 1 to 4 MiB."""
 MAX_RATIO = 300
-"""Most bytes that a file's chunks may unpack to in all, for each byte of the file. An idle body's
-states, of which little more than the times changes, reach about 130."""
+"""Most decompressed bytes for each byte of the file. The states of an idle robot, in which little
+more than the times change, reach about 130."""
 SPARE = 8 * 2**20
-"""Bytes that may be unpacked beyond that, so that a short recording is no exception."""
+"""Decompressed bytes allowed beyond that, for short recordings."""
 
-# Largest schema, channel, metadata or index record that is believed, bytes.
+# Largest schema, channel, metadata or index record that is accepted, bytes.
 _MAX_RECORD = 64 * 2**20
 # Messages outside of chunks are read in runs of this many bytes.
 _RUN = 4 * 2**20
 # A checksum is taken over, and the next record is looked for in, this many bytes at a time.
 _BLOCK = 2**20
 _SCAN = 2**16
-# How often the walk continues behind a record that goes wrong.
+# How often reading resumes after a damaged record.
 _MAX_RESUMED = 1000
-# Records in one chunk that do not belong there, before it is given up.
-_MAX_ODD = 100
-_MAX_TOLD = 50
+# Records in one chunk that do not belong there, before the rest of it is left out.
+_MAX_FOREIGN = 100
+_MAX_MESSAGES = 50
 
 _INDEX = struct.Struct("<HI")  # channel, bytes of its entries
 HEADS = np.dtype(
@@ -111,7 +110,7 @@ class Segment:
 
 
 class _Snapshot:
-    """A file as long as it was when it was opened; a recorder may be writing on meanwhile."""
+    """A file limited to its size when it was opened; a recorder may still be writing to it."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._size = file, size
@@ -128,9 +127,9 @@ class Container:
     """The records of a file; see :meth:`open`.
 
     :ivar truncated: the file ends before its end record.
-    :ivar damage: what contradicts itself, or cannot be read, in sentences with the place.
-    :ivar warnings: the same, and what else is odd.
-    :ivar notes: what is not wrong, but limits what can be checked.
+    :ivar damage: contradictions and unreadable parts, as sentences with the offset.
+    :ivar warnings: the same, and other irregularities.
+    :ivar notes: facts that limit what can be verified.
     """
 
     def __init__(self, path: Path) -> None:
@@ -153,26 +152,26 @@ class Container:
         self._size = 0
         self._complete_definitions = False
 
-    # -- what is odd ---------------------------------------------------------------------------
+    # -- warnings ------------------------------------------------------------------------------
 
     def warn(self, text: str) -> None:
-        """Tell what is odd, once."""
-        _add(self.warnings, text)
+        """Add a warning, unless it is listed already."""
+        _append_limited(self.warnings, text)
 
-    def hurt(self, text: str) -> None:
-        """Tell what is damaged, once."""
-        _add(self.damage, text)
-        _add(self.warnings, text)
+    def report_damage(self, text: str) -> None:
+        """Add damage and a warning, unless it is listed already."""
+        _append_limited(self.damage, text)
+        _append_limited(self.warnings, text)
 
     # -- the walk ------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Walk over the records, reading what is small and noting where the rest lies.
+        """Index the file: read short records, note the offsets of chunks and attachments.
 
         :raises TraceUnreadable: it is missing, not an mcap file, or ends within its header.
         """
         try:
-            with open(self.path, "rb", opener=_at_once) as file:
+            with open(self.path, "rb", opener=_open_nonblocking) as file:
                 status = os.fstat(file.fileno())
                 if not stat.S_ISREG(status.st_mode):
                     raise TraceUnreadable(
@@ -183,12 +182,12 @@ class Container:
                 snapshot = cast(BinaryIO, _Snapshot(file, self._size))
                 self._walk(snapshot, self._read_start(snapshot))
                 sound = self._check_sums(snapshot)
-                self._repeat(sound)
+                self._apply_summary_definitions(sound)
                 self._complete(snapshot, sound)
         except OSError as error:
             raise TraceUnreadable(f"cannot read {self.path}: {error.strerror}") from error
         for text in contradictions(self._summary, self._found, complete=self._complete_definitions):
-            self.hurt(text)
+            self.report_damage(text)
 
     def _read_start(self, file: BinaryIO) -> int:
         magic = file.read(len(MAGIC))
@@ -196,7 +195,7 @@ class Container:
             sum(a != b for a, b in zip(magic, MAGIC, strict=True)) == 1
         )
         if magic != MAGIC and not close:
-            raise TraceUnreadable(f"{self.path} is not an mcap file", hint=_guess(magic))
+            raise TraceUnreadable(f"{self.path} is not an mcap file", hint=_guess_format(magic))
         at = len(MAGIC)
         opcode, _, end = next(self._records(file, at), (0, at, at))
         body = at + HEAD.size
@@ -205,22 +204,22 @@ class Container:
                 file.seek(body)
                 self.profile, self.library = records.header(file.read(end - body))
                 if close:
-                    self.hurt("the first 8 bytes are not quite those of an mcap file")
-                if end == self._size or self._is_record(file, end) or not self._closed(file):
+                    self.report_damage("the first 8 bytes are not quite those of an mcap file")
+                if end == self._size or self._is_record(file, end) or not self._has_end_magic(file):
                     return end
                 problem = "the header is followed by nonsense"
             except BadRecord as error:
                 problem = f"the header cannot be read ({error})"
         else:
             problem = "it ends, or goes wrong, within its header"
-        found = None if close or not self._closed(file) else self._resume(file, at + 1)
+        found = None if close or not self._has_end_magic(file) else self._resume(file, at + 1)
         if found is None:
             raise TraceUnreadable(f"{self.path}: {problem}")
-        self.hurt(problem)
+        self.report_damage(problem)
         return found
 
-    def _closed(self, file: BinaryIO) -> bool:
-        """Whether the file ends as a finished one does."""
+    def _has_end_magic(self, file: BinaryIO) -> bool:
+        """Whether the file ends with the mcap magic bytes, as a finished one does."""
         file.seek(max(0, self._size - len(MAGIC)))
         return file.read() == MAGIC
 
@@ -245,20 +244,20 @@ class Container:
                         at = sure = cut
                         found = self._records(file, at)
                         continue
-                    if cut == size or not self._closed(file):
+                    if cut == size or not self._has_end_magic(file):
                         break
                 behind = None
                 if resumed < _MAX_RESUMED and self._data_end is None:
                     behind = self._resume(file, max(sure, at + 1 if odd else at + HEAD.size))
                 if behind is None:
-                    if odd or self._closed(file):
+                    if odd or self._has_end_magic(file):
                         # zeros are what a file system leaves after a power cut
-                        self.hurt(
+                        self.report_damage(
                             f"nonsense from byte {at}; the remaining {size - at} bytes are lost"
                         )
                     break
                 resumed += 1
-                self.hurt(f"nonsense at byte {at}; {behind - at} bytes are lost")
+                self.report_damage(f"nonsense at byte {at}; {behind - at} bytes are lost")
                 self._run = None
                 at = sure = behind
                 found = self._records(file, at)
@@ -267,22 +266,22 @@ class Container:
                 finished = self._read_footer(file, at, end)
                 at = end
                 break
-            at, sure = self._take(file, opcode, at, end)
+            at, sure = self._read_record(file, opcode, at, end)
             if at != end:
                 found = self._records(file, at)
         if finished:
             return
-        if self._closed(file):
-            self.hurt("the end of the file is damaged: it has no footer")
+        if self._has_end_magic(file):
+            self.report_damage("the end of the file is damaged: it has no footer")
             return
         self.truncated = True
         lost = f"; {size - at} bytes after the last whole record" if size > at else ""
         self.warn(f"unfinished recording: read as far as it goes{lost}")
 
-    def _take(self, file: BinaryIO, opcode: int, at: int, end: int) -> tuple[int, int]:
-        """Read one record, or note where it lies.
+    def _read_record(self, file: BinaryIO, opcode: int, at: int, end: int) -> tuple[int, int]:
+        """Read one record, or note its offset.
 
-        :returns: (where the next one begins, from where on records may have been missed).
+        :returns: (offset of the next record, offset from which records may have been missed).
         """
         body = at + HEAD.size
         length = end - body
@@ -309,25 +308,27 @@ class Container:
                 raise BadRecord(f"it has {length} bytes")
             else:
                 file.seek(body)
-                self._read_small(opcode, file.read(length), at, end)
+                self._read_short_record(opcode, file.read(length), at, end)
         except BadRecord as error:
-            self.hurt(f"the record at byte {at} cannot be read ({error}) and is left out")
+            self.report_damage(f"the record at byte {at} cannot be read ({error}) and is left out")
             return end, body
         return end, end
 
-    def _read_small(self, opcode: int, body: bytes, at: int, end: int) -> None:
+    def _read_short_record(self, opcode: int, body: bytes, at: int, end: int) -> None:
         behind = self._data_end is not None
         definition = opcode in (Opcode.SCHEMA, Opcode.CHANNEL)
         if opcode == Opcode.DATA_END:
             if behind:
-                self.hurt(f"a second end of the data section at byte {at}")
+                self.report_damage(f"a second end of the data section at byte {at}")
             (crc,) = struct.unpack_from("<I", body)
             self._data_end = (at, crc)
             self._summary.begin = end
         elif opcode in _IN_SUMMARY or (definition and behind):
             self._summary.add(opcode, body, at, end)
             if not behind:
-                self.hurt(f"a record of the summary lies in the data section, at byte {at}")
+                self.report_damage(
+                    f"a record of the summary lies in the data section, at byte {at}"
+                )
         elif definition:
             self.define(opcode, body, at)
         elif opcode == Opcode.METADATA:
@@ -340,9 +341,9 @@ class Container:
             raise BadRecord("it is a second header")
 
     def _resume(self, file: BinaryIO, begin: int) -> int | None:
-        """The next place at which three whole records, or the file's last ones, follow each other.
+        """Find the next offset at which three whole records, or the file's last ones, follow.
 
-        Where the summary has its place, nothing is looked for: it is given up as a whole.
+        The summary section is not searched: if it is damaged, it is left out as a whole.
         """
         size = self._size
         for base in range(begin, size, _SCAN):
@@ -358,11 +359,11 @@ class Container:
             room = np.uint64(max(0, size - base))
             likely = np.flatnonzero((least > 0) & (lengths >= least) & (lengths < room))
             for place in likely.tolist():
-                if self._follows(file, base + place):
+                if self._records_follow(file, base + place):
                     return base + int(place)
         return None
 
-    def _follows(self, file: BinaryIO, at: int) -> bool:
+    def _records_follow(self, file: BinaryIO, at: int) -> bool:
         """Whether three whole records, or the file's last ones, follow each other from ``at``."""
         whole = 0
         for opcode, begin, end in islice(self._records(file, at), 3):
@@ -377,7 +378,7 @@ class Container:
         return whole == 3
 
     def _add_chunk(self, file: BinaryIO, at: int, end: int) -> int:
-        """Note a chunk; returns its end as its own lengths have it, or 0 if it is cut short."""
+        """Index a chunk; return its end by its own lengths, or 0 if it is cut short."""
         size = self._size
         body = at + HEAD.size
         file.seek(body)
@@ -385,7 +386,9 @@ class Container:
             head = records.chunk_head(file.read(records.CHUNK_START))
         except BadRecord as error:
             if end <= size:
-                self.hurt(f"the chunk at byte {at} has no readable header ({error}); left out")
+                self.report_damage(
+                    f"the chunk at byte {at} has no readable header ({error}); left out"
+                )
             return end if end <= size else 0
         offset, length, unpacked = body + head.begin, head.packed, head.size
         segment = Segment(
@@ -396,10 +399,14 @@ class Container:
         if inner != end:
             # one of the two lengths is wrong, or the file ends here
             if inner <= size and self._is_record(file, inner):
-                self.hurt(f"the chunk at byte {at} is {inner - at} bytes long, and says {end - at}")
+                self.report_damage(
+                    f"the chunk at byte {at} is {inner - at} bytes long, and says {end - at}"
+                )
                 segment.total = inner - at
             elif end <= size:
-                self.hurt(f"the chunk at byte {at} has {length} bytes in a record of {end - at}")
+                self.report_damage(
+                    f"the chunk at byte {at} has {length} bytes in a record of {end - at}"
+                )
                 segment.length = end - offset
                 inner = end
             else:
@@ -408,11 +415,11 @@ class Container:
             segment.length, segment.cut = size - offset, True
         most = MAX_RATIO * size + SPARE - self._unpacked
         if max(segment.length, unpacked) > MAX_CHUNK:
-            self.hurt(
+            self.report_damage(
                 f"the chunk at byte {at} claims {unpacked} bytes, more than {MAX_CHUNK}; left out"
             )
         elif unpacked > most:
-            self.hurt(
+            self.report_damage(
                 f"the chunk at byte {at} claims {unpacked} bytes: the file's chunks unpack to more "
                 f"than {MAX_RATIO} times its size; left out"
             )
@@ -440,7 +447,7 @@ class Container:
             due = stop or segment.at + segment.total
         if segment is None or not segment.total or at != due:
             if not self._found.left_out:
-                self.hurt(f"the message index at byte {at} belongs to no chunk")
+                self.report_damage(f"the message index at byte {at} belongs to no chunk")
             return
         segment.index = (begin or at, end)
         segment.index_offsets[channel_id] = at
@@ -463,8 +470,8 @@ class Container:
         self._found.attachments.append((at, end - at, about))
         file.seek(stop)
         (crc,) = struct.unpack("<I", file.read(4))
-        if crc and _crc_of(file, body, stop) != crc:
-            self.hurt(
+        if crc and _compute_crc(file, body, stop) != crc:
+            self.report_damage(
                 f"the attachment {about.name[:60]!r} at byte {at} does not match its checksum"
             )
 
@@ -477,37 +484,37 @@ class Container:
             return False
         file.seek(end)
         if file.read(len(MAGIC)) != MAGIC:
-            self.hurt("the last 8 bytes are not those of an mcap file")
+            self.report_damage("the last 8 bytes are not those of an mcap file")
         if self._size > end + len(MAGIC):
             more = self._size - end - len(MAGIC)
-            self.hurt(f"{more} bytes behind the end of the recording are not read")
+            self.report_damage(f"{more} bytes behind the end of the recording are not read")
         return True
 
-    # -- what it says of itself ----------------------------------------------------------------
+    # -- checksums and summary -----------------------------------------------------------------
 
     def _check_sums(self, file: BinaryIO) -> bool:
-        """Compare the checksums of data section and summary; True if the summary's is right."""
+        """Verify the checksums of data section and summary; True if the summary's is right."""
         summary, footer = self._summary, self._summary.footer
         unsure = []
         if self._data_end is None:
             if not self.truncated:
-                self.hurt("the data section has no end record")
+                self.report_damage("the data section has no end record")
         elif not self._data_end[1]:
             unsure.append("the data section")
-        elif _crc_of(file, 0, self._data_end[0]) != self._data_end[1]:
-            self.hurt(
+        elif _compute_crc(file, 0, self._data_end[0]) != self._data_end[1]:
+            self.report_damage(
                 f"the data section, bytes 0 to {self._data_end[0]}, does not match its checksum"
             )
         sound = False
         if footer is not None:
             if not footer.crc:
                 unsure.append("the summary")
-            elif _crc_of(file, summary.begin or summary.end, summary.end + HEAD.size + 16) == (
+            elif _compute_crc(file, summary.begin or summary.end, summary.end + HEAD.size + 16) == (
                 footer.crc
             ):
                 sound = True
             else:
-                self.hurt(
+                self.report_damage(
                     f"the summary, bytes {summary.begin} to {summary.end}, "
                     "does not match its checksum"
                 )
@@ -521,19 +528,19 @@ class Container:
             self.notes.append("unfinished, so no checksum over what lies outside of its chunks")
         return sound
 
-    def _repeat(self, sound: bool) -> None:
-        """Take over what the summary repeats, if it can be believed."""
+    def _apply_summary_definitions(self, sound: bool) -> None:
+        """Use the summary's schemas and channels if its checksum is right."""
         for opcode, body, at in self._summary.definitions if sound else ():
-            self._define_if(opcode, body, at)
+            self._define_if_readable(opcode, body, at)
 
-    def _define_if(self, opcode: int, body: bytes, at: int) -> None:
+    def _define_if_readable(self, opcode: int, body: bytes, at: int) -> None:
         try:
             self.define(opcode, body, at)
         except BadRecord as error:
-            self.hurt(f"a definition at byte {at} cannot be read ({error})")
+            self.report_damage(f"a definition at byte {at} cannot be read ({error})")
 
     def define(self, opcode: int, body: bytes, at: int) -> None:
-        """Take over a schema or a channel; what was defined before must be the same."""
+        """Add a schema or channel; a second definition must equal the first."""
         key = (opcode, int.from_bytes(body[:2], "little"))
         before = self._bodies.get(key)
         if before is None:
@@ -547,18 +554,20 @@ class Container:
         elif before != body:
             if opcode == Opcode.SCHEMA:
                 if self.schemas[key[1]] != records.schema(body):
-                    self.hurt(f"schema {key[1]} is defined twice, again at byte {at}, differently")
+                    self.report_damage(
+                        f"schema {key[1]} is defined twice, again at byte {at}, differently"
+                    )
                 return
             known, channel = self.channels[key[1]], records.channel(body)
             if known != channel:
                 both = f", for {known.topic[:200]} and for {channel.topic[:200]}"
-                self.hurt(
+                self.report_damage(
                     f"channel {key[1]} is defined twice{both * (known.topic != channel.topic)}, "
                     f"again at byte {at}, differently; the first is used"
                 )
 
     def _complete(self, file: BinaryIO, sound: bool) -> None:
-        """Read into those segments that the indexes leave unknown, and into all if in doubt."""
+        """Scan the segments without a usable message index; all of them if in doubt."""
         known = sound and bool(self._summary.definitions)
         doubt = bool(self.damage) or any(contradictions(self._summary, self._found, complete=known))
         read = 0
@@ -566,21 +575,26 @@ class Container:
             # the index of the last chunk of an unfinished file may itself be cut
             last = self.truncated and number + 1 == len(self.segments)
             counts = segment.counts
-            if doubt or last or counts is None or not (_fits(segment) and self._knows(counts)):
-                self._survey(file, segment)
+            if (
+                doubt
+                or last
+                or counts is None
+                or not (_index_matches_header(segment) and self._are_defined(counts))
+            ):
+                self._scan_segment(file, segment)
                 read += 1
         for opcode, body, at in () if sound else self._summary.definitions:
-            self._define_if(opcode, body, at)
+            self._define_if_readable(opcode, body, at)
         self._complete_definitions = bool(self._summary.definitions) or read == len(self.segments)
 
-    def _knows(self, channel_ids: Iterable[int]) -> bool:
+    def _are_defined(self, channel_ids: Iterable[int]) -> bool:
         for channel_id in channel_ids:
             channel = self.channels.get(channel_id)
             if channel is None or (channel.schema_id and channel.schema_id not in self.schemas):
                 return False
         return True
 
-    def _survey(self, file: BinaryIO, segment: Segment) -> None:
+    def _scan_segment(self, file: BinaryIO, segment: Segment) -> None:
         _, _, heads = self.read(file, segment)
         segment.counts = counts = {}
         for channel_id, some in by_channel(heads["channel"]):
@@ -598,22 +612,24 @@ class Container:
                     segment.end_ns,
                 )
             ):
-                self.hurt(f"the chunk at byte {segment.at} holds other times than its header says")
+                self.report_damage(
+                    f"the chunk at byte {segment.at} holds other times than its header says"
+                )
             segment.start_ns, segment.end_ns = first, last
 
     # -- chunks --------------------------------------------------------------------------------
 
     def read(self, file: BinaryIO, segment: Segment) -> tuple[bytes, NDArray[np.int64], Heads]:
-        """The messages in a segment: its bytes, where messages begin in them, and their heads.
+        """Read a segment: its bytes, the offsets of its messages, and their heads.
 
-        What is damaged is left out and told, as is what does not agree with the message index.
+        Damaged messages are left out and reported, as are contradictions to the message index.
         """
         data = self._unpack(file, segment)
         at = 0
         index = _message_index(file, segment) if segment.index[1] else None
         if index is not None:
             channels, times, starts = index
-            if _are_all(data, starts):
+            if _are_contiguous(data, starts):
                 at = self._scan(data, segment, [], int(starts[0]))
                 if at == starts[0]:
                     heads = rows_at(data, starts, HEADS.itemsize).view(HEADS)[:, 0]
@@ -621,7 +637,7 @@ class Container:
                         np.array_equal(heads["channel"], channels)
                         and np.array_equal(heads["log"], times)
                     ):
-                        self._hurt_index(segment)
+                        self._report_index_damage(segment)
                     return data, starts, heads
         found: list[int] = []
         self._scan(data, segment, found)
@@ -635,16 +651,16 @@ class Container:
                 and np.array_equal(heads["channel"], channels[order])
                 and np.array_equal(heads["log"], times[order])
             ):
-                self._hurt_index(segment)
+                self._report_index_damage(segment)
         return data, begins, heads
 
-    def _hurt_index(self, segment: Segment) -> None:
-        self.hurt(
+    def _report_index_damage(self, segment: Segment) -> None:
+        self.report_damage(
             f"the message index of the chunk at byte {segment.at} is not that of its messages"
         )
 
     def _unpack(self, file: BinaryIO, segment: Segment) -> bytes:
-        """The records in a segment; empty if they are damaged."""
+        """Return the decompressed records of a segment; empty if they are damaged."""
         file.seek(segment.offset)
         packed = file.read(segment.length)
         if not segment.total:
@@ -654,37 +670,37 @@ class Container:
             if segment.compression == "":
                 data, more = packed, False
             elif segment.compression == "zstd":
-                data, more = _unzstd(packed, segment.size, segment.cut)
+                data, more = _decompress_zstd(packed, segment.size, segment.cut)
             elif segment.compression == "lz4":
                 unpacker = lz4.frame.LZ4FrameDecompressor()
                 data = unpacker.decompress(packed, segment.size)
                 more = not (unpacker.eof or segment.cut)
             else:
-                self.hurt(f"{where} is compressed with {segment.compression!r}; left out")
+                self.report_damage(f"{where} is compressed with {segment.compression!r}; left out")
                 return b""
         except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
             if not segment.cut:
-                self.hurt(f"{where} is damaged and left out ({error})")
+                self.report_damage(f"{where} is damaged and left out ({error})")
             return b""
         if segment.cut:
             return data[: segment.size]
         if more or len(data) != segment.size:
-            self.hurt(
+            self.report_damage(
                 f"{where} is damaged (it does not unpack to {segment.size} bytes) and left out"
             )
             return b""
         if segment.crc and _crc32(data) != segment.crc:
-            self.hurt(f"{where} is damaged (its checksum does not match) and left out")
+            self.report_damage(f"{where} is damaged (its checksum does not match) and left out")
             return b""
         return data
 
     def _scan(
         self, data: bytes, segment: Segment, found: list[int], stop: int | None = None
     ) -> int:
-        """Go from record to record; where messages begin goes to ``found``.
+        """Scan the records of a segment; append the offsets of messages to ``found``.
 
-        :param stop: where to end; None for the end of the data.
-        :returns: where the last record ended.
+        :param stop: end offset; None for the end of the data.
+        :returns: end offset of the last record.
         """
         odd = 0
         bad = ""
@@ -693,16 +709,16 @@ class Container:
             if after > len(data):
                 bad = "a record is longer than what is left"
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define_if(opcode, data[at + HEAD.size : after], segment.at)
+                self._define_if_readable(opcode, data[at + HEAD.size : after], segment.at)
             elif opcode == Opcode.MESSAGE:
                 if after - at < HEADS.itemsize:
                     bad = "a message is shorter than its head"
             else:
                 odd += 1
-                if odd > _MAX_ODD:
+                if odd > _MAX_FOREIGN:
                     bad = "too many records that do not belong there"
                 else:
-                    self.hurt(
+                    self.report_damage(
                         f"the chunk at byte {segment.at} holds a record of kind {opcode:#x}, which "
                         f"does not belong there, after {at} bytes"
                     )
@@ -715,14 +731,14 @@ class Container:
             if stop is None and at != len(data):
                 bad = "a record ends within its first 9 bytes"
         if bad and not segment.cut:
-            self.hurt(
+            self.report_damage(
                 f"records of the chunk at byte {segment.at} go wrong after {at} bytes ({bad})"
             )
         return at
 
 
 def by_channel(channels: NDArray[np.uint16]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Each channel that occurs, and where."""
+    """Yield each channel id that occurs, and the indices at which it does."""
     if not len(channels):
         return
     order = np.argsort(channels, kind="stable")
@@ -734,14 +750,14 @@ def by_channel(channels: NDArray[np.uint16]) -> Iterator[tuple[int, NDArray[np.i
         begin = end
 
 
-def _add(told: list[str], text: str) -> None:
-    if text in told or len(told) > _MAX_TOLD:
+def _append_limited(told: list[str], text: str) -> None:
+    if text in told or len(told) > _MAX_MESSAGES:
         return
-    told.append(text if len(told) < _MAX_TOLD else "and more, which is not listed")
+    told.append(text if len(told) < _MAX_MESSAGES else "and more, which is not listed")
 
 
-def _fits(segment: Segment) -> bool:
-    """Whether a chunk's header has the times that its message index has."""
+def _index_matches_header(segment: Segment) -> bool:
+    """Whether the times in a chunk's header equal those of its message index."""
     if not segment.total or not segment.counts:
         return True
     first = min(c[1] for c in segment.counts.values())
@@ -759,7 +775,7 @@ def _read_at(file: BinaryIO, at: int, count: int) -> bytes:
     return file.read(count)
 
 
-def _crc_of(file: BinaryIO, begin: int, end: int) -> int:
+def _compute_crc(file: BinaryIO, begin: int, end: int) -> int:
     file.seek(begin)
     crc = 0
     while begin < end:
@@ -771,8 +787,8 @@ def _crc_of(file: BinaryIO, begin: int, end: int) -> int:
     return int(crc)
 
 
-def _guess(magic: bytes) -> str:
-    """What a file that is no mcap file may be, from its first bytes."""
+def _guess_format(magic: bytes) -> str:
+    """Guess the format of a file that is not mcap from its first bytes."""
     if magic.startswith(b"SQLite f"):
         return "a ROS 2 .db3 bag: convert it to mcap ('ros2 bag convert', or 'rosbags-convert')"
     if magic.startswith(b"#ROSBAG"):
@@ -786,8 +802,8 @@ def _guess(magic: bytes) -> str:
     return "recordings are mcap files (https://mcap.dev)"
 
 
-def _unzstd(packed: bytes, size: int, cut: bool) -> tuple[bytes, bool]:
-    """At most ``size`` bytes, whatever the frame says of itself; and whether there are more."""
+def _decompress_zstd(packed: bytes, size: int, cut: bool) -> tuple[bytes, bool]:
+    """Decompress at most ``size`` bytes; also return whether more follow."""
     if cut:
         unpacker = zstandard.ZstdDecompressor().decompressobj()
         out = bytearray()
@@ -829,7 +845,7 @@ def _message_index(
     return np.concatenate(channels)[order], entries[::2][order], starts[order]
 
 
-def _are_all(data: bytes, starts: NDArray[np.int64]) -> bool:
+def _are_contiguous(data: bytes, starts: NDArray[np.int64]) -> bool:
     """Whether messages begin at ``starts``, each where the last ends, up to the end of ``data``."""
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - HEADS.itemsize:
         return False
@@ -843,6 +859,6 @@ def _are_all(data: bytes, starts: NDArray[np.int64]) -> bool:
     )
 
 
-def _at_once(path: str, flags: int) -> int:
-    """Open without waiting for a pipe's writer."""
+def _open_nonblocking(path: str, flags: int) -> int:
+    """Open a file without blocking; a named pipe would block until it has a writer."""
     return os.open(path, flags | os.O_NONBLOCK)

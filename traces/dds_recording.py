@@ -1,9 +1,9 @@
-"""From DDS into a recorder: which topics, which types, and what discovery saw meanwhile.
+"""Record DDS topics: subscribe, pass samples to a recorder, and store the endpoints seen.
 
-A plain DDS reader must know the type. Types come from discovery (any endpoint of a known type
-on a wanted topic, reader or writer) and, for topics asked for by name on which there is nobody
-yet, from the hand models, so that the reader is there before the writer: a controller that forks
-never learns of readers that appear later (docs/sources/unitree-dex.md#b7).
+A DDS reader needs the topic's type. Types come from discovery (any reader or writer of a known type
+on a wanted topic) and, for topics asked for by name without endpoints yet, from the hand models, so
+that the reader exists before the writer: a controller that forks never discovers later readers
+(docs/sources/unitree-dex.md#b7).
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ RECEIVE_BUFFER = 16 * 2**20
 MAX_TOPICS = 256
 # Descriptions of endpoints that are kept.
 _MAX_SEEN = 1000
-# Seconds between looks at what was lost, and between records of it in the file.
-_LOOK_EVERY = 0.25
-_NOTE_EVERY = 2.0
+# Seconds between checks for losses, and between loss records in the file.
+_LOSS_CHECK_INTERVAL = 0.25
+_LOSS_RECORD_INTERVAL = 2.0
 # Seconds between metadata records with the endpoints, at most; they change when a run starts.
-_ENDPOINTS_EVERY = 0.25
-# Seconds in which discovery may tell the type of a topic asked for by name; on one machine it takes
+_ENDPOINTS_INTERVAL = 0.25
+# Seconds to wait for discovery of the type of a topic asked for by name; on one machine it takes
 # a few tens of milliseconds.
-_LOOK = 0.5
-# Seconds after which the thread looks around although nothing woke it.
+_DISCOVERY_WAIT = 0.5
+# Seconds after which the thread runs its checks although nothing woke it.
 _IDLE = 0.1
 
 
@@ -103,12 +103,12 @@ class DdsRecording:
 
     @property
     def unknown(self) -> dict[str, str]:
-        """Wanted topics that cannot be recorded, and why."""
+        """Reason for each wanted topic that cannot be recorded."""
         return dict(self._unknown)
 
     @property
     def failure(self) -> Exception | None:
-        """What ended it before it was stopped, or None."""
+        """The error that ended the recording before it was stopped, or None."""
         return self._thread.failure if self._thread is not None else None
 
     def start(self) -> None:
@@ -122,12 +122,12 @@ class DdsRecording:
         def unused(endpoints: list[Endpoint]) -> set[str]:
             return guesses.keys() - {e.topic for e in endpoints if not e.own}
 
-        self.node.discovery.wait(lambda endpoints: not unused(endpoints), timeout=_LOOK)
+        self.node.discovery.wait(lambda endpoints: not unused(endpoints), timeout=_DISCOVERY_WAIT)
         for topic in sorted(unused(self.node.endpoints())):
             for type_name in guesses[topic]:
                 self._subscribe(topic, type_name)
         self._unsubscribe = self.node.discovery.subscribe(
-            lambda event: self._note(event.endpoint) if event.appeared else None
+            lambda event: self._on_endpoint(event.endpoint) if event.appeared else None
         )
         if (size := self._sockets.enlarge(RECEIVE_BUFFER)) > 0:
             self.recorder.add_metadata("dexkit_recorder", {"receive_buffer": str(size)})
@@ -135,9 +135,9 @@ class DdsRecording:
         self._thread.start()
 
     def stop(self) -> None:
-        """Take what has arrived, unsubscribe. May be called twice.
+        """Read the remaining samples and unsubscribe. May be called twice.
 
-        :raises DexkitError: what ended the recording before.
+        :raises DexkitError: the error that ended the recording before.
         """
         thread, self._thread = self._thread, None
         if thread is None:
@@ -158,8 +158,8 @@ class DdsRecording:
     def __exit__(self, *exc: object) -> None:
         self.stop()
 
-    def _note(self, endpoint: Endpoint) -> None:
-        # in the dispatcher's thread: only note it
+    def _on_endpoint(self, endpoint: Endpoint) -> None:
+        # this runs in the discovery dispatcher's thread, so it only stores the endpoint
         if not endpoint.own and not endpoint.topic.startswith("DCPS"):
             with self._fresh_lock:
                 self._fresh.append(endpoint)
@@ -176,15 +176,15 @@ class DdsRecording:
             if pause is not None:
                 _log.warning("%s", pause)
             changed |= self._discover()
-            self._take()
+            self._read_samples()
             now = time.monotonic()
-            if stopping or pause is not None or now - looked >= _LOOK_EVERY:
+            if stopping or pause is not None or now - looked >= _LOSS_CHECK_INTERVAL:
                 looked = now
                 news |= self._count_losses(now) or pause is not None
-                if stopping or (news and now - noted >= _NOTE_EVERY):
+                if stopping or (news and now - noted >= _LOSS_RECORD_INTERVAL):
                     self.recorder.add_metadata("dexkit_recorder", self.losses.metadata())
                     noted, news = now, False
-            if changed and (stopping or now - told >= _ENDPOINTS_EVERY):
+            if changed and (stopping or now - told >= _ENDPOINTS_INTERVAL):
                 self.recorder.add_metadata("dds_endpoints", self._endpoint_record())
                 told, changed = now, False
             if stopping:
@@ -239,7 +239,7 @@ class DdsRecording:
         except DdsError as error:  # a name that DDS does not allow, and a peer has all the same
             self._unknown[topic] = str(error)
 
-    def _take(self) -> None:
+    def _read_samples(self) -> None:
         for key, reader in self._readers.items():
             samples = reader.take()
             if not samples:

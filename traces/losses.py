@@ -1,18 +1,17 @@
-"""What a recording lacks, as far as the recorder can know; sans IO.
+"""Count samples that are missing in a recording, as far as the recorder can detect; no I/O.
 
 Three things are counted:
 
-* *datagrams* that the kernel dropped because the socket's receive buffer was full. That is
-  proven, but not told by topic. CycloneDDS 0.10 gives no sequence numbers to readers, and its
-  "sample lost" status does not count gaps in them (its source: it is raised only for samples
-  that are too old for their reader).
-* samples that were *refused*, because as many as the reader holds waited already. Proven, by
-  topic.
-* samples that *seem to be missing* on each topic: when datagrams were dropped, gaps in a
-  writer's source timestamps are divided by its period until then. An estimate.
+* *datagrams* that the kernel dropped because the socket's receive buffer was full. An exact count,
+  but not per topic. CycloneDDS 0.10 gives readers no sequence numbers, and its "sample lost" status
+  does not count gaps in them (its source raises it only for samples that are too old for their
+  reader).
+* samples *refused* because the reader's queue was full. An exact count per topic.
+* samples that are *probably missing* on each topic: when datagrams were dropped, gaps in a writer's
+  source timestamps are divided by its period. An estimate.
 
-What is lost before it reaches this machine is not seen: topics are read best-effort, so that the
-recorder never slows down what it records.
+Losses before this machine are not detected: the readers are best-effort, so that the recorder never
+slows down the writers.
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ from datetime import datetime, timezone
 
 __all__ = ["PAUSE", "Losses", "Pause"]
 
-#: Seconds between two turns of the recorder's loop that are told as a pause.
+#: Seconds between two iterations of the recorder's loop from which on it counts as a pause.
 PAUSE = 0.5
-# Periods without a sample that are a gap, and intervals after which the period is known.
+# Periods without a sample that are a gap, and intervals after which the period estimate is used.
 _GAP = 2.5
-_KNOWN = 8
+_MIN_INTERVALS = 8
 # Share of a new interval in the running period.
 _SHARE = 1 / 16
-# Seconds after a drop was seen in which its gap may show: the next sample has to come first.
-_SHOWS = 5.0
-_TOLD = 20  # pauses that are kept
+# Seconds after a drop in which its gap may be detected: the next sample must arrive first.
+_GAP_WINDOW = 5.0
+_MAX_PAUSES = 20  # pauses that are kept
 
 
 @dataclass(frozen=True)
 class Pause:
-    """A time in which the recorder did not run: stopped, suspended, or starved.
+    """A time in which the recorder did not run: stopped, suspended, or not scheduled.
 
     :param end_ns: wall clock.
     """
@@ -84,7 +83,7 @@ class Losses:
         self._until = float("-inf")
 
     def turn(self, now: float, wall_ns: int) -> Pause | None:
-        """The recorder's loop begins a turn.
+        """Note one iteration of the recorder's loop.
 
         :param now: seconds of a clock that counts suspension, too.
         :returns: the pause that has just ended, if there was one.
@@ -94,12 +93,12 @@ class Losses:
             return None
         pause = Pause(now - before, wall_ns)
         self.paused += 1
-        if len(self.pauses) < _TOLD:
+        if len(self.pauses) < _MAX_PAUSES:
             self.pauses.append(pause)
         return pause
 
     def sample(self, topic: str, writer: int, source_ns: int) -> None:
-        """A sample was taken. Those of a writer come in order."""
+        """Note a received sample. Those of one writer must come in order."""
         stream = self._streams.get((topic, writer))
         if stream is None:
             if len(self._streams) >= 4096:  # clients that come and go
@@ -110,7 +109,7 @@ class Losses:
         if before <= 0 or passed <= 0:  # the first, one without a time, a clock that was set
             return
         stream.intervals += 1
-        known = stream.intervals > _KNOWN
+        known = stream.intervals > _MIN_INTERVALS
         if known and passed > _GAP * stream.period:
             stream.missing += round(passed / stream.period) - 1
             stream.holes += 1
@@ -119,16 +118,16 @@ class Losses:
             stream.period += (passed - stream.period) * share
 
     def look(self, now: float, dropped: int, refused: dict[str, int]) -> bool:
-        """Take the counters, from time to time.
+        """Update the counters; call it periodically.
 
-        :param dropped: datagrams since the last look.
-        :param refused: samples ever, by topic.
-        :returns: whether something was lost since the last look.
+        :param dropped: datagrams dropped since the last call.
+        :param refused: samples refused in total, by topic.
+        :returns: whether anything was lost since the last call.
         """
         news = dropped > 0
         self.datagrams += dropped
         if dropped:
-            self._until = now + _SHOWS
+            self._until = now + _GAP_WINDOW
         if refused != self.refused:
             self.refused, news = dict(refused), True
         for stream in self._streams.values():
@@ -141,9 +140,9 @@ class Losses:
 
     @property
     def about(self) -> dict[str, int]:
-        """Samples that seem to be missing, by topic.
+        """Estimated missing samples, by topic.
 
-        Altogether no more than datagrams were dropped, and one for each hole: CycloneDDS 0.10
+        In total at most the dropped datagrams, plus one for each gap: CycloneDDS 0.10
         does not deliver the first sample of a reliable writer after one (measured).
         """
         total = self._about.total()
@@ -154,7 +153,7 @@ class Losses:
         return bool(self.datagrams or sum(self.refused.values()))
 
     def sentences(self) -> list[str]:
-        """What was lost, and the pauses, for people."""
+        """Losses and pauses as sentences for the user."""
         said = [str(pause) for pause in self.pauses]
         if self.paused > len(self.pauses):
             said.append(f"and {self.paused - len(self.pauses)} pauses more")
@@ -172,7 +171,7 @@ class Losses:
         return said
 
     def metadata(self) -> dict[str, str]:
-        """The same for the recording."""
+        """Losses and pauses as a metadata record of the recording."""
         values = {
             "lost_datagrams": str(self.datagrams),
             "refused": str(sum(self.refused.values())),

@@ -1,13 +1,13 @@
-"""Play recordings: messages at their recorded times, towards absolute deadlines.
+"""Replay recordings: publish messages at their recorded times, with absolute deadlines.
 
-Each message has its deadline from the start of the pass, so lateness of one never delays the
-next. Gaps are kept unless capped. What is to be played is loaded beforehand (about 150 bytes a
-message beside its payload), so that no chunk is unpacked between two deadlines.
+Deadlines count from the start of a pass, so a late message never delays the next. Gaps are kept
+unless capped. All messages are loaded beforehand (about 150 bytes each beside the payload), so that
+no chunk is decompressed between two deadlines.
 
-**After a pause of the player itself** (stopped, suspended, starved; more than
-:data:`~dexkit.command_age.PAUSE`) nothing that fell due meanwhile is sent at once: it would be sent
-with the time of now, so that no hand could tell that it is old. The time line is held instead: the
-recording goes on where it was left. So it does when publishing itself cannot keep up.
+**After a pause of the player itself** (stopped, suspended, not scheduled; more than
+:data:`~dexkit.command_age.PAUSE`) messages that became due are not sent at once: they would carry
+the present time, and no hand could detect that they are stale. Instead all later deadlines shift,
+and replay continues where it paused. The same happens when publishing itself cannot keep up.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ __all__ = ["PlayStats", "Player"]
 #: Seconds before a deadline at which waiting turns into polling the clock.
 SPIN = 0.0002
 # Seconds of one sleep, so that a stop is noticed within a long gap.
-_NAP = 0.05
+_MAX_SLEEP = 0.05
 # Errors kept for the percentiles; older ones of a long loop are forgotten.
-_KEPT = 1_000_000
+_MAX_ERRORS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class Player:
         """
         clock = clock if clock is not None else RealClock()
         stop = stop if stop is not None else threading.Event()
-        errors: deque[float] = deque(maxlen=_KEPT)
+        errors: deque[float] = deque(maxlen=_MAX_ERRORS)
         counts: Counter[str] = Counter()
         self.sent = 0
         passes = 0
@@ -179,7 +179,7 @@ class Player:
 
 
 class _TimeLine:
-    """When each message of a pass is due; held while the player stands still.
+    """Deadlines of the messages of a pass; a pause of the player shifts them.
 
     :ivar start: when the pass began, or would have without pauses.
     """
@@ -208,13 +208,13 @@ class _TimeLine:
                 return 0.0
             if left <= 0:
                 return -left
-            if left > _NAP:
-                clock.sleep_until(clock.now() + _NAP / 2)
+            if left > _MAX_SLEEP:
+                clock.sleep_until(clock.now() + _MAX_SLEEP / 2)
             else:
                 wait_until(clock, self.start + offset, spin=SPIN)
 
     def _notice_pause(self) -> None:
-        """Notice a pause, and move what is still to come behind it."""
+        """Detect a pause and shift the remaining deadlines by it."""
         away = self._watch.measure_pause()
         if away:
             self.pauses += 1

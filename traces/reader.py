@@ -45,7 +45,7 @@ Times = NDArray[np.int64]
 
 # glibc keeps what is freed for the next chunk, up to the largest block that was ever freed; what it
 # gives back to the system costs as much as all the rest of reading, page by page.
-_KEPT = 8 * 2**20
+_MALLOC_KEEP = 8 * 2**20
 # Bytes of chunks that are held while those that overlap in time are put in order.
 _MAX_HELD = 64 * 2**20
 # Messages that are made at once.
@@ -287,9 +287,9 @@ class Trace:
                     topic=dds_topic(words[0]),
                     kind=words[1],
                     reliability=parts[0],
-                    durability=_part(parts, "Durability."),
-                    history=_part(parts, "History."),
-                    type_name=_part(parts, "type="),
+                    durability=_remainder_after(parts, "Durability."),
+                    history=_remainder_after(parts, "History."),
+                    type_name=_remainder_after(parts, "type="),
                 )
             )
         return found
@@ -305,7 +305,7 @@ class Trace:
         :param topics: only these, in any spelling, patterns allowed; None for all.
         :raises UsageError: a topic is not in the recording.
         """
-        names = {i: self._info[i] for i in self._wanted(topics)}
+        names = {i: self._info[i] for i in self._select_channels(topics)}
         segments = sorted(self._file.segments, key=lambda s: s.start_ns)
         # (next log time, number, messages) of the segments that are being given
         held: list[tuple[int, int, _Held]] = []
@@ -349,7 +349,7 @@ class Trace:
         :raises UsageError: a topic is not in the recording.
         """
         chosen: dict[str, ChannelInfo] = {}
-        wanted = self._wanted(topics)
+        wanted = self._select_channels(topics)
         for info in sorted(
             (self._info[i] for i in wanted), key=lambda c: (not c.supported, -c.message_count)
         ):
@@ -369,7 +369,7 @@ class Trace:
                     columns=columns.get(topic),
                 )
                 by_topic[topic].append(sinks[i])
-        bytearray(_KEPT)
+        bytearray(_MALLOC_KEEP)
         with self.path.open("rb") as file:
             for segment in self._file.segments:
                 if segment.counts is None or not sinks.keys().isdisjoint(segment.counts):
@@ -389,13 +389,13 @@ class Trace:
         :raises UsageError: the topic is not in the recording.
         :raises TraceUnsupported: its type, layout or encoding cannot be decoded.
         """
-        channels = [self._info[i] for i in self._wanted([topic])]
+        channels = [self._info[i] for i in self._select_channels([topic])]
         info = min(channels, key=lambda c: (not c.supported, -c.message_count))
         if info.problem:
             raise TraceUnsupported(f"{info.topic}: {info.problem}")
         return message_type(info.type_name)
 
-    def _wanted(self, topics: Iterable[str] | None) -> list[int]:
+    def _select_channels(self, topics: Iterable[str] | None) -> list[int]:
         if topics is None:
             return list(self._info)
         if isinstance(topics, str):
@@ -447,7 +447,7 @@ class Trace:
                 entry[1] = min(entry[1], first)
                 entry[2] = max(entry[2], last)
         for channel_id in totals.keys() - self._file.channels.keys():
-            self._file.hurt(
+            self._file.report_damage(
                 f"{totals[channel_id][0]} messages of channel {channel_id}, which is "
                 "nowhere defined, are left out"
             )
@@ -458,7 +458,7 @@ class Trace:
             type_name = dds_type(schema.name) if schema else channel.metadata.get("dds.type", "")
             problem = ""
             if channel.message_encoding != "cdr":
-                problem = f"message encoding {_short(channel.message_encoding)!r} is not 'cdr'"
+                problem = f"message encoding {_shorten(channel.message_encoding)!r} is not 'cdr'"
             elif schema is None:
                 problem = "it has no schema"
             else:
@@ -481,7 +481,7 @@ class Trace:
             )
             # transfers of a conformance run on USB are there on purpose, for its judge
             if problem and count and not channel.topic.startswith(USB):
-                self._file.warn(f"{_short(channel.topic)}: {problem}")
+                self._file.warn(f"{_shorten(channel.topic)}: {problem}")
         types: dict[str, set[str]] = {}
         for info in self._info.values():
             types.setdefault(info.topic, set()).add(info.type_name)
@@ -510,7 +510,7 @@ def open_trace(path: str | os.PathLike[str]) -> Trace:
     return Trace(found)
 
 
-def _part(parts: Sequence[str], prefix: str) -> str:
+def _remainder_after(parts: Sequence[str], prefix: str) -> str:
     return next((p.removeprefix(prefix) for p in parts if p.startswith(prefix)), "")
 
 
@@ -541,13 +541,13 @@ def _times(pieces: list[NDArray[np.uint64]]) -> Times:
     return np.asarray(np.minimum(times, np.uint64(2**63 - 1)), dtype=np.int64)
 
 
-def _short(text: str) -> str:
+def _shorten(text: str) -> str:
     """A text of a file, cut to what fits into a sentence."""
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 @cache
-def _text(type_name: str) -> str:
+def _schema_text(type_name: str) -> str:
     return omgidl(STRUCTS[type_name])
 
 
@@ -555,15 +555,15 @@ def _text(type_name: str) -> str:
 def _layout(type_name: str) -> schemas.Struct:
     from dexkit.traces import schemas
 
-    return schemas.parse("omgidl", type_name, _text(type_name))
+    return schemas.parse("omgidl", type_name, _schema_text(type_name))
 
 
 def _check_layout(type_name: str, schema: Schema) -> tuple[str, list[str]]:
     """(why payloads of this schema cannot be decoded, or empty; remarks)."""
     if type_name not in STRUCTS:
-        return f"dexkit does not know the type {_short(type_name)}", []
+        return f"dexkit does not know the type {_shorten(type_name)}", []
     if (schema.encoding, schema.name) == ("omgidl", type_name) and (
-        schema.data == _text(type_name).encode()
+        schema.data == _schema_text(type_name).encode()
     ):
         return "", []  # as dexkit itself would write it
     from dexkit.traces import schemas
@@ -571,12 +571,12 @@ def _check_layout(type_name: str, schema: Schema) -> tuple[str, list[str]]:
     try:
         theirs = schemas.parse(schema.encoding, schema.name, schema.data.decode("utf-8", "replace"))
     except TraceUnsupported as error:
-        return _short(error.message), []
+        return _shorten(error.message), []
     breaking, harmless = schemas.differences(theirs, _layout(type_name))
     if breaking:
         return (
             f"recorded with another layout of {type_name} than the current one: "
-            f"{_short('; '.join(breaking))}",
+            f"{_shorten('; '.join(breaking))}",
             [],
         )
-    return "", [_short(note) for note in harmless]
+    return "", [_shorten(note) for note in harmless]

@@ -1,12 +1,12 @@
-"""The file that a recording is written to: whole chunks or nothing, and nobody else's.
+"""Write a recording's file: commit whole chunks or nothing, under an exclusive lock.
 
-* What is written goes into memory until :meth:`RecordingFile.commit`, which puts it on the disk.
-  When the disk takes only a part, the file is cut back to the last commit, so what was said to
-  be written is what can be read.
+* Written data stay in memory until :meth:`RecordingFile.commit`, which writes them to the file. If
+  that fails part-way, the file is truncated to the last commit, so every message reported as
+  written can be read.
 * A recording that replaces another is written beside it, under the same name with ``.part``, and
   takes its place when it holds a message. Until then the old one is untouched.
-* What others do to the file meanwhile is noticed: that it was deleted, renamed or cut at the next
-  commit, that bytes in it were changed at the end.
+* Changes by other programs are detected: deletion, renaming or truncation at the next commit,
+  changed bytes at the end.
 * The file is locked (``flock``) while it is written. A second recorder is refused; readers do
   not look at the lock and may follow the file as it grows.
 
@@ -39,12 +39,12 @@ __all__ = ["ChunkIndexes", "RecordingFile"]
 
 _PART = ".part"
 _CREATE = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
-_BESIDE = _CREATE | os.O_NOFOLLOW | os.O_NONBLOCK
+_OPEN_PART = _CREATE | os.O_NOFOLLOW | os.O_NONBLOCK
 # Records of a recording that ended before its first message
 _BEFORE_MESSAGES = frozenset({Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA})
 _BLOCK = 1 << 20
 _RETRIES = (0.001, 0.01, 0.05)  # seconds; a look at a lock takes microseconds
-_LONGER = (0.1, 0.2)  # seconds, for a lock that another program gives up after _RETRIES
+_EXTRA_RETRIES = (0.1, 0.2)  # seconds, for a lock that another program gives up after _RETRIES
 
 
 class RecordingFile:
@@ -64,13 +64,15 @@ class RecordingFile:
         self._overwrite = overwrite
         self._fd = -1
         self._regular = True
-        self._hidden = False  # written beside, still
+        self._is_part = False  # written beside, still
         self._buffer: list[bytes] = []
         self._buffered = 0
         self._size = 0
         self._crc = 0  # of what was committed
         self._changed_ns = -1  # when the file was last changed by this program
-        self._touched = False  # it was changed by another one, or the clock of its disk differs
+        self._changed_by_others = (
+            False  # it was changed by another one, or the clock of its disk differs
+        )
 
     # -- life ----------------------------------------------------------------------------------
 
@@ -99,19 +101,19 @@ class RecordingFile:
             self._regular = False  # a device or a pipe: nothing to keep, cut back or lock
             self._fd = self._open_device()
             return
-        self._refuse_company(self._part)
+        self._refuse_other_recorder(self._part)
         if existing is None:
             self._fd = self._open_new()
             return
-        self._refuse_company(self._target)
+        self._refuse_other_recorder(self._target)
         fd = self._open_beside()
         try:
             self._lock(fd, fcntl.LOCK_EX)
             # the lock may be that of a file which has got its name meanwhile
             now = _status(self._part)
             if now is None or now.st_ino != os.fstat(fd).st_ino:
-                raise self._busy()
-            self._refuse_company(self._target)
+                raise self._busy_error()
+            self._refuse_other_recorder(self._target)
             if _is_worth_keeping(fd):
                 raise UsageError(
                     f"{self._part} holds messages of a recorder that was killed, "
@@ -124,7 +126,7 @@ class RecordingFile:
         except BaseException:
             os.close(fd)
             raise
-        self._fd, self._hidden = fd, True
+        self._fd, self._is_part = fd, True
 
     def _open_new(self) -> int:
         """Create the file. Another recorder may have seen it before it was locked."""
@@ -133,7 +135,7 @@ class RecordingFile:
             self._lock(fd, fcntl.LOCK_EX)
             # Who is to replace this file locks its own before it looks at this one's lock. If it
             # looked too early, it goes on; else it is refused, and gives up within _RETRIES.
-            self._refuse_company(self._part, (*_RETRIES, *_LONGER))
+            self._refuse_other_recorder(self._part, (*_RETRIES, *_EXTRA_RETRIES))
         except BaseException:
             if self._is_at(self._target, fd):
                 self._target.unlink()
@@ -158,7 +160,7 @@ class RecordingFile:
     def _open_beside(self) -> int:
         """Open ``.part``. Others may have put something there: a link is not followed."""
         try:
-            fd = os.open(self._part, _BESIDE, 0o666)
+            fd = os.open(self._part, _OPEN_PART, 0o666)
             if stat.S_ISREG(os.fstat(fd).st_mode):
                 return fd
             os.close(fd)
@@ -173,14 +175,14 @@ class RecordingFile:
                 fcntl.flock(fd, how | fcntl.LOCK_NB)
             except BlockingIOError:
                 if pause is None:
-                    raise self._busy() from None
+                    raise self._busy_error() from None
                 time.sleep(pause)  # somebody may only be looking
             except OSError:
                 return  # a file system without locks
             else:
                 return
 
-    def _refuse_company(self, path: Path, pauses: Sequence[float] = _RETRIES) -> None:
+    def _refuse_other_recorder(self, path: Path, pauses: Sequence[float] = _RETRIES) -> None:
         """Raise if another recorder writes to ``path``."""
         with contextlib.suppress(FileNotFoundError, PermissionError):
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -189,7 +191,7 @@ class RecordingFile:
             finally:
                 os.close(fd)  # and with it the lock
 
-    def _busy(self) -> UsageError:
+    def _busy_error(self) -> UsageError:
         return UsageError(
             f"{self.path} is being recorded by another program",
             hint="choose another name, or stop that one",
@@ -210,7 +212,7 @@ class RecordingFile:
             if keep:
                 self.publish(fd)
                 return
-            place = self._part if self._hidden else self._target
+            place = self._part if self._is_part else self._target
             if self._is_at(place, fd):
                 place.unlink()
         finally:
@@ -221,11 +223,11 @@ class RecordingFile:
 
         :raises TraceError: another recorder has begun to write there, or it cannot be renamed.
         """
-        if not self._hidden:
+        if not self._is_part:
             return
         fd = self._fd if fd is None else fd
         try:
-            self._refuse_company(self._target)
+            self._refuse_other_recorder(self._target)
             if not self._is_at(self._part, fd):
                 raise TraceError(f"{self._part} was deleted while it was recorded")
             os.replace(self._part, self._target)
@@ -236,7 +238,7 @@ class RecordingFile:
                 f"cannot replace {self.path}: {error.strerror}",
                 hint=f"this recording is {self._part}",
             ) from error
-        self._hidden = False
+        self._is_part = False
 
     # -- for the writer ------------------------------------------------------------------------
 
@@ -252,7 +254,7 @@ class RecordingFile:
         return self._size + self._buffered
 
     def flush(self) -> None:
-        """Nothing; it is :meth:`commit` that writes."""
+        """Do nothing: :meth:`commit` writes."""
 
     @property
     def waiting(self) -> int:
@@ -285,8 +287,8 @@ class RecordingFile:
 
     def _notice_changes(self) -> None:
         """Remember whether another program has written to the file."""
-        if self._regular and self._size and not self._touched:
-            self._touched = os.fstat(self._fd).st_mtime_ns != self._changed_ns
+        if self._regular and self._size and not self._changed_by_others:
+            self._changed_by_others = os.fstat(self._fd).st_mtime_ns != self._changed_ns
 
     def check(self) -> None:
         """See whether it is still there.
@@ -298,12 +300,12 @@ class RecordingFile:
         status = os.fstat(self._fd)
         if status.st_nlink == 0:
             raise TraceError(
-                f"{self._part if self._hidden else self.path} was deleted while it was recorded",
+                f"{self._part if self._is_part else self.path} was deleted while it was recorded",
                 hint="what was recorded is lost",
             )
         if status.st_size != self._size:
-            raise self._changed()
-        if not self._hidden and not self.displaced and not self._is_at(self._target, self._fd):
+            raise self._changed_error()
+        if not self._is_part and not self.displaced and not self._is_at(self._target, self._fd):
             self.displaced = (
                 f"{self.path} was renamed or replaced while it was recorded; "
                 "the recording has another name now"
@@ -318,7 +320,7 @@ class RecordingFile:
         :raises TraceError: another program has written into it.
         """
         self._notice_changes()
-        if not self._touched:
+        if not self._changed_by_others:
             return
         crc = at = 0
         while at < self._size:
@@ -328,11 +330,11 @@ class RecordingFile:
             crc = zlib.crc32(block, crc)
             at += len(block)
         if at != self._size or crc != self._crc:
-            raise self._changed()
+            raise self._changed_error()
 
-    def _changed(self) -> TraceError:
+    def _changed_error(self) -> TraceError:
         return TraceError(
-            f"{self._part if self._hidden else self.path} was changed by another program "
+            f"{self._part if self._is_part else self.path} was changed by another program "
             "while it was recorded",
             hint="dexkit info tells what can be read of it, if anything",
         )
@@ -386,7 +388,7 @@ class RecordingFile:
 
 
 class ChunkIndexes:
-    """In place of the list in which the mcap library collects the index of every chunk.
+    """Replaces the list in which the mcap library collects the index of every chunk.
 
     With five chunks a second that list grows by 18 MB an hour; the file holds the same.
     """

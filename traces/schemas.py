@@ -24,7 +24,7 @@ _MAX_TEXT = 1_000_000
 # Longest word or name in one. Scopes are prefixed to names, so long ones would cost their square.
 _MAX_WORD = 256
 # Differences, and names in one of them, that are told.
-_MAX_TOLD = 8
+_MAX_DIFFERENCES = 8
 _MAX_DEPTH = 16
 
 _ROS_PRIMITIVES = {
@@ -137,13 +137,13 @@ def differences(recorded: Struct, ours: Struct) -> tuple[list[str], list[str]]:
     breaking: list[str] = []
     harmless: list[str] = []
     _compare("", recorded, ours, breaking, harmless)
-    return _some(breaking), _some(harmless)
+    return _first_few(breaking), _first_few(harmless)
 
 
-def _some(found: list[str]) -> list[str]:
+def _first_few(found: list[str]) -> list[str]:
     """The first of them, and how many more: a schema may differ in a hundred thousand fields."""
-    more = len(found) - _MAX_TOLD
-    return [*found[:_MAX_TOLD], f"and {more} more"] if more > 0 else found
+    more = len(found) - _MAX_DIFFERENCES
+    return [*found[:_MAX_DIFFERENCES], f"and {more} more"] if more > 0 else found
 
 
 def _compare(path: str, theirs: Node, ours: Node, breaking: list[str], harmless: list[str]) -> None:
@@ -155,8 +155,8 @@ def _compare(path: str, theirs: Node, ours: Node, breaking: list[str], harmless:
             known = set(their_names)
             missing = [n for n in our_names if n not in known]
             extra = [n for n in their_names if n not in our_names]
-            what = [f"lacks {', '.join(_some(missing))}"] if missing else []
-            what += [f"has {', '.join(_some(extra))}"] if extra else []
+            what = [f"lacks {', '.join(_first_few(missing))}"] if missing else []
+            what += [f"has {', '.join(_first_few(extra))}"] if extra else []
             breaking.append(where + (" and ".join(what) or "has another number of fields"))
             return
         if their_names != our_names and sorted(their_names) == sorted(our_names):
@@ -246,7 +246,7 @@ def _parse_msg(name: str, text: str) -> _Structs:
         if not line or set(line) == {"="}:
             continue
         if line.startswith("MSG:"):
-            current = dds_type(_word(line[4:].strip()))
+            current = dds_type(_check_word(line[4:].strip()))
             structs[current] = []
             continue
         parts = line.split(None, 1)
@@ -259,7 +259,9 @@ def _parse_msg(name: str, text: str) -> _Structs:
         if rest[match.end() :].lstrip().startswith("="):
             continue  # a constant
         package = current.split("::", 1)[0]
-        structs[current].append((_word(match.group()), _msg_type(_word(type_text), package)))
+        structs[current].append(
+            (_check_word(match.group()), _msg_type(_check_word(type_text), package))
+        )
     return structs
 
 
@@ -278,7 +280,7 @@ def _msg_type(text: str, package: str) -> object:
     return Array(element, _length(size))  # type: ignore[arg-type]
 
 
-def _word(text: str) -> str:
+def _check_word(text: str) -> str:
     if len(text) > _MAX_WORD:
         raise TraceUnsupported(f"the schema has a name of {len(text)} characters")
     return text
@@ -303,7 +305,7 @@ def _tokens(text: str) -> list[str]:
     for match in _TOKEN.finditer(text):
         token = match[1]
         if token is not None:
-            found.append(token if token[0] in "\"'" else _word(token))
+            found.append(token if token[0] in "\"'" else _check_word(token))
     return found
 
 

@@ -86,7 +86,7 @@ _LONGEST = 4096  # room for an answer, bytes; BUF_SIZE of the manual
 
 @dataclass(frozen=True)
 class Observation:
-    """What a player has observed after an action.
+    """What the script's runner observed after an action.
 
     :param status: of the transfer: 0, or a negative errno.
     :param data: bytes from the device.
@@ -179,8 +179,8 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         """The whole script."""
         yield from self._wait(0.0)
         try:
-            yield from self._talk()
-            if self._know_motors():
+            yield from self._exchange_phase()
+            if self._all_motors_known():
                 yield from self._motion()
                 yield from self._damage()
                 yield from self._protection()
@@ -194,7 +194,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
             phase.end_ns = phase.end_ns or self._obs.now_ns
 
     def lock_frame(self) -> bytes:
-        """A frame that locks every motor, to be sent at any time."""
+        """A frame that locks every motor; it may be sent at any time."""
         return self._frame(Motor())
 
     # -- one transfer ---------------------------------------------------------------------------
@@ -202,13 +202,13 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
     def _wait(self, seconds: float) -> Steps:
         yield from self._do(Wait(self._obs.now_ns + round(seconds * 1e9)))
 
-    def _pace(self) -> Steps:
-        """Wait for the next tick; ticks that were missed are gone."""
+    def _wait_for_tick(self) -> Steps:
+        """Wait for the next tick; missed ticks are skipped."""
         self._next_ns = max(self._next_ns + round(self.plan.period * 1e9), self._obs.now_ns)
         yield from self._do(Wait(self._next_ns))
 
     def _exchange(self, frame: bytes) -> Steps:
-        """One command, one answer."""
+        """Send one command and read one answer."""
         seen = yield from self._do(Out(frame))
         if not seen.status:
             seen = yield from self._do(In())
@@ -218,9 +218,9 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
                 raise _NoAnswer
             return
         self._missed = 0
-        self._learn(seen.data)
+        self._store_answer(seen.data)
 
-    def _learn(self, data: bytes) -> None:
+    def _store_answer(self, data: bytes) -> None:
         motors = {(m.bus, m.id): m.position for m in read_state(data).motors}
         if set(self.plan.buses) <= motors.keys():
             self._q = [
@@ -228,8 +228,8 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
                 for place, joint in zip(self.plan.buses, self._joints, strict=True)
             ]
 
-    def _silence(self, seconds: float) -> Generator[Action, Observation, int]:
-        """Listen without having sent anything; how many frames came."""
+    def _count_silent_frames(self, seconds: float) -> Generator[Action, Observation, int]:
+        """Read without sending; return the number of frames received."""
         end, frames = self._obs.now_ns + round(seconds * 1e9), 0
         while self._obs.now_ns < end:
             seen = yield from self._do(In((end - self._obs.now_ns) / 1e9))
@@ -251,7 +251,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         extra: Mapping[int, Sequence[bytes]] | None = None,
         **frame: Any,
     ) -> bytes:
-        """A frame for all motors, in the order of the joints; one command goes to all.
+        """Encode a frame for all motors, in the order of the joints; one command goes to all.
 
         :param head: of the motor packets; ``wrong_crc`` likewise.
         :param extra: more packets, by bus.
@@ -267,70 +267,70 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
             buses[bus] = [*buses.get(bus, ()), *packets]
         return pack_command(buses, size or self._size, **frame)
 
-    def _holding(self, *, protect: bool = True) -> list[Motor]:
-        """Commands that hold every joint where it is."""
+    def _hold_commands(self, *, protect: bool = True) -> list[Motor]:
+        """Return commands that hold every joint at its position."""
         return [Motor(1, q=q, kp=_KP, kd=_KD, protect=protect) for q in self._q]
 
-    def _inward(self, joint: int, step: float = _STEP) -> float:
-        """The goal of a step toward the middle of the joint's range, rad."""
+    def _goal_inward(self, joint: int, step: float = _STEP) -> float:
+        """Return a goal one step toward the middle of the joint's range, rad."""
         spec = self._joints[joint]
         return self._q[joint] + (step if self._q[joint] < (spec.q_min + spec.q_max) / 2 else -step)
 
-    def _goals(self, motors: Sequence[Motor]) -> list[Motor]:
-        """The same commands with every goal inward."""
-        return [replace(m, q=self._inward(i)) for i, m in enumerate(motors)]
+    def _goals_inward(self, motors: Sequence[Motor]) -> list[Motor]:
+        """Return the same commands with every goal one step toward the middle."""
+        return [replace(m, q=self._goal_inward(i)) for i, m in enumerate(motors)]
 
     # -- phases ---------------------------------------------------------------------------------
 
-    def _begin(self, name: str, **params: Any) -> UsbPhase:
+    def _begin_phase(self, name: str, **params: Any) -> UsbPhase:
         return self._mark(UsbPhase(name, self._obs.now_ns, params=params))
 
-    def _during(self, seconds: float, frame: bytes) -> Steps:
+    def _send_for(self, seconds: float, frame: bytes) -> Steps:
         """Send the same command, once a tick."""
 
         def exchange() -> Steps:
             yield from self._exchange(frame)
-            yield from self._pace()
+            yield from self._wait_for_tick()
 
         self._next_ns = self._obs.now_ns
         yield from self._repeat(seconds, exchange)
 
-    def _talk(self) -> Steps:
+    def _exchange_phase(self) -> Steps:
         self._report("exchanging frames without motion")
-        yield from self._silence(0.1)  # reads what another program has left unread
-        phase = self._begin("quiet")
-        yield from self._silence(0.15)
+        yield from self._count_silent_frames(0.1)  # reads what another program has left unread
+        phase = self._begin_phase("quiet")
+        yield from self._count_silent_frames(0.15)
         self._end(phase)
         yield from self._probe()
 
         frame = self._frame(Motor())
-        phase = self._begin("exchange", status=0, size=self._size)
-        yield from self._during(20 * self.plan.period, frame)
-        yield from self._silence(0.05)
+        phase = self._begin_phase("exchange", status=0, size=self._size)
+        yield from self._send_for(20 * self.plan.period, frame)
+        yield from self._count_silent_frames(0.05)
         self._end(phase)
 
         yield from self._burst()
-        phase = self._begin("pair")
+        phase = self._begin_phase("pair")
         for _ in range(2):
             yield from self._do(Out(frame))
-        phase.params["answers"] = yield from self._silence(0.1)
+        phase.params["answers"] = yield from self._count_silent_frames(0.1)
         self._end(phase)
         yield from self._exchange(frame)
 
     def _burst(self) -> Steps:
         frame = self._frame(Motor())
         yield from self._do(Alone(True))
-        phase = self._begin("burst", status=0)
+        phase = self._begin_phase("burst", status=0)
         for _ in range(self.plan.burst):
             yield from self._exchange(frame)
         self._end(phase)
         yield from self._do(Alone(False))
 
     def _probe(self) -> Steps:
-        """Which size of command frame is answered at all: the specification's, or the other."""
+        """Find the size of command frame that the hand answers."""
         for size in (1234, 734):
             self._size = size
-            phase = self._begin("probe", size=size)
+            phase = self._begin_phase("probe", size=size)
             yield from self._do(Out(self._frame(Motor())))
             seen = yield from self._do(In())
             self._end(phase)
@@ -338,37 +338,39 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
                 return
         self._size = 1234
 
-    def _know_motors(self) -> bool:
+    def _all_motors_known(self) -> bool:
         if not self._q:
             self.trouble = "the states lack a motor that is to be moved, or its bus and id"
         return bool(self._q)
 
     def _motion(self) -> Steps:
         self._report("moving one joint at a time by 0.2 rad")
-        hold = self._holding()
-        yield from self._during(0.05, self._frame(hold))
+        hold = self._hold_commands()
+        yield from self._send_for(0.05, self._frame(hold))
         for joint in range(len(self._joints)):
-            target = self._inward(joint)
-            phase = self._begin("move", joint=joint, begin=self._q[joint], target=target, status=1)
+            target = self._goal_inward(joint)
+            phase = self._begin_phase(
+                "move", joint=joint, begin=self._q[joint], target=target, status=1
+            )
             hold[joint] = replace(hold[joint], q=target)
-            yield from self._during(0.2, self._frame(hold))
+            yield from self._send_for(0.2, self._frame(hold))
             self._end(phase)
 
-        locked = [replace(m, status=0) for m in self._goals(self._holding())]
-        yield from self._during(0.05, self._frame(Motor(protect=True)))
-        phase = self._begin("lock", status=0)
-        yield from self._during(0.2, self._frame(locked))
+        locked = [replace(m, status=0) for m in self._goals_inward(self._hold_commands())]
+        yield from self._send_for(0.05, self._frame(Motor(protect=True)))
+        phase = self._begin_phase("lock", status=0)
+        yield from self._send_for(0.2, self._frame(locked))
         self._end(phase)
         yield from self._burst()
 
-    def _settle(self, seconds: float) -> Steps:
+    def _hold_still(self, seconds: float) -> Steps:
         """Hold every joint; a time-out that has tripped is cleared first."""
-        yield from self._exchange(self._frame(self._holding(protect=False)))
-        yield from self._during(seconds, self._frame(self._holding()))
+        yield from self._exchange(self._frame(self._hold_commands(protect=False)))
+        yield from self._send_for(seconds, self._frame(self._hold_commands()))
 
     def _damaged(self, kind: str) -> bytes:
-        hold = self._holding()
-        wish = self._goals(hold)
+        hold = self._hold_commands()
+        wish = self._goals_inward(hold)
         if kind == "frame-crc":
             return self._frame(wish, spoil=True)
         if kind == "packet-crc":
@@ -394,11 +396,11 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
     def _damage(self) -> Steps:
         self._report("damaged frames: nothing may move")
         for kind in DAMAGES:
-            yield from self._settle(0.03)
-            phase = self._begin("malformed", kind=kind)
+            yield from self._hold_still(0.03)
+            phase = self._begin_phase("malformed", kind=kind)
             yield from self._do(Out(self._damaged(kind)))
-            phase.params["answers"] = yield from self._silence(_SETTLE)
-            hold = self._frame(self._holding())
+            phase.params["answers"] = yield from self._count_silent_frames(_SETTLE)
+            hold = self._frame(self._hold_commands())
             for _ in range(3):
                 yield from self._exchange(hold)
             self._end(phase)
@@ -406,11 +408,11 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         yield from self._short()
 
     def _broadcast(self) -> Steps:
-        yield from self._settle(0.05)
-        hold = self._holding()
+        yield from self._hold_still(0.05)
+        hold = self._hold_commands()
         bus, _ = self.plan.buses[DRIVEN]
         # one position for all motors of the bus: that of the first, a little inward
-        target = self._inward(DRIVEN, 0.15)
+        target = self._goal_inward(DRIVEN, 0.15)
         begin = list(self._q)
         order = motor_packet(BROADCAST_ID, replace(hold[DRIVEN], q=target), self._joints[DRIVEN])
         elsewhere: dict[int, list[bytes]] = {bus: [order]}
@@ -419,79 +421,81 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
                 elsewhere.setdefault(place, []).append(
                     motor_packet(number, hold[i], self._joints[i])
                 )
-        phase = self._begin("broadcast", bus=bus, target=target, begin=begin)
+        phase = self._begin_phase("broadcast", bus=bus, target=target, begin=begin)
         yield from self._do(Out(pack_command(elsewhere, self._size)))
-        phase.params["answers"] = yield from self._silence(0.2)
-        yield from self._exchange(self._frame(self._holding()))
+        phase.params["answers"] = yield from self._count_silent_frames(0.2)
+        yield from self._exchange(self._frame(self._hold_commands()))
         self._end(phase)
 
     def _short(self) -> Steps:
         size = 734 if self._size == 1234 else 1234
         joint = len(self._joints) - 1
-        yield from self._settle(0.05)
-        hold = self._holding()
-        target = self._inward(joint)
-        phase = self._begin("short", size=size, joint=joint, begin=self._q[joint], target=target)
+        yield from self._hold_still(0.05)
+        hold = self._hold_commands()
+        target = self._goal_inward(joint)
+        phase = self._begin_phase(
+            "short", size=size, joint=joint, begin=self._q[joint], target=target
+        )
         hold[joint] = replace(hold[joint], q=target)
         yield from self._do(Out(self._frame(hold, size=size)))
-        phase.params["answers"] = yield from self._silence(0.2)
-        yield from self._exchange(self._frame(self._holding()))
+        phase.params["answers"] = yield from self._count_silent_frames(0.2)
+        yield from self._exchange(self._frame(self._hold_commands()))
         self._end(phase)
 
     def _protection(self) -> Steps:
         self._report("time-out protection: a pause, then 1.5 s of silence while a finger moves")
         spec = self._joints[DRIVEN]
-        hold = self._holding()
-        yield from self._exchange(self._frame(self._holding(protect=False)))
+        hold = self._hold_commands()
+        yield from self._exchange(self._frame(self._hold_commands(protect=False)))
         # a place with room for what an unprotected hand would do in the silence
         open_end = spec.q_min if spec.closing > 0 else spec.q_max
         start = open_end + spec.closing * 0.25
         hold[DRIVEN] = replace(hold[DRIVEN], q=start)
-        yield from self._during(0.35, self._frame(hold))
+        yield from self._send_for(0.35, self._frame(hold))
 
-        yield from self._during(0.03, self._frame(self._holding()))
-        phase = self._begin("pause", seconds=0.6)
+        yield from self._send_for(0.03, self._frame(self._hold_commands()))
+        phase = self._begin_phase("pause", seconds=0.6)
         yield from self._wait(0.6)
-        yield from self._exchange(self._frame(self._holding()))
+        yield from self._exchange(self._frame(self._hold_commands()))
         self._end(phase)
-        yield from self._exchange(self._frame(self._holding(protect=False)))
+        yield from self._exchange(self._frame(self._hold_commands(protect=False)))
 
-        motors = self._holding()
+        motors = self._hold_commands()
         motors[DRIVEN] = Motor(1, dq=spec.closing * _SPEED, kd=_KD, protect=True)
         motors[FREE] = Motor(1, dq=self._joints[FREE].closing * _SPEED / 2, kd=_KD)
-        phase = self._begin("drive")
-        yield from self._during(0.4, self._frame(motors))
+        phase = self._begin_phase("drive")
+        yield from self._send_for(0.4, self._frame(motors))
         self._end(phase)
 
-        phase = self._begin("silence", seconds=1.5)
+        phase = self._begin_phase("silence", seconds=1.5)
         yield from self._wait(1.5)
         self._end(phase)
 
         # the first answer has the positions; goals elsewhere come after it
-        phase = self._begin("tripped")
+        phase = self._begin_phase("tripped")
         yield from self._exchange(self._frame(motors))
-        motors = self._holding()
+        motors = self._hold_commands()
         motors[FREE] = replace(motors[FREE], protect=False)
         for joint in (DRIVEN, FREE):
-            motors[joint] = replace(motors[joint], q=self._inward(joint))
+            motors[joint] = replace(motors[joint], q=self._goal_inward(joint))
         phase.params["begin"] = list(self._q)
         phase.params["targets"] = [m.q for m in motors]
-        yield from self._during(0.25, self._frame(motors))
+        yield from self._send_for(0.25, self._frame(motors))
         self._end(phase)
 
-        free = [replace(m, protect=False) for m in self._holding()]
-        free[DRIVEN] = replace(free[DRIVEN], q=self._inward(DRIVEN))
-        phase = self._begin("clear", begin=self._q[DRIVEN], target=free[DRIVEN].q)
-        yield from self._during(0.25, self._frame(free))
+        free = [replace(m, protect=False) for m in self._hold_commands()]
+        free[DRIVEN] = replace(free[DRIVEN], q=self._goal_inward(DRIVEN))
+        phase = self._begin_phase("clear", begin=self._q[DRIVEN], target=free[DRIVEN].q)
+        yield from self._send_for(0.25, self._frame(free))
         self._end(phase)
 
     def _reopen(self) -> Steps:
         self._report("releasing the interface and claiming it again")
-        hold = self._frame(self._holding())
+        hold = self._frame(self._hold_commands())
         yield from self._exchange(hold)
-        phase = self._begin("reopen")
+        phase = self._begin_phase("reopen")
         yield from self._do(Reopen())
         for _ in range(5):
             yield from self._exchange(hold)
-            yield from self._pace()
+            yield from self._wait_for_tick()
         self._end(phase)

@@ -1,1 +1,1 @@
-"""Codecs of the wires that hands hang on: bytes in, packets out, no I/O and no clock."""
+"""Codecs of serial, USB and low-level frames: bytes to packets and back, without I/O or clock."""

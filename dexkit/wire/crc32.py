@@ -1,4 +1,4 @@
-"""The CRC of Unitree's motors, hands and robots: CRC-32/MPEG-2 over words, not bytes.
+"""Compute the CRC of Unitree's motors, hands and robots: CRC-32/MPEG-2 over 32-bit words.
 
 Polynomial 0x04C11DB7, initial value 0xFFFFFFFF, not reflected, no final xor. The vendor's function
 takes the data as 32-bit little-endian words and feeds each of them most significant byte first,
@@ -19,8 +19,8 @@ from dexkit.errors import EncodeError
 __all__ = ["crc32_swapped", "crc32_words"]
 
 crc32_swapped: Callable[[bytes | bytearray | memoryview], int] = fastcrc.crc32.mpeg_2
-"""The same CRC of data whose words have been turned round already: for callers that turn a whole
-frame round at once and then want the CRC of its parts."""
+"""The same CRC of data with byte-swapped words, for callers that swap a whole frame once
+and then need the CRCs of its parts."""
 
 _WORD = next(code for code in "IL" if array(code).itemsize == 4)
 

@@ -1,4 +1,4 @@
-"""ROBOTIS DYNAMIXEL Protocol 2.0 framing: instruction and status packets, sans-IO.
+"""Encode and decode DYNAMIXEL Protocol 2.0 packets (instruction and status), without I/O.
 
 A frame is ``FF FF FD 00, ID, length (2, little-endian), instruction, parameters, CRC (2)``;
 the length counts everything behind itself. A status packet has instruction 0x55 and an error
@@ -245,7 +245,7 @@ def split_fast_status(packet: Packet, sizes: Sequence[int]) -> list[tuple[int, i
 
 
 def decode(data: bytes) -> Packet:
-    """The one packet that ``data`` consist of.
+    """Decode ``data``, which must be exactly one packet.
 
     :raises WireError: it does not start with the header, or bytes follow it.
     :raises TruncatedError: it ends too early.
@@ -283,13 +283,13 @@ def _packet(frame: bytes) -> Packet:
 
 
 class PacketParser:
-    """Finds packets in a stream of bytes that may come in any pieces, garbage between them.
+    """Finds packets in a stream of bytes that may arrive in any pieces, with garbage between them.
 
     :param keep_bad: also return packets whose CRC does not match, marked ``crc_ok=False``.
 
-    A false header costs only itself: when its length is absurd or its CRC wrong, the search
-    goes on right behind it, so a packet that it seemed to swallow is still found. At most
-    :data:`MAX_PACKET` bytes are held.
+    After a false header (impossible length or wrong CRC) the search continues at the next byte, so
+    packets within its supposed length are still found. At most :data:`MAX_PACKET` bytes are
+    buffered.
 
     :ivar skipped: bytes that belonged to no packet.
     :ivar crc_errors: packets whose CRC did not match.

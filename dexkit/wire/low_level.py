@@ -1,4 +1,4 @@
-"""The CRC that ``LowCmd_`` and ``LowState_`` carry in their last member
+"""Compute and verify the CRC in the last member of ``LowCmd_`` and ``LowState_``
 (docs/sources/unitree-dex.md#a7).
 
     >>> from dexkit.messages.unitree_go import LowCmd_
@@ -8,10 +8,10 @@
     >>> verify_payload("unitree_go::msg::dds_::LowCmd_", payload)
     True
 
-It is :func:`~dexkit.wire.crc32.crc32_words` of everything before it, not as the message travels
-but as it lies in the memory of Unitree's C++ program: as a C struct, where each member is aligned
-to its size, each inner struct to its largest member, and the gaps are zero. The two differ little
-enough to be mixed up: a whole CDR sample with its header is as long as the struct.
+It is :func:`~dexkit.wire.crc32.crc32_words` of all members before it, not of the CDR sample but of
+the C struct in Unitree's C++ program: each member is aligned to its size, each inner struct to its
+largest member, and padding is zero. The two are easily confused: a whole CDR sample with its header
+is as long as the struct.
 
 A sender that leaves the ``u8`` temperatures of ``unitree_go`` at 127 or less also suits Unitree's
 Python SDK, whose CRC function packs them as signed numbers and raises above that.
@@ -52,7 +52,7 @@ def _alignment(kind: Primitive | Struct) -> int:
     return max(_alignment(member.type) for member in kind.fields)
 
 
-def _numbers(kind: Primitive | Struct, at: int) -> Iterator[tuple[int, int]]:
+def _number_offsets(kind: Primitive | Struct, at: int) -> Iterator[tuple[int, int]]:
     """Where each number of a C object at ``at`` lies, and its size; last, where it ends, and 0."""
     if isinstance(kind, Primitive):
         yield at, kind.size
@@ -61,7 +61,7 @@ def _numbers(kind: Primitive | Struct, at: int) -> Iterator[tuple[int, int]]:
     for member in kind.fields:
         at = -(-at // _alignment(member.type)) * _alignment(member.type)
         for _ in range(member.array or 1):
-            *numbers, (at, _) = _numbers(member.type, at)
+            *numbers, (at, _) = _number_offsets(member.type, at)
             yield from numbers
     yield -(-at // _alignment(kind)) * _alignment(kind), 0
 
@@ -72,7 +72,7 @@ class _Image:
     def __init__(self, name: str) -> None:
         self._type = message_type(name)
         kind = self._type.layout
-        *numbers, (self.size, _) = _numbers(kind, 0)
+        *numbers, (self.size, _) = _number_offsets(kind, 0)
         source = np.zeros(self.size, dtype=np.intp)
         gap = np.ones(self.size, dtype=np.bool_)
         wire = 4
@@ -121,7 +121,7 @@ class _Image:
 _image = cache(_Image)
 
 
-def _of(name: str) -> _Image:
+def _image_of(name: str) -> _Image:
     if name not in LOW_LEVEL_TYPES:
         raise UsageError(
             f"a {name} carries no CRC", hint=f"those that do: {', '.join(LOW_LEVEL_TYPES)}"
@@ -136,7 +136,7 @@ def struct_of_payload(name: str, payload: Buffer) -> bytes:
     :raises UsageError: another type.
     :raises WireError: not a sample of that type.
     """
-    image = _of(name)
+    image = _image_of(name)
     return image.struct(image.little(payload))
 
 
@@ -146,7 +146,7 @@ def payload_of_struct(name: str, struct: Buffer) -> bytes:
     :param name: DDS type name, one of :data:`LOW_LEVEL_TYPES`.
     :raises UsageError: another type, or a struct of another size.
     """
-    image = _of(name)
+    image = _image_of(name)
     if len(struct) != image.size:
         raise UsageError(f"the struct of a {name} has {image.size} bytes, not {len(struct)}")
     return image.payload(struct)
@@ -159,7 +159,7 @@ def crc_of_payload(name: str, payload: Buffer) -> int:
     :raises UsageError: another type.
     :raises WireError: not a sample of that type.
     """
-    image = _of(name)
+    image = _image_of(name)
     return image.crc(image.little(payload))
 
 
@@ -170,7 +170,7 @@ def verify_payload(name: str, payload: Buffer) -> bool:
     :raises UsageError: another type.
     :raises WireError: not a sample of that type.
     """
-    image = _of(name)
+    image = _image_of(name)
     payload = image.little(payload)
     return image.crc(payload) == int.from_bytes(payload[-4:], "little")
 
@@ -181,7 +181,7 @@ def crc_of(message: Any) -> int:
     :raises UsageError: a type without a CRC.
     :raises EncodeError: a value that its type cannot hold.
     """
-    return _of(_name(message)).crc(encode(message))
+    return _image_of(_name(message)).crc(encode(message))
 
 
 def verify(message: Any) -> bool:
@@ -199,7 +199,7 @@ def encode_with_crc(message: Any) -> bytes:
     :raises UsageError: a type without a CRC.
     :raises EncodeError: a value that its type cannot hold.
     """
-    image = _of(_name(message))
+    image = _image_of(_name(message))
     payload = encode(message)
     return payload[:-4] + image.crc(payload).to_bytes(4, "little")
 

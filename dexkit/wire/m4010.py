@@ -1,5 +1,5 @@
-"""The M4010's serial frames, sans-IO: the motor of the Dex1-1 (docs/sources/unitree-dex.md#g,
-measured from the vendor's library).
+"""Encode and decode serial frames of the M4010, the Dex1-1's motor, without I/O
+(docs/sources/unitree-dex.md#g, measured from the vendor's library).
 
 A command is 20 bytes, the data that answer it 26: the structures of the Dex3-1's motors (the Dex3-1
 manual) with other units. Several motors on a line are told apart by the id in the mode byte; id 15
@@ -197,13 +197,13 @@ def _mode(number: int, status: int, timeout: bool) -> int:
     return ris_mode(number, status, timeout)  # which says what is wrong
 
 
-def _sealed(structure: Structure, *values: int | bytes) -> bytes:
+def _pack_with_crc(structure: Structure, *values: int | bytes) -> bytes:
     start, end = structure.covered
     packet = structure.pack(structure.head, *values, 0)
     return packet[:end] + _U32.pack(crc32_words(packet[start:end]))
 
 
-def _opened(structure: Structure, data: Bytes) -> tuple[int, ...]:
+def _unpack_checked(structure: Structure, data: Bytes) -> tuple[int, ...]:
     """Fields between head and CRC."""
     if len(data) < structure.size:
         raise TruncatedError(f"{structure.name} is {structure.size} bytes, got {len(data)}")
@@ -293,7 +293,7 @@ class MotorCmd:
         """
         mode = _mode(self.id, self.status, self.timeout)
         values = (self.tor_des, self.spd_des, self.pos_des, self.k_pos, self.k_spd)
-        return _sealed(COMMAND, mode, self.res, *values)
+        return _pack_with_crc(COMMAND, mode, self.res, *values)
 
     @classmethod
     def parse(cls, data: Bytes) -> MotorCmd:
@@ -301,7 +301,7 @@ class MotorCmd:
 
         :raises WireError: wrong length, head or CRC.
         """
-        mode, res, tor, spd, pos, k_pos, k_spd = _opened(COMMAND, data)
+        mode, res, tor, spd, pos, k_pos, k_spd = _unpack_checked(COMMAND, data)
         return cls(mode & 15, mode >> 4 & 7, mode > 127, tor, spd, pos, k_pos, k_spd, res)
 
 
@@ -386,7 +386,7 @@ class MotorData:
         heat = (self.temp, self.winding, self.vol)
         motion = (self.torque, self.speed, self.pos)
         rest = (self.merror, self.ex_sensor1, self.ex_sensor2)
-        return _sealed(DATA, mode, *heat, *motion, *rest)
+        return _pack_with_crc(DATA, mode, *heat, *motion, *rest)
 
     @classmethod
     def parse(cls, data: Bytes) -> MotorData:
@@ -394,7 +394,7 @@ class MotorData:
 
         :raises WireError: wrong length, head or CRC.
         """
-        mode, *values = _opened(DATA, data)
+        mode, *values = _unpack_checked(DATA, data)
         return cls(mode & 15, mode >> 4 & 7, mode > 127, *values)
 
 
@@ -501,13 +501,13 @@ _KINDS: dict[str, type[MotorCmd] | type[MotorData]] = {
 
 
 class FrameParser:
-    """Finds frames in a stream of bytes that may come in any pieces, garbage between them.
+    """Finds frames in a stream of bytes that may arrive in any pieces, with garbage between them.
 
     :param kinds: of frames that may come: :data:`COMMAND` at the motor's end, :data:`DATA` at the
         host's, both for a listener.
 
-    A frame with a wrong CRC costs one byte: the search goes on right behind, so a frame that it
-    seemed to swallow is found. Less than one frame is held.
+    After a frame with a wrong CRC the search continues at the next byte, so frames within it are
+    still found. Less than one frame is buffered.
 
     :ivar frames: found so far.
     :ivar skipped: bytes that belonged to no frame.
@@ -554,7 +554,7 @@ class FrameParser:
                 self.skipped += len(buffer) - keep - start
                 start = len(buffer) - keep
                 break
-            at, kind = min(places, key=_place)
+            at, kind = min(places, key=_frame_offset)
             self.skipped += at - start
             start = at
             if len(buffer) - start < kind.size:
@@ -574,5 +574,5 @@ class FrameParser:
         return frames
 
 
-def _place(found: tuple[int, Structure]) -> int:
+def _frame_offset(found: tuple[int, Structure]) -> int:
     return found[0]

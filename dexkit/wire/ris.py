@@ -1,5 +1,4 @@
-"""What Unitree's hand motors share on the wire, whatever carries it: packed structures as data, the
-mode byte, and how quantities are counted.
+"""Packed structures, mode byte and scales that the frames of Unitree's hand motors share.
 
 The Dex3-1's packets (the Dex3-1 manual) and the frames of the Dex1-1's M4010
 (docs/sources/unitree-dex.md#g) are of one family: the same mode byte, position count and checksum,
@@ -143,9 +142,9 @@ class Structure:
         try:
             return self.struct.pack(*values)
         except struct.error as error:
-            raise EncodeError(f"{self.name}: {self._misfit(values) or error}") from None
+            raise EncodeError(f"{self.name}: {self._describe_misfit(values) or error}") from None
 
-    def _misfit(self, values: tuple[int | bytes, ...]) -> str:
+    def _describe_misfit(self, values: tuple[int | bytes, ...]) -> str:
         rest = list(values)
         for field in self.fields:
             if field.format.endswith("s"):

@@ -1,5 +1,5 @@
-"""Finding a motor: which port, as the vendor's service probes them
-(docs/sources/unitree-dex.md#b2).
+"""Find the serial port of a Dex1-1 motor: probe the ports that match glob patterns, as the vendor's
+service does (docs/sources/unitree-dex.md#b2).
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ PAUSE = 0.05
 
 
 def list_ports(patterns: Sequence[str]) -> list[str]:
-    """The ports that match glob patterns, each once."""
+    """Return the paths that match the glob patterns, without duplicates."""
     return list(dict.fromkeys(p for pattern in patterns for p in sorted(glob.glob(pattern))))
 
 
 def find_motor(
     settings: Dex1Settings, number: int, sleep: Callable[[float], None] = time.sleep
 ) -> tuple[MotorLine, MotorData]:
-    """The line with motor ``number`` on it, and what the motor answered.
+    """Find motor ``number``; return its open line and its first data frame.
 
-    The probe is a brake: unlike the vendor's (FOC without gains) it never lets go of anything.
+    The probe is a brake command. The vendor's probe (FOC with zero gains) would drop a held object.
 
-    :raises HandNotFound: there is none, or more than one; says what there is.
-    :raises HandRefused: the one port that was named is another program's.
-    :raises HandLost: it goes away meanwhile.
+    :raises HandNotFound: the motor does not answer on any port; the hint lists what does.
+    :raises HandRefused: more than one port has such a motor, or another program uses the port that
+        was named.
+    :raises HandLost: the port goes away during the search.
     """
     if settings.device is not None:
         ports = [find_device(settings.device).path]
@@ -57,7 +58,7 @@ def find_motor(
                 if data is not None:
                     found.append((line, data))
                     continue
-                remarks.append(_who_else(line, number, settings.timeout, sleep))
+                remarks.append(_describe_answering_motor(line, number, settings.timeout, sleep))
             except HandError as error:
                 line.release()
                 if settings.device is not None:
@@ -79,7 +80,7 @@ def find_motor(
 def _probe(
     line: MotorLine, number: int, timeout: float, attempts: int, sleep: Callable[[float], None]
 ) -> MotorData | None:
-    # without the time-out bit: a protection that has tripped is cleared
+    # without the time-out bit, which clears a tripped protection
     frame = MotorCmd(number).pack()
     for attempt in range(attempts):
         if attempt:
@@ -91,9 +92,11 @@ def _probe(
     return None
 
 
-def _who_else(line: MotorLine, number: int, timeout: float, sleep: Callable[[float], None]) -> str:
-    """What a port without the motor has instead."""
-    if not is_shared(line):  # nobody else's motor is braked by being asked
+def _describe_answering_motor(
+    line: MotorLine, number: int, timeout: float, sleep: Callable[[float], None]
+) -> str:
+    """Say what answers on a port on which the wanted motor does not."""
+    if not is_shared(line):  # the probe is a brake: do not brake a motor that is in use
         for other, side in SIDES.items():
             if other != number and _probe(line, other, timeout, 1, sleep) is not None:
                 return f"{line.path}: motor {other} answers, which is the {side} one"

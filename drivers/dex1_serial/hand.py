@@ -1,4 +1,4 @@
-"""The Dex1-1 on its serial line behind the common interface."""
+"""Implement :class:`dexkit.hand.Hand` for the Dex1-1 on its serial line."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ __all__ = ["Dex1Serial", "Dex1Statistics", "backend"]
 log = logging.getLogger(__name__)
 
 _IO_RATE = 500.0  # docs/sources/unitree-dex.md#b2: 2000 us loop
-_GOODBYES = 3
-"""Times that closing tries to brake a motor which is there and does not answer."""
+_BRAKE_ATTEMPTS = 3
+"""Brake commands that ``close`` sends at most to a motor that does not answer."""
 _FLASH_TIME = 1.0
 """Seconds that a motor may take to store a calibration; assumed."""
-_CLOSE_ENOUGH = 0.1  # rad between what was calibrated and what is reported behind it
+_CALIBRATION_TOLERANCE = 0.1  # rad, between the calibrated position and the next one reported
 
 
 @dataclass
 class Dex1Statistics:
-    """Counters since the hand was made.
+    """Counters since the object was created.
 
-    :ivar trips: times that the motor was found stopped by its own time-out protection.
-    :ivar faults: times that it began to report an error.
+    :ivar trips: times that the motor's time-out protection had stopped it.
+    :ivar faults: times that the motor began to report an error.
     """
 
     trips: int = 0
@@ -53,16 +53,16 @@ class Dex1Statistics:
 class Dex1Serial:
     """A Dex1-1 gripper (Unitree M4010 motor) on a serial port.
 
-    :param side: which hand; motor 0 is the right one, 1 the left.
-    :param configuration: how to reach it and how to talk to it.
+    :param side: which hand; the right hand's motor has id 0, the left hand's id 1.
+    :param configuration: port, baud rate, id, protection and time-out.
 
-    ``open`` finds the motor and brakes it; ``close`` brakes it. While it is driven, the motor's own
-    protection is on (unless ``protect`` is off): it stops a second after the last command, whatever
-    becomes of this process or the cable.
+    ``open`` finds the motor and brakes it; ``close`` brakes it. Commands enable the motor's own
+    time-out protection (unless ``protect`` is off): the motor stops one second after the last
+    command, even if this process dies or the cable is pulled.
     """
 
     reconnect_interval = 0.5
-    """Seconds at most between attempts of the service to open a lost hand again."""
+    """Longest time between the service's attempts to open a lost hand again, seconds."""
 
     def __init__(
         self,
@@ -82,18 +82,18 @@ class Dex1Serial:
         self._spec = DEX1_1.spec(
             side,
             io_rate=_IO_RATE,
-            # the other motor on the line may have its turn first
+            # an exchange with the other motor on the line may come first
             exchange_timeout=2 * (self.configuration.timeout + LATE) + LATE,
         )
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is."""
+        """Side, joints, rates and time-outs of this hand."""
         return self._spec
 
     @property
     def path(self) -> str:
-        """The port that it is on; empty while it is not open."""
+        """Path of the serial port; empty while the hand is not open."""
         return self._line.path if self._line is not None else ""
 
     @property
@@ -104,11 +104,11 @@ class Dex1Serial:
     # --- opening and closing
 
     def open(self) -> None:
-        """Find the motor and brake it. Nothing moves.
+        """Find the motor and brake it. No motion.
 
-        :raises HandNotFound: no such port, or the motor does not answer; says what does.
-        :raises HandRefused: another program has the port, or more than one has such a motor.
-        :raises HandLost: it goes away meanwhile.
+        :raises HandNotFound: no such port, or the motor does not answer; the hint lists what does.
+        :raises HandRefused: another program uses the port, or more than one port has such a motor.
+        :raises HandLost: the port goes away during the search.
         """
         if self._line is not None:
             return
@@ -123,15 +123,15 @@ class Dex1Serial:
             data.temp,
             data.voltage,
         )
-        self._look_at(data)
+        self._report_status(data)
 
     def close(self) -> None:
-        """Brake the motor and release the port, as far as it is still there."""
+        """Brake the motor and release the port. Failures are logged, not raised."""
         line, self._line = self._line, None
         if line is None:
             return
         try:
-            self._let_go(line)
+            self._brake_motor(line)
         except HandError as error:
             rest = (
                 "the motor stops by itself within a second"
@@ -143,10 +143,10 @@ class Dex1Serial:
             line.release()
             log.info("Dex1-1 on %s closed: %s, %s", line.path, self.statistics, line.statistics)
 
-    def _let_go(self, line: MotorLine) -> None:
-        # without the bit: a brake needs no protection, and a trip would only be left behind
+    def _brake_motor(self, line: MotorLine) -> None:
+        # without the time-out bit: otherwise the protection would trip a second after this
         frame = MotorCmd(self.id).pack()
-        for left in reversed(range(_GOODBYES)):
+        for left in reversed(range(_BRAKE_ATTEMPTS)):
             try:
                 line.exchange(frame, self.id, self.configuration.timeout)
                 return
@@ -164,25 +164,25 @@ class Dex1Serial:
     # --- exchanging
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Send one command frame, return what the motor answers.
+        """Send one command frame and return the state in the motor's answer.
 
-        :raises HandLost: the port has gone, or the hand is not open.
-        :raises HandTimeout: no intact answer in time, or this program stood still before the
+        :raises HandLost: the port has gone away, or the hand is not open.
+        :raises HandTimeout: no intact answer in time, or this program was paused before the
             command was written.
         """
         deadline = WriteDeadline(self._clock)
         line = self._line
         if line is None:
             raise HandLost("the gripper is not open", hint="call open() first")
-        frame = self._frame(command)
+        frame = self._encode_command(command)
         data = line.exchange(frame, self.id, self.configuration.timeout, deadline)
         stamp = self._clock.now()
-        self._look_at(data)
-        return _state(data, stamp)
+        self._report_status(data)
+        return _decode_state(data, stamp)
 
-    def _frame(self, command: HandCommand) -> bytes:
+    def _encode_command(self, command: HandCommand) -> bytes:
         if self._tripped:
-            # one brake without the bit clears the protection; the command after it is obeyed
+            # one brake without the time-out bit clears the trip; the next command is obeyed
             return MotorCmd(self.id).pack()
         protect = self.configuration.protect
         if not command.mode[0]:
@@ -197,21 +197,25 @@ class Dex1Serial:
             timeout=protect,
         ).pack()
 
-    def _look_at(self, data: MotorData) -> None:
+    def _report_status(self, data: MotorData) -> None:
         if data.timeout and not self._tripped:
             self.statistics.trips += 1
-            log.warning("motor %d heard nothing for a second and stopped; going on", self.id)
+            log.warning(
+                "motor %d received no command for 1 s and its protection stopped it; driving it "
+                "again",
+                self.id,
+            )
         self._tripped = data.timeout
         error = data.merror & ~MotorError.MOTOR_SAW_HOST_TIMEOUT
         if error != self._error:
             if error:
                 self.statistics.faults += 1
-                log.error("motor %d reports: %s", self.id, _names(error))
+                log.error("motor %d reports: %s", self.id, _describe_error(error))
             else:
                 log.warning("motor %d reports no error any more", self.id)
             self._error = error
 
-    # --- calibrating
+    # --- calibration
 
     def calibrate(
         self,
@@ -219,16 +223,17 @@ class Dex1Serial:
         *,
         time: Callable[[], float] = time.time,
     ) -> float:
-        """Make the motor take the place where it is for ``position``; what it reports then, rad.
+        """Set the motor's present position to ``position``; return the position reported next, rad.
 
-        The vendor's way: the jaws are held closed and that is zero (docs/sources/unitree-dex.md#b2,
-        docs/sources/unitree-dex.md#g). The motor stores it, once between two power-ups. Nothing
-        moves. Unlike the vendor's library it fails unless the motor has said that it succeeded.
+        The vendor's procedure holds the jaws closed and sets 0 (docs/sources/unitree-dex.md#b2,
+        docs/sources/unitree-dex.md#g). The motor stores the calibration in flash memory and accepts
+        one per power-up. No motion. Unlike the vendor's library, this method fails unless the motor
+        reports success.
 
         :param position: rad, 0 or more.
-        :raises HandRefused: the motor does not do it; says why.
-        :raises HandTimeout: no answer: perhaps it did it, perhaps not.
-        :raises HandLost: the port has gone, or the hand is not open.
+        :raises HandRefused: the motor refuses, or reports another position; the message says why.
+        :raises HandTimeout: no answer; the motor may or may not be calibrated.
+        :raises HandLost: the port has gone away, or the hand is not open.
         """
         line = self._line
         if line is None:
@@ -239,7 +244,7 @@ class Dex1Serial:
             raise HandRefused(f"motor {self.id} was not calibrated: {problem}")
         data = line.exchange(MotorCmd(self.id).pack(), self.id, self.configuration.timeout)
         q = data.joint().q
-        if abs(q - position) > _CLOSE_ENOUGH:
+        if abs(q - position) > _CALIBRATION_TOLERANCE:
             raise HandRefused(
                 f"motor {self.id} says that it is calibrated, but is at {q:.2f} rad",
                 hint="hold the jaws still, switch its supply off and on, and try again",
@@ -250,7 +255,7 @@ class Dex1Serial:
 _FOC, _BRAKE = int(JointMode.FOC), int(JointMode.BRAKE)
 
 
-def _state(data: MotorData, stamp: float) -> HandState:
+def _decode_state(data: MotorData, stamp: float) -> HandState:
     q, dq, tau = data.joint()
     fault = data.merror
     if data.timeout:
@@ -269,19 +274,19 @@ def _state(data: MotorData, stamp: float) -> HandState:
     )
 
 
-def _names(error: int) -> str:
+def _describe_error(error: int) -> str:
     known = [bit.name.lower().replace("_", " ") for bit in MotorError if bit & error and bit.name]
     return " and ".join(known) or f"error bits 0x{error:X}"
 
 
-def _make(options: BackendOptions) -> Dex1Serial:
+def _create_hand(options: BackendOptions) -> Dex1Serial:
     return Dex1Serial(options.side, from_options(options))
 
 
 backend = Backend(
     summary="Dex1-1 gripper with an M4010 motor on a serial port",
     model=DEX1_1.name,
-    make=_make,
+    make=_create_hand,
     needs="--device PATH or USB serial number, if the port is not to be looked for",
     settings=SETTINGS,
 )

@@ -1,12 +1,12 @@
-"""A serial line with motors on it: one command out, one data frame back.
+"""Exchange frames with the M4010 motors on one serial line: one command out, one data frame back.
 
-The two motors of a robot may share a line, and one process may serve both: its hands then share
-one :class:`MotorLine`, which :func:`acquire` gives out, and take turns on it.
+The two motors of a robot may share a line. Two hands of one process then share one
+:class:`MotorLine`, which they get from :func:`acquire`; a lock serialises their exchanges.
 
-Unlike the vendor's library (docs/sources/unitree-dex.md#g "Receive behaviour") it looks for frames
-by head and CRC, checks the id, forgets what was left over before each command, and waits for an
-answer that is late before it sends the next command: a stray byte or a late answer costs one
-exchange at most.
+Unlike the vendor's library (docs/sources/unitree-dex.md#g "Receive behaviour"), this module finds
+frames by head and CRC, checks the id, discards received bytes before each command, and waits for a
+late answer before it sends the next command. A stray byte or a late answer costs at most one
+exchange.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ __all__ = ["LATE", "LineStatistics", "MotorLine", "acquire", "is_shared"]
 log = logging.getLogger(__name__)
 
 LATE = 0.01
-"""Seconds that a late answer is waited for, before the next command is sent."""
+"""Seconds to wait for a late answer before the next command is sent."""
 _CHUNK = 4096
-_MOST_STRAY = 64
-"""Chunks that are passed over before a command: more than an adapter and the kernel hold."""
-_LATE_LOOKS = 8
-"""Chunks that are looked at after the deadline of an answer, for the same reason."""
+_MAX_STRAY_CHUNKS = 64
+"""Chunks discarded at most before a command: more than an adapter and the kernel buffer."""
+_MAX_LATE_CHUNKS = 8
+"""Chunks read at most after the deadline of an answer, for the same reason."""
 
 
 @dataclass
 class LineStatistics:
-    """What happened on the line since it was opened, for all its motors.
+    """Counters since the line was opened, for all its motors.
 
-    :ivar exchanges: commands that were answered.
-    :ivar timeouts: commands that were not.
+    :ivar exchanges: commands with an answer.
+    :ivar timeouts: commands without one.
     :ivar damaged: frames with a wrong CRC.
-    :ivar stray: bytes that belonged to no frame, or came when none was due.
-    :ivar foreign: frames of a motor that was not asked.
+    :ivar stray: bytes outside of frames, or received when no answer was expected.
+    :ivar foreign: frames from a motor that was not addressed.
     """
 
     exchanges: int = 0
@@ -58,12 +58,12 @@ class LineStatistics:
 
 
 class MotorLine:
-    """An open port; :func:`acquire` makes it.
+    """An open serial port; use :func:`acquire` to get one.
 
-    :param path: of the port.
+    :param path: path of the port.
     :param baudrate: bits a second.
     :raises HandNotFound: no such port, no permission, or no serial port.
-    :raises HandRefused: another program has it, or it does not do the baud rate.
+    :raises HandRefused: another program uses it, or it does not support the baud rate.
     :raises HandLost: it cannot be opened for another reason.
     """
 
@@ -74,12 +74,12 @@ class MotorLine:
         self.users = 0
         self._lock = threading.Lock()
         self._parser = FrameParser((DATA,))
-        self._owed = False
+        self._answer_pending = False
         try:
             self._port: serial.Serial | None = serial.Serial(
                 path, baudrate, timeout=0, exclusive=True
             )
-        except ValueError as error:  # of a rate that its driver does not know
+        except ValueError as error:  # a baud rate that the kernel's driver does not support
             raise HandRefused(
                 f"{path} does not do {baudrate} baud: {error}",
                 hint="the motor needs a USB adapter for 6000000 baud, such as a CH343",
@@ -95,12 +95,12 @@ class MotorLine:
     def exchange(
         self, command: bytes, number: int, timeout: float, before: WriteDeadline | None = None
     ) -> MotorData:
-        """Send a command, return the data of that motor.
+        """Send a command frame and return the data frame of motor ``number``.
 
         :param command: a frame that motor ``number`` answers.
         :param timeout: seconds until the answer.
-        :param before: asked right before the command is written.
-        :raises HandTimeout: no intact answer of that motor, or ``before`` refuses.
+        :param before: checked right before the command is written.
+        :raises HandTimeout: no intact answer of that motor, or ``before`` raises it.
         :raises HandLost: the port has gone away.
         """
         with self._lock:
@@ -113,20 +113,20 @@ class MotorLine:
             except HandTimeout:
                 raise
             except HandError:
-                self._break()
+                self._close_port()
                 raise
             except BaseException:  # Ctrl-C, perhaps between the command and its answer
-                self._owed = True
+                self._answer_pending = True
                 raise
 
     def _exchange(
         self, fd: int, command: bytes, number: int, timeout: float, before: WriteDeadline | None
     ) -> MotorData:
         statistics, parser = self.statistics, self._parser
-        if self._owed:
-            self._owed = False
+        if self._answer_pending:
+            self._answer_pending = False
             select.select([fd], [], [], LATE)
-        for _ in range(_MOST_STRAY):  # a device that never stops must not keep this for ever
+        for _ in range(_MAX_STRAY_CHUNKS):  # bounded, for a device that sends without end
             if not (data := self._read(fd)):
                 break
             statistics.stray += len(data)
@@ -139,8 +139,8 @@ class MotorLine:
         skipped, errors = parser.skipped, parser.crc_errors
         late = 0
         try:
-            # looks after the deadline, too: the answer may be there, and this process was late
-            while late < _LATE_LOOKS:
+            # reads after the deadline, too: the process may have been scheduled late
+            while late < _MAX_LATE_CHUNKS:
                 left = deadline - time.monotonic()
                 late += left <= 0
                 if not select.select([fd], [], [], max(0.0, left))[0]:
@@ -158,7 +158,7 @@ class MotorLine:
             statistics.stray += parser.skipped - skipped
             statistics.damaged += parser.crc_errors - errors
         statistics.timeouts += 1
-        self._owed = True
+        self._answer_pending = True
         raise HandTimeout(
             f"motor {number} on {self.path} does not answer",
             hint="check its supply, the cable and the id",
@@ -171,8 +171,8 @@ class MotorLine:
         except BlockingIOError:
             return b""
 
-    def _break(self) -> None:
-        """Close the port; whoever shares it finds out at its next exchange."""
+    def _close_port(self) -> None:
+        """Close the port; the other user's next exchange raises ``HandLost``."""
         port, self._port = self._port, None
         if port is not None:
             try:
@@ -181,37 +181,37 @@ class MotorLine:
                 log.debug("closing %s: %s", self.path, error)
 
     def release(self) -> None:
-        """Give it back; the last one closes it."""
+        """Give the line back; the last user closes the port."""
         with _lines_lock:
             self.users -= 1
             if self.users > 0:
                 return
-            # by the line, not by its path: a link that is gone leads nowhere
+            # compare the object: a symbolic link that is gone no longer resolves to the path
             for key in [k for k, line in _lines.items() if line is self]:
                 del _lines[key]
         with self._lock:
-            self._break()
+            self._close_port()
 
 
 _lines: dict[str, MotorLine] = {}
 _lines_lock = threading.Lock()
 
 
-def _key(path: str) -> str:
+def _resolve_path(path: str) -> str:
     return os.path.realpath(path)
 
 
 def acquire(path: str, baudrate: int) -> MotorLine:
-    """The line at ``path``, shared with whoever of this process has it already.
+    """Open the line at ``path``, or share the one that this process has open.
 
     Raises as :class:`MotorLine`.
 
-    :raises HandRefused: it is open at another baud rate.
+    :raises HandRefused: the line is open at another baud rate.
     """
     with _lines_lock:
-        line = _lines.get(_key(path))
+        line = _lines.get(_resolve_path(path))
         if line is None or line.broken:
-            line = _lines[_key(path)] = MotorLine(path, baudrate)
+            line = _lines[_resolve_path(path)] = MotorLine(path, baudrate)
         elif line.baudrate != baudrate:
             raise HandRefused(
                 f"{path} is open at {line.baudrate} baud already",
@@ -222,6 +222,6 @@ def acquire(path: str, baudrate: int) -> MotorLine:
 
 
 def is_shared(line: MotorLine) -> bool:
-    """Whether more than one hand has it."""
+    """Whether more than one hand uses the line."""
     with _lines_lock:
         return line.users > 1

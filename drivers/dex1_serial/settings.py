@@ -1,4 +1,4 @@
-"""How to reach a motor and how to talk to it; ``--set`` on the command line."""
+"""Settings of the Dex1-1 driver, which ``--set`` changes on the command line."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ PORTS = ("/dev/ttyUSB*", "/dev/ttyCH343USB*")
 
 @dataclass(frozen=True)
 class Dex1Settings:
-    """How to reach a motor and how to talk to it.
+    """Settings of :class:`~dexkit.drivers.dex1_serial.hand.Dex1Serial`.
 
-    :param device: path of the serial port or USB serial number of its adapter; None to look for
-        the motor on every port of ``ports``.
+    :param device: path of the serial port or USB serial number of its adapter; None to probe every
+        port that matches ``ports``.
     :param ports: glob patterns.
-    :param id: of the motor; None for that of the side.
+    :param id: id of the motor; None for the one of the side.
     :param baudrate: bits a second.
-    :param protect: have the motor stop by itself after a second without a command.
+    :param protect: enable the motor's time-out protection, which stops it 1 s after a command.
     :param timeout: seconds to wait for an answer.
     """
 
@@ -46,24 +46,24 @@ class Dex1Settings:
             raise UsageError("ports must name at least one place to look")
 
 
-def _switch(text: str) -> bool:
+def _parse_switch(text: str) -> bool:
     if text not in ("on", "off"):
         raise ValueError("on or off")
     return text == "on"
 
 
-def _patterns(text: str) -> tuple[str, ...]:
+def _parse_patterns(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
 _PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
     "ports": (
-        _patterns,
+        _parse_patterns,
         f"where to look without --device, patterns with commas (default {','.join(PORTS)})",
     ),
     "id": (int, "of the motor (default 0 for the right hand, 1 for the left)"),
     "baudrate": (int, f"bits a second (default {m4010.BAUD_RATE})"),
-    "protect": (_switch, "on: the motor stops after 1 s without a command; off (default on)"),
+    "protect": (_parse_switch, "on: the motor stops after 1 s without a command; off (default on)"),
     "timeout": (float, f"seconds to wait for an answer (default {m4010.REPLY_TIMEOUT:g})"),
 }
 
@@ -72,9 +72,9 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def from_options(options: BackendOptions) -> Dex1Settings:
-    """The settings that a user's options make.
+    """Build the settings from command-line options.
 
-    :raises UsageError: one of them makes no sense.
+    :raises UsageError: a value cannot be parsed or is out of range.
     """
     values: dict[str, object] = {}
     for name, text in options.settings.items():

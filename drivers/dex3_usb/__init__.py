@@ -1,8 +1,8 @@
 """Driver of the Dex3-1 on USB (docs/dex3-usb.md).
 
-``Dex3Usb`` is the hand, ``backend`` what ``dexkit serve dex3-usb`` opens. Below it:
-:mod:`discovery` (which device), :mod:`link` (its bulk pipes, on PyUSB), :mod:`usbip` (PyUSB over
-USB/IP, bounded in time) and :mod:`settings`. The bytes are :mod:`dexkit.wire.dex3_usb`'s.
+``Dex3Usb`` is the hand, ``backend`` what ``dexkit serve dex3-usb`` opens. It uses :mod:`discovery`
+(which device), :mod:`link` (bulk transfers, on PyUSB) and :mod:`settings`. USB/IP is in
+:mod:`dexkit.usbip`, the frames in :mod:`dexkit.wire.dex3_usb`.
 """
 
 from dexkit.drivers.dex3_usb.discovery import Server, find_hand, list_hands

@@ -1,4 +1,4 @@
-"""Finding a hand: on this machine's USB, or behind a USB/IP server."""
+"""Find a Dex3-1 on this machine's USB or behind a USB/IP server."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["LOCAL_SERVER", "Candidate", "Server", "find_hand", "list_hands", "pa
 log = logging.getLogger(__name__)
 
 _SIDES = {product: side for side, product in PRODUCT_ID.items()}
-_DEFAULT_PORT = 3240  # registered for USB/IP
+_DEFAULT_PORT = 3240  # the TCP port that IANA registered for USB/IP
 _NO_LIBUSB = "libusb is not installed"
 _INSTALL_LIBUSB = "install it: sudo apt install libusb-1.0-0"
 
@@ -40,14 +40,13 @@ class Server:
 
 
 LOCAL_SERVER = Server("127.0.0.1")
-"""Where a hand is looked for at last if nobody says where it is: that of
-``dexkit emulate dex3-usb``."""
+"""Searched last if no place is given: the server of ``dexkit emulate dex3-usb``."""
 
 
 def parse_server(text: str) -> tuple[Server, str | None]:
-    """``usbip://host[:port][/serial]``: the server and the serial number.
+    """Parse ``usbip://host[:port][/serial]``; return the server and the serial number.
 
-    :raises UsageError: it is something else.
+    :raises UsageError: the text has another form.
     """
     try:
         parts = urlsplit(text)
@@ -66,13 +65,13 @@ _URL_HINT = "write usbip://HOST[:PORT][/SERIAL], for example usbip://127.0.0.1:3
 
 @dataclass
 class Candidate:
-    """A device that says it is a Dex3-1.
+    """A USB device with the vendor and product id of a Dex3-1.
 
-    :param backend: PyUSB backend that sees it.
+    :param backend: PyUSB backend that lists it.
     :param device: one of the backend's devices.
-    :param side: by its product id.
-    :param where: for messages.
-    :param server: that exports it; None for this machine's USB.
+    :param side: from its product id.
+    :param where: its place, for messages.
+    :param server: the USB/IP server that exports it; None for this machine's USB.
     """
 
     backend: Backend
@@ -85,9 +84,9 @@ class Candidate:
         return f"the {self.side} Dex3-1 on {self.where}"
 
     def serial(self) -> str:
-        """Its serial number, empty if it has none.
+        """Read the serial number; empty if the device has none.
 
-        :raises OSError: as libusb; no permission to open it, for example.
+        :raises OSError: from libusb, for example without permission to open the device.
         """
         handle = self.backend.open_device(self.device)
         try:
@@ -99,40 +98,41 @@ class Candidate:
 def find_hand(
     side: Side, *, serial: str | None = None, server: Server | None = None, local: bool = True
 ) -> Candidate:
-    """The hand of ``side``, or the one with a serial number.
+    """Find the hand of ``side``, or the one with a serial number.
 
-    :param server: look there only; otherwise on this machine's USB and, if it is not there, on
+    :param server: search this server only; otherwise this machine's USB, then
         :data:`LOCAL_SERVER`.
-    :param local: whether to look on :data:`LOCAL_SERVER` at all.
-    :raises HandNotFound: there is none, or more than one; says what there is.
-    :raises HandRefused: that serial number is the other side's, or it may not be read.
+    :param local: whether to search :data:`LOCAL_SERVER` at all.
+    :raises HandNotFound: there is none, or more than one; the message lists what there is.
+    :raises HandRefused: the hand with that serial number is the other side's, or the number may not
+        be read.
     """
     seen: list[str] = []
     hints: list[str] = []
     if server is not None:
         try:
-            candidates = _on_server(server)
+            candidates = _list_on_server(server)
         except OSError as error:
             raise HandNotFound(
                 f"no USB/IP server at {server}: {error.__cause__ or error.strerror or error}",
                 hint=f"start one there: dexkit emulate dex3-usb --side {side}, or usbipd for a "
                 "real hand",
             ) from error
-        with _reporting(f"looking at {server}"):
-            found = _choose(candidates, side, serial, seen)
+        with _translate_errors(f"looking at {server}"):
+            found = _choose_candidate(candidates, side, serial, seen)
         places = str(server)
     else:
-        with _reporting("looking at the USB devices"):
-            found = _choose(_on_system(seen, hints), side, serial, seen)
+        with _translate_errors("looking at the USB devices"):
+            found = _choose_candidate(_list_on_usb(seen, hints), side, serial, seen)
         places = "this machine's USB"
         if found is None and local:
             try:
-                candidates = _on_server(LOCAL_SERVER)
+                candidates = _list_on_server(LOCAL_SERVER)
             except OSError:
                 candidates = []
                 seen.append("no USB/IP server there")
-            with _reporting(f"looking at {LOCAL_SERVER}"):
-                found = _choose(candidates, side, serial, seen)
+            with _translate_errors(f"looking at {LOCAL_SERVER}"):
+                found = _choose_candidate(candidates, side, serial, seen)
             if found is not None:
                 log.info("no %s hand on this machine's USB; taking %s", side, found)
             places += f" or {LOCAL_SERVER}"
@@ -152,30 +152,30 @@ def find_hand(
 
 
 def list_hands(server: Server | None = None) -> list[Candidate]:
-    """Every Dex3-1 on this machine's USB, or on a server.
+    """List every Dex3-1 on this machine's USB, or on a server.
 
-    :raises OSError: as libusb, or the server cannot be reached.
+    :raises OSError: from libusb, or the server cannot be reached.
     """
-    return _on_system([], []) if server is None else _on_server(server)
+    return _list_on_usb([], []) if server is None else _list_on_server(server)
 
 
-def _on_system(seen: list[str], hints: list[str]) -> list[Candidate]:
+def _list_on_usb(seen: list[str], hints: list[str]) -> list[Candidate]:
     backend = usb.backend.libusb1.get_backend()
     if backend is None:
         seen.append(_NO_LIBUSB)
         hints.append(_INSTALL_LIBUSB)
         return []
-    return _candidates(backend)
+    return _find_candidates(backend)
 
 
-def _on_server(server: Server) -> list[Candidate]:
-    # here, not above: it loads the mDNS code that comes with the package
+def _list_on_server(server: Server) -> list[Candidate]:
+    # imported here because it loads the mDNS code of the usbip package
     from dexkit.usbip import UsbIpBackend
 
-    return _candidates(UsbIpBackend(server.host, server.port), server)
+    return _find_candidates(UsbIpBackend(server.host, server.port), server)
 
 
-def _candidates(backend: Backend, server: Server | None = None) -> list[Candidate]:
+def _find_candidates(backend: Backend, server: Server | None = None) -> list[Candidate]:
     where = "USB" if server is None else str(server)
     found = []
     for device in backend.enumerate_devices():
@@ -187,21 +187,21 @@ def _candidates(backend: Backend, server: Server | None = None) -> list[Candidat
     return found
 
 
-def _choose(
+def _choose_candidate(
     candidates: list[Candidate], side: Side, serial: str | None, seen: list[str]
 ) -> Candidate | None:
-    """The one that is meant; None, and what there is in ``seen``, if it is not there."""
+    """Choose the hand by serial number or side; None if it is absent. ``seen`` lists the others."""
     if serial is None:
         mine = [c for c in candidates if c.side is side]
         if len(mine) > 1:
-            listed = ", ".join(_name(c) for c in mine)
+            listed = ", ".join(_name_with_serial(c) for c in mine)
             raise HandNotFound(
                 f"more than one {side} Dex3-1: {listed}",
                 hint="say which: --device SERIAL, or --device usbip://HOST:PORT/SERIAL",
             )
         if mine:
             return mine[0]
-        # not asked for their numbers: that would take them from whoever is about to have them
+        # their serial numbers are not read: that would open devices that others are about to open
         seen += [f"there is {c}" for c in candidates]
         return None
     denied: OSError | None = None
@@ -221,12 +221,12 @@ def _choose(
             )
         else:
             return candidate
-    if denied is not None:  # it may well be that one
+    if denied is not None:  # it may be the wanted hand
         raise denied
     return None
 
 
-def _name(candidate: Candidate) -> str:
+def _name_with_serial(candidate: Candidate) -> str:
     try:
         number = candidate.serial() or "no serial number"
     except OSError as error:
@@ -236,7 +236,7 @@ def _name(candidate: Candidate) -> str:
 
 
 @contextmanager
-def _reporting(what: str) -> Iterator[None]:
+def _translate_errors(what: str) -> Iterator[None]:
     try:
         yield
     except HandError:

@@ -1,4 +1,4 @@
-"""The Dex3-1 behind the common interface: opening, exchanging, and what is done about faults."""
+"""Implement :class:`dexkit.hand.Hand` for the Dex3-1 on USB or USB/IP."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ __all__ = ["Dex3Statistics", "Dex3Usb", "backend"]
 log = logging.getLogger(__name__)
 
 _IO_RATE = 1000.0  # the Dex3-1 manual "Communication rate"
-_SLACK = 0.05  # seconds of an exchange beyond its two time-outs: waiting for a late answer
-_MISSED = 10
-"""Exchanges in a row without a motor's packet until it is reported as lost: a hundredth of a
-second, which no flipped bit lasts."""
-_GREETINGS = 5
-"""Exchanges that opening does at most to hear of every motor."""
-_GOODBYES = 2
-"""Times that closing tries to brake a hand which is there and does not answer."""
+_LATE_ANSWER_TIME = 0.05  # seconds of an exchange beyond its two time-outs, for a late answer
+_LOST_AFTER = 10
+"""Exchanges in a row without a motor's packet until the motor is reported as lost: 10 ms at 1000
+Hz, which random bit errors do not reach."""
+_OPENING_EXCHANGES = 5
+"""Exchanges that ``open`` makes at most until every motor has reported its state."""
+_BRAKE_ATTEMPTS = 2
+"""Brake commands that ``close`` sends at most to a hand that does not answer."""
 
 
 @dataclass
 class Dex3Statistics:
-    """Counters since the hand was made.
+    """Counters since the object was created.
 
     :ivar damaged_frames: answers that were not intact frames.
     :ivar damaged_packets: motor and sensor packets lost inside intact frames.
-    :ivar trips: times that motors were found stopped by their own time-out protection.
-    :ivar link: those of the link since it was opened.
+    :ivar trips: times that the motors' time-out protection had stopped them.
+    :ivar link: counters of the link since it was opened.
     """
 
     damaged_frames: int = 0
@@ -54,17 +54,17 @@ class Dex3Usb:
     """A Dex3-1 on USB, or behind a USB/IP server.
 
     :param side: which hand.
-    :param configuration: how to reach it and how to talk to it.
+    :param configuration: place, frame layout, bus map, protection and time-outs.
 
-    ``open`` finds the hand and brakes it; a hand that was lost is looked for where it was found
-    the first time. The motors obey for a second at most without the next
-    command (unless ``protect`` is off), so a process that dies leaves none of them driven;
-    those that stopped by themselves are braked and take the command after that one.
+    ``open`` finds the hand and brakes it; it searches a lost hand where it was found the first
+    time. Commands enable the motors' time-out protection (unless ``protect`` is off): each motor
+    stops one second after its last command, so none is driven after this process dies. A motor
+    whose protection has tripped gets one brake command, which clears the trip, and obeys the next.
     """
 
     reconnect_interval = 0.5
-    """Seconds at most between attempts of the service to open a lost hand again: looking for a
-    USB device costs nothing."""
+    """Longest time between the service's attempts to open a lost hand again, seconds. Short,
+    because listing USB devices is cheap."""
 
     def __init__(
         self,
@@ -78,11 +78,13 @@ class Dex3Usb:
         self._clock: Clock = clock if clock is not None else RealClock()
         self._link: UsbLink | None = None
         self._found = False
-        self._server: Server | None = None  # where it was found
+        self._server: Server | None = None  # where the hand was found
         self._spec = DEX3_1.spec(
             side,
             io_rate=_IO_RATE,
-            exchange_timeout=self.configuration.send_timeout + self.configuration.timeout + _SLACK,
+            exchange_timeout=self.configuration.send_timeout
+            + self.configuration.timeout
+            + _LATE_ANSWER_TIME,
         )
         n = self._spec.n_joints
         self._brake = HandCommand.brake(n)
@@ -100,11 +102,11 @@ class Dex3Usb:
         self._last: HandState | None = None
         self._tripped: NDArray[np.bool_] | None = None
         self._missed = np.zeros(self._spec.n_joints, np.intp)
-        self._some_missed = False
+        self._any_missed = False
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is."""
+        """Side, joints, rates and time-outs of this hand."""
         return self._spec
 
     @property
@@ -115,10 +117,10 @@ class Dex3Usb:
     # --- opening and closing
 
     def open(self) -> None:
-        """Find the hand, claim it, brake it and hear of every motor. Nothing moves.
+        """Find the hand, claim its interface, brake it and wait for every motor's state. No motion.
 
-        :raises HandNotFound: there is none, or more than one; says what there is.
-        :raises HandRefused: no permission, another program has it, it is the other side's, or a
+        :raises HandNotFound: there is none, or more than one; the message lists what there is.
+        :raises HandRefused: no permission, another program uses it, it is the other side's, or a
             motor is not where the bus map says.
         :raises HandTimeout: it does not answer, or not with whole state frames.
         :raises HandLost: it goes away meanwhile.
@@ -142,11 +144,11 @@ class Dex3Usb:
         )
         self.statistics.link = self._link.statistics
         try:
-            state = self._greet(self._link)
+            state = self._await_all_motors(self._link)
         except BaseException:
             self.close()
             raise
-        # whoever drives an emulated hand must not find a real one in its place, nor the reverse
+        # opening again must not replace an emulated hand by a real one, or the reverse
         self._found, self._server = True, candidate.server
         log.info(
             "%s: serial number %s, endpoints %#04x and %#04x, supply %.1f V",
@@ -157,21 +159,21 @@ class Dex3Usb:
             state.supply.power_v if state.supply else np.nan,
         )
 
-    def _greet(self, link: UsbLink) -> HandState:
-        # bit 7 = 0: whatever tripped while nobody drove the hand is cleared (the Dex3-1 manual
+    def _await_all_motors(self, link: UsbLink) -> HandState:
+        # bit 7 = 0 clears protections that tripped while no host sent commands (the Dex3-1 manual
         # RIS_Mode_t)
         frame = self._codec.encode(self._brake, False)
         problem: HandError | None = None
         answer = b""
-        for _ in range(_GREETINGS):
+        for _ in range(_OPENING_EXCHANGES):
             try:
                 answer, state = self._transfer(link, frame)
             except HandTimeout as error:
                 problem = error
-                if link.statistics.timeouts >= 2:  # once may be a leftover of whoever had it
+                if link.statistics.timeouts >= 2:  # the first may come from the last host's traffic
                     break
                 continue
-            self._fill_in(state)
+            self._keep_last_values(state)
             if not np.isnan(state.q).any():
                 self._last = state
                 return state
@@ -180,11 +182,11 @@ class Dex3Usb:
             raise HandTimeout(
                 problem.message,
                 hint="is its power on? The manual has two sizes of the command frame: "
-                f"try --set frame={_other(self.configuration.layout)}",
+                f"try --set frame={_other_layout(self.configuration.layout)}",
             ) from problem
-        raise self._incomplete(answer)
+        raise self._missing_motors_error(answer)
 
-    def _incomplete(self, answer: bytes) -> HandRefused:
+    def _missing_motors_error(self, answer: bytes) -> HandRefused:
         motors = self.configuration.bus_map.motors
         silent = ", ".join(
             f"{self._spec.joints[i].name} (bus {motors[i][0]} id {motors[i][1]})"
@@ -198,13 +200,13 @@ class Dex3Usb:
         )
 
     def close(self) -> None:
-        """Brake the motors and release the hand, as far as it is still there."""
+        """Brake the motors and release the hand. Failures are logged, not raised."""
         link, self._link = self._link, None
         if link is None:
             return
         try:
             if self._last is not None:
-                self._let_go(link)
+                self._brake_motors(link)
         except HandError as error:
             rest = (
                 "its motors stop by themselves within a second"
@@ -214,19 +216,19 @@ class Dex3Usb:
             log.warning("could not brake: %s; %s", error, rest)
         finally:
             link.close()
-            # one that did not open is reported by open(), every time that it is tried
+            # a failed opening is reported by open() at every attempt
             level = logging.DEBUG if self._last is None else logging.INFO
             log.log(level, "%s closed: %s", link.name, self.statistics)
 
-    def _let_go(self, link: UsbLink) -> None:
-        # bit 7 = 0: a brake needs no protection, and trips would only be left behind
+    def _brake_motors(self, link: UsbLink) -> None:
+        # bit 7 = 0: otherwise the protections would trip a second after this
         frame = self._codec.encode(self._brake, False)
         configuration = self.configuration
-        for left in reversed(range(_GOODBYES)):
+        for left in reversed(range(_BRAKE_ATTEMPTS)):
             try:
                 link.exchange(frame, configuration.send_timeout, configuration.timeout)
                 return
-            except HandTimeout:  # a stalled endpoint, for one: it has not heard the command
+            except HandTimeout:  # the command may be lost, for example at a stalled endpoint
                 if not left:
                     raise
 
@@ -240,14 +242,14 @@ class Dex3Usb:
     # --- exchanging
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Send one command frame, return what the state frame says.
+        """Send one command frame and return the state frame that answers it.
 
         A motor whose packet is missing or damaged keeps its last state; after ten exchanges it
-        shows ``MotorError.HOST_SAW_MOTOR_TIMEOUT``.
+        reports ``MotorError.HOST_SAW_MOTOR_TIMEOUT``.
 
-        :raises HandLost: the hand has gone, or is not open.
-        :raises HandTimeout: no answer in time, none that is intact, a stalled endpoint, or this
-            program stood still before the command was sent.
+        :raises HandLost: the hand has gone away, or is not open.
+        :raises HandTimeout: no intact answer in time, a stalled endpoint, or this program was
+            paused before the command was sent.
         """
         deadline = WriteDeadline(self._clock)
         link = self._link
@@ -255,12 +257,12 @@ class Dex3Usb:
             raise HandLost("the hand is not open", hint="call open() first")
         protect, tripped = self._protect, self._tripped
         if tripped is not None:
-            # one lock frame with bit 7 = 0 clears a motor that stopped by itself
-            command, protect = _locked(command, tripped), protect & ~tripped
+            # one lock packet with bit 7 = 0 clears a motor's trip
+            command, protect = _brake_joints(command, tripped), protect & ~tripped
         _, state = self._transfer(link, self._codec.encode(command, protect), deadline)
-        if self._codec.missing_motors or self._some_missed:
-            self._fill_in(state)
-        self._look_for_trips(state)
+        if self._codec.missing_motors or self._any_missed:
+            self._keep_last_values(state)
+        self._detect_trips(state)
         self._last = state
         return state
 
@@ -280,12 +282,12 @@ class Dex3Usb:
             log.debug("damaged packets: %s", "; ".join(map(str, self._codec.problems)))
         return answer, state
 
-    def _fill_in(self, state: HandState) -> None:
-        """What was not heard of in this frame stays as it was, but not for long unremarked."""
+    def _keep_last_values(self, state: HandState) -> None:
+        """Repeat the last state of motors missing in this frame; report long absence as a fault."""
         gone = list(self._codec.missing_motors)
         self._missed[gone] += 1
         self._missed[[i for i in range(len(self._missed)) if i not in gone]] = 0
-        self._some_missed = bool(gone)
+        self._any_missed = bool(gone)
         if self._last is not None:
             for name in ("q", "dq", "tau_est", "temperature", "voltage", "mode", "fault"):
                 getattr(state, name)[gone] = getattr(self._last, name)[gone]
@@ -293,9 +295,9 @@ class Dex3Usb:
                 self._last.winding_temperature is not None
             ):
                 state.winding_temperature[gone] = self._last.winding_temperature[gone]
-        state.fault[self._missed >= _MISSED] |= np.uint32(MotorError.HOST_SAW_MOTOR_TIMEOUT)
+        state.fault[self._missed >= _LOST_AFTER] |= np.uint32(MotorError.HOST_SAW_MOTOR_TIMEOUT)
 
-    def _look_for_trips(self, state: HandState) -> None:
+    def _detect_trips(self, state: HandState) -> None:
         bits = state.fault & _TRIPPED
         if not bits.any():
             self._tripped = None
@@ -304,18 +306,22 @@ class Dex3Usb:
         if before is None:
             self.statistics.trips += 1
             joints = [self._spec.joints[i].name for i in np.flatnonzero(bits)]
-            log.warning("%s heard nothing for a second and stopped; going on", ", ".join(joints))
+            log.warning(
+                "%s received no command for 1 s and the protection stopped them; "
+                "driving them again",
+                ", ".join(joints),
+            )
 
 
 _TRIPPED = np.uint32(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 
 
-def _other(layout: CommandLayout) -> str:
+def _other_layout(layout: CommandLayout) -> str:
     return next(other.name for other in COMMAND_LAYOUTS if other is not layout)
 
 
-def _locked(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
-    """``command`` with some joints braked."""
+def _brake_joints(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
+    """Return ``command`` with some joints braked."""
     keep = ~joints
     return replace(
         command,
@@ -324,14 +330,14 @@ def _locked(command: HandCommand, joints: NDArray[np.bool_]) -> HandCommand:
     )
 
 
-def _make(options: BackendOptions) -> Dex3Usb:
+def _create_hand(options: BackendOptions) -> Dex3Usb:
     return Dex3Usb(options.side, from_options(options))
 
 
 backend = Backend(
     summary="Dex3-1 on USB, or behind a USB/IP server (dexkit emulate dex3-usb)",
     model=DEX3_1.name,
-    make=_make,
+    make=_create_hand,
     needs="--device serial number or usbip://HOST:PORT, if there is more than one hand",
     settings=SETTINGS,
 )

@@ -1,10 +1,9 @@
-"""The bulk pipes of one hand: one buffer out, one buffer back.
+"""Exchange frames with a Dex3-1 on its USB bulk endpoints: one OUT transfer, one IN transfer.
 
-It works on PyUSB's backend interface (:class:`usb.backend.IBackend`), below
-:class:`usb.core.Device`: the calls are the same, without the bookkeeping that each
-``Device.write`` and ``Device.read`` repeats (about a fifth of the processor time of an
-exchange). What libusb or the USB/IP client raise becomes a :class:`~dexkit.errors.HandError`
-here and nowhere else.
+It calls PyUSB's backend interface (:class:`usb.backend.IBackend`) directly, because
+:class:`usb.core.Device` repeats checks in each ``write`` and ``read`` (about a fifth of the
+processor time of an exchange). This module alone translates errors of libusb and of the USB/IP
+client to :class:`~dexkit.errors.HandError`.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ Backend: TypeAlias = Any
 
 _INTERFACE = 0
 _BULK, _TYPE_MASK, _DIRECTION_IN = 0x02, 0x03, 0x80
-_ANSWER_ROOM = 2048
-"""Bytes asked for: more than an answer has (1270), and whole packets of 512, so that an answer
-that is too long arrives and is seen to be too long instead of as an overflow."""
+_ANSWER_BUFFER_SIZE = 2048
+"""Bytes of an IN transfer: more than an answer has (1270), in whole packets of 512, so that an
+answer that is too long is received and rejected by its length instead of as a USB overflow."""
 _STRING_TIMEOUT = 500  # ms
-_DRAIN_TIMEOUT = 1  # ms: as short as libusb can wait (0 is for ever)
-_QUIET = 0.02
-"""Seconds that a late answer is waited for after a time-out, before the next command is sent."""
-_WATCH = 0.5
-"""Seconds after that for which each answer is checked for another one behind it."""
+_DRAIN_TIMEOUT = 1  # ms: the shortest that libusb supports (0 means no time-out)
+_LATE_ANSWER_WAIT = 0.02
+"""Seconds to wait for a late answer after a time-out, before the next command is sent."""
+_LATE_ANSWER_WATCH = 0.5
+"""Seconds after a time-out in which each exchange checks for a second, newer answer."""
 
 UDEV_RULE = "packaging/70-dexkit-dex3.rules"
 UDEV_HINT = (
@@ -47,12 +46,12 @@ UDEV_HINT = (
     " (or, without the file, see docs/dex3-usb.md)"
 )
 
-_LOST = frozenset(
+_LOST_ERRNOS = frozenset(
     {
         errno.ENODEV,
         errno.ENOENT,
         errno.ENXIO,
-        errno.EIO,  # what a pulled cable gives on a transfer under way
+        errno.EIO,  # a cable pulled during a transfer
         errno.EPROTO,
         errno.ESHUTDOWN,
         errno.ECONNREFUSED,
@@ -62,13 +61,13 @@ _LOST = frozenset(
         errno.ENETUNREACH,
     }
 )
-_LATE = frozenset({errno.ETIMEDOUT, errno.EINTR, errno.EAGAIN})
+_TIMEOUT_ERRNOS = frozenset({errno.ETIMEDOUT, errno.EINTR, errno.EAGAIN})
 
 
 def hand_error(error: Exception, what: str) -> HandError:
-    """What a :class:`usb.core.USBError` or another :class:`OSError` says about the hand.
+    """Translate a :class:`usb.core.USBError` or another :class:`OSError` to an error of the hand.
 
-    :param what: what was being done, for the message: ``"opening the left hand"``.
+    :param what: the operation, for the message: ``"opening the left hand"``.
     """
     number = error.errno if isinstance(error, OSError) else None
     text = f"{what}: {error.strerror or error if isinstance(error, OSError) else error}"
@@ -81,16 +80,16 @@ def hand_error(error: Exception, what: str) -> HandError:
             "device over? See: sudo lsof /dev/bus/usb/*/*; over USB/IP: another client of its "
             "server",
         )
-    if number in _LATE or isinstance(error, TimeoutError):
+    if number in _TIMEOUT_ERRNOS or isinstance(error, TimeoutError):
         return HandTimeout(text)
-    if number in _LOST or isinstance(error, ConnectionError):
+    if number in _LOST_ERRNOS or isinstance(error, ConnectionError):
         return HandLost(text, hint="is the hand plugged in and powered?")
     return HandError(text)
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses of the bulk pipes, with bit 7 set for the one that the host reads."""
+    """Addresses of the bulk endpoints; bit 7 is set in the one that the host reads."""
 
     out: int
     into: int
@@ -101,9 +100,9 @@ class LinkStatistics:
     """Counters of a link since it was opened.
 
     :ivar exchanges: answers received, intact or not.
-    :ivar timeouts: commands that were not answered in time.
-    :ivar late: answers that came after their time and were passed over.
-    :ivar stalls: halts of an endpoint that were cleared.
+    :ivar timeouts: commands without an answer in time.
+    :ivar late: answers that came after their time-out and were discarded.
+    :ivar stalls: endpoint halts that were cleared.
     """
 
     exchanges: int = 0
@@ -113,15 +112,15 @@ class LinkStatistics:
 
 
 class UsbLink:
-    """An opened device whose interface 0 is claimed.
+    """An open USB device whose interface 0 is claimed.
 
     :param backend: PyUSB backend.
     :param device: one of the backend's devices.
     :param name: for messages.
-    :param out_endpoint: address instead of the first bulk OUT of the interface.
+    :param out_endpoint: address; None for the first bulk OUT endpoint of the interface.
     :param in_endpoint: likewise IN.
-    :raises HandRefused: no permission, another program has it, no such endpoints.
-    :raises HandLost, HandTimeout: it goes away or says nothing meanwhile.
+    :raises HandRefused: no permission, another program uses it, no such endpoints.
+    :raises HandLost, HandTimeout: it goes away or does not answer while it is opened.
     """
 
     def __init__(
@@ -138,17 +137,17 @@ class UsbLink:
         self._backend = backend
         self._handle: Any = None
         self._claimed = self._detached = False
-        self._drain = True  # whoever had it before may have left an answer behind
-        self._owed = 0  # answers that were waited for in vain, and may still come
+        self._drain_first = True  # the last host may have left an unread answer
+        self._pending_answers = 0  # answers that timed out and may still arrive
         self._watch_until = 0.0
-        self._passed_over = 0  # of the late answers, those that the backend has dropped
-        self._buffer = array.array("B", bytes(_ANSWER_ROOM))
+        self._passed_over = 0  # late answers that the USB/IP client has dropped itself
+        self._buffer = array.array("B", bytes(_ANSWER_BUFFER_SIZE))
         self._exchange = getattr(backend, "exchange", None)
         try:
             self._handle = backend.open_device(device)
-            self._take()
-            self.endpoints = _endpoints(backend, device, name, out_endpoint, in_endpoint)
-            self.serial = _serial(backend, self._handle)
+            self._claim_interface()
+            self.endpoints = _find_endpoints(backend, device, name, out_endpoint, in_endpoint)
+            self.serial = _read_serial_or_empty(backend, self._handle)
         except (OSError, NotImplementedError) as error:
             self.close()
             raise hand_error(error, f"opening {name}") from error
@@ -156,19 +155,19 @@ class UsbLink:
             self.close()
             raise
 
-    def _take(self) -> None:
+    def _claim_interface(self) -> None:
         backend, handle = self._backend, self._handle
-        if _kernel_driver(backend, handle):
+        if _has_kernel_driver(backend, handle):
             backend.detach_kernel_driver(handle, _INTERFACE)
             self._detached = True
         if not backend.get_configuration(handle):
-            # only if needed: setting it resets the device, toggles and all
+            # only if needed: setting it resets the device's endpoints and data toggles
             backend.set_configuration(handle, 1)
         backend.claim_interface(handle, _INTERFACE)
         self._claimed = True
 
     def close(self) -> None:
-        """Give everything back, as far as it is still there. May be called twice."""
+        """Release the interface and close the device. May be called twice."""
         handle, self._handle = self._handle, None
         if handle is None:
             return
@@ -191,20 +190,20 @@ class UsbLink:
         timeout: float,
         before: WriteDeadline | None = None,
     ) -> bytes:
-        """Send one buffer, return the one that answers it.
+        """Send one command frame and return the answer.
 
         :param data: a whole command frame.
         :param send_timeout: seconds that the device may take to accept it.
         :param timeout: seconds until the answer.
-        :param before: asked right before it is sent.
+        :param before: checked right before the frame is sent.
         :raises HandTimeout: no answer in time, a stalled endpoint, which was cleared, or
-            ``before`` refuses.
-        :raises HandLost: the device has gone.
-        :raises HandRefused, HandError: anything else that libusb may say.
+            ``before`` raises it.
+        :raises HandLost: the device has gone away.
+        :raises HandRefused, HandError: any other error of libusb.
         """
         if self._handle is None:
             raise HandLost(f"{self.name} is not open")
-        if self._drain:
+        if self._drain_first:
             self._wait_for_late()
         if before is not None:
             before.check()
@@ -215,15 +214,15 @@ class UsbLink:
         except BaseException:  # Ctrl-C, perhaps between the command and its answer
             self._expect_late()
             raise
-        if self._owed:
-            self._count_passed_over()
-            answer = self._newest(answer)
+        if self._pending_answers:
+            self._count_dropped_answers()
+            answer = self._newest_answer(answer)
         self.statistics.exchanges += 1
         return answer
 
     def resynchronise(self) -> None:
-        """Before the next command, pass over what the device has still sent."""
-        self._drain = True
+        """Discard what the device has sent, before the next command."""
+        self._drain_first = True
 
     # -- details
 
@@ -237,24 +236,28 @@ class UsbLink:
                     endpoints.out,
                     data,
                     endpoints.into,
-                    _ANSWER_ROOM,
-                    _ms(send_timeout),
-                    _ms(timeout),
+                    _ANSWER_BUFFER_SIZE,
+                    _milliseconds(send_timeout),
+                    _milliseconds(timeout),
                 )
                 return answer
             count = self._backend.bulk_write(
-                self._handle, endpoint, _INTERFACE, array.array("B", data), _ms(send_timeout)
+                self._handle,
+                endpoint,
+                _INTERFACE,
+                array.array("B", data),
+                _milliseconds(send_timeout),
             )
             if count != len(data):
-                raise self._late(f"took {count} of the {len(data)} bytes of a command")
+                raise self._late_answer_error(f"took {count} of the {len(data)} bytes of a command")
             endpoint = endpoints.into
-            return self._read(_ms(timeout))
+            return self._read(_milliseconds(timeout))
         except HandError:  # HandTimeout is an OSError too
             raise
         except OSError as error:
             if error.errno == errno.EPIPE:
-                raise self._stalled(getattr(error, "endpoint", endpoint)) from error
-            raise self._failed(error) from error
+                raise self._clear_stall(getattr(error, "endpoint", endpoint)) from error
+            raise self._exchange_error(error) from error
 
     def _read(self, timeout: int) -> bytes:
         count = self._backend.bulk_read(
@@ -263,59 +266,61 @@ class UsbLink:
         return self._buffer[:count].tobytes()
 
     def _wait_for_late(self) -> None:
-        self._drain = False
-        deadline = time.monotonic() + _QUIET
-        while (self._read_late() is not None or self._owed) and time.monotonic() < deadline:
+        self._drain_first = False
+        deadline = time.monotonic() + _LATE_ANSWER_WAIT
+        while (
+            self._read_late() is not None or self._pending_answers
+        ) and time.monotonic() < deadline:
             pass
 
-    def _newest(self, answer: bytes) -> bytes:
-        """``answer``, or the last one behind it: then ``answer`` was that to an old command."""
-        while self._owed and (following := self._read_late()) is not None:
+    def _newest_answer(self, answer: bytes) -> bytes:
+        """Return ``answer``, or a newer one: then ``answer`` belonged to an earlier command."""
+        while self._pending_answers and (following := self._read_late()) is not None:
             answer = following
         if time.monotonic() > self._watch_until:
-            self._owed = 0  # it was lost
+            self._pending_answers = 0  # they were lost
         return answer
 
     def _read_late(self) -> bytes | None:
         try:
             data = self._read(_DRAIN_TIMEOUT)
         except OSError as error:
-            if error.errno in _LATE:
-                self._count_passed_over()
+            if error.errno in _TIMEOUT_ERRNOS:
+                self._count_dropped_answers()
                 return None
-            raise self._failed(error) from error
-        self._came_late(1)
+            raise self._exchange_error(error) from error
+        self._count_late(1)
         return data
 
-    def _count_passed_over(self) -> None:
-        """The USB/IP client drops an answer that crosses the cancelling of its read."""
+    def _count_dropped_answers(self) -> None:
+        """Count answers that the USB/IP client dropped because they arrived after an unlink."""
         before, self._passed_over = self._passed_over, getattr(self._handle, "passed_over", 0)
-        self._came_late(self._passed_over - before)
+        self._count_late(self._passed_over - before)
 
-    def _came_late(self, count: int) -> None:
+    def _count_late(self, count: int) -> None:
         self.statistics.late += count
-        self._owed = max(0, self._owed - count)
+        self._pending_answers = max(0, self._pending_answers - count)
 
-    def _late(self, what: str) -> HandTimeout:
+    def _late_answer_error(self, what: str) -> HandTimeout:
         self.statistics.timeouts += 1
         self._expect_late()
         return HandTimeout(f"{self.name} {what}")
 
     def _expect_late(self) -> None:
-        """An answer may still come. They come in order, and do not say to what: one that is late
-        would be taken for that to the next command, and so on for ever.
+        """Note that an answer may still arrive. Answers arrive in order and do not name their
+        command, so one late answer would shift all later ones by one command.
         """
-        self._drain = True
-        self._owed += 1
-        self._watch_until = time.monotonic() + _WATCH
+        self._drain_first = True
+        self._pending_answers += 1
+        self._watch_until = time.monotonic() + _LATE_ANSWER_WATCH
 
-    def _failed(self, error: OSError) -> HandError:
+    def _exchange_error(self, error: OSError) -> HandError:
         translated = hand_error(error, f"exchanging with {self.name}")
         if isinstance(translated, HandTimeout):
-            return self._late("does not answer")
+            return self._late_answer_error("does not answer")
         return translated
 
-    def _stalled(self, endpoint: int) -> HandError:
+    def _clear_stall(self, endpoint: int) -> HandError:
         name = "IN" if endpoint & _DIRECTION_IN else "OUT"
         try:
             self._backend.clear_halt(self._handle, endpoint)
@@ -326,11 +331,11 @@ class UsbLink:
         return HandTimeout(f"{self.name} stalled its {name} endpoint {endpoint:#04x}; cleared")
 
 
-def _ms(seconds: float) -> int:
-    return max(1, round(seconds * 1000))  # 0 would be for ever
+def _milliseconds(seconds: float) -> int:
+    return max(1, round(seconds * 1000))  # 0 would mean no time-out
 
 
-def _serial(backend: Backend, handle: Any) -> str:
+def _read_serial_or_empty(backend: Backend, handle: Any) -> str:
     try:
         return read_serial(backend, handle)
     except (OSError, NotImplementedError) as error:
@@ -338,17 +343,17 @@ def _serial(backend: Backend, handle: Any) -> str:
         return ""
 
 
-def _kernel_driver(backend: Backend, handle: Any) -> bool:
+def _has_kernel_driver(backend: Backend, handle: Any) -> bool:
     try:
         return bool(backend.is_kernel_driver_active(handle, _INTERFACE))
-    except NotImplementedError:  # of the operating system
+    except NotImplementedError:  # the operating system has no such call
         return False
 
 
-def _endpoints(
+def _find_endpoints(
     backend: Backend, device: Any, name: str, out: int | None, into: int | None
 ) -> Endpoints:
-    """The first bulk endpoints of interface 0; the manual does not number them
+    """Find the first bulk endpoints of interface 0; the manual does not give their addresses
     (docs/sources/unitree-dex.md#c1).
     """
     interface = backend.get_interface_descriptor(device, _INTERFACE, 0, 0)
@@ -374,12 +379,12 @@ def _endpoints(
 
 
 def read_serial(backend: Backend, handle: Any) -> str:
-    """The serial number string of an opened device, empty if it has none.
+    """Read the serial number string of an open device; empty if it has none.
 
-    It is asked of the device itself: the USB/IP client's device descriptor comes from the
+    The string index is read from the device: the USB/IP client's device descriptor comes from the
     server's list, which has no string indices.
 
-    :raises OSError: as libusb.
+    :raises OSError: from libusb.
     """
 
     def descriptor(kind: int, index: int, language: int, size: int) -> bytes:

@@ -1,4 +1,4 @@
-"""How to reach a hand and how to talk to it; ``--set`` on the command line."""
+"""Settings of the Dex3-1 driver, which ``--set`` changes on the command line."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ __all__ = ["SETTINGS", "Dex3Settings", "from_options", "parse_places"]
 
 @dataclass(frozen=True)
 class Dex3Settings:
-    """How to reach a hand and how to talk to it.
+    """Settings of :class:`~dexkit.drivers.dex3_usb.hand.Dex3Usb`.
 
     :param serial: serial number, or None for the only hand of its side.
-    :param server: USB/IP server to look on, or None for this machine's USB.
-    :param local: without a server, look on the local one too if USB has no such hand.
-    :param layout: of the command frame; the manual has two sizes (docs/sources/unitree-dex.md#c5).
+    :param server: USB/IP server to search, or None for this machine's USB.
+    :param local: without a server, also search the local one if USB has no such hand.
+    :param layout: layout of the command frame; the manual gives two sizes
+        (docs/sources/unitree-dex.md#c5).
     :param head: first two bytes of the command frame, which the manual does not give.
-    :param bus_map: which motor and sensor is where; the manual's figure of it is lost
+    :param bus_map: bus and id of each motor and sensor; the manual's figure of it is lost
         (docs/sources/unitree-dex.md#c7).
-    :param protect: have the motors stop by themselves after a second without a command.
+    :param protect: enable the motors' time-out protection, which stops them 1 s after a command.
     :param timeout: seconds to wait for an answer.
     :param send_timeout: seconds that the hand may take to accept a command.
-    :param out_endpoint: address instead of the first bulk OUT endpoint.
+    :param out_endpoint: address; None for the first bulk OUT endpoint.
     :param in_endpoint: likewise IN.
     """
 
@@ -73,9 +74,9 @@ class Dex3Settings:
 
 
 def parse_places(text: str) -> tuple[tuple[int, int], ...]:
-    """``BUS.ID,BUS.ID,...``, one for each motor or sensor packet.
+    """Parse ``BUS.ID,BUS.ID,...``, one entry for each motor or sensor packet.
 
-    :raises ValueError: it is something else.
+    :raises ValueError: the text has another form.
     """
     places = []
     for part in text.split(","):
@@ -86,51 +87,54 @@ def parse_places(text: str) -> tuple[tuple[int, int], ...]:
     return tuple(places)
 
 
-def _seconds(text: str) -> float:
+def _parse_seconds(text: str) -> float:
     return float(text)
 
 
-def _switch(text: str) -> bool:
+def _parse_switch(text: str) -> bool:
     if text not in ("on", "off"):
         raise ValueError("on or off")
     return text == "on"
 
 
-def _layout(text: str) -> CommandLayout:
+def _parse_layout(text: str) -> CommandLayout:
     for layout in COMMAND_LAYOUTS:
         if layout.name == text:
             return layout
     raise ValueError(f"known: {', '.join(layout.name for layout in COMMAND_LAYOUTS)}")
 
 
-def _address(text: str) -> int:
+def _parse_address(text: str) -> int:
     value = int(text, 0)
     if not 0 <= value <= 0xFF:
         raise ValueError("not an endpoint address")
     return value
 
 
-def _places_text(places: tuple[tuple[int, int], ...]) -> str:
+def _format_places(places: tuple[tuple[int, int], ...]) -> str:
     return ",".join(f"{bus}.{number}" for bus, number in places)
 
 
 _PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
-    "timeout": (_seconds, "seconds to wait for an answer (default 0.1)"),
-    "send_timeout": (_seconds, "seconds that a command may take to be accepted (default 0.1)"),
-    "protect": (_switch, "on: motors stop after 1 s without a command; off (default on)"),
-    "frame": (_layout, "bytes of the command frame, 1234 or 734 (default 1234)"),
+    "timeout": (_parse_seconds, "seconds to wait for an answer (default 0.1)"),
+    "send_timeout": (
+        _parse_seconds,
+        "seconds that a command may take to be accepted (default 0.1)",
+    ),
+    "protect": (_parse_switch, "on: motors stop after 1 s without a command; off (default on)"),
+    "frame": (_parse_layout, "bytes of the command frame, 1234 or 734 (default 1234)"),
     "head": (bytes.fromhex, f"two bytes that start it, in hex (default {COMMAND_HEAD.hex()})"),
     "motors": (
         parse_places,
         "BUS.ID of each motor, in the joints' order "
-        f"(default {_places_text(DEFAULT_BUS_MAP.motors)})",
+        f"(default {_format_places(DEFAULT_BUS_MAP.motors)})",
     ),
     "sensors": (
         parse_places,
-        f"BUS.ID of each sensor packet (default {_places_text(DEFAULT_BUS_MAP.sensors)})",
+        f"BUS.ID of each sensor packet (default {_format_places(DEFAULT_BUS_MAP.sensors)})",
     ),
-    "out_endpoint": (_address, "address such as 0x02 (default the first bulk OUT)"),
-    "in_endpoint": (_address, "address such as 0x81 (default the first bulk IN)"),
+    "out_endpoint": (_parse_address, "address such as 0x02 (default the first bulk OUT)"),
+    "in_endpoint": (_parse_address, "address such as 0x81 (default the first bulk IN)"),
 }
 _USB = (
     "where: auto (this machine's USB, then the USB/IP server on 127.0.0.1), system (its USB "
@@ -144,9 +148,9 @@ SETTINGS: dict[str, str] = {"usb": _USB} | {
 
 
 def from_options(options: BackendOptions) -> Dex3Settings:
-    """The settings that a user's options make.
+    """Build the settings from command-line options.
 
-    :raises UsageError: one of them makes no sense, or two contradict each other.
+    :raises UsageError: a value cannot be parsed or is out of range, or two contradict each other.
     """
     values: dict[str, object] = {}
     for name, text in options.settings.items():
@@ -169,10 +173,10 @@ def from_options(options: BackendOptions) -> Dex3Settings:
                 ) from error
     if "frame" in values:
         values["layout"] = values.pop("frame")
-    return Dex3Settings(bus_map=bus_map, **_place(options), **values)  # type: ignore[arg-type]
+    return Dex3Settings(bus_map=bus_map, **_parse_location(options), **values)  # type: ignore[arg-type]
 
 
-def _place(options: BackendOptions) -> dict[str, object]:
+def _parse_location(options: BackendOptions) -> dict[str, object]:
     usb = options.settings.get("usb", "auto")
     server: Server | None = None
     serial: str | None = None

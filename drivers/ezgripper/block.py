@@ -1,7 +1,7 @@
-"""What is exchanged with the servo each cycle: one write and one contiguous read.
+"""Layout of the registers written and read in each exchange: one write and one contiguous read.
 
-The items wanted are scattered over the control table (64, 70, 98, 102, 112 to 120, 126 to 146),
-so their bytes are mapped side by side through Indirect Address 1 to 28
+The items are scattered over the control table (64, 70, 98, 102, 112 to 120, 126 to 146), so
+Indirect Address 1 to 28 map their bytes side by side
 (docs/sources/mx64-ezgripper.md#b2)::
 
     Indirect Data   1..4    5..6    7..10      11    12     13       14..15 16.. ..28
@@ -11,10 +11,10 @@ so their bytes are mapped side by side through Indirect Address 1 to 28
                             |--------------------- read ----------------------------------|
 
 - The write (10 bytes, 25 on the line) is a Sync Write, which has no status packet. A status
-  would cost 110 µs on the line and, more, another wait for the USB adapter's latency timer.
-- Because goal current and goal position are read back in the same block, a write that was lost
-  or refused (bus watchdog tripped) shows in the very next sample; torque, hardware error and
-  watchdog are seen in every sample too.
+  packet would take 110 µs on the line and one more period of the USB adapter's latency timer.
+- Goal current and goal position are read back in the same block, so the next sample shows a write
+  that was lost or refused (bus watchdog tripped). Every sample also has torque, hardware error and
+  watchdog.
 - At 1 Mbaud: 250 µs write, 140 µs read instruction, 4 µs return delay, 350 µs answer: 744 µs.
   With a latency timer of 1 ms that is 1000 exchanges a second for a host that sends the next one
   within 256 µs, 500 for one that needs up to 1.256 ms (serial_port.exchange_period).
@@ -71,11 +71,11 @@ assert mx64.PROFILE_VELOCITY.size + READ_SIZE <= _BLOCK.count
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What is written in one exchange.
+    """Registers written in one exchange.
 
-    :param position: ticks, in the servo's present count of turns.
-    :param current: units; 0 leaves the fingers limp.
-    :param profile_velocity: register units.
+    :param position: ticks, in the servo's present multi-turn count.
+    :param current: units of 3.36 mA; 0 leaves the fingers limp.
+    :param profile_velocity: units of 0.229 rpm; 0 means no limit.
     """
 
     position: int
@@ -85,9 +85,9 @@ class Goal:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What is read in one exchange, register units; positions in the servo's count of turns.
+    """Registers read in one exchange, in register units; positions in the multi-turn count.
 
-    :param time: monotonic time of measurement, seconds.
+    :param time: monotonic time of the measurement, seconds.
     :param error: bits of :class:`~dexkit.wire.mx64.HardwareError`.
     """
 
@@ -106,7 +106,7 @@ class Sample:
 
 
 def mapping() -> bytes:
-    """Bytes for Indirect Address 1 and up that map :data:`MAPPED`."""
+    """Return the bytes for Indirect Address 1 and up that map :data:`MAPPED`."""
     return b"".join(
         address.to_bytes(2, "little")
         for item in MAPPED
@@ -127,14 +127,14 @@ _READ_LAYOUT = _layout(_READ)
 
 
 def encode(goal: Goal) -> bytes:
-    """The bytes to write at :data:`WRITE_ADDRESS`."""
+    """Return the bytes to write at :data:`WRITE_ADDRESS`."""
     return _WRITE_LAYOUT.pack(goal.profile_velocity, goal.current, goal.position)
 
 
 def decode(data: bytes, time: float) -> Sample:
-    """The sample in the bytes read at :data:`READ_ADDRESS`.
+    """Decode the bytes read at :data:`READ_ADDRESS`.
 
-    :raises TruncatedError: there are not :data:`READ_SIZE` of them.
+    :raises TruncatedError: there are not :data:`READ_SIZE` bytes.
     """
     if len(data) != READ_SIZE:
         raise TruncatedError(f"a sample has {READ_SIZE} bytes, not {len(data)}")

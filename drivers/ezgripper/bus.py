@@ -1,13 +1,13 @@
-"""The serial line to the servo: DYNAMIXEL Protocol 2.0 transactions on pyserial.
+"""DYNAMIXEL Protocol 2.0 transactions with servos on a serial port.
 
-Packets are those of :mod:`dexkit.wire.dynamixel`. The port blocks in ``select`` until bytes or the
-deadline come, so that waiting costs no processor time and does not hold Python's interpreter lock
+:mod:`dexkit.wire.dynamixel` encodes and decodes the packets. The port blocks in ``select`` until
+bytes arrive or the deadline passes, so waiting costs no processor time and does not hold the GIL
 against the thread that publishes state. pyserial reports a vanished device as SerialException,
 OSError or termios.error; all become :class:`~dexkit.errors.HandLost`.
 
-Why not dynamixel-sdk (docs/sources/mx64-ezgripper.md#a3, docs/sources/mx64-ezgripper.md#c3): it
+dynamixel-sdk is not used (docs/sources/mx64-ezgripper.md#a3, docs/sources/mx64-ezgripper.md#c3): it
 polls the port while it waits, does not stuff what it sends, damages some of what it receives, and
-reads the CRC of a short error status as data. It is the client that tests the emulated servo.
+reads the CRC of a short error status as data. Tests of the emulated servo use it as the client.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ __all__ = ["BITS_PER_BYTE", "BusStatistics", "DevicePort", "Ping", "ServoBus", "
 BITS_PER_BYTE = 10
 """8N1: start bit, eight data bits, stop bit."""
 
-_BUFFERED = 0.1
-"""Seconds that a USB adapter may hold bytes that the system has handed over."""
+_ADAPTER_BUFFER_TIME = 0.1
+"""Seconds that a USB adapter may buffer bytes after the kernel has handed them over."""
 _STATUS = 11
 """Bytes of a status packet without data."""
 _LONGEST_REQUEST = 64
-"""Bytes that may still be leaving when the wait for the answer begins."""
+"""Bytes that may still be in the transmit buffer when the wait for the answer begins."""
 _PING_DATA = 3  # model number (2), firmware (1)
 
 
 @dataclass
 class BusStatistics:
-    """What happened on the line since it was opened.
+    """Counters of the line since it was opened.
 
-    :ivar transactions: instructions sent that expect an answer, retries included.
-    :ivar timeouts: of these, how many got none.
-    :ivar corrupt: of these, how many got a damaged or wrong one.
-    :ivar retries: how many were sent again because of that.
+    :ivar transactions: instructions sent that expect a status packet, retries included.
+    :ivar timeouts: transactions without a status packet.
+    :ivar corrupt: transactions with a damaged or wrong status packet.
+    :ivar retries: instructions sent again because of that.
     """
 
     transactions: int = 0
@@ -58,7 +58,7 @@ class BusStatistics:
 
 @dataclass(frozen=True)
 class Ping:
-    """What a servo says of itself."""
+    """Model and firmware in a servo's answer to a ping."""
 
     id: int
     model: int
@@ -66,7 +66,7 @@ class Ping:
 
 
 class ServoError(HandRefused):
-    """The servo answers that it will not do what it was told.
+    """The servo refuses an instruction.
 
     :param number: error number of the status packet (docs/sources/mx64-ezgripper.md#a4).
     """
@@ -77,7 +77,7 @@ class ServoError(HandRefused):
 
 
 class DevicePort:
-    """A serial port whose reads sleep until bytes or a deadline come.
+    """A serial port whose reads block until bytes arrive or a deadline passes.
 
     :param path: device path.
     :param timeout: seconds after which a write is given up.
@@ -90,16 +90,16 @@ class DevicePort:
 
     @property
     def is_open(self) -> bool:
-        """Whether it is open."""
+        """Whether the port is open."""
         return self._port is not None
 
     def open(self, baudrate: int) -> None:
-        """Open, or open again, for this process alone. Raises as :class:`serial.Serial`."""
+        """Open or reopen the port with an exclusive lock. Raises as :class:`serial.Serial`."""
         self.close()
         self._port = serial.Serial(self.path, baudrate, timeout=0, exclusive=True)
 
     def close(self) -> None:
-        """Close; a port that has gone away is closed as well."""
+        """Close the port, even if it has gone away."""
         port, self._port = self._port, None
         if port is not None:
             try:
@@ -108,18 +108,17 @@ class DevicePort:
                 pass
 
     def clear(self) -> None:
-        """Drop what has been received."""
+        """Discard received bytes."""
         self._opened().reset_input_buffer()
 
     def flush(self) -> None:
-        """Wait until the system has handed over what was written."""
+        """Wait until the kernel has handed over what was written."""
         self._opened().flush()
 
     def read(self, deadline: float) -> bytes:
-        """What has been received, or nothing when the deadline (monotonic seconds) has come.
+        """Return received bytes, or nothing once the deadline (monotonic seconds) has passed.
 
-        The port is looked at after the deadline, too: a process that was not scheduled in time
-        has its answer there.
+        The port is read after the deadline, too: the process may have been scheduled late.
         """
         fd = self._opened().fileno()
         while True:
@@ -135,7 +134,7 @@ class DevicePort:
             return data
 
     def write(self, data: bytes) -> bool:
-        """Write; False if the port does not take all of it within the timeout."""
+        """Write; return False if the port does not accept all bytes within the time-out."""
         fd = self._opened().fileno()
         deadline = time.monotonic() + self.timeout
         sent = 0
@@ -160,8 +159,8 @@ class ServoBus:
     :param path: device path.
     :param baudrate: bits a second.
     :param timeout: seconds to wait for a reply beyond the time of its bytes.
-    :param retries: how often an unanswered or damaged transaction is sent again. All
-        transactions here may be repeated: they set absolute values or read.
+    :param retries: how often a transaction without an intact status is sent again. Repeating is
+        safe: all transactions here read or set absolute values.
     """
 
     def __init__(
@@ -176,7 +175,7 @@ class ServoBus:
         self.statistics = BusStatistics()
         self._port = DevicePort(path, timeout)
         self._parser = PacketParser(keep_bad=True)
-        self._held = b""  # leaves together with the next packet
+        self._queued = b""  # written together with the next packet
         self._before: WriteDeadline | None = None
 
     @property
@@ -195,13 +194,13 @@ class ServoBus:
         self.set_baudrate(self.baudrate)
 
     def set_baudrate(self, baudrate: int) -> None:
-        """Open, or open again, at another baud rate. Raises as :meth:`open`."""
+        """Open or reopen the port at another baud rate. Raises as :meth:`open`."""
         if baudrate not in mx64.BAUD_RATES.values():
             raise UsageError(
                 f"baud rate {baudrate} is none of a servo's",
                 hint="use " + ", ".join(str(b) for b in mx64.BAUD_RATES.values()),
             )
-        self._held, self._before = b"", None
+        self._queued, self._before = b"", None
         self.baudrate = baudrate
         try:
             self._port.open(baudrate)
@@ -210,13 +209,13 @@ class ServoBus:
             raise open_failed(self.path, error) from error
 
     def drain(self) -> None:
-        """Wait until what was written has left the adapter, whatever it buffers.
+        """Wait until what was written has left the adapter's buffer.
 
         :raises HandLost: the port has gone away.
         """
         with port_errors(self.path):
             self._port.flush()
-        time.sleep(_BUFFERED)
+        time.sleep(_ADAPTER_BUFFER_TIME)
 
     def close(self) -> None:
         """Close the port; may be called twice."""
@@ -227,16 +226,16 @@ class ServoBus:
         return n_bytes * BITS_PER_BYTE / self.baudrate
 
     def ping(self, servo_id: int, *, retries: int | None = None) -> Ping:
-        """Model and firmware of a servo.
+        """Read model and firmware of a servo.
 
-        :raises HandTimeout: nobody with that id answers at this baud rate.
+        :raises HandTimeout: no servo with that id answers at this baud rate.
         :raises HandLost: the port has gone away.
         """
         _, data = self._transact(servo_id, Instruction.PING, b"", _PING_DATA, retries=retries)
-        return _ping_of(servo_id, data)
+        return _parse_ping(servo_id, data)
 
     def ping_all(self) -> list[Ping]:
-        """Every servo that answers a broadcast; takes about a second
+        """Ping all servos by broadcast; takes about a second
         (docs/sources/mx64-ezgripper.md#c3).
 
         :raises HandLost: the port has gone away.
@@ -250,11 +249,11 @@ class ServoBus:
             while data := self._port.read(deadline):
                 for packet in parser.feed(data):
                     if packet.is_status and len(packet.params) == 1 + _PING_DATA:
-                        found[packet.id] = _ping_of(packet.id, packet.data)
+                        found[packet.id] = _parse_ping(packet.id, packet.data)
         return [found[number] for number in sorted(found)]
 
     def ping_protocol_1(self, servo_id: int) -> int | None:
-        """Model number of a servo that still speaks Protocol 1.0, or None.
+        """Return the model number of a servo with Protocol 1.0 firmware, or None.
 
         :raises HandLost: the port has gone away.
         """
@@ -272,7 +271,7 @@ class ServoBus:
         return None
 
     def read(self, servo_id: int, address: int, length: int) -> tuple[bytes, bool]:
-        """``length`` bytes from ``address``, and whether the servo signals a hardware error.
+        """Read ``length`` bytes from ``address``; also whether the alert bit is set.
 
         :raises HandTimeout: no (intact) answer.
         :raises HandLost: the port has gone away.
@@ -283,16 +282,16 @@ class ServoBus:
         return data, alert
 
     def read_item(self, servo_id: int, item: mx64.Item) -> int:
-        """Value of one item. Raises as :meth:`read`."""
+        """Read one item. Raises as :meth:`read`."""
         return item.decode(self.read(servo_id, item.address, item.size)[0])
 
     def write(self, servo_id: int, address: int, data: bytes) -> bool:
-        """Write and wait for the acknowledgement; returns the alert bit. Raises as :meth:`read`."""
+        """Write and wait for the status; return the alert bit. Raises as :meth:`read`."""
         params = address.to_bytes(2, "little") + data
         return self._transact(servo_id, Instruction.WRITE, params, 0)[0]
 
     def write_item(self, servo_id: int, item: mx64.Item, value: int) -> None:
-        """Set one item. Raises as :meth:`read`."""
+        """Write one item. Raises as :meth:`read`."""
         self.write(servo_id, item.address, item.encode(value))
 
     def write_unacknowledged(
@@ -304,12 +303,12 @@ class ServoBus:
         with_next: bool = False,
         before: WriteDeadline | None = None,
     ) -> None:
-        """Write without a status packet (a Sync Write to one servo): half the time, no reply.
+        """Write without a status packet, as a Sync Write to one servo.
 
-        :param with_next: let it leave together with the next transaction: one system call and, on
-            a USB adapter, one transfer instead of two.
-        :param before: asked right before it leaves. What it raises comes from here, or from the
-            next transaction.
+        :param with_next: send it together with the next transaction: one system call and, on a USB
+            adapter, one transfer instead of two.
+        :param before: checked right before the bytes are written. What it raises comes from here,
+            or from the next transaction.
         :raises HandLost: the port has gone away or takes no more bytes.
         """
         size = len(data)
@@ -317,15 +316,15 @@ class ServoBus:
         packet = dynamixel.encode(BROADCAST_ID, Instruction.SYNC_WRITE, params)
         self._before = before
         if with_next:
-            self._held = packet
+            self._queued = packet
             return
         with port_errors(self.path):
             self._send(packet)
 
     def reboot(self, servo_id: int) -> None:
-        """Restart the servo; it stays silent until it has booted.
+        """Reboot the servo; it does not answer until it has booted.
 
-        :raises HandTimeout: it did not acknowledge.
+        :raises HandTimeout: no status packet.
         :raises HandLost: the port has gone away.
         """
         self._transact(servo_id, Instruction.REBOOT, b"", 0, retries=0)
@@ -339,7 +338,7 @@ class ServoBus:
         *,
         retries: int | None = None,
     ) -> tuple[bool, bytes]:
-        """(alert bit, data) of the answer; ``answer`` is the length that the data must have."""
+        """Send an instruction, with retries; return (alert bit, data of length ``answer``)."""
         attempts = 1 + (self.retries if retries is None else retries)
         statistics = self.statistics
         request = dynamixel.encode(servo_id, instruction, params)
@@ -364,10 +363,10 @@ class ServoBus:
                 problem = "receives damaged packets"
                 continue
             if number:
-                raise ServoError(_refusal(servo_id, instruction, params, number), number)
+                raise ServoError(_describe_refusal(servo_id, instruction, params, number), number)
             if len(packet.data) == answer:
                 return packet.alert, packet.data
-            # the late answer to something else, for example
+            # for example a late answer to an earlier instruction
             statistics.corrupt += 1
             problem = "answers with packets of the wrong length"
         raise HandTimeout(
@@ -377,8 +376,8 @@ class ServoBus:
         )
 
     def _send(self, packet: bytes) -> None:
-        """Write what is held and ``packet`` at once; what has been received before is dropped."""
-        data, self._held = self._held + packet, b""
+        """Write queued bytes and ``packet`` at once, after discarding received bytes."""
+        data, self._queued = self._queued + packet, b""
         before, self._before = self._before, None
         self._port.clear()
         if before is not None:
@@ -387,11 +386,11 @@ class ServoBus:
             raise HandLost(f"the port {self.path} takes no more bytes")
 
     def _deadline(self, answer: int) -> float:
-        """When an answer of that many bytes must be there; monotonic seconds."""
+        """Return the deadline of an answer of ``answer`` bytes, monotonic seconds."""
         return time.monotonic() + self.wire_time(answer + _LONGEST_REQUEST) + self.timeout
 
     def _receive(self, servo_id: int, deadline: float) -> Packet | None:
-        """The servo's status, or a damaged packet (``crc_ok`` False), or None for silence."""
+        """Return the servo's status, a damaged packet (``crc_ok`` False), or None at a time-out."""
         parser = self._parser
         parser.reset()
         skipped = parser.skipped
@@ -415,11 +414,11 @@ class ServoBus:
 _DAMAGED = Packet(0, Instruction.STATUS, crc_ok=False)
 
 
-def _ping_of(servo_id: int, data: bytes) -> Ping:
+def _parse_ping(servo_id: int, data: bytes) -> Ping:
     return Ping(servo_id, int.from_bytes(data[:2], "little"), data[2])
 
 
-def _refusal(servo_id: int, instruction: Instruction, params: bytes, number: int) -> str:
+def _describe_refusal(servo_id: int, instruction: Instruction, params: bytes, number: int) -> str:
     try:
         name = dynamixel.ErrorNumber(number).name.replace("_", " ").lower()
     except ValueError:

@@ -1,17 +1,15 @@
-"""Calibration: the zero (where the gripper is closed) and the speed of either direction.
+"""Calibrate the EZGripper: the zero (closed position) and the speeds of opening and closing.
 
 The zero is found by closing at reduced current until the fingers stop
-(docs/sources/mx64-ezgripper.md#d4). A servo alone cannot tell closed fingers from fingers on an
-object, nor from fingers that are stuck, so the stop is believed only if the gripper then opens by
-its whole stroke. Even so an object can deceive it where the fingers open wider than the stroke: the
-gripper must be empty.
+(docs/sources/mx64-ezgripper.md#d4). The stop may be an object or a jam instead of closed fingers,
+so it is accepted only if the gripper then opens by its whole stroke. An object is not detected if
+the fingers can open wider than the stroke, so the gripper must be empty.
 
-The speed is measured as in the note on predictive state over the full stroke at full effort, but
-between 10 % and 90 % of it and from positions with their times, so that neither the command's way
-nor the settling is counted (docs/sources/mx64-ezgripper.md#d10-6,
-docs/sources/mx64-ezgripper.md#d10-7).
+The speed is measured over the full stroke at full effort, as in the note on predictive state, but
+from timed positions between 10 % and 90 %, which excludes command latency and settling
+(docs/sources/mx64-ezgripper.md#d10-6, docs/sources/mx64-ezgripper.md#d10-7).
 
-Pure logic over a :class:`Drive` and a clock.
+No I/O of its own: it works on a :class:`Drive` and a clock.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from typing import Protocol
 
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import ContactDetector
-from dexkit.drivers.ezgripper.control import at_once
+from dexkit.drivers.ezgripper.control import without_profile
 from dexkit.drivers.ezgripper.recovery import describe
 from dexkit.drivers.ezgripper.scaling import (
     STROKE,
@@ -46,32 +44,32 @@ __all__ = [
 ]
 
 EFFORT = 30.0
-"""Percent, while looking for the closed position (docs/sources/mx64-ezgripper.md#d2,
+"""Percent, while closing to find the zero (docs/sources/mx64-ezgripper.md#d2,
 docs/sources/mx64-ezgripper.md#d4)."""
 SPEED = 60.0
-"""Percent of stroke a second, while looking for it."""
+"""Percent of stroke a second, while closing to find the zero."""
 UNLIMITED = 600.0
-"""Percent of stroke a second that no motor of this kind reaches
+"""Percent of stroke a second, faster than the motor can be
 (docs/sources/mx64-ezgripper.md#d1)."""
-_BEYOND = 1500
-"""Ticks that are closed beyond one stroke before the search is given up: the gripper may
-stand open wider than its stroke."""
-_OPENED = 50
-"""Ticks (2 %) short of the full stroke at which opening still counts as whole."""
+_SEARCH_MARGIN = 1500
+"""Ticks beyond one stroke after which the search ends without a stop: the gripper may start open
+wider than its stroke."""
+_OPEN_TOLERANCE = 50
+"""Ticks (2 %) short of the full stroke at which opening still counts as complete."""
 
 Progress = Callable[[str], None]
 Cancelled = Callable[[], bool]
 
 
 class CalibrationFailed(HandError):
-    """No trustworthy zero or speed was found. The motor is left without current."""
+    """No zero or speed could be measured. The motor is left without current."""
 
 
 class Drive(Protocol):
-    """What calibration needs of a servo."""
+    """The servo operations that calibration uses."""
 
     def exchange(self, goal: Goal) -> Sample:
-        """Write a goal, read a sample."""
+        """Write a goal and read a sample."""
         ...
 
     def sample(self) -> Sample:
@@ -85,7 +83,7 @@ class Drive(Protocol):
 
 @dataclass(frozen=True)
 class Track:
-    """A motion that was made: samples in order, and whether it was stopped short of its goal."""
+    """Samples of one motion, and whether the fingers stopped before the goal."""
 
     samples: tuple[Sample, ...]
     stopped: bool
@@ -98,18 +96,18 @@ class Track:
 
 @dataclass(frozen=True)
 class SpeedResult:
-    """Average speeds, percent of stroke a second, and the single runs behind them."""
+    """Average speeds, percent of stroke a second, and those of each run."""
 
     opening: float
     closing: float
     runs: tuple[tuple[float, float], ...]
 
 
-def _no_progress(text: str) -> None:
+def _ignore_progress(text: str) -> None:
     pass
 
 
-def _never() -> bool:
+def _never_cancelled() -> bool:
     return False
 
 
@@ -130,13 +128,13 @@ def move(
     effort: float,
     speed: float,
     timeout: float,
-    cancelled: Cancelled = _never,
+    cancelled: Cancelled = _never_cancelled,
 ) -> Track:
-    """Move to an absolute position, until it is reached or the fingers stop.
+    """Move to an absolute position until it is reached or the fingers stop.
 
-    :param position: ticks in the servo's present count.
+    :param position: ticks in the servo's present multi-turn count.
     :raises CalibrationFailed: neither happens within ``timeout`` seconds, the servo reports an
-        error, or ``cancelled`` says so. The motor then carries no current.
+        error, or ``cancelled`` returns True. The motor then carries no current.
     """
     goal = Goal(position, current_of_effort(effort), profile_velocity(speed))
     first = drive.sample()
@@ -146,9 +144,9 @@ def move(
     settled: float | None = None
     try:
         if not first.torque:
-            drive.engage(at_once(first.position, goal.current))
+            drive.engage(without_profile(first.position, goal.current))
         else:
-            drive.exchange(at_once(first.position, goal.current))
+            drive.exchange(without_profile(first.position, goal.current))
         while True:
             sample = drive.exchange(goal)
             _check(sample)
@@ -168,7 +166,7 @@ def move(
                     f"the fingers have been moving for {timeout:g} s without coming to a stop"
                 )
     except BaseException:
-        # limp, whatever happened; if even that cannot be said, the bus watchdog stops the motor
+        # limp after any failure; if this write fails, too, the bus watchdog stops the motor
         try:
             drive.exchange(limp)
         except HandError:
@@ -185,17 +183,17 @@ def find_zero(
     *,
     effort: float = EFFORT,
     speed: float = SPEED,
-    progress: Progress = _no_progress,
-    cancelled: Cancelled = _never,
+    progress: Progress = _ignore_progress,
+    cancelled: Cancelled = _never_cancelled,
 ) -> int:
-    """Close, find the stop, open by a whole stroke; returns the zero within the turn, ticks.
+    """Close to the stop, open by a whole stroke; return the zero within one turn, ticks.
 
     The gripper must be empty. It is left open.
 
     :raises CalibrationFailed: there is no stop, or the gripper does not open by its stroke.
     """
     start = drive.sample().position
-    reach = STROKE + _BEYOND
+    reach = STROKE + _SEARCH_MARGIN
     progress(f"closing at {effort:g} % effort")
     closing = move(
         drive,
@@ -206,7 +204,7 @@ def find_zero(
         cancelled=cancelled,
     )
     if not closing.stopped:
-        _release(drive, closing.end)
+        _stop_current(drive, closing.end)
         raise CalibrationFailed(
             f"the servo turned {reach} ticks closing and met no stop",
             hint="are the tendons attached?",
@@ -222,8 +220,8 @@ def find_zero(
         cancelled=cancelled,
     )
     travel = abs(opening.end.position - zero)
-    if travel < STROKE - _OPENED:
-        _release(drive, opening.end)
+    if travel < STROKE - _OPEN_TOLERANCE:
+        _stop_current(drive, opening.end)
         raise CalibrationFailed(
             f"the gripper opens only {travel / TICKS_PER_PERCENT:.0f} % of its stroke from where "
             "it stopped closing",
@@ -232,7 +230,7 @@ def find_zero(
     return zero % mx64.TICKS_PER_TURN
 
 
-def _release(drive: Drive, sample: Sample) -> None:
+def _stop_current(drive: Drive, sample: Sample) -> None:
     drive.exchange(Goal(sample.position, 0, 1))
 
 
@@ -242,19 +240,19 @@ def measure_speed(
     *,
     effort: float = 100.0,
     runs: int = 3,
-    progress: Progress = _no_progress,
-    cancelled: Cancelled = _never,
+    progress: Progress = _ignore_progress,
+    cancelled: Cancelled = _never_cancelled,
 ) -> SpeedResult:
-    """Run the full stroke ``runs`` times each way; returns the average speeds.
+    """Run the full stroke ``runs`` times in each direction; return the average speeds.
 
-    :param zero: in any turn.
-    :raises CalibrationFailed: the fingers do not make the whole stroke.
+    :param zero: ticks, in any turn.
+    :raises CalibrationFailed: the fingers do not complete the stroke.
     """
     results: list[tuple[float, float]] = []
     _stroke(drive, zero, 0, effort=EFFORT, speed=SPEED, cancelled=cancelled)
     for run in range(runs):
-        opening = _timed(drive, zero, STROKE, effort, cancelled)
-        closing = _timed(drive, zero, 0, effort, cancelled)
+        opening = _measure_run(drive, zero, STROKE, effort, cancelled)
+        closing = _measure_run(drive, zero, 0, effort, cancelled)
         results.append((opening, closing))
         progress(f"run {run + 1} of {runs}: opens {opening:.0f} %/s, closes {closing:.0f} %/s")
     return SpeedResult(
@@ -277,8 +275,8 @@ def _stroke(
         timeout=10.0,
         cancelled=cancelled,
     )
-    if abs(track.end.position - base - target) > _OPENED:
-        _release(drive, track.end)
+    if abs(track.end.position - base - target) > _OPEN_TOLERANCE:
+        _stop_current(drive, track.end)
         raise CalibrationFailed(
             f"the fingers stopped at {(track.end.position - base) / TICKS_PER_PERCENT:.0f} % on "
             f"the way to {target / TICKS_PER_PERCENT:.0f} %",
@@ -287,20 +285,22 @@ def _stroke(
     return track
 
 
-def _timed(drive: Drive, zero: int, target: int, effort: float, cancelled: Cancelled) -> float:
-    # beyond the motor: the profile does not limit
+def _measure_run(
+    drive: Drive, zero: int, target: int, effort: float, cancelled: Cancelled
+) -> float:
+    # faster than the motor, so the profile does not limit the speed
     track = _stroke(drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled)
     points = [(s.time, relative_position(s.position, zero)) for s in track.samples]
     if target == 0:
         points = [(t, STROKE - p) for t, p in points]
     low, high = 0.1 * STROKE, 0.9 * STROKE
-    elapsed = _crossing(points, high) - _crossing(points, low)
+    elapsed = _crossing_time(points, high) - _crossing_time(points, low)
     if elapsed <= 0:
         raise CalibrationFailed("too few samples to measure a speed", hint="see the latency timer")
     return (high - low) / TICKS_PER_PERCENT / elapsed
 
 
-def _crossing(points: list[tuple[float, int]], level: float) -> float:
+def _crossing_time(points: list[tuple[float, int]], level: float) -> float:
     for (t0, p0), (t1, p1) in pairwise(points):
         if p0 < level <= p1:
             return t0 + (t1 - t0) * (level - p0) / (p1 - p0)
@@ -315,13 +315,13 @@ def measure_current(
     *,
     settle: float = 0.5,
     average: float = 0.3,
-    cancelled: Cancelled = _never,
+    cancelled: Cancelled = _never_cancelled,
 ) -> float:
-    """Squeeze what is between the fingers; returns the mean motor current, units.
+    """Close on the gauge between the fingers; return the mean motor current, units of 3.36 mA.
 
-    :param holding: called with the mean current as soon as it is known and from then on in
-        every cycle, to hold on while somebody reads the gauge: True holds, False ends. It must
-        not block: the servo's watchdog stops a grip that nobody looks after.
+    :param holding: called in every cycle with the mean current, once it is known, while the user
+        reads the gauge: True goes on holding, False ends. It must not block: the servo's bus
+        watchdog stops the motor when exchanges cease.
     :raises CalibrationFailed: there is nothing between the fingers.
     """
     present = drive.sample().position
@@ -335,7 +335,7 @@ def measure_current(
         cancelled=cancelled,
     )
     if not track.stopped:
-        _release(drive, track.end)
+        _stop_current(drive, track.end)
         raise CalibrationFailed(
             "the gripper closed without meeting anything",
             hint="put the gauge between the fingers",
@@ -347,7 +347,7 @@ def measure_current(
         sample = drive.exchange(goal)
         _check(sample)
         if cancelled():
-            _release(drive, sample)
+            _stop_current(drive, sample)
             raise CalibrationFailed("interrupted")
         held = sample.time - started
         if settle <= held < settle + average:

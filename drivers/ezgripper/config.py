@@ -1,7 +1,7 @@
-"""What is known of each gripper: its zero, its speed, its force table, in a user's JSON file.
+"""Store the calibration of each gripper (zero, speeds, force table) in the user's JSON file.
 
-The layout is that of the note on predictive state, so that a file of SAKE's driver can be read as
-it is::
+The layout is that of the note on predictive state, so a file of SAKE's driver can be used
+unchanged::
 
     {"calibration":    {"DA1Z9T40": 3010},
      "movement_speed": {"DA1Z9T40": {"opening": 131.0, "closing": 127.5}},
@@ -10,7 +10,7 @@ it is::
 Keys are the USB serial number of the adapter, or the device path where there is none (a
 pseudo-terminal); ``#2`` is appended for servo id 2. Zero in ticks within the turn, speed in
 percent of stroke a second (one number serves for both directions), force over current units.
-Entries that this module does not know are kept.
+Unknown entries are kept.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ _HINT = "correct it, or remove it and calibrate again"
 __all__ = ["ENVIRONMENT", "GripperRecord", "Store", "default_path", "record_key"]
 
 ENVIRONMENT = "DEXKIT_EZGRIPPER_CONFIG"
-"""Environment variable that names another file."""
+"""Environment variable with the path of another file."""
 
 _ZERO, _SPEED, _FORCE = "calibration", "movement_speed", "force_lookup"
 
 
 def default_path() -> Path:
-    """The user's file: ``$DEXKIT_EZGRIPPER_CONFIG``, or ezgripper.json in the user's config."""
+    """Return ``$DEXKIT_EZGRIPPER_CONFIG``, or ezgripper.json in the user's configuration."""
     named = os.environ.get(ENVIRONMENT)
     return Path(named) if named else platformdirs.user_config_path("dexkit") / "ezgripper.json"
 
 
 def record_key(device: str, servo_id: int) -> str:
-    """Key of a gripper.
+    """Return the key of a gripper in the file.
 
     :param device: USB serial number, or path.
     """
@@ -55,7 +55,7 @@ def record_key(device: str, servo_id: int) -> str:
 
 @dataclass(frozen=True)
 class GripperRecord:
-    """What is stored of one gripper; None is unknown.
+    """Stored calibration of one gripper; None where unknown.
 
     :param zero: position of the closed gripper, ticks within the turn.
     :param opening: percent of stroke a second.
@@ -69,7 +69,7 @@ class GripperRecord:
 
 
 class Store:
-    """The file.
+    """The calibration file.
 
     :param path: by default :func:`default_path`.
     """
@@ -88,37 +88,37 @@ class Store:
             raise UsageError(f"{self.path} must hold a JSON object")
         return content
 
-    def _section(self, content: dict[str, Any], name: str) -> dict[str, Any]:
+    def _get_section(self, content: dict[str, Any], name: str) -> dict[str, Any]:
         section = content.get(name, {})
         if not isinstance(section, dict):
             raise UsageError(f"{self.path}: {name!r} must be an object")
         return section
 
     def keys(self) -> list[str]:
-        """Every gripper in the file.
+        """List the keys of all grippers in the file.
 
         :raises UsageError: the file cannot be read.
         """
         content = self._load()
         names: set[str] = set()
         for section in (_ZERO, _SPEED, _FORCE):
-            names.update(self._section(content, section))
+            names.update(self._get_section(content, section))
         return sorted(names)
 
     def read(self, key: str) -> GripperRecord:
-        """What is known of a gripper; an empty record when nothing is.
+        """Read a gripper's calibration; an empty record if there is none.
 
-        :raises UsageError: the file cannot be read, or this gripper's entries make no sense.
+        :raises UsageError: the file cannot be read, or this gripper's entries are invalid.
         """
         content = self._load()
         where = f"{self.path}: {key}"
-        zero = self._section(content, _ZERO).get(key)
+        zero = self._get_section(content, _ZERO).get(key)
         if zero is not None and (
             isinstance(zero, bool) or not isinstance(zero, int) or abs(zero) > mx64.POSITION_SPAN
         ):
             raise UsageError(f"{where}: zero {zero!r} is not a position in ticks")
-        opening, closing = self._speeds(where, self._section(content, _SPEED).get(key))
-        table = self._section(content, _FORCE).get(key)
+        opening, closing = self._parse_speeds(where, self._get_section(content, _SPEED).get(key))
+        table = self._get_section(content, _FORCE).get(key)
         if table is not None and not isinstance(table, dict):
             raise UsageError(f"{where}: the force table must be an object")
         return GripperRecord(
@@ -129,7 +129,7 @@ class Store:
         )
 
     @staticmethod
-    def _speeds(where: str, value: object) -> tuple[float | None, float | None]:
+    def _parse_speeds(where: str, value: object) -> tuple[float | None, float | None]:
         if value is None:
             return None, None
         pair = value if isinstance(value, dict) else {"opening": value, "closing": value}
@@ -146,23 +146,23 @@ class Store:
         return speeds[0], speeds[1]
 
     def write(self, key: str, record: GripperRecord) -> None:
-        """Store what ``record`` knows; what it does not know stays as it is in the file.
+        """Store the known values of ``record``; the file keeps its values for the others.
 
-        What other programs store at the same time is kept (:func:`dexkit.documents.update_file`).
+        Concurrent changes of other programs are kept (:func:`dexkit.documents.update_file`).
 
         :raises UsageError: the file cannot be read or written.
         """
 
         def change(text: str | None) -> str:
             content = {} if text is None else self._parse(text)
-            self._enter(content, key, record)
+            self._store_record(content, key, record)
             return json.dumps(content, indent=2, sort_keys=True) + "\n"
 
         documents.update_file(self.path, change)
 
-    def _enter(self, content: dict[str, Any], key: str, record: GripperRecord) -> None:
+    def _store_record(self, content: dict[str, Any], key: str, record: GripperRecord) -> None:
         if record.zero is not None:
-            content[_ZERO] = self._section(content, _ZERO) | {
+            content[_ZERO] = self._get_section(content, _ZERO) | {
                 key: record.zero % mx64.TICKS_PER_TURN
             }
         speeds = {
@@ -171,8 +171,8 @@ class Store:
             if value is not None
         }
         if speeds:
-            content[_SPEED] = self._section(content, _SPEED) | {key: speeds}
+            content[_SPEED] = self._get_section(content, _SPEED) | {key: speeds}
         if record.force_table is not None:
-            content[_FORCE] = self._section(content, _FORCE) | {
+            content[_FORCE] = self._get_section(content, _FORCE) | {
                 key: record.force_table.to_mapping()
             }

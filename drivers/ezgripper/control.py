@@ -1,24 +1,23 @@
-"""From commands and samples to goals: the gripper's behaviour without the servo.
+"""Plan the servo's goals from commands and samples, without I/O; time comes with the samples.
 
-Pure logic on the injected time. The phases:
+The phases:
 
 - *limp*: command with kp = 0. The motor carries no current (the springs open the fingers), as
   the vendor's motor with zero gains (docs/sources/unitree-dex.md#b2,
-  docs/sources/unitree-dex.md#d10). tau and kd do not act.
-- *brake*: command mode BRAKE, and the time after a recovery until a new command comes. The
-  fingers are stopped and then held where they came to rest, at hold effort. Before the first FOC
-  command since opening or since a recovery there is nothing to brake: the motor carries no current,
-  as the servo itself leaves it off at power-up (docs/sources/mx64-ezgripper.md#b5), and nobody has
-  asked for torque.
-- *moving*: the fingers go to q at most at the effort limit, or rest there.
-- *contact*: they are stopped short of q (:mod:`contact`). For ``hold_after`` seconds the effort
-  stays, so that the grip closes.
-- *holding*: contact that lasts: the limit sinks to the hold effort, because a stalled motor
-  turns all its current to heat (docs/sources/mx64-ezgripper.md#d5,
+  docs/sources/unitree-dex.md#d10). tau and kd have no effect.
+- *brake*: command mode BRAKE, and the time from a recovery to a new command. The fingers are
+  stopped and held where they came to rest, at hold effort. Before the first FOC command after
+  opening or a recovery, the motor carries no current: the servo leaves it off at power-up
+  (docs/sources/mx64-ezgripper.md#b5), and no command has asked for torque.
+- *moving*: the fingers move to q, at the effort limit at most, or rest there.
+- *contact*: they have stopped before q (:mod:`contact`). The effort limit stays for
+  ``hold_after`` seconds, so that the grip closes.
+- *holding*: after that the limit falls to the hold effort, because a stalled motor turns all its
+  current to heat (docs/sources/mx64-ezgripper.md#d5,
   docs/sources/mx64-ezgripper.md#d6).
 
-kp > 0 selects position control, its size does not matter: the servo has a position loop of its
-own, whose force is bounded by Goal Current. dq, kd and tau of a position command are ignored
+kp > 0 selects position control; its value has no effect, because the servo has its own position
+loop, whose force Goal Current limits. dq, kd and tau of a position command are ignored
 (docs/sources/mx64-ezgripper.md#d10-20).
 """
 
@@ -40,11 +39,11 @@ from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, JointMode
 from dexkit.wire import mx64
 
-__all__ = ["Control", "ControlSettings", "Phase", "at_once"]
+__all__ = ["Control", "ControlSettings", "Phase", "without_profile"]
 
 
 class Phase(str, Enum):
-    """What the gripper is doing; see the module's text."""
+    """Phase of the gripper's control; see the module's docstring."""
 
     LIMP = "limp"
     BRAKE = "brake"
@@ -58,20 +57,19 @@ class Phase(str, Enum):
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """What a user may set of the behaviour.
+    """Limits and times that a user may set.
 
     :param effort: limit while moving and at first contact, percent
         (docs/sources/mx64-ezgripper.md#d2, docs/sources/mx64-ezgripper.md#d3).
-    :param hold_effort: limit while an object is held, braking, or hot, percent.
-    :param hold_after: seconds of contact after which the limit sinks to ``hold_effort``
+    :param hold_effort: limit while holding an object, while braking, and while hot, percent.
+    :param hold_after: seconds of contact after which the limit falls to ``hold_effort``
         (docs/sources/mx64-ezgripper.md#d5).
-    :param speed: limit, percent of stroke a second. At 12 V the motor can do 172 without load
-        (docs/sources/mx64-ezgripper.md#d1); a profile that it cannot follow runs ahead, and a
-        reversal waits until it is back.
-    :param startup_speed: the same from opening until the fingers have once come to rest at
-        their goal.
+    :param speed: limit, percent of stroke a second. At 12 V the motor reaches 172 without load
+        (docs/sources/mx64-ezgripper.md#d1). A faster profile runs ahead of the fingers and delays a
+        reversal until it has come back.
+    :param startup_speed: the same limit from opening until the fingers first rest at their goal.
     :param startup_time: seconds after which the start-up limit ends in any case.
-    :param warm: °C from which the limit is ``hold_effort``, whatever is commanded.
+    :param warm: °C at and above which the limit is ``hold_effort`` for every command.
     """
 
     effort: float = 50.0
@@ -90,7 +88,7 @@ class ControlSettings:
         least = 2 * MIN_FREE_SPEED
         for name in ("speed", "startup_speed"):
             value = getattr(self, name)
-            # slower motion could not be told from contact
+            # slower motion cannot be distinguished from contact
             if not least <= value <= 1000:
                 raise UsageError(f"{name} must be {least:g} to 1000 %/s, not {value:g}")
         for name in ("hold_after", "startup_time"):
@@ -101,26 +99,25 @@ class ControlSettings:
             raise UsageError(f"warm must be within 0 and 80 degrees, not {self.warm:g}")
 
 
-_ARRIVED = 25
-"""Ticks (1 %) from the goal within which the fingers count as there
+_AT_GOAL = 25
+"""Ticks (1 %) from the goal within which the fingers count as arrived
 (docs/sources/mx64-ezgripper.md#d5)."""
 _STILL = 2
 """Velocity units (31 ticks/s, 1.3 %/s) below which the fingers count as stopped."""
 _REST_TIME = 0.2
 """Seconds at the goal that end the start-up limit."""
-_COOLED = 5.0
-"""°C below ``warm`` at which the full effort comes back."""
+_COOL_HYSTERESIS = 5.0
+"""°C below ``warm`` at which the full effort is allowed again."""
 
 
-def at_once(position: int, current: int) -> Goal:
-    """A goal for one exchange that brings the servo's trajectory back to where the fingers are.
+def without_profile(position: int, current: int) -> Goal:
+    """Return a goal that makes the servo's trajectory jump to the fingers' position.
 
-    While fingers are blocked the servo's profile runs on to its goal, and the next profile
-    starts from there: told to open, the fingers would wait until it has come all the way back.
-    A Profile Velocity of 0 makes the trajectory jump to the goal
-    (docs/sources/mx64-ezgripper.md#b5).
+    While the fingers are blocked, the servo's profile runs on to its goal, and the next profile
+    starts there, so opening would be delayed until the profile has come back. With a Profile
+    Velocity of 0 the trajectory jumps to the goal (docs/sources/mx64-ezgripper.md#b5).
     """
-    return Goal(_bounded(position), current, 0)
+    return Goal(_clamp_to_stroke(position), current, 0)
 
 
 class Control:
@@ -149,20 +146,20 @@ class Control:
 
     @property
     def contact(self) -> Contact | None:
-        """The contact in force, or None."""
+        """The present contact, or None."""
         return self.detector.contact
 
     def position(self, sample: Sample) -> int:
-        """Ticks from the zero."""
+        """Return a sample's position, ticks from the zero."""
         return relative_position(sample.position, self.zero)
 
     def recovered(self, command: HandCommand | None, *, overload_at: float | None = None) -> None:
-        """The servo has been restarted: no torque until a command differs from ``command``.
+        """Start over after a servo reboot: no torque until a command differs from ``command``.
 
-        :param command: the one in force when the fault came; None lets any command through.
+        :param command: the command at the time of the fault; None accepts any command.
         :param overload_at: position of the overload, ticks from the zero, or None for another
-            fault. The effort stays at ``hold_effort`` until the gripper is told to open from
-            there, so that the same load does not trip it again.
+            fault. The effort stays at ``hold_effort`` until a command opens the gripper from there,
+            so that the same load does not cause another overload.
         """
         self._refused = command
         self._commanded = False
@@ -173,12 +170,12 @@ class Control:
         self._start_up()
 
     def plan(self, command: HandCommand, sample: Sample) -> Goal:
-        """The goal for ``command``, given the newest sample."""
+        """Return the goal for ``command``, given the newest sample."""
         now = sample.time
         position = self.position(sample)
         base = sample.position - position
         braking = command.mode[0] == JointMode.BRAKE
-        # a brake in between (the service's, while the fault lasted) does not make it new
+        # the service brakes during the fault; that brake does not make the old command new
         if self._refused is not None and not braking and not command.same_as(self._refused):
             self._refused = None
         goal: Goal
@@ -186,12 +183,12 @@ class Control:
             self._commanded = True
         if not self._commanded:
             self._leave_drive(Phase.BRAKE)
-            goal = Goal(_bounded(sample.position), 0, self._profile())
+            goal = Goal(_clamp_to_stroke(sample.position), 0, self._profile_velocity())
         elif braking:
             goal = self._brake(sample, position, base)
         elif command.kp[0] <= 0:
             self._leave_drive(Phase.LIMP)
-            goal = Goal(_bounded(sample.position), 0, self._profile())
+            goal = Goal(_clamp_to_stroke(sample.position), 0, self._profile_velocity())
         else:
             goal = self._drive(command, sample, now, position, base)
         return goal
@@ -211,13 +208,13 @@ class Control:
             self._braked_at = position
             self._braking = 0 if still else (1 if sample.velocity > 0 else -1)
         elif self._braking and (still or sample.velocity * self._braking < 0):
-            # where it came to a stop is where it stays: going back would be a new motion
+            # hold the position of the stop: returning to an earlier one would be a new motion
             self._braking = 0
             self._braked_at = position
-            return at_once(sample.position, current_of_effort(settings.effort))
+            return without_profile(sample.position, current_of_effort(settings.effort))
         effort = settings.effort if self._braking else settings.hold_effort
         current = current_of_effort(min(effort, settings.effort))
-        return Goal(_bounded(base + self._braked_at), current, self._profile())
+        return Goal(_clamp_to_stroke(base + self._braked_at), current, self._profile_velocity())
 
     def _drive(
         self, command: HandCommand, sample: Sample, now: float, position: int, base: int
@@ -227,9 +224,9 @@ class Control:
         target = ticks_of_joint(float(command.q[0]))
         held = self.detector.contact
         contact = self.detector.update(now, position, target)
-        self._end_startup(now, abs(target - position) <= _ARRIVED)
-        self._warm = sample.temperature >= settings.warm - (_COOLED if self._warm else 0.0)
-        if self._overloaded_at is not None and target > self._overloaded_at + _ARRIVED:
+        self._end_startup(now, abs(target - position) <= _AT_GOAL)
+        self._warm = sample.temperature >= settings.warm - (_COOL_HYSTERESIS if self._warm else 0.0)
+        if self._overloaded_at is not None and target > self._overloaded_at + _AT_GOAL:
             self._overloaded_at = None
         if contact is None:
             self.phase = Phase.MOVING
@@ -242,8 +239,8 @@ class Control:
             effort = min(effort, settings.hold_effort)
         current = current_of_effort(effort)
         if held is not None and contact is None:
-            return at_once(sample.position, current)
-        return Goal(_bounded(base + target), current, self._profile())
+            return without_profile(sample.position, current)
+        return Goal(_clamp_to_stroke(base + target), current, self._profile_velocity())
 
     def _end_startup(self, now: float, at_goal: bool) -> None:
         if not self._starting:
@@ -258,11 +255,11 @@ class Control:
         if rested or now - self._started >= self.settings.startup_time:
             self._starting = False
 
-    def _profile(self) -> int:
+    def _profile_velocity(self) -> int:
         settings = self.settings
         speed = min(settings.speed, settings.startup_speed) if self._starting else settings.speed
         return profile_velocity(speed)
 
 
-def _bounded(ticks: int) -> int:
+def _clamp_to_stroke(ticks: int) -> int:
     return min(max(ticks, -mx64.POSITION_SPAN), mx64.POSITION_SPAN)

@@ -1,4 +1,4 @@
-"""Finding the gripper: its port, its servo's id and baud rate, and what slows the line down."""
+"""Find the gripper's servo on a serial line: its id and baud rate."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ __all__ = [
 ]
 
 SCAN_BAUD_RATES = (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600)
-"""In the order of likelihood: SAKE's driver, ROBOTIS' and SAKE's factory setting, the others of
-the servo up to 4 Mbaud (docs/sources/mx64-ezgripper.md#b3)."""
+"""Most likely first: SAKE's driver, the factory setting of ROBOTIS and SAKE, the servo's others up
+to 4 Mbaud (docs/sources/mx64-ezgripper.md#b3)."""
 
 _UPGRADE = (
     "upgrade it to Protocol 2.0 with ROBOTIS DYNAMIXEL Wizard 2 (firmware recovery, model "
@@ -36,21 +36,21 @@ def find_servo(
 ) -> Ping:
     """Find the gripper's servo and leave the bus open at its baud rate.
 
-    :param servo_id: or None for whichever single servo there is.
-    :param baudrate: or None to try all of :data:`SCAN_BAUD_RATES`.
-    :param progress: told what is being tried.
-    :raises HandNotFound: nothing (or more than one servo) answers; says what did.
-    :raises HandRefused: what answers is no MX-64, or speaks Protocol 1.0.
+    :param servo_id: id, or None for the only servo on the line.
+    :param baudrate: bits a second, or None to try all of :data:`SCAN_BAUD_RATES`.
+    :param progress: called with a message for each attempt.
+    :raises HandNotFound: no servo, or more than one, answers; the hint lists those that did.
+    :raises HandRefused: the servo is no MX-64, or has Protocol 1.0 firmware.
     :raises HandLost: the port has gone away.
     """
     rates = SCAN_BAUD_RATES if baudrate is None else (baudrate,)
     if servo_id is not None:
-        # a ping takes milliseconds, a broadcast seconds: ask by name everywhere first
+        # a ping takes milliseconds, a broadcast about a second: ping all baud rates first
         for rate in rates:
             progress(f"looking for servo {servo_id} at {rate} baud")
             bus.set_baudrate(rate)
             try:
-                return _checked(bus.ping(servo_id), bus)
+                return _check_model(bus.ping(servo_id), bus)
             except HandTimeout:
                 pass
     others: list[str] = []
@@ -60,7 +60,7 @@ def find_servo(
         bus.set_baudrate(rate)
         found = bus.ping_all()
         if len(found) == 1 and servo_id in (None, found[0].id):
-            return _checked(found[0], bus)
+            return _check_model(found[0], bus)
         if len(found) > 1 and servo_id is None:
             listed = ", ".join(f"id {p.id} (model {p.model})" for p in found)
             raise HandNotFound(
@@ -89,7 +89,7 @@ def find_servo(
     )
 
 
-def _checked(ping: Ping, bus: ServoBus) -> Ping:
+def _check_model(ping: Ping, bus: ServoBus) -> Ping:
     where = f"the servo with id {ping.id} on {bus.path}"
     if ping.model == mx64.MODEL:
         return ping

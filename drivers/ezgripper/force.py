@@ -1,11 +1,11 @@
-"""Force from motor current, through a table that can be calibrated (the note on predictive state).
+"""Estimate grip force from motor current with a calibrated table (the note on predictive state).
 
-The table maps Present Current (absolute value, units of 3.36 mA) to grip force; between its
-points it is interpolated, beyond them it stays at its end. The state's ``tau_est`` is the force
-divided by ten, as the note on predictive state and the interface specification have it.
+The table maps Present Current (absolute value, units of 3.36 mA) to grip force, by linear
+interpolation; outside its range it keeps the end values. The state's ``tau_est`` is the force
+divided by ten, as in the note on predictive state and the interface specification.
 
-Present Current of an MX-64 is a noisy estimate (docs/sources/mx64-ezgripper.md#d10-11): good for
-feedback, never for a decision.
+Present Current of an MX-64 is a noisy estimate (docs/sources/mx64-ezgripper.md#d10-11), so no
+decision of the driver uses it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ForceTable:
     """Grip force over motor current: points of rising current.
 
     :param points: (current units, force), current rising strictly, force never falling.
-    :raises UsageError: the points are no such table.
+    :raises UsageError: the points do not fulfil this.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -52,9 +52,9 @@ class ForceTable:
 
     @classmethod
     def from_mapping(cls, table: Mapping[str, object]) -> ForceTable:
-        """A table as the note on predictive state stores it: ``{"0": 0.0, "100": 0.5, ...}``.
+        """Build a table from the note's JSON form: ``{"0": 0.0, "100": 0.5, ...}``.
 
-        :raises UsageError: keys or values are not numbers, or make no table.
+        :raises UsageError: keys or values are not numbers, or not a valid table.
         """
         points = []
         for key, value in table.items():
@@ -67,11 +67,11 @@ class ForceTable:
         return cls(tuple(sorted(points)))
 
     def to_mapping(self) -> dict[str, float]:
-        """The table as the note on predictive state stores it."""
+        """Return the table in the note's JSON form."""
         return {f"{current:g}": force for current, force in self.points}
 
     def force(self, current: float) -> float:
-        """Force at ``current`` units; the sign of the current does not matter."""
+        """Return the force at ``current`` units; the sign of the current has no effect."""
         current = abs(current)
         index = bisect_right(self.points, current, key=lambda p: p[0])
         if index == 0:
@@ -82,11 +82,11 @@ class ForceTable:
         return f0 + (f1 - f0) * (current - c0) / (c1 - c0)
 
     def tau(self, current: float) -> float:
-        """Magnitude of ``tau_est`` at ``current`` units, N·m as the seed counts it."""
+        """Return the magnitude of ``tau_est`` at ``current`` units (force / 10)."""
         return self.force(current) * TAU_PER_FORCE
 
 
 DEFAULT_FORCE_TABLE = ForceTable(
     ((0.0, 0.0), (100.0, 0.5), (200.0, 1.2), (300.0, 2.0), (1023.0, 10.0))
 )
-"""The example of the note on predictive state, used until a gripper has a table of its own."""
+"""The example of the note on predictive state, used for grippers without a calibrated table."""

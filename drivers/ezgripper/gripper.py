@@ -1,4 +1,4 @@
-"""The EZGripper as a Dex1-1: opening, exchanging, and coming back from faults."""
+"""Implement :class:`dexkit.hand.Hand` for the EZGripper, as a Dex1-1, with recovery from faults."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 class Calibrate(str, Enum):
-    """Whether opening may move the gripper to find its zero."""
+    """Whether ``open`` may move the gripper to find its zero."""
 
     NO = "no"
     AUTO = "auto"
@@ -60,18 +60,18 @@ class Calibrate(str, Enum):
 
 @dataclass(frozen=True)
 class GripperSettings:
-    """How to reach a gripper and how it shall behave.
+    """Settings of :class:`EZGripper`.
 
-    :param id: servo id, or None to take the one that answers.
-    :param baudrate: bits a second, or None to try those known.
-    :param control: the behaviour.
+    :param id: servo id, or None for the only servo that answers.
+    :param baudrate: bits a second, or None to try the known ones.
+    :param control: limits and times of the control.
     :param calibrate: NO needs a stored zero, and opening never moves; AUTO closes and opens the
-        gripper if there is none; YES does so in any case. Either only at the first opening:
-        a gripper that is opened again, after a lost link for example, never moves for it.
+        gripper if there is no zero; YES does so always. AUTO and YES act at the first opening only:
+        opening again, for example after a lost link, never moves the gripper.
     :param zero: zero in ticks, instead of the stored one.
-    :param config: file of the stored calibration; None is the user's.
-    :param force_table: instead of the stored one.
-    :param timeout: seconds to wait for one reply.
+    :param config: file of the stored calibration; None for the user's file.
+    :param force_table: table instead of the stored one.
+    :param timeout: seconds to wait for a status packet.
     :param retries: how often an unanswered transaction is sent again within an exchange.
     """
 
@@ -101,11 +101,11 @@ class GripperSettings:
 
 @dataclass
 class GripperStatistics:
-    """Counters since the gripper was made.
+    """Counters since the object was created.
 
-    :ivar faults: hardware shutdowns seen.
-    :ivar reboots: made to recover from them.
-    :ivar resets: times that the servo lost its settings by itself (a supply dip).
+    :ivar faults: hardware shutdowns of the servo.
+    :ivar reboots: reboots to recover from them.
+    :ivar resets: times that the servo restarted by itself (a supply dip).
     """
 
     faults: int = 0
@@ -114,42 +114,40 @@ class GripperStatistics:
 
 
 _LATENCY_TIMER = 1e-3
-"""Seconds, assumed of an adapter whose timer the system does not show: a full-speed USB adapter
-without one is still asked once in a frame of 1 ms."""
+"""Seconds, assumed for an adapter whose timer the system does not show: a full-speed USB adapter is
+polled once per frame of 1 ms."""
 _SETUP_TIMEOUT = 0.25
-"""Seconds to wait for each answer while the servo is set up."""
+"""Seconds to wait for each status packet while ``open`` configures the servo."""
 _TURNAROUND = 0.5e-3
-"""Seconds that the service is given from an answer to its next request. An exchange costs CPython
-0.1 ms of processor time (benchmarks/bench_serial.py); the rest is for what else wants the
-processor."""
+"""Seconds allowed from a status packet to the next request. An exchange takes CPython 0.1 ms of
+processor time (benchmarks/bench_serial.py); the rest is for other load on the processor."""
 
-_LONGEST_PAUSE = 2.0
-"""Seconds that opening waits for a restart to be due; a later one is left to a later opening."""
+_MAX_RESTART_WAIT = 2.0
+"""Seconds that ``open`` waits at most for a reboot to be due; otherwise it raises."""
 
 
 def _is_shutdown(error: int) -> bool:
-    # an input voltage error does not cut the torque by default (docs/sources/mx64-ezgripper.md#b6)
+    # by default an input voltage error leaves torque on (docs/sources/mx64-ezgripper.md#b6)
     return error > HardwareError.INPUT_VOLTAGE
 
 
-class _Trouble(Enum):
+class _Recovery(Enum):
     NONE = 0
     FAULT = 1
     BOOTING = 2
 
 
 class EZGripper:
-    """A SAKE EZGripper (dual, one MX-64 with Protocol 2.0 firmware) behind the common interface.
+    """A SAKE EZGripper (dual, one MX-64 with Protocol 2.0 firmware) as a Dex1-1.
 
     :param device: path of the serial port, or USB serial number of the adapter.
-    :param side: which hand it stands for.
-    :param configuration: how to reach it and how it shall behave.
+    :param side: the side that it serves.
+    :param configuration: servo, calibration and control settings.
 
-    ``open`` finds the servo, sets its registers and loads the calibration; nothing moves
-    (unless asked to calibrate). The motor is first energised by the first FOC command with a
-    stiffness, and so it is after the servo has restarted: a brake before that exerts no torque.
-    ``close`` switches it off. If the process dies, the servo's own watchdog stops it within
-    half a second.
+    ``open`` finds the servo, sets its registers and loads the calibration, without motion (unless
+    ``calibrate`` asks for it). Torque is switched on by the first FOC command with kp > 0, also
+    after a reboot of the servo; a brake before that exerts no torque. ``close`` switches torque
+    off. If the process dies, the servo's bus watchdog stops the motor within 0.5 s.
     """
 
     def __init__(
@@ -175,7 +173,7 @@ class EZGripper:
         self._policy = RebootPolicy()
         self._moved_for: str | None = None
         self._found: int | None = None
-        self._trouble = _Trouble.NONE
+        self._recovery_state = _Recovery.NONE
         self._error = 0
         self._fault = MotorError.NONE
         self._message = ""
@@ -191,22 +189,22 @@ class EZGripper:
         return DEX1_1.spec(
             side,
             io_rate=1.0 / exchange_period(busy, timer, _TURNAROUND),
-            # the first exchange switches the motor on: two transactions
+            # the first exchange also switches torque on: two transactions
             exchange_timeout=2 * attempts * (self.configuration.timeout + busy + timer),
         )
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is.
+        """Side, joints, rates and time-outs of this hand.
 
-        ``io_rate`` is what a host gets that needs half a millisecond between two exchanges, at
-        the line's baud rate and, once it is open, the latency timer of its adapter.
+        ``io_rate`` is the rate of a host that needs 0.5 ms between two exchanges, at the line's
+        baud rate and, once the port is open, the latency timer of its adapter.
         """
         return self._spec
 
     @property
     def phase(self) -> Phase | None:
-        """What the gripper is doing, or None when it is not open."""
+        """Phase of the control, or None while the gripper is not open."""
         return self._control.phase if self._control is not None else None
 
     @property
@@ -221,10 +219,9 @@ class EZGripper:
 
     @property
     def joint_speeds(self) -> tuple[tuple[float, float]]:
-        """Speeds of the joint opening and closing, rad/s: what the service's estimator expects.
+        """Speeds of the joint opening and closing, rad/s, for the service's state estimator.
 
-        As calibrated, but no faster than the speed limit that is set, which the servo's profile
-        keeps; where none was measured, that limit.
+        The calibrated speeds, or the speed limit where it is lower or none was measured.
         """
         limit = self.configuration.control.speed
         per_percent = self._spec.joints[0].stroke / 100
@@ -237,13 +234,13 @@ class EZGripper:
     # --- opening and closing
 
     def open(self) -> None:
-        """Find the servo, set it up, load the calibration; without moving (see ``calibrate``).
+        """Find and configure the servo, load the calibration; no motion (see ``calibrate``).
 
-        :raises HandNotFound: no such port, or nothing answers.
-        :raises HandRefused: no MX-64(2.0), no calibration, a register that does not take its
+        :raises HandNotFound: no such port, or no servo answers.
+        :raises HandRefused: no MX-64(2.0), no calibration, a register that does not keep its
             value, or a port that another program uses.
-        :raises HandFault: the servo is in shutdown and may not be restarted yet.
-        :raises HandLost, HandTimeout: it goes away meanwhile.
+        :raises HandFault: the servo is in shutdown and may not be rebooted yet.
+        :raises HandLost, HandTimeout: the port goes away or the servo stops answering.
         """
         if self._servo is not None:
             return
@@ -265,9 +262,9 @@ class EZGripper:
         )
 
     def connect(self, progress: Callable[[str], None] = log.info) -> Servo:
-        """The first half of :meth:`open`: a configured servo, no calibration needed.
+        """Open the port and configure the servo, without a calibration; :meth:`close` ends it.
 
-        For calibration; :meth:`close` ends it. Raises as :meth:`open`.
+        For ``dexkit calibrate``. Raises as :meth:`open`.
         """
         configuration = self.configuration
         device = find_device(self.device_name)
@@ -289,7 +286,7 @@ class EZGripper:
             self._spec = self._make_spec(
                 self._spec.side, bus.baudrate, _LATENCY_TIMER if timer is None else timer * 1e-3
             )
-            # nothing moves yet, and a busy computer may delay an answer
+            # a longer time-out: nothing moves yet, and a busy machine may delay an answer
             bus.timeout = max(configuration.timeout, _SETUP_TIMEOUT)
             self._clear_shutdown(servo)
             self._limits = servo.configure()
@@ -298,7 +295,7 @@ class EZGripper:
             bus.close()
             self._servo = None
             raise
-        self._trouble = _Trouble.NONE
+        self._recovery_state = _Recovery.NONE
         self.record = Store(configuration.config).read(self.key)
         self._force = configuration.force_table or self.record.force_table or DEFAULT_FORCE_TABLE
         return servo
@@ -317,7 +314,7 @@ class EZGripper:
         if self._moved_for == self.key and self._found is not None:
             return self._found
         if self._moved_for is not None:
-            # a link that comes back must not set the gripper in motion by itself
+            # opening again after a lost link must not move the gripper
             raise HandRefused(
                 f"the gripper {self.key} has no zero: calibration is not repeated by itself",
                 hint="see that it is empty and start again",
@@ -338,7 +335,7 @@ class EZGripper:
         return zero
 
     def close(self) -> None:
-        """Switch the motor off and release the port, as far as it is still there."""
+        """Switch torque off and release the port. Failures are logged, not raised."""
         servo, self._servo = self._servo, None
         self._control = None
         self._last = None
@@ -347,7 +344,7 @@ class EZGripper:
         try:
             servo.set_torque(False)
         except HandError as error:
-            # gone or silent: its watchdog has stopped it, or will within half a second
+            # the servo's bus watchdog stops the motor within 0.5 s
             log.warning("could not switch the motor off: %s", error)
         finally:
             servo.bus.close()
@@ -369,32 +366,32 @@ class EZGripper:
     # --- exchanging
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Send the goal that ``command`` makes, return what was measured.
+        """Plan and send the goal for ``command``; return the measured state.
 
-        :raises HandFault: the servo has shut down, or is being restarted; further calls carry
-            the recovery on, one bounded step each.
+        :raises HandFault: the servo has shut down or is rebooting; each further call does one
+            bounded step of the recovery.
         :raises HandLost: the port has gone away, or the gripper is not open.
-        :raises HandTimeout: no intact answer to any of the attempts, or this program stood still
-            before the goal was written.
+        :raises HandTimeout: no intact answer to any attempt, or this program was paused before the
+            goal was written.
         """
         deadline = WriteDeadline(self._clock)
         servo, control, last = self._servo, self._control, self._last
         if servo is None or control is None or last is None:
             raise HandLost("the gripper is not open", hint="call open() first")
-        if self._trouble is not _Trouble.NONE:
-            last = self._recover(servo, control)
+        if self._recovery_state is not _Recovery.NONE:
+            last = self._recovery_step(servo, control)
         if self._clock.now() - last.time > PAUSE:
-            last = self._last = servo.sample()  # the fingers went on; a brake must not go back
+            last = self._last = servo.sample()  # the fingers moved on during the pause
         goal = control.plan(command, last)
         if goal.current and not last.torque:
             servo.engage(Goal(last.position, goal.current, goal.profile_velocity), deadline)
         sample = servo.exchange(goal, deadline)
-        self._examine(servo, control, command, sample, engaged=goal.current > 0)
+        self._check_sample(servo, control, command, sample, engaged=goal.current > 0)
         self._commanded = command
         self._last = sample
-        return self._state(control, sample)
+        return self._hand_state(control, sample)
 
-    def _examine(
+    def _check_sample(
         self,
         servo: Servo,
         control: Control,
@@ -404,9 +401,9 @@ class EZGripper:
         engaged: bool,
     ) -> None:
         if sample.voltage == 0:
-            # the indirect addresses are back at their defaults: the servo has restarted
+            # voltage 0: the indirect addresses have their defaults, so the servo has restarted
             self.statistics.resets += 1
-            self._fail(
+            self._begin_recovery(
                 HardwareError.NONE,
                 MotorError.ABNORMAL_RESET,
                 command,
@@ -418,22 +415,22 @@ class EZGripper:
             if sample.error & HardwareError.OVERLOAD:
                 self._overload_at = float(control.position(sample))
             self._policy.fault(self._clock.now())
-            self._fail(
+            self._begin_recovery(
                 sample.error,
                 self._motor_error(sample),
                 command,
                 f"the servo has shut down: {describe(sample.error)}",
             )
         if engaged and not sample.torque:
-            # switched off behind the driver's back: start over as after a reset
-            self._fail(
+            # another program switched torque off: start over as after a reset
+            self._begin_recovery(
                 HardwareError.NONE,
                 MotorError.ABNORMAL_RESET,
                 command,
                 "the servo's torque was switched off by something else",
             )
         if sample.watchdog == mx64.WATCHDOG_TRIPPED:
-            log.warning("nothing was sent to the servo for too long; it stopped, going on")
+            log.warning("the servo's bus watchdog tripped for lack of instructions; clearing it")
             servo.rearm_watchdog()
         if sample.temperature >= control.settings.warm and not self._was_warm:
             log.warning("the servo is at %d degC: effort is reduced", sample.temperature)
@@ -444,10 +441,10 @@ class EZGripper:
         voltage = sample.voltage * mx64.VOLTAGE_UNIT
         return motor_error(sample.error, voltage, limits.voltage_min, limits.voltage_max)
 
-    def _state(self, control: Control, sample: Sample) -> HandState:
+    def _hand_state(self, control: Control, sample: Sample) -> HandState:
         contact = control.contact
-        # signed as the joint: closing is toward smaller q, so squeezing is negative, as the
-        # vendor's gripper reports it (docs/sources/unitree-dex.md#b7)
+        # sign of the joint: closing is toward smaller q, so gripping torque is negative, as in the
+        # vendor's gripper (docs/sources/unitree-dex.md#b7)
         tau = contact.direction * self._force.tau(sample.current) if contact else 0.0
         mode = JointMode.BRAKE if control.phase is Phase.BRAKE else JointMode.FOC
         return HandState(
@@ -464,7 +461,7 @@ class EZGripper:
 
     # --- faults
 
-    def _fail(
+    def _begin_recovery(
         self,
         error: int,
         fault: MotorError,
@@ -476,43 +473,43 @@ class EZGripper:
         self._fault = fault
         self._commanded = command
         self._since = self._clock.now()
-        # without an error the servo only needs its settings again
-        self._trouble = _Trouble.FAULT if error else _Trouble.BOOTING
+        # without an error bit the servo only needs its registers set again
+        self._recovery_state = _Recovery.FAULT if error else _Recovery.BOOTING
         self._message = message
         log.error("%s", message)
         raise HandFault(message, bits=(fault,), hint=hint)
 
-    def _recover(self, servo: Servo, control: Control) -> Sample:
-        """One bounded step towards a working servo; the sample when it works again.
+    def _recovery_step(self, servo: Servo, control: Control) -> Sample:
+        """Do one bounded step of the recovery; return a sample once the servo works again.
 
-        Nothing moves: torque is off after the restart, and stays off until a command comes that
-        differs from the last one.
+        No motion: torque is off after the reboot, and stays off until a command differs from the
+        last one.
         """
         now = self._clock.now()
-        if self._trouble is _Trouble.FAULT:
+        if self._recovery_state is _Recovery.FAULT:
             temperature = servo.temperature()
             if not self._policy.due(now, self._error, temperature, self._limits.temperature):
-                raise self._still(f"waiting before the restart ({temperature} degC)")
+                raise self._pending_fault(f"waiting before the restart ({temperature} degC)")
             self._reboot(servo, now)
-            raise self._still("restarting")
+            raise self._pending_fault("restarting")
         if not servo.answers():
             if now - self._since > BOOT_TIME:
                 raise HandTimeout(
                     f"servo {servo.id} on {servo.bus.path} does not come back after its restart",
                     hint="switch its supply off and on",
                 )
-            raise self._still("restarting")
+            raise self._pending_fault("restarting")
         error = servo.hardware_error()
         if _is_shutdown(error):
             self._error = error
-            self._trouble = _Trouble.FAULT
+            self._recovery_state = _Recovery.FAULT
             self._policy.fault(now)
-            raise self._still("the restart did not help")
+            raise self._pending_fault("the restart did not help")
         self._limits = servo.configure()
         sample = servo.sample()
         control.recovered(self._commanded, overload_at=self._overload_at)
         self._overload_at = None
-        self._trouble = _Trouble.NONE
+        self._recovery_state = _Recovery.NONE
         self._fault = MotorError.NONE
         self._last = sample
         log.warning("the servo works again; its motor is off until a new command comes")
@@ -523,23 +520,23 @@ class EZGripper:
         log.warning("restarting the servo after: %s", describe(self._error))
         servo.reboot()
         self._since = now
-        self._trouble = _Trouble.BOOTING
+        self._recovery_state = _Recovery.BOOTING
 
-    def _still(self, what: str) -> HandFault:
+    def _pending_fault(self, what: str) -> HandFault:
         return HandFault(f"{self._message}; {what}", bits=(self._fault,))
 
     def _clear_shutdown(self, servo: Servo) -> None:
-        """Restart a servo that is found in shutdown, if it may be restarted soon."""
+        """Reboot a servo that is in shutdown at opening, if a reboot is due soon enough."""
         error = servo.hardware_error()
         if not _is_shutdown(error):
             return
-        # the fault that made the last exchange or opening fail is not a new one
-        if self._trouble is not _Trouble.FAULT:
+        # do not count the fault of the last exchange or opening again
+        if self._recovery_state is not _Recovery.FAULT:
             self.statistics.faults += 1
             self._policy.fault(self._clock.now())
         self._error = error
-        self._trouble = _Trouble.FAULT
-        if self._policy.delay <= _LONGEST_PAUSE:
+        self._recovery_state = _Recovery.FAULT
+        if self._policy.delay <= _MAX_RESTART_WAIT:
             self._clock.sleep_until(self._clock.now() + self._policy.delay)
         temperature = servo.temperature()
         limit = servo.bus.read_item(servo.id, mx64.TEMPERATURE_LIMIT)
@@ -565,7 +562,7 @@ class EZGripper:
 # --- the backend
 
 
-def _number(low: float, high: float) -> Callable[[str], float]:
+def _in_range(low: float, high: float) -> Callable[[str], float]:
     def parse(text: str) -> float:
         value = float(text)
         if not low <= value <= high:
@@ -575,11 +572,11 @@ def _number(low: float, high: float) -> Callable[[str], float]:
     return parse
 
 
-def _or_auto(text: str) -> int | None:
+def _parse_or_auto(text: str) -> int | None:
     return None if text == "auto" else int(text)
 
 
-def _table(text: str) -> ForceTable:
+def _read_force_table(text: str) -> ForceTable:
     if text == "default":
         return DEFAULT_FORCE_TABLE
     content = documents.read_json(Path(text))
@@ -591,8 +588,8 @@ def _table(text: str) -> ForceTable:
 _CONTROL = {f.name for f in fields(ControlSettings)}
 
 _SETTINGS: dict[str, tuple[Callable[[str], object], str]] = {
-    "id": (_or_auto, "servo id, or auto for the one that answers (default 1)"),
-    "baudrate": (_or_auto, "bits a second, or auto to try those known (default 1000000)"),
+    "id": (_parse_or_auto, "servo id, or auto for the one that answers (default 1)"),
+    "baudrate": (_parse_or_auto, "bits a second, or auto to try those known (default 1000000)"),
     "calibrate": (
         Calibrate,
         "no: needs a stored zero; auto: moves at the start to find one if needed; "
@@ -600,20 +597,23 @@ _SETTINGS: dict[str, tuple[Callable[[str], object], str]] = {
     ),
     "zero": (int, "zero in servo ticks, instead of the stored one"),
     "config": (Path, "calibration file (default the user's)"),
-    "force_table": (_table, "JSON file {current units: force}, or default (default: as stored)"),
-    "effort": (_number(0, 100), "force limit while moving, % (default 50)"),
-    "hold_effort": (_number(0, 100), "force limit while holding and braking, % (default 15)"),
-    "hold_after": (_number(0, 60), "seconds of contact until hold_effort (default 0.5)"),
-    "speed": (_number(0, 1000), "speed limit, % of stroke a second (default 150)"),
-    "startup_speed": (_number(0, 1000), "speed limit of the first motion, %/s (default 50)"),
-    "startup_time": (_number(0, 60), "seconds after which that limit ends anyway (default 3)"),
-    "warm": (_number(0, 80), "degC from which effort is reduced to hold_effort (default 70)"),
-    "timeout": (_number(0, 1), "seconds to wait for a reply (default 0.03)"),
+    "force_table": (
+        _read_force_table,
+        "JSON file {current units: force}, or default (default: as stored)",
+    ),
+    "effort": (_in_range(0, 100), "force limit while moving, % (default 50)"),
+    "hold_effort": (_in_range(0, 100), "force limit while holding and braking, % (default 15)"),
+    "hold_after": (_in_range(0, 60), "seconds of contact until hold_effort (default 0.5)"),
+    "speed": (_in_range(0, 1000), "speed limit, % of stroke a second (default 150)"),
+    "startup_speed": (_in_range(0, 1000), "speed limit of the first motion, %/s (default 50)"),
+    "startup_time": (_in_range(0, 60), "seconds after which that limit ends anyway (default 3)"),
+    "warm": (_in_range(0, 80), "degC from which effort is reduced to hold_effort (default 70)"),
+    "timeout": (_in_range(0, 1), "seconds to wait for a reply (default 0.03)"),
     "retries": (int, "times that an unanswered request is repeated (default 2)"),
 }
 
 
-def _settings(options: BackendOptions) -> GripperSettings:
+def _parse_settings(options: BackendOptions) -> GripperSettings:
     values: dict[str, object] = {}
     for name, text in options.settings.items():
         parse, meaning = _SETTINGS[name]
@@ -626,15 +626,15 @@ def _settings(options: BackendOptions) -> GripperSettings:
     return GripperSettings(control=control, **rest)  # type: ignore[arg-type]
 
 
-def _make(options: BackendOptions) -> EZGripper:
+def _create_hand(options: BackendOptions) -> EZGripper:
     assert options.device is not None  # Backend.create has checked it
-    return EZGripper(options.device, options.side, _settings(options))
+    return EZGripper(options.device, options.side, _parse_settings(options))
 
 
 backend = Backend(
     summary="SAKE EZGripper with an MX-64 servo (Protocol 2.0) on a serial port",
     model=DEX1_1.name,
-    make=_make,
+    make=_create_hand,
     needs="--device PATH or USB serial number",
     needs_device=True,
     settings={name: meaning for name, (_, meaning) in _SETTINGS.items()},

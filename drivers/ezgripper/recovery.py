@@ -1,9 +1,9 @@
-"""When a servo that has shut itself down may be restarted.
+"""Decide when a servo in hardware shutdown may be rebooted.
 
-After a shutdown (overload, overheating, electrical shock) only a reboot brings torque back
-(docs/sources/mx64-ezgripper.md#b6). Rebooting at once and for ever would heat the motor against the
-same load, so each further fault within a while waits twice as long, and a hot motor first cools
-down. Pure logic: no device, no clock of its own.
+After a shutdown (overload, overheating, electrical shock) only a reboot restores torque
+(docs/sources/mx64-ezgripper.md#b6). Immediate and endless reboots would overheat the motor under
+the same load, so the delay doubles with each further fault, and a hot motor must cool down first.
+No I/O and no clock of its own.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _MOTOR_ERRORS = {
 
 
 def motor_error(error: int, voltage: float, voltage_min: float, voltage_max: float) -> MotorError:
-    """The servo's error bits in the vocabulary of all hands (docs/sources/unitree-dex.md#b6).
+    """Translate the servo's error bits to :class:`MotorError` (docs/sources/unitree-dex.md#b6).
 
-    The servo keeps an input voltage error until it is rebooted; it is reported while the
+    The servo keeps an input voltage error until it is rebooted; it is reported only while the
     voltage is outside the limits.
 
-    :param voltage: present supply, V.
-    :param voltage_min: the servo's limits, V.
-    :param voltage_max: see ``voltage_min``.
+    :param voltage: present supply voltage, V.
+    :param voltage_min: the servo's lower limit, V.
+    :param voltage_max: the servo's upper limit, V.
     """
     bits = MotorError.NONE
     if not error:
@@ -53,24 +53,23 @@ def motor_error(error: int, voltage: float, voltage_min: float, voltage_max: flo
 
 
 def describe(error: int) -> str:
-    """The error bits in words."""
+    """Describe the error bits in words."""
     names = [e.name.lower().replace("_", " ") for e in HardwareError if e & error and e.name]
     return " and ".join(names) or (f"unknown error 0x{error:02X}" if error else "no error")
 
 
 @dataclass
 class RebootPolicy:
-    """Whether a reboot is due.
+    """Limits reboots after faults.
 
-    It limits reboots and is not only a delay between attempts: it forgets old faults, and an
-    overheated servo must cool down first. The delays are those of a
-    :class:`~dexkit.backoff.Backoff`.
+    The delays are those of a :class:`~dexkit.backoff.Backoff`; in addition the policy forgets old
+    faults, and an overheated servo must cool down first.
 
-    :param first: seconds from a fault to its reboot.
-    :param factor: how much longer each further fault waits.
-    :param longest: bound of that, seconds.
+    :param first: seconds from the first fault to its reboot.
+    :param factor: factor by which each further fault's delay grows.
+    :param longest: longest delay, seconds.
     :param forget: seconds without a fault after which the next counts as the first.
-    :param cool: °C below the temperature limit at which an overheated servo may go on.
+    :param cool: °C below the temperature limit at which an overheated servo may be rebooted.
     """
 
     first: float = 0.5
@@ -87,11 +86,11 @@ class RebootPolicy:
 
     @property
     def delay(self) -> float:
-        """Seconds that the present (or last) fault waits."""
+        """Delay of the present (or last) fault, seconds."""
         return self._delay
 
     def fault(self, now: float) -> None:
-        """A fault has appeared (or a reboot has not helped)."""
+        """Note a fault, or a reboot that has not cleared it."""
         if now - self._last > self.forget:
             self._backoff.reset()
         self._delay = self._backoff.next()
@@ -99,7 +98,7 @@ class RebootPolicy:
         self._due = now + self._delay
 
     def due(self, now: float, error: int, temperature: float, temperature_limit: float) -> bool:
-        """Whether to reboot now.
+        """Whether a reboot is due.
 
         :param temperature: present, °C.
         """

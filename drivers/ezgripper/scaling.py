@@ -1,7 +1,7 @@
-"""Units: servo ticks, percent of stroke, joint radians, effort, current, speed.
+"""Convert between servo ticks, percent of stroke, joint radians, effort, current and speed.
 
-Everything here is relative to the calibrated zero: 0 ticks is closed, 2500 ticks, 100 %, and
-5.4 rad of the Dex1 joint are fully open (docs/sources/mx64-ezgripper.md#d2,
+Positions are relative to the calibrated zero: 0 ticks is closed; 2500 ticks, 100 % and 5.4 rad
+of the Dex1 joint are fully open (docs/sources/mx64-ezgripper.md#d2,
 docs/sources/mx64-ezgripper.md#d7; docs/sources/mx64-ezgripper.md#d10-3,
 docs/sources/mx64-ezgripper.md#d10-4, docs/sources/mx64-ezgripper.md#d10-5).
 """
@@ -40,7 +40,7 @@ CURRENT_LIMIT = 1600
 servo at 12 V."""
 
 VELOCITY_LIMIT = 1023
-"""Highest value of Velocity Limit(44): 640 % of the stroke a second, far beyond the motor."""
+"""Highest value of Velocity Limit(44): 640 % of stroke a second, far above the motor's speed."""
 
 _TICKS_PER_SECOND = mx64.VELOCITY_UNIT_RPM / 60 * mx64.TICKS_PER_TURN
 """ticks/s of one velocity unit (0.229 rpm): 15.63."""
@@ -89,14 +89,14 @@ def amperes(units: float) -> float:
 
 
 def relative_position(present: int, zero: int) -> int:
-    """Ticks between the zero and ``present``, whatever turn either was counted in.
+    """Return ticks from the zero to ``present``, which may be counted in different turns.
 
     The encoder is absolute only within one turn: after power-on or a reboot the servo reports
     0..4095, while the zero may have been stored in another turn (docs/sources/mx64-ezgripper.md#b4,
     docs/sources/mx64-ezgripper.md#d4). The difference modulo 4096 is still unique, because the
-    stroke is 2500 ticks: a closed gripper is near 0 and an open one near 2500, which leaves 1596
-    ticks that no position can be in. Their middle is where the answer flips: up to 798 ticks (32 %)
-    past open still read as open, up to 798 below the zero as negative.
+    stroke is 2500 ticks, which leaves 1596 ticks that no position can have. The result wraps in
+    the middle of these: up to 798 ticks (32 %) beyond open read as open, up to 798 below the zero
+    as negative.
     """
     margin = (mx64.TICKS_PER_TURN - STROKE) // 2
     return (present - zero + margin) % mx64.TICKS_PER_TURN - margin

@@ -1,4 +1,4 @@
-"""One servo on a bus: goals in, samples out, with a dead man's switch."""
+"""Exchange goals and samples with one servo, with its bus watchdog enabled."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from dexkit.wire import mx64
 __all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "line_time"]
 
 BOOT_TIME = 5.0
-"""Seconds after which a rebooted servo should answer again; the real time is not published
-(docs/sources/mx64-ezgripper.md#d6: 0.5 to 1.5 s were waited)."""
+"""Seconds after which a rebooted servo should answer again; the true boot time is not published
+(docs/sources/mx64-ezgripper.md#d6: its authors waited 0.5 to 1.5 s)."""
 
 _SYNC_WRITE_OVERHEAD = 15
 _READ_INSTRUCTION = 14
@@ -31,15 +31,15 @@ _RETURN_DELAY = 4e-6  # as settings.py sets it
 
 
 def exchange_bytes() -> tuple[int, int]:
-    """Bytes on the line of one exchange: (to the servo, from the servo)."""
+    """Return the bytes on the line of one exchange: (to the servo, from the servo)."""
     sent = _SYNC_WRITE_OVERHEAD + block.WRITE_SIZE + _READ_INSTRUCTION
     return sent, _STATUS_OVERHEAD + block.READ_SIZE
 
 
 def line_time(baudrate: int, return_delay: float = _RETURN_DELAY) -> float:
-    """Seconds that one exchange takes on the line, without the USB adapter.
+    """Return the seconds that one exchange takes on the line, without the USB adapter.
 
-    What the adapter makes of it: :func:`dexkit.drivers.serial_port.exchange_period`.
+    With the adapter: :func:`dexkit.drivers.serial_port.exchange_period`.
 
     :param baudrate: bits a second.
     :param return_delay: seconds that the servo waits before it answers.
@@ -49,12 +49,12 @@ def line_time(baudrate: int, return_delay: float = _RETURN_DELAY) -> float:
 
 @dataclass
 class ServoStatistics:
-    """What happened in the exchanges.
+    """Counters of the exchanges.
 
-    :ivar exchanges: completed.
-    :ivar lost_writes: goals that the next sample did not show.
-    :ivar stale: samples with the same servo time as the one before.
-    :ivar watchdog_trips: times that the servo stopped because nothing was said to it.
+    :ivar exchanges: exchanges completed.
+    :ivar lost_writes: goals that were not in the next sample.
+    :ivar stale: samples with the same Realtime Tick as the one before.
+    :ivar watchdog_trips: times that the servo's bus watchdog tripped.
     """
 
     exchanges: int = 0
@@ -81,14 +81,14 @@ class Servo:
         self._read_to_measurement = bus.wire_time(_READ_INSTRUCTION)
 
     def configure(self) -> ServoLimits:
-        """Set and verify all registers. Raises as :func:`settings.apply_settings`."""
+        """Write and verify all registers. Raises as :func:`settings.apply_settings`."""
         return apply_settings(self.bus, self.id)
 
     def exchange(self, goal: Goal, before: WriteDeadline | None = None) -> Sample:
-        """One write, one read.
+        """Write a goal and read a sample.
 
-        :param before: asked right before the goal is written.
-        :raises HandTimeout: no answer, or ``before`` refuses.
+        :param before: checked right before the goal is written.
+        :raises HandTimeout: no answer, or ``before`` raises it.
         :raises HandLost: the port has gone away.
         """
         started = self._clock.now()
@@ -103,12 +103,12 @@ class Servo:
         return sample
 
     def sample(self) -> Sample:
-        """One read, nothing written. Raises as :meth:`exchange`."""
+        """Read a sample. Raises as :meth:`exchange`."""
         return self._read(self._clock.now() + self._read_to_measurement)
 
     def _read(self, measured_at: float) -> Sample:
         data, _ = self.bus.read(self.id, block.READ_ADDRESS, block.READ_SIZE)
-        # a repeated read was measured later than planned; never claim a time in the future
+        # a retried read was measured later than assumed; the time must not be in the future
         sample = block.decode(data, min(measured_at, self._clock.now()))
         if sample.tick == self._tick:
             self.statistics.stale += 1
@@ -116,30 +116,30 @@ class Servo:
         return sample
 
     def set_torque(self, on: bool) -> None:
-        """Switch the motor; raises as the bus, and ServoError in a shutdown."""
+        """Write Torque Enable. Raises as the bus, and ServoError in a shutdown."""
         self.bus.write_item(self.id, mx64.TORQUE_ENABLE, int(on))
 
     def engage(self, goal: Goal, before: WriteDeadline | None = None) -> None:
-        """Switch the motor on with ``goal`` already in its registers."""
+        """Write ``goal``, then switch torque on."""
         data = block.encode(goal)
         self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, data, before=before)
         self.set_torque(True)
 
     def rearm_watchdog(self) -> None:
-        """Make a servo that stopped by its watchdog take goals again; it stays where it is."""
+        """Clear a tripped bus watchdog, so that the servo accepts goals; it holds its position."""
         self.statistics.watchdog_trips += 1
         hold_here(self.bus, self.id, WATCHDOG_UNITS)
 
     def hardware_error(self) -> int:
-        """Hardware Error Status(70), one byte: 71 does not exist."""
+        """Read Hardware Error Status(70), one byte: address 71 does not exist."""
         return self.bus.read_item(self.id, mx64.HARDWARE_ERROR_STATUS)
 
     def temperature(self) -> int:
-        """Present Temperature, °C."""
+        """Read Present Temperature(146), °C."""
         return self.bus.read_item(self.id, mx64.PRESENT_TEMPERATURE)
 
     def reboot(self) -> None:
-        """Restart the servo. Raises as the bus."""
+        """Reboot the servo. Raises as the bus."""
         self.bus.reboot(self.id)
 
     def answers(self) -> bool:

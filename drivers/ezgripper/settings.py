@@ -1,9 +1,9 @@
-"""The servo's registers: what they must hold, compared before they are written and verified after.
+"""Write and verify the servo registers that the driver needs.
 
-EEPROM is written only where it differs (its life is limited), with torque off, because the
+EEPROM is written only where it differs (its write cycles are limited), with torque off, because the
 servo refuses otherwise (docs/sources/mx64-ezgripper.md#a4, docs/sources/mx64-ezgripper.md#d3). RAM
-is lost at power-off and reboot, so it is set at every start. The order matters: the operating mode
-resets Goal Current and the profile, and Velocity Limit bounds the profile
+is lost at power-off and reboot, so it is written at every start. The order matters: a new operating
+mode resets Goal Current and the profile, and Velocity Limit bounds the profile
 (docs/sources/mx64-ezgripper.md#b4, docs/sources/mx64-ezgripper.md#b5).
 """
 
@@ -33,7 +33,7 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 EEPROM: tuple[tuple[mx64.Item, int], ...] = (
-    # current-based position: force is Goal Current, and changing it needs no torque-off
+    # current-based position: Goal Current limits the force, and may be written with torque on
     # (docs/sources/mx64-ezgripper.md#d10-8)
     (mx64.OPERATING_MODE, OperatingMode.CURRENT_BASED_POSITION),
     (mx64.DRIVE_MODE, 0),  # closing is toward smaller ticks; profile in velocities
@@ -48,22 +48,22 @@ RAM: tuple[tuple[mx64.Item, int], ...] = (
     (mx64.STATUS_RETURN_LEVEL, StatusReturnLevel.ALL),
     (mx64.PROFILE_ACCELERATION, 800),
 )
-"""RAM items and their values (docs/sources/mx64-ezgripper.md#d3); the rest is in every exchange."""
+"""RAM items and their values (docs/sources/mx64-ezgripper.md#d3); exchanges write the others."""
 
 WATCHDOG_TIME = 0.5
-"""Seconds without an instruction after which the servo stops by itself: the dead man's switch
-for a driver that is killed or a cable that is pulled."""
+"""Seconds without an instruction after which the servo stops by itself, for example after the
+driver is killed or the cable is pulled."""
 WATCHDOG_UNITS = round(WATCHDOG_TIME / mx64.WATCHDOG_UNIT)
-"""The same as Bus Watchdog(98) takes it."""
+"""The same in units of Bus Watchdog(98)."""
 
 
 @dataclass(frozen=True)
 class ServoLimits:
-    """The servo's own limits, read from it.
+    """Limits read from the servo's registers.
 
-    :param temperature: °C at which it shuts down.
-    :param voltage_min: V.
-    :param voltage_max: V.
+    :param temperature: Temperature Limit(31), °C, above which it shuts down.
+    :param voltage_min: Min Voltage Limit(34), V.
+    :param voltage_max: Max Voltage Limit(32), V.
     """
 
     temperature: int
@@ -72,7 +72,7 @@ class ServoLimits:
 
 
 def differences(bus: ServoBus, servo_id: int) -> list[tuple[mx64.Item, int, int]]:
-    """EEPROM items that differ: (item, value found, value wanted). Raises as the bus."""
+    """List EEPROM items that differ: (item, value read, value needed). Raises as the bus."""
     found = [(item, bus.read_item(servo_id, item), wanted) for item, wanted in EEPROM]
     return [entry for entry in found if entry[1] != entry[2]]
 
@@ -87,10 +87,10 @@ def _verify(bus: ServoBus, servo_id: int, item: mx64.Item, value: int) -> None:
 
 
 def hold_here(bus: ServoBus, servo_id: int, watchdog: int = 0) -> None:
-    """Set the bus watchdog, and the goal to where the servo is, with nothing in between.
+    """Write the bus watchdog, and right after it the present position as goal.
 
-    A servo stopped by its watchdog refuses goals until that is cleared; whether it then goes on
-    to its old goal is not documented.
+    A servo with a tripped watchdog refuses goals until that is cleared; whether it then moves on to
+    its old goal is not documented.
     """
     present = bus.read_item(servo_id, mx64.PRESENT_POSITION)
     bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
@@ -100,16 +100,16 @@ def hold_here(bus: ServoBus, servo_id: int, watchdog: int = 0) -> None:
 
 
 def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
-    """Bring the registers of a servo to what the driver needs. Nothing moves.
+    """Write the registers of a servo to what the driver needs. No motion.
 
-    Torque is switched off only if EEPROM or the mapping has to change; a servo that holds
-    something goes on holding it, at the position where it is.
+    Torque is switched off only if EEPROM or the mapping must change; otherwise a servo that holds
+    an object goes on holding it at its present position.
 
-    :returns: the limits that the servo watches itself.
-    :raises HandRefused: a register does not take its value.
+    :returns: the servo's own limits.
+    :raises HandRefused: a register does not keep its value.
     :raises HandTimeout, HandLost: as the bus.
     """
-    # with the level at "ping" nothing else would be answered, and at "read" writes would not
+    # first: at a lower Status Return Level the servo does not answer writes, or reads and writes
     bus.write_unacknowledged(
         servo_id,
         mx64.STATUS_RETURN_LEVEL.address,
@@ -118,12 +118,12 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
     differing = [(item, wanted) for item, _, wanted in differences(bus, servo_id)]
     mapped = _mapping(bus, servo_id) == block.mapping()
     if bus.read_item(servo_id, mx64.TORQUE_ENABLE):
-        # ROBOTIS' examples map indirect addresses with torque off only
+        # ROBOTIS' examples write indirect addresses only with torque off
         if differing or not mapped:
             bus.write_item(servo_id, mx64.TORQUE_ENABLE, 0)
         else:
             hold_here(bus, servo_id)
-    # only now: a servo stopped by its watchdog may move again
+    # after the mapping: a servo with a tripped watchdog may move once that is cleared
     bus.write_item(servo_id, mx64.BUS_WATCHDOG, 0)
     for item, value in differing:
         log.info("servo %d: setting %s(%d) to %d", servo_id, item.name, item.address, value)

@@ -1,4 +1,4 @@
-"""An emulated Unitree Dex3-1: the hand's processor and motors, on USB by way of USB/IP.
+"""Emulate a Unitree Dex3-1 on USB/IP: the hand's processor and motors.
 
 From the inside out: :mod:`settings` (uncertain points), :mod:`device` (the processor: frames,
 motors, time-outs, faults) and :mod:`answer` (its state as bytes) are sans-IO, over the mechanics of

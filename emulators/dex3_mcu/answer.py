@@ -1,7 +1,7 @@
-"""A mechanics's state as a frame, at a thousand a second.
+"""Encode the state of the mechanics as Dex3-1 state frames, fast enough for 1000 Hz.
 
-The bytes are those of :meth:`dexkit.wire.dex3_usb.HandCodec.encode_state`, which takes a whole
-:class:`~dexkit.hand.HandState` apart for every frame; this writes what changes.
+The bytes equal those of :meth:`dexkit.wire.dex3_usb.HandCodec.encode_state`, which encodes a whole
+:class:`~dexkit.hand.HandState` per frame; this writes only the fields that change.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 
 
 class AnswerWriter:
-    """Writes the state frames of one mechanics.
+    """Encodes the state frames of one hand.
 
-    :param bus_map: which packet is whose.
+    :param bus_map: bus and id of each joint and sensor.
     :param model: ``mode[0]`` of the frames.
     """
 
@@ -52,9 +52,9 @@ class AnswerWriter:
         self._sensors = [b""] * len(bus_map.sensors)
 
     def frame(self, motors: Sequence[int], tripped: Sequence[bool]) -> bytes:
-        """A state frame of the mechanics as it is now.
+        """Encode a state frame with the present state.
 
-        :param motors: indices of those that answer.
+        :param motors: indices of the motors that answer.
         :param tripped: whether each motor's time-out protection has tripped.
         """
         mechanics = self._mechanics
@@ -105,12 +105,12 @@ class AnswerWriter:
             data = pack(
                 MOTOR_STATE.head,
                 number | mode << 4 | trip << 7,
-                _within(case, -128, 127),
-                _within(winding, 0, 255),
+                _clamp(case, -128, 127),
+                _clamp(winding, 0, 255),
                 volts,
-                _within(tau * torque, -0x8000, 0x7FFF),
-                _within(dq * speed, -0x8000, 0x7FFF),
-                _within(q * position, -0x80000000, 0x7FFFFFFF),
+                _clamp(tau * torque, -0x8000, 0x7FFF),
+                _clamp(dq * speed, -0x8000, 0x7FFF),
+                _clamp(q * position, -0x80000000, 0x7FFFFFFF),
                 error | _TRIPPED if trip else error,
                 0,
                 0,
@@ -120,7 +120,7 @@ class AnswerWriter:
         return packets
 
     def _renew_sensors(self) -> None:
-        """Write the sensor packets again, if anything is felt otherwise than before."""
+        """Encode the sensor packets again if a pressure has changed."""
         pressure = self._mechanics.pressure
         key = pressure.tobytes()
         if key == self._pressure:
@@ -139,6 +139,6 @@ class AnswerWriter:
             self._sensors[i] = data + crc32_words(data).to_bytes(4, "little")
 
 
-def _within(value: float, low: int, high: int) -> int:
+def _clamp(value: float, low: int, high: int) -> int:
     count = int(value)
     return low if count < low else high if count > high else count

@@ -1,7 +1,7 @@
-"""An ordinary command frame, taken apart at a thousand a second.
+"""Decode ordinary Dex3-1 command frames, fast enough for 1000 Hz.
 
-What :meth:`dexkit.wire.dex3_usb.HandCodec.decode_command` does for every frame there can be, for
-the ones that a driver sends: all packets whole, each for a motor that is there.
+It handles the frames that a driver sends: every packet intact and for an existing motor.
+:meth:`dexkit.wire.dex3_usb.HandCodec.decode_command` handles all others.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _FIRST, _BEHIND = MOTOR_CMD.covered
 
 
 class CommandReader:
-    """Takes command frames of one hand apart."""
+    """Decodes command frames of one hand."""
 
     def __init__(self, side: Side, bus_map: BusMap) -> None:
         self._layouts = {layout.size: layout for layout in COMMAND_LAYOUTS}
@@ -38,7 +38,7 @@ class CommandReader:
         }
 
     def read(self, data: bytes) -> list[MotorCommand] | None:
-        """The motors' commands in order of the frame; None if anything in it is unusual."""
+        """Return the motor commands in the frame's order; None if the frame is not ordinary."""
         layout = self._layouts.get(len(data))
         if layout is None or not _intact(data, layout.structure.covered):
             return None

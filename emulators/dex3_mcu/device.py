@@ -1,8 +1,8 @@
-"""The Dex3-1's processor and its seven motors, sans-IO: a frame in, a frame out.
+"""Emulate the Dex3-1's processor and its seven motors, without I/O: a frame in, a frame out.
 
-The processor takes a frame apart, hands each motor its packet, and answers with the state of that
-moment. Each motor keeps its last command and watches over its own time-out protection, whatever
-becomes of USB: a cable that is pulled does not stop a motor, its protection does.
+The processor decodes a frame, passes each motor its packet, and answers with the present state.
+Each motor keeps its last command and runs its own time-out protection: a pulled USB cable does not
+stop a motor, its protection does.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP, BusMap, DecodedCommand, HandCo
 
 __all__ = ["Counters", "Dex3Mcu"]
 
-_MOST_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
+_MAX_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not simulated
 _KNOWN = (int(JointMode.BRAKE), int(JointMode.FOC))
-_HOT_SLICE = 0.05  # seconds between which a motor held hot may cool
+_HOT_SLICE = 0.05  # seconds between settings of the temperature of an ``overheat`` fault
 
 
 @dataclass
 class Counters:
-    """What the hand has seen and done."""
+    """Counters of the hand."""
 
     frames: int = 0
     answers: int = 0
@@ -51,12 +51,12 @@ class Counters:
     delayed: int = 0
 
     def summary(self) -> str:
-        """One line for the end of a run: what is not zero."""
+        """One line with the counters that are not zero."""
         return ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in vars(self).items() if v)
 
 
 class _Motor:
-    """What one motor knows."""
+    """Command and time-out protection of one motor."""
 
     __slots__ = ("deadline", "silent", "tripped")
 
@@ -67,16 +67,16 @@ class _Motor:
 
 
 class Dex3Mcu:
-    """One Dex3-1, from its USB endpoints inwards.
+    """A Dex3-1 behind its USB endpoints.
 
-    :param mechanics: of the same side; its own by default.
-    :param clock: real time unless given; with a manual clock the hand is deterministic.
-    :param faults: to come, times counted from now. Those for the other side are left out.
-    :param seed: of the faults' chance.
+    :param mechanics: mechanics of the same side; a new one by default.
+    :param clock: real time by default; with a manual clock the hand is deterministic.
+    :param faults: planned faults, times counted from now. Those for the other side are ignored.
+    :param seed: seed of the faults' random numbers.
 
-    :ivar plugged: the USB cable is in. The motors' power is another cable.
-    :ivar late: seconds by which the last answer is to be held back.
-    :ivar on_stall: called with ``"in"`` or ``"out"`` when that endpoint shall halt.
+    :ivar plugged: whether the USB cable is plugged. The motors have a supply of their own.
+    :ivar late: seconds by which the last answer must be delayed.
+    :ivar on_stall: called with ``"in"`` or ``"out"`` when that endpoint must halt.
     """
 
     def __init__(
@@ -114,22 +114,22 @@ class Dex3Mcu:
     # --- time and faults
 
     def inject(self, fault: Fault) -> None:
-        """Have a fault, its time counted from now."""
+        """Add a fault, its time counted from now."""
         if fault.side in (None, self.side):
             self.schedule.add(fault, self._clock.now())
 
     @property
     def next_time(self) -> float | None:
-        """When a fault begins or ends next, or None."""
+        """Time at which a fault begins or ends next, or None."""
         return self.schedule.next_time
 
     @property
     def tripped(self) -> list[bool]:
-        """Which motors' time-out protection has tripped."""
+        """Whether each motor's time-out protection has tripped."""
         return [motor.tripped for motor in self._motors]
 
     def advance(self) -> None:
-        """Let the motors live, and faults strike, up to now."""
+        """Advance motors and faults to the present time."""
         now = self._clock.now()
         while self._now < now or self.schedule.next_time is not None:
             following = self.schedule.next_time
@@ -137,21 +137,21 @@ class Dex3Mcu:
             until = min(until, *(motor.deadline for motor in self._motors))
             if self._hot:
                 until = min(until, self._now + _HOT_SLICE)
-            self._live(max(until, self._now))
+            self._advance_motors(max(until, self._now))
             for index, motor in enumerate(self._motors):
                 if motor.deadline <= self._now:
                     self._trip(index)
             for fault, begins in self.schedule.poll(self._now):
-                self._strike(fault, begins)
+                self._apply_fault(fault, begins)
             for index, celsius in self._hot.items():
                 self.mechanics.heat(index, celsius)
             if until >= now:
                 return
 
-    def _live(self, until: float) -> None:
+    def _advance_motors(self, until: float) -> None:
         self._now = until
         due = int((until - self._origin) / STEP + 1e-6)
-        most = int(_MOST_CATCH_UP / STEP)
+        most = int(_MAX_CATCH_UP / STEP)
         if due - self._steps > most:
             self._steps = due - most
         if due > self._steps:
@@ -167,7 +167,7 @@ class Dex3Mcu:
         mode = JointMode.BRAKE if self.firmware.tripped_brakes else JointMode.FOC
         self.mechanics.command(index, mode)
 
-    def _strike(self, fault: Fault, begins: bool) -> None:
+    def _apply_fault(self, fault: Fault, begins: bool) -> None:
         kind = fault.kind
         if kind in ("stall", "stall-out"):
             self.on_stall("in" if kind == "stall" else "out")
@@ -204,15 +204,15 @@ class Dex3Mcu:
     # --- frames
 
     def exchange(self, data: bytes) -> bytes | None:
-        """Take what the host sent in one transfer; the answer, or None where it is silent.
+        """Process one OUT transfer; return the answer, or None without one.
 
-        :attr:`late` then says how long the answer is to be held back.
+        :attr:`late` is then the delay of the answer, seconds.
         """
         self.advance()
         self.counters.frames += 1
         answering: list[int] | None = None
         try:
-            answering = self._obey(data)
+            answering = self._apply_frame(data)
         except ChecksumError:
             self.counters.bad_crc += 1
         except WireError:
@@ -223,10 +223,10 @@ class Dex3Mcu:
             answering = list(range(len(self._motors)))
         return self._send(self.state(answering))
 
-    def _obey(self, data: bytes) -> list[int]:
-        """Hand each motor its packet; the motors that answer.
+    def _apply_frame(self, data: bytes) -> list[int]:
+        """Pass each motor its packet; return the indices of the motors that answer.
 
-        :raises WireError: the frame is not one.
+        :raises WireError: it is not a valid frame.
         """
         silent: set[int] = set()
         commands = self._reader.read(data)
@@ -235,7 +235,7 @@ class Dex3Mcu:
             self.counters.damaged_packets += len(decoded.problems)
             silent = set(np.flatnonzero(decoded.silent).tolist())
             self.counters.broadcasts += bool(silent)
-            commands = _present(decoded)
+            commands = _commands_present(decoded)
         for command in commands:
             if not self._motors[command[0]].silent:
                 self._command(*command)
@@ -257,7 +257,7 @@ class Dex3Mcu:
             motor.tripped = False
             motor.deadline = math.inf
         elif motor.tripped:
-            # stays stopped until the host has taken note, which it says with bit 7 = 0
+            # stays stopped until the host acknowledges the trip with bit 7 = 0
             self.counters.ignored_packets += 1
             return
         else:
@@ -265,9 +265,9 @@ class Dex3Mcu:
         self.mechanics.command(index, status if known else JointMode.BRAKE, *setpoint)
 
     def state(self, motors: Sequence[int] | None = None) -> bytes:
-        """A state frame of now.
+        """Encode a state frame with the present state.
 
-        :param motors: that answer; all by default. One that is silent is left out in any case.
+        :param motors: indices of motors that answer; all by default. Silent ones are left out.
         """
         which = range(len(self._motors)) if motors is None else motors
         heard = [index for index in which if not self._motors[index].silent]
@@ -292,7 +292,7 @@ class Dex3Mcu:
         return answer
 
 
-def _present(decoded: DecodedCommand) -> list[MotorCommand]:
+def _commands_present(decoded: DecodedCommand) -> list[MotorCommand]:
     command = decoded.command
     assert command.timeout is not None
     return [

@@ -1,22 +1,22 @@
-"""USB/IP over TCP in one thread: devices that are listed, imported, cut off and put back.
+"""USB/IP server over TCP in one thread, whose devices can be listed, imported and unplugged.
 
-Descriptors, control requests, endpoint halts, parked IN transfers and the bytes of the protocol
-are the ``usbip`` package's. Its own listener is as fast, but never closes a connection that it
-has accepted, so nothing can be unplugged; it cannot say which free port it took; and its devices
-only live while a client talks to them.
+The ``usbip`` package provides descriptors, control requests, endpoint halts, parked IN transfers
+and the bytes of the protocol. Its own listener is not used: it never closes an accepted connection,
+so nothing can be unplugged; it does not tell which free port it took; and its devices advance only
+while a client sends requests.
 
-One client at a time has a device, as on a real host: a second import is refused as busy.
+One client at a time can import a device, as on a real host: a second import is refused as busy.
 
-What a client can make this program hold is bounded:
+A client's use of memory and connections is bounded:
 
-* :data:`MOST_PARKED` transfers that wait for data; one more ends with -ENOMEM, as a host
+* :data:`MAX_PARKED` transfers that wait for data; one more ends with -ENOMEM, as a host
   controller's driver ends one for which its ring has no room (Linux ``xhci-ring.c``);
-* :data:`MOST_PAYLOAD` bytes of a transfer and :data:`MOST_UNREAD` of replies that it does not
-  read: beyond, it is cut off;
-* :data:`MOST_CONNECTIONS`: a further one takes the place of the oldest that has no device, and is
-  turned away if there is none;
-* :data:`GREETING` seconds to list or import, and :data:`DEAD` until a peer that has vanished from
-  the network is noticed; a client that has a device may be silent for as long as it likes.
+* :data:`MAX_PAYLOAD` bytes of a transfer and :data:`MAX_UNREAD` of replies that it does not
+  read: above that, its connection is closed;
+* :data:`MAX_CONNECTIONS`: a further one takes the place of the oldest that has no device, and is
+  refused if there is none;
+* :data:`IMPORT_TIMEOUT` seconds to list or import, and :data:`PEER_TIMEOUT` until a peer that has
+  vanished from the network is disconnected; a client with a device may be idle without limit.
 """
 
 from __future__ import annotations
@@ -43,31 +43,31 @@ from dexkit.escaping import one_line
 from dexkit.threads import Worker
 
 __all__ = [
-    "DEAD",
-    "GREETING",
-    "MOST_CONNECTIONS",
-    "MOST_PARKED",
-    "MOST_PAYLOAD",
-    "MOST_UNREAD",
+    "IMPORT_TIMEOUT",
+    "MAX_CONNECTIONS",
+    "MAX_PARKED",
+    "MAX_PAYLOAD",
+    "MAX_UNREAD",
+    "PEER_TIMEOUT",
     "Plug",
     "Server",
 ]
 
 log = logging.getLogger("dexkit.emulators")
 
-MOST_PARKED = 1024
+MAX_PARKED = 1024
 """IN transfers of one client that wait for data. A hand's driver has one; 256 fit into a segment of
 a Linux xHCI ring (TRBS_PER_SEGMENT)."""
-MOST_PAYLOAD = 1 << 20
+MAX_PAYLOAD = 1 << 20
 """Bytes of a transfer. A frame to a hand has 1234; usbfs of Linux has 16 MB for all programs."""
-MOST_UNREAD = 1 << 18
-"""Bytes of replies that a client may leave unread: some 200 answers of a hand."""
-MOST_CONNECTIONS = 32
-"""Clients at a time. Two can have a hand; the others list."""
-GREETING = 10.0
+MAX_UNREAD = 1 << 18
+"""Bytes of replies that a client may leave unread: about 200 answers of a hand."""
+MAX_CONNECTIONS = 32
+"""Clients at a time. Two can import a hand; the others list."""
+IMPORT_TIMEOUT = 10.0
 """Seconds from a connection to its import. A list and an import take milliseconds."""
-DEAD = 30
-"""Seconds after which a peer that no longer acknowledges anything is dropped."""
+PEER_TIMEOUT = 30
+"""Seconds after which a peer that no longer acknowledges TCP data is disconnected."""
 
 _REQUEST = 8  # bytes: version, code, status
 _BUSID = 32
@@ -76,8 +76,8 @@ _FIELDS = struct.Struct(">I8xI8xI")  # of a command: its code, direction, length
 _ST_DEV_BUSY = 2  # of the kernel's usbip_common.h
 _RETURN = struct.Struct(">IIIIIi24x")
 _SET_CONFIGURATION = b"\x00\x09"
-_DEAF = 0.1  # seconds without accepting, where the system has no more file descriptors
-_UNLINKED = -errno.ECONNRESET  # what vhci expects of a transfer that was called back
+_ACCEPT_PAUSE = 0.1  # seconds without accepting after the system ran out of file descriptors
+_UNLINKED = -errno.ECONNRESET  # status of an unlinked transfer that Linux' vhci expects
 _TICK = 4e-3
 _SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
 
@@ -92,15 +92,15 @@ class Plug(Protocol):
 
     @property
     def plugged(self) -> bool:
-        """Whether the cable is in."""
+        """Whether the cable is plugged."""
         ...
 
     def advance(self) -> float | None:
-        """Live up to now; say when something is due next, or None."""
+        """Advance to the present time; return the time of the next event, or None."""
         ...
 
     def attached(self) -> None:
-        """A client has imported it: nothing of an earlier one may be left."""
+        """Called when a client imports the device: discard transfers of earlier clients."""
         ...
 
 
@@ -117,8 +117,8 @@ class Server:
 
     :ivar port: the port taken.
     :ivar error: what ended the thread, or None.
-    :ivar failure: the first exception on a message of a client, a mistake in the emulator, if any;
-        that client was cut off.
+    :ivar failure: the first exception while serving a client's message (a defect of the emulator),
+        or None; that client was disconnected.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class Server:
         self.host = host
         self.error: BaseException | None = None
         self.failure: Exception | None = None
-        self._deaf_until = 0.0
+        self._accept_paused_until = 0.0
         self._clock: Clock = clock or RealClock()
         self._plugs = list(plugs)
         for index, plug in enumerate(self._plugs):
@@ -154,30 +154,30 @@ class Server:
 
     @property
     def url(self) -> str:
-        """What a client opens."""
+        """URL for clients."""
         return f"usbip://{self.host}:{self.port}"
 
     # --- running
 
     def start(self) -> None:
         """Serve in a background thread."""
-        self._thread = Worker("USB/IP", self.run, failed=self._died)
+        self._thread = Worker("USB/IP", self.run, failed=self._record_error)
         self._thread.start()
 
-    def _died(self, error: Exception) -> None:
+    def _record_error(self, error: Exception) -> None:
         self.error = error
 
     def stop(self) -> None:
         """Ask :meth:`run` to return; from any thread or a signal handler."""
         self._stopping = True
-        self._wake()
+        self._wake_server()
 
     def call(self, function: Callable[[], None]) -> None:
-        """Have ``function`` called by the serving thread, soon."""
+        """Have the serving thread call ``function`` soon."""
         self._calls.append(function)  # atomic, as is the pop
-        self._wake()
+        self._wake_server()
 
-    def _wake(self) -> None:
+    def _wake_server(self) -> None:
         with contextlib.suppress(OSError):
             self._wake_in.send(b"x")
 
@@ -197,19 +197,19 @@ class Server:
                     self._drop(connection)
                 else:
                     self._flush(connection)
-            self._look_after(time.monotonic())
+            self._close_idle_connections(time.monotonic())
             self._wait(clock, due)
 
-    def _look_after(self, now: float) -> None:
-        """Drop who does not come to the point; listen again after a pause."""
+    def _close_idle_connections(self, now: float) -> None:
+        """Close connections that import nothing in time; accept again after a pause."""
         for connection in [c for c in self._connections.values() if c.until < now]:
             self._drop(connection)
-        if self._deaf_until and now >= self._deaf_until:
-            self._deaf_until = 0.0
+        if self._accept_paused_until and now >= self._accept_paused_until:
+            self._accept_paused_until = 0.0
             self._poll.modify(self._listener, select.EPOLLIN)
 
     def _wait(self, clock: Clock, due: float | None) -> None:
-        """Serve what comes within a tick, or until ``due`` if that is sooner."""
+        """Serve requests for one tick, or until ``due`` if that is sooner."""
         pause = _TICK
         if due is not None:
             pause = min(pause, due - clock.now())
@@ -233,22 +233,22 @@ class Server:
     # --- connections
 
     def _accept(self) -> None:
-        for _ in range(MOST_CONNECTIONS):
+        for _ in range(MAX_CONNECTIONS):
             if not self._accept_one():
                 return
 
     def _accept_one(self) -> bool:
-        """Whether there may be another one."""
+        """Accept one connection; return whether another may wait."""
         try:
             sock, _ = self._listener.accept()
         except OSError as error:
             if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
-                # it would be reported again and again: not to be a busy loop
-                self._deaf_until = time.monotonic() + _DEAF
+                # accepting would fail again at once: pause, to avoid a busy loop
+                self._accept_paused_until = time.monotonic() + _ACCEPT_PAUSE
                 self._poll.modify(self._listener, 0)
             return False
-        if len(self._connections) >= MOST_CONNECTIONS:
-            # the eldest first: dictionaries keep their order
+        if len(self._connections) >= MAX_CONNECTIONS:
+            # the oldest first: dictionaries keep their order
             idle = next((c for c in self._connections.values() if c.plug is None), None)
             if idle is None:
                 sock.close()
@@ -258,13 +258,13 @@ class Server:
         for level, option, value in (
             (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
             (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
-            (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, DEAD // 2),
-            (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, DEAD // 6),
+            (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, PEER_TIMEOUT // 2),
+            (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, PEER_TIMEOUT // 6),
             (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3),
-            (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, DEAD * 1000),
+            (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, PEER_TIMEOUT * 1000),
         ):
             sock.setsockopt(level, option, value)
-        self._connections[sock.fileno()] = _Connection(sock, time.monotonic() + GREETING)
+        self._connections[sock.fileno()] = _Connection(sock, time.monotonic() + IMPORT_TIMEOUT)
         self._poll.register(sock, select.EPOLLIN)
         return True
 
@@ -286,15 +286,15 @@ class Server:
         if not data:
             self._drop(connection)
             return
-        if connection.closing:  # it is only still there for what it has not read
+        if connection.closing:  # it stays open only until its client has read the replies
             return
         connection.inbox += data
         try:
             while connection.inbox and self._serve(connection):
                 pass
-        except (_Nonsense, struct.error):
+        except (_NotUsbIp, struct.error):
             connection.close_soon()
-        except Exception as error:  # one client must not end the others' service
+        except Exception as error:  # an error on one client's message must not stop the server
             if self.failure is None:
                 self.failure = error
                 log.error("the emulated device failed (said once)", exc_info=error)
@@ -312,7 +312,7 @@ class Server:
                 self._drop(connection)
                 return
             del outbox[:sent]
-            if len(outbox) > MOST_UNREAD:
+            if len(outbox) > MAX_UNREAD:
                 self._drop(connection)
                 return
         if connection.waiting != bool(outbox):
@@ -323,24 +323,24 @@ class Server:
             self._drop(connection)
 
     def _serve(self, connection: _Connection) -> bool:
-        """Serve one message if a whole one is there."""
+        """Serve one message if it is complete."""
         if connection.plug is None:
-            return self._greet(connection)
+            return self._serve_list_or_import(connection)
         inbox = connection.inbox
         if len(inbox) < _COMMAND:
             return False
         command, direction, length = _FIELDS.unpack_from(inbox)
         if command not in (protocol.CMD_SUBMIT, protocol.CMD_UNLINK):
-            raise _Nonsense
+            raise _NotUsbIp
         if command == protocol.CMD_SUBMIT:
-            if length > MOST_PAYLOAD or direction > 1:
-                raise _Nonsense
+            if length > MAX_PAYLOAD or direction > 1:
+                raise _NotUsbIp
             if direction == protocol.OUT and len(inbox) < _COMMAND + length:
                 return False
         urb = protocol.read_cmd(connection)
         device = connection.plug.device
         if urb.command == protocol.CMD_UNLINK:
-            # its flags field is the number of the transfer to call back
+            # its flags field is the number of the transfer to unlink
             late = connection.complete(urb.flags)
             if not late:
                 device.cancel_urb(urb.flags)
@@ -352,8 +352,8 @@ class Server:
     def _submit(self, connection: _Connection, device: USBDevice, urb: Any) -> None:
         parked = connection.parked
         if urb.seqnum in parked:  # whose answer would be whose?
-            raise _Nonsense
-        if urb.direction == protocol.IN and urb.ep and len(parked) >= MOST_PARKED:
+            raise _NotUsbIp
+        if urb.direction == protocol.IN and urb.ep and len(parked) >= MAX_PARKED:
             connection.fail(urb, -errno.ENOMEM)
             return
         if urb.ep == 0 and urb.setup[:2] == _SET_CONFIGURATION:
@@ -364,7 +364,7 @@ class Server:
         if device.handle_urb(urb, connection.respond) is not None:
             connection.respond(urb)
 
-    def _greet(self, connection: _Connection) -> bool:
+    def _serve_list_or_import(self, connection: _Connection) -> bool:
         """Serve a list or an import."""
         inbox = connection.inbox
         if len(inbox) < _REQUEST:
@@ -383,7 +383,7 @@ class Server:
                     connection.close_soon()
                     return False
         elif code != protocol.OP_REQ_DEVLIST:
-            raise _Nonsense
+            raise _NotUsbIp
         device = protocol.serve_handshake(connection, [plug.device for plug in present])
         connection.plug = next((p for p in present if p.device is device), None)
         if connection.plug is None:
@@ -424,15 +424,15 @@ class Server:
         self.close()
 
 
-class _Nonsense(Exception):
-    """A client that does not speak USB/IP."""
+class _NotUsbIp(Exception):
+    """The client does not follow the USB/IP protocol."""
 
 
 class _Connection:
-    """One client: what came and was not served yet, what shall go.
+    """One client's connection with its receive and send buffers.
 
-    ``recv`` and ``sendall`` make it the socket that the protocol's functions want, so that
-    header and data of a reply leave in one piece.
+    ``recv`` and ``sendall`` let the protocol's functions use it as a socket, so that header and
+    data of a reply are sent together.
     """
 
     def __init__(self, sock: socket.socket, until: float) -> None:
@@ -441,24 +441,24 @@ class _Connection:
         self.outbox = bytearray()
         self.plug: Plug | None = None
         self.parked: dict[int, Any] = {}  # transfers under way, by number
-        self.until = until  # when it is dropped unless it has come to the point
+        self.until = until  # when it is closed without an import
         self.closing = False
         self.waiting = False
 
     def close_soon(self) -> None:
-        """Close it when it has read what there is for it, or has had the time to."""
+        """Close it once its client has read the replies, or after a time-out."""
         self.closing = True
         self.inbox.clear()
-        self.until = time.monotonic() + GREETING
+        self.until = time.monotonic() + IMPORT_TIMEOUT
 
     @property
     def cut_off(self) -> bool:
-        """Its device has been unplugged."""
+        """Whether its device has been unplugged."""
         return self.plug is not None and not self.plug.plugged
 
     @property
     def wants_attention(self) -> bool:
-        """There is something to send, or it is cut off."""
+        """Whether there is something to send, or its device is unplugged."""
         return bool(self.outbox) or self.cut_off
 
     def recv(self, size: int) -> bytes:
@@ -470,7 +470,7 @@ class _Connection:
         self.outbox += data
 
     def complete(self, seqnum: int) -> bool:
-        """Take a transfer off the list; True if it was completed before."""
+        """Remove a transfer from the list; return True if it was completed before."""
         return self.parked.pop(seqnum, None) is None
 
     def respond(self, urb: Any) -> None:
@@ -492,12 +492,12 @@ class _Connection:
         self.outbox += _RETURN.pack(command, urb.seqnum, urb.devid, urb.direction, urb.ep, status)
 
 
-def _keep_networks_out(listener: socket.socket) -> None:
-    """With route_localnet set, the kernel takes packets for 127.0.0.1 from networks, too."""
+def _drop_remote_packets(listener: socket.socket) -> None:
+    """Drop packets from networks: with route_localnet the kernel accepts them for 127.0.0.1."""
     try:
         interface_filter.restrict(listener, "lo")
     except OSError as error:
-        # the address alone keeps them out unless the kernel was told otherwise
+        # without this option the loopback address keeps them out, unless route_localnet is set
         log.warning("packets from networks are not kept from 127.0.0.1: %s", error.strerror)
 
 
@@ -507,8 +507,8 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         listener.bind((host, port))
         if listener.getsockname()[0].startswith("127."):
-            _keep_networks_out(listener)
-        listener.listen(MOST_CONNECTIONS)
+            _drop_remote_packets(listener)
+        listener.listen(MAX_CONNECTIONS)
     except (OSError, TypeError, ValueError) as error:  # the latter two: no host has such a name
         listener.close()
         hint = "--host takes an address of this machine"

@@ -1,7 +1,7 @@
-"""A Dex3-1's USB side: descriptors, strings, two bulk endpoints.
+"""USB side of the emulated Dex3-1: descriptors, strings, two bulk endpoints.
 
-Numbers and strings are the manual's (docs/sources/unitree-dex.md#c1); those of the endpoints are in
-none of the sources that can be trusted, so they are options.
+Ids and strings are the manual's (docs/sources/unitree-dex.md#c1). No reliable source gives the
+endpoint addresses, so they are options.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SERIAL = {Side.LEFT: "2024061800", Side.RIGHT: "2024061801"}
 """The left one is the manual's example."""
 MAX_PACKET = 512
 """Bytes of a high-speed bulk packet."""
-_MOST_TRANSFER = 4096  # BUF_SIZE of the manual
-_MOST_HELD = 64  # answers that a fault delays; a host asks for one at a time
+_MAX_TRANSFER = 4096  # BUF_SIZE of the manual
+_MAX_HELD = 64  # answers that a fault delays; a host asks for one at a time
 _VENDOR_CLASS = 0xFF
 
 
@@ -80,11 +80,11 @@ class Dex3Usb:
 
     @property
     def plugged(self) -> bool:
-        """Whether the cable is in."""
+        """Whether the cable is plugged."""
         return self.mcu.plugged
 
     def advance(self) -> float | None:
-        """Live up to now; when something is due next, or None."""
+        """Advance to the present time; return the time of the next event, or None."""
         self.mcu.advance()
         if self._held:
             now = self._clock.now()
@@ -97,7 +97,7 @@ class Dex3Usb:
         return min(times, default=None)
 
     def attached(self) -> None:
-        """A bus reset: nothing of an earlier client is left, but what the motors do."""
+        """Reset the bus: discard transfers and answers; the motors keep their commands."""
         self._transfer.clear()
         self._held.clear()
         self.device.reset_io()
@@ -109,7 +109,7 @@ class Dex3Usb:
 
     def _received(self, endpoint: Any, data: bytes) -> None:
         transfer = self._transfer
-        if len(transfer) <= _MOST_TRANSFER:  # what is longer is no frame, however it goes on
+        if len(transfer) <= _MAX_TRANSFER:  # what is longer is no frame, however it goes on
             transfer += data
         if data and len(data) % MAX_PACKET == 0:
             return
@@ -124,7 +124,7 @@ class Dex3Usb:
             if self._held:
                 due = max(due, self._held[-1][0])  # answers do not overtake each other
             self._held.append((due, answer))
-            if len(self._held) > _MOST_HELD:
+            if len(self._held) > _MAX_HELD:
                 self._held.popleft()
                 self.mcu.counters.unread += 1
         else:
@@ -135,9 +135,9 @@ class Dex3Usb:
         self._in.write(answer)
 
     def _make_room(self) -> None:
-        """Throw away the oldest answers beyond the queue, if nobody waits for one."""
+        """Discard the oldest answers beyond the queue's size, if no transfer waits for one."""
         kept = []
-        while (chunk := self._in.take_or_park(0, _nobody, _PROBE)) is not None:
+        while (chunk := self._in.take_or_park(0, _reject_probe_data, _PROBE)) is not None:
             kept.append(chunk)
         self._in.cancel(_PROBE)
         room = self.mcu.firmware.queue - 1
@@ -149,5 +149,5 @@ class Dex3Usb:
 _PROBE = -1  # no transfer has this number
 
 
-def _nobody(data: bytes, status: int = 0) -> None:
+def _reject_probe_data(data: bytes, status: int = 0) -> None:
     raise AssertionError("the probe of the queue was answered")

@@ -77,10 +77,10 @@ class Bus(SerialLine):
         if not events:
             return
         if any(fault.kind == "unplug" for fault, _ in events):
-            self._plug()
+            self._apply_plug()
             self._parser.reset()
         for motor in self.motors:
-            motor.suffer(self.schedule.active)
+            motor.apply_faults(self.schedule.active)
 
     @property
     def busy(self) -> bool:
@@ -114,7 +114,7 @@ class Bus(SerialLine):
             try:
                 self._dispatch(frame, hearing, arrival)
             except Exception as error:  # one frame must not end the others' service
-                self._failed(error, frame)
+                self._record_failure(error, frame)
         counters.crc_errors, counters.skipped = self._parser.crc_errors, self._parser.skipped
 
     def _dispatch(self, command: MotorCmd, hearing: Sequence[Motor], at: float) -> None:

@@ -1,7 +1,7 @@
-"""One M4010 with the gripper on its shaft, sans-IO: a command in, its data out.
+"""Emulate one M4010 with the gripper on its shaft, without I/O: a command in, a data frame out.
 
-It keeps its last command until the next one, and watches over its own time-out protection: a cable
-that is pulled does not stop it, the protection does.
+It keeps its last command until the next one and runs its own time-out protection: a pulled cable
+does not stop it, the protection does.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from dexkit.wire.m4010 import (
 __all__ = ["LOCKING", "Motor"]
 
 LOCKING = 1.0
-"""Self-locking: jaws that hold something go on holding it without the motor."""
-_MOST_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
+"""Self-locking: the jaws hold an object without motor torque."""
+_MAX_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
 _HEAT_STEPS = 20  # heat is stepped once in so many steps
 _OVERHEATED = MotorError.WINDING_OVERTEMPERATURE | MotorError.CASE_TEMPERATURE
 
@@ -75,7 +75,7 @@ class Motor:
         self._own_errors = MotorError.NONE
         self._faults = MotorError.NONE
         self._deadline = math.inf  # when the protection trips
-        self._steps = FixedSteps(STEP, most=_MOST_CATCH_UP)
+        self._steps = FixedSteps(STEP, most=_MAX_CATCH_UP)
         self._steps.restart(now)
         self._to_heat = _HEAT_STEPS
         self._now = now
@@ -99,9 +99,9 @@ class Motor:
     # --- time and faults
 
     def advance_to(self, now: float) -> None:
-        """Live up to ``now``."""
+        """Advance to ``now``."""
         if self._deadline <= now:
-            self._live(max(self._deadline, self._now))
+            self._step_mechanics(max(self._deadline, self._now))
             self._deadline = math.inf
             self.tripped = True
             self.trips += 1
@@ -109,9 +109,9 @@ class Motor:
                 self.mechanics.brake()
             else:
                 self.mechanics.drive(0.0, 0.0, 0.0, 0.0, 0.0)
-        self._live(now)
+        self._step_mechanics(now)
 
-    def _live(self, now: float) -> None:
+    def _step_mechanics(self, now: float) -> None:
         self._now = max(self._now, now)
         left = self._steps.due(now)
         while left:
@@ -121,9 +121,9 @@ class Motor:
             self._to_heat -= part
             if not self._to_heat:
                 self._to_heat = _HEAT_STEPS
-                self._warm(_HEAT_STEPS * STEP)
+                self._step_heat(_HEAT_STEPS * STEP)
 
-    def _warm(self, dt: float) -> None:
+    def _step_heat(self, dt: float) -> None:
         heat = self.heat
         to_case = (self.winding - self.case) / heat.winding_to_case
         to_air = (self.case - heat.ambient) / heat.case_to_air
@@ -132,10 +132,10 @@ class Motor:
         self.case += dt * (to_case - to_air) / heat.case_capacity
         if self._held_hot is not None:
             self.winding = self._held_hot
-        self._examine()
+        self._check_limits()
 
-    def _examine(self) -> None:
-        """Errors that the motor finds by itself; it brakes on any."""
+    def _check_limits(self) -> None:
+        """Set the errors that the motor detects itself; it brakes on any."""
         heat = self.heat
         errors = self._own_errors & ~_OVERHEATED & ~MotorError.UNDERVOLTAGE
         for bit, value, limit in (
@@ -154,8 +154,8 @@ class Motor:
         if (self._own_errors | self._faults) and self.mechanics.mode is not JointMode.BRAKE:
             self.mechanics.brake()
 
-    def suffer(self, faults: Iterable[Fault]) -> None:
-        """The faults that are on now, for this motor or for all."""
+    def apply_faults(self, faults: Iterable[Fault]) -> None:
+        """Apply the active faults for this motor or for all."""
         mine = [fault for fault in faults if fault.device in (None, self.number)]
         kinds = {fault.kind: fault for fault in mine}
         self.silent = "silent" in kinds
@@ -171,7 +171,7 @@ class Motor:
             self._faults |= MotorError.OVERCURRENT
         if "encoder" in kinds:
             self._faults |= MotorError.OUTPUT_ENCODER
-        self._examine()
+        self._check_limits()
 
     # --- the line
 
@@ -186,11 +186,11 @@ class Motor:
         if calibration is not None:
             answer = self._calibrate(calibration)
         else:
-            self._obey(command)
+            self._apply_command(command)
             answer = self.data()
         return None if command.id == BROADCAST_ID else answer
 
-    def _obey(self, command: MotorCmd) -> None:
+    def _apply_command(self, command: MotorCmd) -> None:
         known = command.status in (Status.BRAKE, Status.FOC)
         if not known and not self.firmware.other_status_brakes:
             self.ignored += 1
@@ -199,7 +199,7 @@ class Motor:
             self.tripped = False
             self._deadline = math.inf
         elif self.tripped:
-            # stays stopped until the host has taken note, which it says with the bit at 0
+            # stays stopped until the host acknowledges the trip with the time-out bit at 0
             self.ignored += 1
             return
         else:

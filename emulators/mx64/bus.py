@@ -92,7 +92,7 @@ class Bus(SerialLine):
     def advance_to(self, now: float) -> None:
         """Let faults strike and servos live up to ``now``."""
         for fault, begins in self.schedule.poll(now):
-            self._strike(fault, begins)
+            self._apply_fault(fault, begins)
         for servo in self.servos:
             servo.advance_to(now)
 
@@ -101,9 +101,9 @@ class Bus(SerialLine):
         """Whether a servo moves or holds, so that time should be let pass often."""
         return any(not servo.drive.resting for servo in self.servos)
 
-    def _strike(self, fault: Fault, begins: bool) -> None:
+    def _apply_fault(self, fault: Fault, begins: bool) -> None:
         if fault.kind == "unplug":
-            self._plug()
+            self._apply_plug()
             self._parser.reset()
             return
         for servo in self.servos:
@@ -157,7 +157,7 @@ class Bus(SerialLine):
             try:
                 self._dispatch(packet, hearing, arrival)
             except Exception as error:  # one packet must not end the others' service
-                self._failed(error, packet)
+                self._record_failure(error, packet)
         self.counters.crc_errors = self._parser.crc_errors
         self.counters.skipped = self._parser.skipped
 

@@ -36,7 +36,7 @@ _ACCELERATION_TICKS = mx64.ACCELERATION_UNIT / mx64.TICK  # ticks/s² of one acc
 
 @dataclass
 class Demand:
-    """What the registers ask of the drive, refreshed when they change; register units."""
+    """Setpoints and gains from the registers, updated when they change; register units."""
 
     torque: bool = False
     mode: int = int(OperatingMode.POSITION)
@@ -177,8 +177,8 @@ class Drive:
         self.duty = 0.0
         self.supply = physics.supply_voltage
         self.voltage = physics.supply_voltage
-        # it has been standing switched on: at the temperature of its own electronics
-        self.temperature = physics.ambient + self._rise(physics.idle_power)
+        # initial temperature: heated by its own electronics
+        self.temperature = physics.ambient + self._temperature_rise(physics.idle_power)
         self._integral = 0.0
         self._last_error = 0.0
         self._ramped = 0.0  # velocity trajectory of mode 1, ticks/s
@@ -190,7 +190,7 @@ class Drive:
 
     # --- encoder
 
-    def _rise(self, power: float) -> float:
+    def _temperature_rise(self, power: float) -> float:
         return power * self.physics.cooling_time / self.physics.heat_capacity
 
     @property
@@ -322,13 +322,13 @@ class Drive:
             self._still = self._still + 1 if still else 0
         self._phase += 1
         if self._phase >= SLOW:
-            self._slow(self._phase * PERIOD)
+            self._step_slowly(self._phase * PERIOD)
 
     def rest(self, periods: int) -> None:
         """Let time pass for a drive that is :attr:`resting`."""
-        self._slow((self._phase + periods) * PERIOD)
+        self._step_slowly((self._phase + periods) * PERIOD)
 
-    def _slow(self, dt: float) -> None:
+    def _step_slowly(self, dt: float) -> None:
         p = self.physics
         self._phase = 0
         power = p.idle_power + (p.drive_power if self.demand.torque else 0.0)

@@ -1,8 +1,7 @@
-"""Messages as the C structs that Unitree's SDK makes of them, in the eyes of numpy.
+"""Map low-level messages to the C structs of Unitree's SDK as numpy arrays.
 
-So all motors of a message are read and written at once, without one Python object for each of
-them, 500 times a second; and it is the C struct that the CRC is over
-(docs/sources/unitree-dex.md#a7).
+All motors of a message are read and written at once, without a Python object for each, 500 times a
+second. The CRC is computed over the C struct (docs/sources/unitree-dex.md#a7).
 """
 
 from __future__ import annotations

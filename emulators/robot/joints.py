@@ -1,4 +1,4 @@
-"""All joints of a robot, moved at once.
+"""Simulate all joints of a robot as numpy arrays.
 
 A robot has up to 29 joints and lives 500 steps a second, so they are numpy arrays here, where
 :class:`~dexkit.emulators.joint_mechanics.Joint` is one joint with a richer mechanism. Each is an
@@ -87,13 +87,13 @@ class Joints:
         """
         damping = law.kd + law.kp * STEP
         push = law.bias - law.kp * self.q
-        dq = self._after(push, self._drag + self._rate * damping)
+        dq = self._speed_after_step(push, self._drag + self._rate * damping)
         tau = push - damping * dq
         most = self.tau_max
         if (np.abs(tau) > most).any():
             clipped = np.minimum(np.maximum(tau, -most), most)
             # as much as it can, whatever the speed: nothing of its damping is left
-            dq = np.where(tau == clipped, dq, self._after(clipped, self._drag))
+            dq = np.where(tau == clipped, dq, self._speed_after_step(clipped, self._drag))
             tau = clipped
         fast = np.abs(dq) > self.dq_max
         if fast.any():
@@ -111,7 +111,7 @@ class Joints:
         self.ddq = (dq - self.dq) / STEP
         self.q, self.dq, self.tau = stopped, dq, tau
 
-    def _after(self, push: Array, drag: Array) -> Array:
+    def _speed_after_step(self, push: Array, drag: Array) -> Array:
         """Speed after a step under ``push``; Coulomb friction can stop a joint, not turn it."""
         free = self.dq + self._rate * push
         speed: Array = np.copysign(np.maximum(np.abs(free) - self._stick, 0.0), free) / drag + 0.0

@@ -1,7 +1,7 @@
-"""A robot: commands in, states out, as samples on an injected clock.
+"""Emulate an H1 or G1: obey command samples and produce state samples.
 
-No thread, no DDS: :class:`RobotMechanics` is told the time and given bytes.
-:mod:`dexkit.emulators.robot.run` puts it on the topics.
+No thread, clock or DDS: the caller of :class:`RobotMechanics` passes the time and the samples.
+:mod:`dexkit.emulators.robot.run` connects it to the topics.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Counters:
 
 
 @dataclass(frozen=True)
-class _Order:
+class _ActiveCommand:
     """A command in force."""
 
     law: Law
@@ -129,8 +129,8 @@ class RobotMechanics:
         self._arm = np.isin(self._used, model.arm_slots)
         self._damping = Law.damping(np.array([model.client_gains[slot][1] for slot in model.used]))
         self._law = self._damping
-        self._order: _Order | None = None
-        self._arm_order: _Order | None = None
+        self._active_command: _ActiveCommand | None = None
+        self._active_arm_command: _ActiveCommand | None = None
         self._lost = False
         self._mode_pr = 0
         self._random = np.random.default_rng(settings.seed)
@@ -146,7 +146,7 @@ class RobotMechanics:
     @property
     def driven(self) -> bool:
         """Whether commands are in force; otherwise it damps."""
-        return self._order is not None or self._arm_order is not None
+        return self._active_command is not None or self._active_arm_command is not None
 
     def position(self, slot: int) -> float:
         """Where a joint is, rad."""
@@ -155,22 +155,22 @@ class RobotMechanics:
     # commands
 
     def command(self, data: bytes, now: float) -> bool:
-        """Take a sample of the command topic; whether it is obeyed."""
+        """Process a sample of the command topic; return whether it is obeyed."""
         topic = self.model.cmd_topic
         if not self._read(data, topic):
             return False
-        numbers = self._numbers(topic)
-        if numbers is None or not self._is_ours(topic):
+        numbers = self._read_setpoints(topic)
+        if numbers is None or not self._check_header(topic):
             return False
-        mode = self._known_modes(topic)
-        self._order = _Order(_law(numbers, mode != 0), mode, now)
+        mode = self._accepted_modes(topic)
+        self._active_command = _ActiveCommand(_law(numbers, mode != 0), mode, now)
         self._lost = False
         self.counters.commands += 1
-        self._settle()
+        self._update_law()
         return True
 
     def arm_command(self, data: bytes, now: float) -> bool:
-        """Take a sample of the arm topic; whether it is obeyed.
+        """Process a sample of the arm topic; return whether it is obeyed.
 
         Unitree's arm examples set neither CRC nor mode bytes (unitree_sdk2
         ``g1_arm7_sdk_dds_example.cpp``), so a CRC of 0 counts as none, and all modes as on.
@@ -178,15 +178,15 @@ class RobotMechanics:
         topic = self.model.arm_topic
         if not self._read(data, topic, crc_may_be_unset=True):
             return False
-        numbers = self._numbers(topic)
+        numbers = self._read_setpoints(topic)
         weight = float(self._orders[self.model.weight_slot, 0])
         if numbers is None or not self._finite(weight, topic):
             return False
         weight = min(max(weight, 0.0), 1.0)
         mode = self._enable * (self._arm & (weight > 0))
-        self._arm_order = _Order(_law(numbers, self._arm), mode, now, weight)
+        self._active_arm_command = _ActiveCommand(_law(numbers, self._arm), mode, now, weight)
         self.counters.arm_commands += 1
-        self._settle()
+        self._update_law()
         return True
 
     def _read(self, data: bytes, topic: str, *, crc_may_be_unset: bool = False) -> bool:
@@ -208,8 +208,8 @@ class RobotMechanics:
         )
         return False
 
-    def _is_ours(self, topic: str) -> bool:
-        """Look at what stands before the motors; whether the command is for this robot."""
+    def _check_header(self, topic: str) -> bool:
+        """Check head, level_flag, mode_machine and mode_pr; return whether to obey the command."""
         message, machine = self._cmd.message, self.model.mode_machine
         if machine is None:
             if (message["head"][0].tolist(), message["level_flag"][0]) != _LOW_LEVEL:
@@ -234,7 +234,7 @@ class RobotMechanics:
             )
         return True
 
-    def _numbers(self, topic: str) -> Array | None:
+    def _read_setpoints(self, topic: str) -> Array | None:
         """q, dq, tau, kp, kd of the used motors, shape (5, n); None if one is no number."""
         with np.errstate(invalid="ignore"):  # what is not finite is found below, and said
             numbers: Array = self._orders[self._used].astype(np.float64).T
@@ -249,7 +249,7 @@ class RobotMechanics:
         self._report_once("number", f"{topic}: NaN or infinity; such commands are ignored")
         return False
 
-    def _known_modes(self, topic: str) -> NDArray[np.uint8]:
+    def _accepted_modes(self, topic: str) -> NDArray[np.uint8]:
         """The mode bytes of the used motors, 0 in the place of those that a motor does not know."""
         mode: NDArray[np.uint8] = self._cmd.message["motor_cmd"][0]["mode"][self._used]
         known: NDArray[np.bool_] = mode == self._enable
@@ -267,11 +267,14 @@ class RobotMechanics:
         mode = np.where(known, mode, self._all_off)
         return mode
 
-    def _settle(self) -> None:
-        """Find the law of the motors from the commands in force."""
-        law = self._order.law if self._order is not None else self._damping
-        if self._arm_order is not None:
-            law = law.blend(self._arm_order.law, np.where(self._arm, self._arm_order.weight, 0.0))
+    def _update_law(self) -> None:
+        """Compute the motors' control law from the active commands."""
+        law = self._active_command.law if self._active_command is not None else self._damping
+        if self._active_arm_command is not None:
+            law = law.blend(
+                self._active_arm_command.law,
+                np.where(self._arm, self._active_arm_command.weight, 0.0),
+            )
         self._law = law
 
     def _report_once(self, kind: str, text: str) -> None:
@@ -282,8 +285,8 @@ class RobotMechanics:
     # time
 
     def advance(self, now: float) -> None:
-        """Live until ``now``; after a pause of more than 0.1 s, only its last 0.1 s."""
-        for order in (self._order, self._arm_order):
+        """Advance to ``now``; after a pause of more than 0.1 s, by its last 0.1 s only."""
+        for order in (self._active_command, self._active_arm_command):
             if order is not None and now - order.since > self.timeout:
                 self.counters.timeouts += 1
                 topic = self._expire(order)
@@ -297,9 +300,9 @@ class RobotMechanics:
                 self._show_supply()
 
     def paused(self) -> None:
-        """The program stood still until now: no command from before counts any more."""
+        """Drop all commands: the program was paused, so they are stale."""
         self.counters.pauses += 1
-        for order in (self._order, self._arm_order):
+        for order in (self._active_command, self._active_arm_command):
             if order is not None:
                 self._expire(order)
         self._report_once(
@@ -308,16 +311,16 @@ class RobotMechanics:
             "motors damp until a command comes that was sent later",
         )
 
-    def _expire(self, order: _Order) -> str:
-        """A command counts no more; the topic that it came on."""
-        if order is self._order:
-            self._order = None
+    def _expire(self, order: _ActiveCommand) -> str:
+        """Drop a command; return the topic that it came on."""
+        if order is self._active_command:
+            self._active_command = None
             self._lost = True
             topic = self.model.cmd_topic
         else:
-            self._arm_order = None
+            self._active_arm_command = None
             topic = self.model.arm_topic
-        self._settle()
+        self._update_law()
         return topic
 
     # states
@@ -360,9 +363,9 @@ class RobotMechanics:
         """The state as it is, as a sample with its CRC."""
         message, joints, used = self._state.message, self.joints, self._used
         motors = message["motor_state"][0]
-        mode = self._order.mode if self._order is not None else self._all_off
-        if self._arm_order is not None:
-            mode = np.where(self._arm_order.mode, self._arm_order.mode, mode)
+        mode = self._active_command.mode if self._active_command is not None else self._all_off
+        if self._active_arm_command is not None:
+            mode = np.where(self._active_arm_command.mode, self._active_arm_command.mode, mode)
         motors["mode"][used] = mode
         motion = np.array((joints.q, joints.dq, joints.ddq, joints.tau)).T
         self._motion[used] = motion
@@ -373,7 +376,7 @@ class RobotMechanics:
             error = MotorError.MOTOR_SAW_HOST_TIMEOUT if self._lost else MotorError.NONE
             motors["motorstate"][used] = int(error)
         if self.settings.noise:
-            self._shake(message["imu_state"][0])
+            self._add_imu_noise(message["imu_state"][0])
         message["tick"] = int((now - self._start) * 1000.0) & 0xFFFFFFFF
         message["wireless_remote"] = np.frombuffer(self._remote_bytes(), np.uint8)
         self.counters.states += 1
@@ -384,7 +387,7 @@ class RobotMechanics:
         sticks = {name: self.remote.sticks.get(name, 0.0) for name in Remote.STICKS}
         return WirelessController_(**sticks, keys=self.remote.bits)
 
-    def _shake(self, imu: Any) -> None:
+    def _add_imu_noise(self, imu: Any) -> None:
         noise = self.settings.noise * self._random.standard_normal((2, 3))
         imu["gyroscope"] = _GYRO_NOISE * noise[0]
         imu["accelerometer"] = _ACCELEROMETER_NOISE * noise[1] + (0.0, 0.0, _GRAVITY)

@@ -28,7 +28,7 @@ __all__ = ["EmulatedRobot", "run_robot"]
 log = logging.getLogger("dexkit.robot")
 
 _DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
-_WATCH = 0.2  # seconds between looks whether it still lives
+_LIVENESS_PERIOD = 0.2  # seconds between looks whether it still lives
 
 
 class EmulatedRobot:
@@ -125,7 +125,7 @@ class EmulatedRobot:
         try:
             model = self.model
             sole = self._sole = SolePublisher(
-                [NodeTopics(node, {model.state_topic}, self._counts)],
+                [NodeTopics(node, {model.state_topic}, self._is_same_type)],
                 hint="stop the other robot, choose another --domain, or add --force",
                 force=self._force,
             )
@@ -179,7 +179,7 @@ class EmulatedRobot:
             hint="stop the other robot, choose another --domain, or add --force",
         )
 
-    def _counts(self, endpoint: Endpoint) -> bool:
+    def _is_same_type(self, endpoint: Endpoint) -> bool:
         """A writer of another type is another robot's; its states cannot arrive."""
         return self._heard or endpoint.type_name != self.model.state_type
 
@@ -189,7 +189,7 @@ class EmulatedRobot:
         try:
             if self._sole is not None:
                 self._sole.poll()
-            self._live(missed)
+            self._advance_robot(missed)
         except TopicConflict as error:
             self._failure = error
             log.error("%s; this %s ends", error, self.model.name)
@@ -197,7 +197,7 @@ class EmulatedRobot:
             self._failure = error
             log.error("the %s died: %s: %s", self.model.name, type(error).__name__, error)
 
-    def _live(self, missed: int) -> None:
+    def _advance_robot(self, missed: int) -> None:
         robot, now = self.robot, self._clock.now()
         assert self._writer is not None
         assert self._remote is not None
@@ -245,7 +245,7 @@ def run_robot(
     ) as robot:
         if ready is not None:
             ready.set()
-        while not stop.wait(_WATCH):
+        while not stop.wait(_LIVENESS_PERIOD):
             if isinstance(robot.failure, TopicConflict):
                 raise robot.failure
             if robot.failure is not None:

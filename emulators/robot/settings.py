@@ -1,4 +1,4 @@
-"""What an emulated robot is made of, and what it forgives. Invented unless a source is named."""
+"""Settings of an emulated robot. Values are assumed unless a source is named."""
 
 from __future__ import annotations
 

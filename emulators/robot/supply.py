@@ -1,4 +1,4 @@
-"""What the work of the motors does to temperatures and the battery, ten times a second."""
+"""Simulate motor temperatures and the battery from the motors' torques, ten times a second."""
 
 from __future__ import annotations
 

@@ -1,12 +1,11 @@
-"""A hand's commands and states straight to frames and back: SI units, joint order, fast.
+"""Encode commands and decode states of a whole Dex3-1: SI units, joint order, fast.
 
-:class:`HandCodec` is what a driver and an emulated device use; :mod:`.packets` is the same wire
-with every field in the open.
+The driver and the emulated device use :class:`HandCodec`; :mod:`.packets` has the same frames with
+every field as a raw integer.
 
-How it is fast: a state frame's packets lie where they lay in the frame before, so one gather by a
-prepared index brings all fields, and all bytes under the packets' CRCs with their words turned
-round, into one buffer with prepared views. Whatever is different (sizes, heads, ids, a CRC) goes
-through the general scan.
+For speed, decoding expects the packets at the offsets of the last frame. One gather with a prepared
+index copies all fields, and the byte-swapped words under the packets' CRCs, into one buffer with
+prepared views. A frame that differs (sizes, heads, ids, a CRC) goes through the general scan.
 """
 
 from __future__ import annotations
@@ -108,7 +107,7 @@ DEFAULT_BUS_MAP = BusMap(
 
 @dataclass(frozen=True, eq=False)
 class DecodedCommand:
-    """What a command frame asks of a hand, joint side.
+    """A decoded command frame, in SI units at the joints.
 
     :param command: ``timeout`` holds each motor's bit 7. NaN, and mode 0, where ``present`` is
         False.
@@ -335,10 +334,10 @@ class HandCodec:
                 model=model,
                 timeout=timeout,
                 fans=fans,
-                pin_v=_known(units.VOLTAGE, supply.power_v),
-                vin_v=_known(units.VOLTAGE, supply.system_v),
-                vm_v=_known(units.VOLTAGE, supply.device_v),
-                pin_a=_known(units.CURRENT, supply.power_a),
+                pin_v=_encode_or_zero(units.VOLTAGE, supply.power_v),
+                vin_v=_encode_or_zero(units.VOLTAGE, supply.system_v),
+                vm_v=_encode_or_zero(units.VOLTAGE, supply.device_v),
+                pin_a=_encode_or_zero(units.CURRENT, supply.power_a),
                 imu=imu,
                 error=state.error,
             )
@@ -364,7 +363,7 @@ class HandCodec:
         )
 
 
-def _known(scale: units.Scale, value: float) -> int:
+def _encode_or_zero(scale: units.Scale, value: float) -> int:
     return 0 if math.isnan(value) else scale.encode(value)
 
 
@@ -667,7 +666,7 @@ class _StatePlan:
             "system_v": vin_v * _VOLT,
             "device_v": vm_v * _VOLT,
         }
-        return _made(
+        return _build_frozen(
             HandState,
             {
                 "q": q,
@@ -681,8 +680,8 @@ class _StatePlan:
                 "stamp": stamp,
                 "measured": True,
                 "pressure": pressure,
-                "imu": _made(ImuState, imu),
-                "supply": _made(SupplyState, supply),
+                "imu": _build_frozen(ImuState, imu),
+                "supply": _build_frozen(SupplyState, supply),
                 "winding_temperature": winding,
                 "sensor_temperature": heat,
                 "sensor_lost": sensor_lost,
@@ -694,7 +693,7 @@ class _StatePlan:
 _T = TypeVar("_T")
 
 
-def _made(cls: type[_T], fields: dict[str, Any]) -> _T:
+def _build_frozen(cls: type[_T], fields: dict[str, Any]) -> _T:
     """``cls(**fields)``, without the setter that a frozen dataclass calls for each field.
 
     Saves a decode 5 of the 25 us that it may take.

@@ -1,7 +1,7 @@
-"""Dex3-1 packets and frames as objects: raw integers in, bytes out, and back. Sans-IO.
+"""Pack and parse Dex3-1 packets and frames with raw integer fields, without I/O.
 
-A frame holds five bus buffers, and a bus buffer packets back to back. A frame that is damaged
-raises; a damaged packet inside a good frame is lost alone and listed in ``problems``.
+A frame has five bus buffers, each with packets back to back. A damaged frame raises an error; a
+damaged packet in an intact frame is left out and listed in ``problems``.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ __all__ = [
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
 
-def _seal(structure: Structure, packet: bytes) -> bytes:
+def _fill_crc(structure: Structure, packet: bytes) -> bytes:
     """``packet`` with its CRC, which is its last word, filled in."""
     start, end = structure.covered
     return packet[:-4] + crc32_words(packet[start:end]).to_bytes(4, "little")
@@ -73,7 +73,7 @@ def _check_length(structure: Structure, data: Bytes) -> None:
         raise OversizeError(f"{structure.name} is {structure.size} bytes, got {len(data)}")
 
 
-def _open(structure: Structure, data: Bytes) -> tuple[int, ...]:
+def _unpack_checked(structure: Structure, data: Bytes) -> tuple[int, ...]:
     """Fields of a packet between head and CRC.
 
     :raises WireError: wrong length, head or CRC.
@@ -109,7 +109,7 @@ class MotorCmd:
         """
         mode = ris_mode(self.id, self.status, self.timeout)
         values = (self.tor_des, self.spd_des, self.pos_des, self.k_pos, self.k_spd)
-        return _seal(MOTOR_CMD, MOTOR_CMD.pack(MOTOR_CMD.head, mode, self.res, *values, 0))
+        return _fill_crc(MOTOR_CMD, MOTOR_CMD.pack(MOTOR_CMD.head, mode, self.res, *values, 0))
 
     @classmethod
     def parse(cls, data: Bytes) -> MotorCmd:
@@ -117,10 +117,10 @@ class MotorCmd:
 
         :raises WireError: wrong length, head or CRC.
         """
-        return cls._of(*_open(MOTOR_CMD, data))
+        return cls._from_fields(*_unpack_checked(MOTOR_CMD, data))
 
     @classmethod
-    def _of(
+    def _from_fields(
         cls, mode: int, res: int, tor: int, spd: int, pos: int, k_pos: int, k_spd: int
     ) -> MotorCmd:
         return cls(mode & 15, mode >> 4 & 7, mode > 127, tor, spd, pos, k_pos, k_spd, res)
@@ -152,7 +152,7 @@ class MotorState:
 
         :raises EncodeError: a value does not fit.
         """
-        return _seal(
+        return _fill_crc(
             MOTOR_STATE,
             MOTOR_STATE.pack(
                 MOTOR_STATE.head,
@@ -176,10 +176,10 @@ class MotorState:
 
         :raises WireError: wrong length, head or CRC.
         """
-        return cls._of(*_open(MOTOR_STATE, data))
+        return cls._from_fields(*_unpack_checked(MOTOR_STATE, data))
 
     @classmethod
-    def _of(cls, mode: int, *values: int) -> MotorState:
+    def _from_fields(cls, mode: int, *values: int) -> MotorState:
         return cls(mode & 15, mode >> 4 & 7, mode > 127, *values)
 
 
@@ -206,7 +206,7 @@ class SensorState:
                 raise EncodeError(f"SensorState_t: 12 of {name}, not {len(getattr(self, name))}")
         mode = self.id | self.status << 4
         values = (*self.pressure, *self.temperature)
-        return _seal(
+        return _fill_crc(
             SENSOR_STATE, SENSOR_STATE.pack(SENSOR_STATE.head, mode, self.reverse, *values, 0)
         )
 
@@ -216,10 +216,10 @@ class SensorState:
 
         :raises WireError: wrong length, head or CRC.
         """
-        return cls._of(*_open(SENSOR_STATE, data))
+        return cls._from_fields(*_unpack_checked(SENSOR_STATE, data))
 
     @classmethod
-    def _of(cls, mode: int, reverse: int, *values: int) -> SensorState:
+    def _from_fields(cls, mode: int, reverse: int, *values: int) -> SensorState:
         return cls(mode & 15, mode >> 4, values[:12], values[12:], reverse)
 
 
@@ -284,7 +284,7 @@ def scan_bus(
         if kind is not None:
             packet = data[offset : offset + kind.size]
             try:
-                _open(kind, packet)
+                _unpack_checked(kind, packet)
             except WireError as problem:
                 error = problem
             else:
@@ -319,8 +319,12 @@ def _packet(kind: Structure, data: bytes, offset: int) -> Packet:
     """One that :func:`scan_bus` has found, and checked."""
     values = kind.struct.unpack_from(data, offset)[1:-1]
     if kind is MOTOR_CMD:
-        return MotorCmd._of(*values)
-    return MotorState._of(*values) if kind is MOTOR_STATE else SensorState._of(*values)
+        return MotorCmd._from_fields(*values)
+    return (
+        MotorState._from_fields(*values)
+        if kind is MOTOR_STATE
+        else SensorState._from_fields(*values)
+    )
 
 
 def bus_part(
@@ -394,7 +398,7 @@ class StateFrame:
         return [(b, p) for b, ps in enumerate(self.buses) for p in ps if isinstance(p, SensorState)]
 
 
-def _fill(buses: Sequence[Sequence[Packet]], capacity: int) -> tuple[list[int], bytes]:
+def _pack_buses(buses: Sequence[Sequence[Packet]], capacity: int) -> tuple[list[int], bytes]:
     """(bytes used of each bus buffer, the five buffers)."""
     if len(buses) != N_BUSES:
         raise EncodeError(f"a frame has {N_BUSES} buses, not {len(buses)}")
@@ -405,7 +409,7 @@ def _fill(buses: Sequence[Sequence[Packet]], capacity: int) -> tuple[list[int], 
     return [len(part) for part in parts], b"".join(part.ljust(capacity, b"\0") for part in parts)
 
 
-def _exactly(name: str, value: Sequence[int] | bytes, length: int) -> None:
+def _check_count(name: str, value: Sequence[int] | bytes, length: int) -> None:
     if len(value) != length:
         raise EncodeError(f"{name} has {length} elements, not {len(value)}")
 
@@ -418,11 +422,11 @@ def pack_command(frame: CommandFrame, layout: CommandLayout | None = None) -> by
     :raises OversizeError: more packets on a bus than its buffer holds.
     """
     layout = layout or frame.layout
-    _exactly("head", frame.head, 2)
-    _exactly("mode", frame.mode, 4)
-    sizes, buffers = _fill(frame.buses, layout.bus_size)
+    _check_count("head", frame.head, 2)
+    _check_count("mode", frame.mode, 4)
+    sizes, buffers = _pack_buses(frame.buses, layout.bus_size)
     structure = layout.structure
-    return _seal(
+    return _fill_crc(
         structure, structure.pack(frame.head, frame.mode, *sizes, buffers, frame.reserve, 0)
     )
 
@@ -463,11 +467,11 @@ def pack_state(frame: StateFrame) -> bytes:
     :raises EncodeError: a value does not fit.
     :raises OversizeError: more packets on a bus than its buffer holds.
     """
-    _exactly("fans", frame.fans, 2)
-    _exactly("imu", frame.imu, 6)
-    _exactly("reserve", frame.reserve, 4)
-    sizes, buffers = _fill(frame.buses, STATE_BUS_SIZE)
-    return _seal(
+    _check_count("fans", frame.fans, 2)
+    _check_count("imu", frame.imu, 6)
+    _check_count("reserve", frame.reserve, 4)
+    sizes, buffers = _pack_buses(frame.buses, STATE_BUS_SIZE)
+    return _fill_crc(
         STATE,
         STATE.pack(
             STATE.head,

@@ -1,4 +1,4 @@
-"""Between the integers on the Dex3-1's wire and SI units on the joint's side, as one table.
+"""Convert between the Dex3-1's integer fields and SI units at the joint.
 
 The manual's figures are read as counts per unit on the *rotor's* side, with a torque unit of
 1 mN·m and a velocity unit of 100 rad/s, although its command structure says "joint output": a

@@ -221,7 +221,7 @@ def motor_line(case: Inputs, count: int) -> None:
             users=1,
             _lock=threading.Lock(),
             _parser=m4010.FrameParser((m4010.DATA,)),
-            _owed=False,
+            _answer_pending=False,
             _port=peer.near,
             before=None,
         )
@@ -309,7 +309,7 @@ def dex3_usb(case: Inputs, count: int) -> None:
                 case.run(b"", lambda hand=hand: _typed(hand.open))  # type: ignore[misc]
             backend.honest = False
         clock.advance(0.001)
-        with mock.patch("dexkit.drivers.dex3_usb.link._QUIET", 0.0):
+        with mock.patch("dexkit.drivers.dex3_usb.link._LATE_ANSWER_WAIT", 0.0):
             command = rnd.choice((HandCommand.brake(7), HandCommand.position([0.1] * 7)))
             case.run(b"", lambda hand=hand, c=command: _typed(lambda: hand.exchange(c)))  # type: ignore[misc]
         if (i + 1) % _BLOCK == 0:
