@@ -65,24 +65,24 @@ def read_text(path: Path, *, error: type[DexkitError] = UsageError, hint: str = 
     :param hint: what to do then.
     """
     try:
-        # a pipe without a writer would be waited for
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(path, "rb", opener=_open_without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
+            data = file.read(LARGEST + 1)
     except (OSError, ValueError) as why:  # ValueError: a null character in the name
         reason = why.strerror if isinstance(why, OSError) else str(why)
         raise error(f"cannot read {path}: {reason}", hint=hint) from why
-    try:
-        with os.fdopen(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
-            data = file.read(LARGEST + 1)
-    except OSError as why:
-        raise error(f"cannot read {path}: {why.strerror}", hint=hint) from why
     if len(data) > LARGEST:
         raise error(f"cannot read {path}: it is larger than {LARGEST >> 20} MB", hint=hint)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as why:
         raise error(f"{path} is not UTF-8 text (at byte {why.start})", hint=hint) from why
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    """Open a file; a pipe without a writer is not waited for."""
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def read_json(path: Path, *, error: type[DexkitError] = UsageError, hint: str = "") -> Any:

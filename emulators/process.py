@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import select
 import subprocess
 import time
 from collections.abc import Sequence
 from typing import IO
 
 from dexkit.child_processes import command_line
+from dexkit.descriptors import wait_readable
 from dexkit.emulators.faults import FaultFamily, parse_fault
 from dexkit.errors import EmulatorError
 
@@ -58,7 +58,7 @@ class EmulatorProcess:
         line = b""
         while not line.endswith(b"\n"):
             left = max(0.0, deadline - time.monotonic())
-            ready, _, _ = select.select([stdout], [], [], left)
+            ready = wait_readable([stdout.fileno()], left)
             piece = os.read(stdout.fileno(), 1) if ready else b""
             if not piece:
                 try:

@@ -12,13 +12,13 @@ import contextlib
 import errno
 import fcntl
 import os
-import select
 import threading
 import time
 import tty
 from pathlib import Path
 
 from dexkit.clock import Clock, RealClock
+from dexkit.descriptors import wait_readable
 from dexkit.emulators.faults import Fault
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
@@ -211,7 +211,7 @@ class Port:
             if left <= 0:
                 return
             pause = max(0.0, left - _SPIN) if sharp else left
-            ready, _, _ = select.select(fds, [], [], pause)
+            ready = wait_readable(fds, pause)
             if self._wake_read in ready:
                 with contextlib.suppress(BlockingIOError):
                     os.read(self._wake_read, _CHUNK)

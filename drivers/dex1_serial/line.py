@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import logging
 import os
-import select
 import termios
 import threading
 import time
@@ -22,6 +21,7 @@ from dataclasses import dataclass
 import serial
 
 from dexkit.command_age import WriteDeadline
+from dexkit.descriptors import wait_readable
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
 from dexkit.wire.m4010 import DATA, FrameParser, MotorData
@@ -125,7 +125,7 @@ class MotorLine:
         statistics, parser = self.statistics, self._parser
         if self._answer_pending:
             self._answer_pending = False
-            select.select([fd], [], [], LATE)
+            wait_readable([fd], LATE)
         for _ in range(_MAX_STRAY_CHUNKS):  # bounded, for a device that sends without end
             if not (data := self._read(fd)):
                 break
@@ -143,7 +143,7 @@ class MotorLine:
             while late < _MAX_LATE_CHUNKS:
                 left = deadline - time.monotonic()
                 late += left <= 0
-                if not select.select([fd], [], [], max(0.0, left))[0]:
+                if not wait_readable([fd], max(0.0, left)):
                     break
                 data = self._read(fd)
                 if not data:

@@ -13,7 +13,6 @@ reads the CRC of a short error status as data. Tests of the emulated servo use i
 from __future__ import annotations
 
 import os
-import select
 import termios
 import time
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from dataclasses import dataclass
 import serial
 
 from dexkit.command_age import WriteDeadline
+from dexkit.descriptors import wait_readable, wait_writable
 from dexkit.drivers.serial_port import open_failed, port_errors
 from dexkit.errors import HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.wire import dynamixel, mx64
@@ -123,7 +123,7 @@ class DevicePort:
         fd = self._opened().fileno()
         while True:
             remaining = max(0.0, deadline - time.monotonic())
-            if not select.select([fd], [], [], remaining)[0]:
+            if not wait_readable([fd], remaining):
                 return b""
             try:
                 data = os.read(fd, 4096)
@@ -143,7 +143,7 @@ class DevicePort:
                 sent += os.write(fd, data[sent:])
             except BlockingIOError:
                 remaining = deadline - time.monotonic()
-                if remaining <= 0 or not select.select([], [fd], [], remaining)[1]:
+                if remaining <= 0 or not wait_writable(fd, remaining):
                     return False
         return True
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import math
-import select
 import socket
 import struct
 
 from dexkit.clock import ManualClock
+from dexkit.descriptors import wait_readable
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.settings import Firmware as Dex3Firmware
@@ -390,7 +390,7 @@ def _client(case: Inputs, hands: Dex3Hands, stream: bytes) -> None:
             sock.sendall(stream[len(stream) * i // pieces : len(stream) * (i + 1) // pieces])
         sock.setblocking(False)
         for _ in range(rnd.choice((0, 1, 5))):
-            if not select.select([sock], [], [], 0.01)[0] or not sock.recv(1 << 16):
+            if not wait_readable([sock.fileno()], 0.01) or not sock.recv(1 << 16):
                 break
     for problem in (hands.error, hands.failure):
         if problem is not None:
