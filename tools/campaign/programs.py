@@ -268,13 +268,17 @@ def _emulated(name: str) -> Stage:
 def _recording_grows(scene: Scene, program: Program) -> None:
     path = scene.scratch / "out.mcap"
 
-    def size() -> int:
-        return path.stat().st_size if path.exists() else 0
+    def count() -> int:
+        """Messages in the file; what else is in it grows before and without them."""
+        from dexkit.traces import open_trace
 
-    # a recording begins with a header; messages, which it must keep, come after it
-    until(lambda: not program.running or size() > 0, f"{path.name} to exist")
-    before = size()
-    until(lambda: not program.running or size() > before, f"{path.name} to grow")
+        try:
+            return sum(1 for _ in open_trace(path).messages()) if path.exists() else 0
+        except DexkitError:
+            return 0
+
+    before = count()
+    until(lambda: not program.running or count() > before, f"messages in {path.name}")
 
 
 def _readable(scene: Scene, killed: bool) -> None:
