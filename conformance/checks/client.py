@@ -19,7 +19,7 @@ from dexkit.models import ModeByte, model
 
 _MOST_PLACES = 5
 _FEWEST = 20
-"""Commands of a session at least: fewer belong to the session before."""
+"""Commands of a session at least."""
 _SAME = 1e-6
 """Part by which two equal times may differ after rounding."""
 _MOVES = 0.02
@@ -35,18 +35,19 @@ Mask = NDArray[np.bool_]
 def sessions(ctx: Context) -> list[slice]:
     """The commands by session: a pause longer than the hand's time-out separates two.
 
-    A run of fewer than :data:`_FEWEST` commands belongs to the session before it. Otherwise a
-    client that sends less than one command in that time would have no session to be judged.
+    A run of fewer than :data:`_FEWEST` commands is no session of its own. Otherwise a client that
+    sends less than one command in that time would have no session to be judged.
     """
     times = _clock(ctx)
     pause = model(ctx.recording.dialect.model).command_timeout
-    begins = [0]
-    for at in np.flatnonzero(np.diff(times) > pause) + 1:
-        if at - begins[-1] >= _FEWEST:
-            begins.append(int(at))
-    if len(begins) > 1 and len(times) - begins[-1] < _FEWEST:
-        begins.pop()
-    return [slice(a, b) for a, b in zip(begins, [*begins[1:], len(times)], strict=True)]
+    edges = [0, *(int(i) + 1 for i in np.flatnonzero(np.diff(times) > pause)), len(times)]
+    lengths = np.diff(edges)
+    ends = [
+        edge
+        for edge, before, after in zip(edges[1:-1], lengths[:-1], lengths[1:], strict=True)
+        if min(before, after) >= _FEWEST
+    ]
+    return [slice(a, b) for a, b in zip([0, *ends], [*ends, len(times)], strict=True)]
 
 
 def _clock(ctx: Context) -> Floats:
