@@ -40,14 +40,19 @@ def judge(
     claims = claims or Claims()
     wanted = None if requirements is None else {r.id for r in requirements}
 
-    def results_of(name: str, part: Any) -> list[Result]:
+    def results_of(name: str, part: Any, client: Sequence[Result] = ()) -> list[Result]:
         every = claims.apply(catalogue(recording.model.name, name))
-        return judge_layer(layer(name), part, every, claims)
+        return judge_layer(layer(name), part, every, claims, client)
 
-    results = results_of(recording.layer, recording)
+    # in a run of the kit the kit is the client, and sends wrong commands on purpose
+    client = results_of("client", recording) if recording.stimulus is None else []
+    results = results_of(recording.layer, recording, client)
     if recording.usb is not None:
         judged = {str(side) for side in recording.judged}
         results += [r for r in results_of("usb", recording.usb) if r.side in judged]
+    chosen = [r for r in results if wanted is None or r.requirement.id in wanted]
+    if wanted is not None:  # what blocks another requirement is reported with it
+        wanted |= {r.blocked_by for r in chosen}
     about = {
         "model": recording.model.name,
         "dialect": recording.dialect.name,
@@ -56,7 +61,8 @@ def judge(
     when = datetime.fromtimestamp(recording.origin_ns / 1e9, tz=timezone.utc)
     return RunResult(
         subject={**claims.subject, **about, **(subject or {})},
-        results=[r for r in results if wanted is None or r.requirement.id in wanted],
+        results=chosen,
+        client=[r for r in client if wanted is None or r.requirement.id in wanted],
         stage={str(s): _stage(recording, s) for s in recording.judged},
         duration_s=recording.duration,
         notes=list(recording.notes),
@@ -72,20 +78,23 @@ def judge_layer(
     recording: RecordingT,
     requirements: Sequence[Requirement],
     claims: Claims | None = None,
+    client: Sequence[Result] = (),
 ) -> list[Result]:
     """Judge every requirement of one layer for every subject; results in the requirements' order.
 
     :param requirements: all those of the layer that are about the model, at the levels that
         ``claims`` gives them: some are judged by what came before them.
     :param claims: what the vendor claims of the hand.
+    :param client: results of the requirements about the client, of every subject.
     """
     claims = claims or Claims()
     whole = layer.whole(recording)
     results: list[Result] = []
     for subject, view in layer.subjects(recording):
         found: dict[str, Result] = {}
+        driven_by = [r for r in client if r.side == str(subject)]
         for requirement in requirements:
-            judgement = Judgement(requirement, subject, claims, found)
+            judgement = Judgement(requirement, subject, claims, found, driven_by)
             context = layer.context(recording, view, requirement)
             found[requirement.id] = _judge_one(layer, judgement, context, whole)
         results += found.values()

@@ -97,9 +97,7 @@ class States:
         from reception in the middle of all samples is taken off, so that they can be compared
         with the recording's times.
         """
-        if not len(self.sent) or not np.isfinite(self.sent).all():
-            return self.t
-        return np.asarray(self.sent + median(self.t - self.sent))
+        return _publisher_times(self.t, self.sent)
 
     def between(self, begin: float, end: float) -> slice:
         """The samples received in [begin, end]."""
@@ -112,11 +110,13 @@ class States:
 class Commands:
     """The commands to a subject, of all writers. Values that a sample lacks are NaN.
 
+    :param length: motors in the sequence; -1 where the sample does not decode.
     :param q: shape (n, n_joints), as ``dq``, ``tau``, ``kp``, ``kd`` and ``mode``.
     """
 
     topic: str
     t: Floats
+    sent: Floats
     length: NDArray[np.intp]
     q: Floats
     dq: Floats
@@ -127,6 +127,11 @@ class Commands:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @cached_property
+    def clock(self) -> Floats:
+        """The times to judge the client by; see :attr:`States.clock`."""
+        return _publisher_times(self.t, self.sent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,12 +355,10 @@ def _states(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: 
     def column(name: str) -> Floats:
         return _joints(columns, codec, side, codec.state_sequence, name)
 
-    sent = _seconds(samples.publish_time_ns, origin)
-    sent[samples.publish_time_ns == 0] = np.nan
     return States(
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
-        sent=sent,
+        sent=_sent(samples, origin),
         length=columns.count(codec.state_sequence),
         q=column("q"),
         dq=column("dq"),
@@ -365,6 +368,20 @@ def _states(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: 
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
     )
+
+
+def _publisher_times(t: Floats, sent: Floats) -> Floats:
+    """Source timestamps on the recording's clock; times of reception where there are none."""
+    if not len(sent) or not np.isfinite(sent).all():
+        return t
+    return np.asarray(sent + median(t - sent))
+
+
+def _sent(samples: SampleArray, origin: int) -> Floats:
+    """Source timestamps, seconds; NaN where they are unknown."""
+    sent = _seconds(samples.publish_time_ns, origin)
+    sent[samples.publish_time_ns == 0] = np.nan
+    return sent
 
 
 def _is_blank(view: SideView) -> bool:
@@ -387,7 +404,8 @@ def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin
     if samples is None or samples.type_name != codec.dialect.cmd_type:
         none = np.empty((0, codec.joints))
         count = np.empty(0, np.intp)
-        return Commands(topic, np.empty(0), count, none, none, none, none, none, none)
+        t = np.empty(0)
+        return Commands(topic, t, t, count, none, none, none, none, none, none)
     columns = samples.decoded
     if columns is None:
         columns = codec.command.columns(samples.payloads)
@@ -398,6 +416,7 @@ def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin
     return Commands(
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
+        sent=_sent(samples, origin),
         length=columns.count(codec.command_sequence),
         q=column("q"),
         dq=column("dq"),

@@ -58,6 +58,8 @@ def read_json(path: Path) -> RunResult:
         catalogue=data["catalogue"],
         recorded_at=data["recorded_at"],
         results=[_result_of(entry) for entry in data["results"]],
+        # files of the first programs that wrote version 3 have none
+        client=[_result_of(entry) for entry in (data.get("client") or {"results": []})["results"]],
     )
 
 

@@ -43,6 +43,7 @@ __all__ = [
     "Stage",
     "Verdict",
     "environment",
+    "grouped",
     "overall_of",
     "worst",
 ]
@@ -232,6 +233,14 @@ def overall_of(results: Iterable[Result]) -> Overall:
     return Overall.PASS
 
 
+def grouped(results: Iterable[Result]) -> list[tuple[Requirement, list[Result]]]:
+    """Results by requirement, in their order."""
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result.requirement.id, []).append(result)
+    return [(group[0].requirement, group) for group in groups.values()]
+
+
 @dataclass
 class RunResult:
     """A whole run.
@@ -246,6 +255,9 @@ class RunResult:
     :param claims: by unit, whether the vendor claims it; None without claims.
     :param catalogue: how many requirements there are for such a run, selected or not; 0 if it is
         not known.
+    :param client: results of the requirements about the client that commands the hands, each for
+        the hand of that side. They do not count in the verdict on the hands. Empty in a run of
+        the kit, which is its own client.
     """
 
     subject: dict[str, str]
@@ -258,11 +270,12 @@ class RunResult:
     harness: dict[str, float] = field(default_factory=dict)
     claims: dict[str, bool] | None = None
     catalogue: int = 0
+    client: list[Result] = field(default_factory=list)
 
     @property
     def partial(self) -> bool:
         """Whether only a part of the catalogue was selected: no proof of a drop-in."""
-        return sum(self.counts().values()) < self.catalogue
+        return not self.client_only and sum(self.counts().values()) < self.catalogue
 
     @property
     def starved(self) -> float:
@@ -275,16 +288,20 @@ class RunResult:
         return {v: rows.count(v) for v in Verdict}
 
     def by_requirement(self) -> list[tuple[Requirement, list[Result]]]:
-        """Results grouped by requirement, in the catalogue's order."""
-        groups: dict[str, list[Result]] = {}
-        for result in self.results:
-            groups.setdefault(result.requirement.id, []).append(result)
-        return [(group[0].requirement, group) for group in groups.values()]
+        """Results about the hands by requirement, in the catalogue's order."""
+        return grouped(self.results)
 
     @property
     def judged(self) -> int:
-        """How many results came to a finding about the hand."""
-        return sum(r.verdict.judged for r in self.results)
+        """How many results came to a finding: about the hands, or about the client where only
+        requirements about it were selected.
+        """
+        return sum(r.verdict.judged for r in self.results or self.client)
+
+    @property
+    def client_only(self) -> bool:
+        """Whether only requirements about the client were selected."""
+        return bool(self.client) and not self.results
 
     @property
     def disturbed(self) -> bool:
@@ -300,23 +317,56 @@ class RunResult:
 
     @property
     def overall(self) -> Overall:
-        """The verdict on the whole run; see :func:`overall_of`."""
-        return overall_of(self.results)
+        """The verdict on the hands, see :func:`overall_of`; on their client where only requirements
+        about it were selected.
+        """
+        return overall_of(self.results or self.client)
 
     def sentence(self) -> str:
         """The verdict in one sentence."""
+        if self.client_only:
+            return self.client_sentence()
         counts = self.counts()
         total = sum(counts.values())
         parts = [f"{n} {v}" for v, n in counts.items() if n]
+        spoiled = self.spoiled_by
         heads = {
             Overall.PASS: "PASS: every MUST that could be judged is met",
             Overall.FAIL: "FAIL: a MUST is not met",
             Overall.INCONCLUSIVE: "INCONCLUSIVE: nothing can be said of the hand"
             if self.judged == 0
-            else "INCONCLUSIVE: a MUST could not be judged",
+            else "INCONCLUSIVE: a MUST could not be judged"
+            + (f", because of the client ({', '.join(spoiled)})" if spoiled else ""),
         }
         of = f"{total} of {self.catalogue}" if self.partial else f"{total}"
         return f"{heads[self.overall]} ({of} requirements: {', '.join(parts)})"
+
+    @property
+    def spoiled_by(self) -> list[str]:
+        """Ids of the requirements about the client that block a MUST of the hand."""
+        blocked = {
+            r.blocked_by
+            for r in self.results
+            if r.verdict is Verdict.BLOCKED and r.requirement.level is Level.MUST
+        }
+        about_client = dict.fromkeys(r.requirement.id for r in self.client)
+        return [name for name in about_client if name in blocked]
+
+    def client_sentence(self) -> str:
+        """The verdict on the client in one sentence; empty if it was not judged."""
+        if not self.client:
+            return ""
+        rows = [worst(r.verdict for r in group) for _, group in grouped(self.client)]
+        parts = [f"{rows.count(v)} {v}" for v in Verdict if v in rows]
+        heads = {
+            Overall.PASS: "PASS: every MUST that could be judged is met",
+            Overall.FAIL: "FAIL: a MUST is not met",
+            Overall.INCONCLUSIVE: "INCONCLUSIVE: a MUST could not be judged",
+        }
+        return (
+            f"the client: {heads[overall_of(self.client)]} ({len(rows)} requirements: "
+            f"{', '.join(parts)})"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The result as plain data."""
@@ -336,6 +386,13 @@ class RunResult:
             "environment": dict(self.environment),
             "notes": list(self.notes),
             "results": [_result_dict(r) for r in self.results],
+            "client": {
+                "overall": str(overall_of(self.client)),
+                "sentence": self.client_sentence(),
+                "results": [_result_dict(r) for r in self.client],
+            }
+            if self.client
+            else None,
         }
 
     def write_json(self, path: Path) -> None:
@@ -345,7 +402,8 @@ class RunResult:
 
 def _result_dict(result: Result) -> dict[str, Any]:
     requirement = asdict(result.requirement)
-    del requirement["negative"]  # about the catalogue, no part of the format
+    for name in ("negative", "spoils"):  # about the catalogue, no part of the format
+        del requirement[name]
     requirement["level"] = str(result.requirement.level)
     requirement["plots"] = [str(plot) for plot in result.requirement.plots]
     return {

@@ -275,17 +275,18 @@ def _states(
 def _commands(model: RobotModel, samples: SampleArray | None, origin: int) -> Commands:
     if samples is None:
         none = np.empty((0, len(model.used)))
-        return Commands(
-            model.cmd_topic, np.empty(0), np.empty(0, np.intp), none, none, none, none, none, none
-        )
+        empty, count = np.empty(0), np.empty(0, np.intp)
+        return Commands(model.cmd_topic, empty, empty, count, none, none, none, none, none, none)
     columns = samples.columns()
 
     def column(name: str) -> Floats:
         return _used(columns, model, f"motor_cmd[].{name}")
 
+    t, sent = _times(samples, origin)
     return Commands(
         topic=model.cmd_topic,
-        t=_times(samples, origin)[0],
+        t=t,
+        sent=sent,
         length=np.where(columns.ok, model.slots, -1).astype(np.intp),
         q=column("q"),
         dq=column("dq"),

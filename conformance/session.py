@@ -239,8 +239,10 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
     model_name = name if name in ROBOTS else dialect(name).model if name else None
     path = config.getoption("dexkit_capabilities")
     claims = Claims.load(Path(path) if path else None, model_name)
+    every = catalogue(model_name or claims.hand.get("model"), None)
+    # the suite is the client itself
     found = select(
-        claims.apply(catalogue(model_name or claims.hand.get("model"), None)),
+        claims.apply(r for r in every if not r.about_client),
         prefixes=config.getoption("dexkit_require"),
         level=config.getoption("dexkit_level"),
     )

@@ -64,6 +64,7 @@ MOST_PLACES = 5
 """Places that a result names; all of them are looked at before a failure is excused."""
 
 _OPEN = (Verdict.FAIL, Verdict.BLOCKED, Verdict.ERROR)
+_NOT_MET = (Verdict.FAIL, Verdict.WARN)
 
 
 class Machine(Protocol):
@@ -190,6 +191,7 @@ class Judgement:
 
     :param requirement: at the level that the claims give it.
     :param found: the results of this subject so far, by requirement.
+    :param client: the results of the requirements about the client that drives the subject.
     """
 
     def __init__(
@@ -198,11 +200,13 @@ class Judgement:
         subject: Subject,
         claims: Claims,
         found: Mapping[str, Result],
+        client: Sequence[Result] = (),
     ) -> None:
         self.requirement = requirement
         self._subject = subject
         self._claimed = claims.claimed(requirement)
         self._found = found
+        self._client = client
 
     def result(
         self,
@@ -249,6 +253,15 @@ class Judgement:
             if self._found[before].verdict in _OPEN:
                 reason = f"blocked by {before}"
                 return self.result(Verdict.BLOCKED, Outcome(None, reason=reason), before)
+        return None
+
+    def spoiled(self) -> Result | None:
+        """The result *blocked*, if the client's commands do not allow to judge it; else None."""
+        for result in self._client:
+            need = result.requirement
+            if result.verdict in _NOT_MET and self.requirement.id.startswith(need.spoils):
+                reason = f"blocked by {need.id}, a fault of the client: {result.observed}"
+                return self.result(Verdict.BLOCKED, Outcome(None, reason=reason), need.id)
         return None
 
     def run_check(

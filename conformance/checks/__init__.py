@@ -4,8 +4,8 @@ A check is a function of a :class:`Context` that returns an :class:`Outcome`. It
 missing evidence, and takes every limit from its requirement's tolerances, so that several hand
 models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.motion`, :mod:`~.force`,
-:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, and :mod:`~.fingers` for hands of several
-joints.
+:mod:`~.safety`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers` for hands of several
+joints, and :mod:`~.client` for the client that drives them.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ CHECK_MODULES: Mapping[str, Sequence[str]] = {
         f"{__name__}.{n}" for n in ("robot", "discovery", "timing", "fields", "lifecycle")
     ),
     "usb": ("dexkit.conformance.usb.checks",),
+    "client": (f"{__name__}.client",),
 }
 """The modules that register the checks of each layer."""
 

@@ -1,11 +1,12 @@
-"""The layers at which a device is judged: a hand's DDS topics, a robot's DDS topics, a hand's USB.
+"""The layers of judging: a hand's DDS topics, a robot's DDS topics, a hand's USB, and the client.
 
 A :class:`Layer` is the data by which the one engine (:mod:`dexkit.conformance.judge`) goes from a
 recording to verdicts. Each layer is in a module of its own, imported when it is asked for:
 
 * :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
 * :mod:`~dexkit.conformance.layers.robot`: ``robot``, the low-level DDS topics of robots;
-* :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands.
+* :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands;
+* :mod:`~dexkit.conformance.layers.client`: ``client``, the commands that a client sends to hands.
 """
 
 from __future__ import annotations
@@ -27,7 +28,15 @@ from dexkit.topics import HAND_TOPICS
 if TYPE_CHECKING:
     from dexkit.hand import Subject
 
-__all__ = ["Layer", "Precondition", "claimed", "layer", "not_blocked", "recording_of"]
+__all__ = [
+    "Layer",
+    "Precondition",
+    "claimed",
+    "layer",
+    "not_blocked",
+    "not_spoiled",
+    "recording_of",
+]
 
 
 RecordingT = TypeVar("RecordingT")
@@ -76,7 +85,7 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
         return catalogue(model, self.name)
 
 
-_MODULES = {"dds": "hand", "robot": "robot", "usb": "usb"}
+_MODULES = {"dds": "hand", "robot": "robot", "usb": "usb", "client": "client"}
 
 
 def layer(name: str) -> Layer[Any, Any, Any]:
@@ -112,3 +121,8 @@ def claimed(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | No
 def not_blocked(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
     """A precondition: nothing has failed that the requirement depends on."""
     return judgement.blocked()
+
+
+def not_spoiled(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
+    """A precondition: the client's commands allow to judge it."""
+    return judgement.spoiled()

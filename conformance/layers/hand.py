@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.checks import Context, Outcome
-from dexkit.conformance.layers import Layer, claimed, not_blocked
+from dexkit.conformance.layers import Layer, claimed, not_blocked, not_spoiled
 from dexkit.conformance.recording import Recording, SideView, TraceLike
 from dexkit.conformance.results import Result
 from dexkit.conformance.verdicts import Judgement
@@ -111,7 +111,7 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     decode=_decode,
     subjects=subjects,
     context=Context,
-    preconditions=(applies_to_dialect, claimed, recorded, not_blocked),
+    preconditions=(applies_to_dialect, claimed, recorded, not_spoiled, not_blocked),
     refine=with_silence,
     whole=whole,
     script=_script,

@@ -1,5 +1,5 @@
-"""Deliberately wrong hands, robots and USB devices: each has one fault, and the checks must find
-exactly that.
+"""Deliberately wrong hands, robots, USB devices and clients: each has one fault, and the checks
+must find exactly that.
 
 A wrong hand is a small change of a reference that meets every requirement, declared by the
 decorator :func:`~dexkit.conformance.mutants.registry.wrong_hand`.
@@ -9,14 +9,22 @@ from __future__ import annotations
 
 from functools import cache
 
-from dexkit.conformance.mutants import any_model, fingers, gripper, operator, robot, usb
+from dexkit.conformance.mutants import (
+    any_model,
+    clients,
+    fingers,
+    gripper,
+    operator,
+    robot,
+    usb,
+)
 from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
 from dexkit.models import model_plugins
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
-MODULES = (any_model, gripper, fingers, operator, robot, usb)
+MODULES = (any_model, gripper, fingers, operator, clients, robot, usb)
 """Where wrong hands are declared."""
 
 

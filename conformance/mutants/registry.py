@@ -1,9 +1,10 @@
 """Register wrong hands: classes with the decorator :func:`wrong_hand`.
 
 A wrong hand is a small change of a reference that meets every requirement: of a service that
-publishes hands on DDS, of a robot, or of a USB device. The decorator names the requirement that
-must find the fault. It holds for every model whose catalogue has that requirement, or one that is
-``like`` it: the class is mixed into the reference of each of them.
+publishes hands on DDS, of a robot, of a USB device, or of a client that drives good hands. The
+decorator names the requirement that must find the fault. It holds for every model whose catalogue
+has that requirement, or one that is ``like`` it: the class is mixed into the reference of each of
+them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ C = TypeVar("C", bound=type[Any])
 
 @dataclass(frozen=True)
 class Mutant:
-    """One wrong hand, robot or USB device.
+    """One wrong hand, robot, USB device or client.
 
     :param layer: of its requirement, one of :data:`~dexkit.conformance.requirements.LAYERS`.
     :param made: the reference of the model with the fault in it.
@@ -91,7 +92,7 @@ def wrong_hand(
     brief: bool = False,
     whole: bool = False,
 ) -> Callable[[C], C]:
-    """Declare a class to be a wrong hand, robot or USB device.
+    """Declare a class to be a wrong hand, robot, USB device or client.
 
     A second decorator on the same class is for another model, where it fails other requirements.
 

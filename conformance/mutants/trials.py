@@ -1,7 +1,8 @@
 """Run a wrong hand on the virtual clock and judge it: one trial for each layer.
 
 Services and robots go through the script for their model's topics, USB devices through that for
-USB; both are judged against every requirement of the layer.
+USB; both are judged against every requirement of the layer. Clients drive good hands through a
+session, and are judged together with them: no requirement of the hands may fail.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.virtual import TopicDevice, run_virtual
+from dexkit.conformance.virtual.client import run_client
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import dialect, model
@@ -172,5 +174,25 @@ class UsbTrial:
         return _blamed(run_usb_mutant(mutant.made, every, side))
 
 
-TRIALS: Mapping[str, Trial] = {"dds": HandTrial(), "robot": RobotTrial(), "usb": UsbTrial()}
+class ClientTrial:
+    """In a session with good hands."""
+
+    def cost(self, mutant: Mutant) -> float:
+        """Roughly how long a run takes, in units of the shortest on DDS."""
+        return 1.0 if len(model(mutant.model).joints[Side.LEFT]) == 1 else 4.0
+
+    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
+        """The requirements that fail or warn, the hands' included; there is no short form."""
+        spoken = dialect(mutant.dialect) if mutant.dialect else model(mutant.model).dialects[0]
+        trace = run_client(mutant.made, spoken)
+        result = judge(recording_of(trace, spoken.name, ()))
+        return _blamed([*result.results, *result.client])
+
+
+TRIALS: Mapping[str, Trial] = {
+    "dds": HandTrial(),
+    "robot": RobotTrial(),
+    "usb": UsbTrial(),
+    "client": ClientTrial(),
+}
 """By layer."""

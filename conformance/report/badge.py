@@ -20,6 +20,9 @@ def badge_text(result: RunResult) -> tuple[str, str]:
     only a part of the requirements was selected.
     """
     found = tally(result)
+    name = model_title(result).removesuffix(" gripper")
+    if result.client_only:
+        return f"{name} client", str(result.overall)
     if result.overall is Overall.INCONCLUSIVE:
         text = f"inconclusive, {found.passed} of {found.applicable} pass"
     elif result.overall is Overall.FAIL:
@@ -34,9 +37,7 @@ def badge_text(result: RunResult) -> tuple[str, str]:
         ]
         text += "".join(f", {n} {what}" for n, what in rest if n)
     real = nature(result)
-    return f"{model_title(result).removesuffix(' gripper')} drop-in", (
-        f"{text} ({real})" if real else text
-    )
+    return f"{name} drop-in", (f"{text} ({real})" if real else text)
 
 
 def _width(text: str) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Evidence, Result, RunResult, Verdict, worst
+from dexkit.conformance.results import Evidence, Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
 __all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards"]
@@ -79,8 +79,9 @@ class Card:
 
     @property
     def sides(self) -> str:
-        """``left and right``."""
-        return " and ".join(r.side for r in self.results)
+        """``left and right``, or ``client, left and right`` of a requirement about the client."""
+        names = " and ".join(r.side for r in self.results)
+        return f"client, {names}" if self.requirement.about_client else names
 
     @property
     def expected(self) -> str:
@@ -144,14 +145,15 @@ def _described(place: Evidence) -> str:
 
 
 def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
-    """A card for each requirement with one of ``verdicts`` that no other requirement blocked.
+    """A card for each requirement with one of ``verdicts`` that no other requirement blocked, about
+    the hands or their client.
 
     In the order of ``verdicts``; among equals, the one that blocks most others comes first.
     """
     blocks = Counter(r.blocked_by for r in result.results)
     found = [
         Card.of(group)
-        for _, every in result.by_requirement()
+        for _, every in [*result.by_requirement(), *grouped(result.client)]
         if (group := [r for r in every if r.verdict in verdicts and not r.blocked_by])
     ]
     return sorted(

@@ -37,6 +37,8 @@ from dexkit.conformance.results import (
     RunResult,
     Stage,
     Verdict,
+    grouped,
+    overall_of,
     worst,
 )
 from dexkit.conformance.stimuli.operator import OPERATOR
@@ -101,6 +103,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _operator(result),
         run_plots(result, view) if view is not None else "",
         _requirements(result, link),
+        _client(result, link),
         _what(result),
         _glossary(result),
         _environment(result),
@@ -140,10 +143,19 @@ def _verdict(result: RunResult) -> str:
         )
     if of := part(result):
         caution = f"<p><b>{of}</b>: this does not prove a drop-in.</p>{caution}"
+    question = f"Is this a drop-in for Unitree's {escape(model_title(result))}?"
+    if result.client_only:
+        question = f"Is this a client for Unitree's {escape(model_title(result))}?"
+        sentence = f"Only {result.client_sentence()}."
+    elif overall_of(result.client) is Overall.FAIL or result.spoiled_by:
+        caution += (
+            "<p><b>The client that commanded it is at fault</b>, which is no failure of the "
+            f'{what}: see <a href="#client">the client</a>.</p>'
+        )
     stages = "".join(_stage(side, stage) for side, stage in result.stage.items())
     return (
         f'<header class="verdict {answer.css}">'
-        f"<p class='question'>Is this a drop-in for Unitree's {escape(model_title(result))}?</p>"
+        f"<p class='question'>{question}</p>"
         f"<h1>{answer.text}<small>{escape(hand_name(result))}{badge}</small></h1>"
         f"<p>{escape(sentence)}</p>{caution}</header>"
         f'<div class="chips">{chips}</div><div class="stages">{stages}</div>'
@@ -293,9 +305,10 @@ def _card(card: Card, plots: _Plots, link: str) -> str:
     figures = "".join(plots.of(result) for result in card.results)
     if figures and card.verdict is Verdict.BLOCKED:
         figures = f"<details><summary>What was seen</summary>{figures}</details>"
+    whom = " of the client" if need.about_client else ""
     return (
         f'<article class="card {word.css}" id="card-{escape(need.id)}">'
-        f'<h3><b class="{word.css}">{word.text}</b> {escape(need.title)} '
+        f'<h3><b class="{word.css}">{word.text}</b>{whom} {escape(need.title)} '
         f'<code>{escape(need.id)}</code> <span class="dim">{escape(card.sides)}</span></h3>'
         f'<dl class="facts">{facts}</dl>{figures}</article>'
     )
@@ -353,6 +366,8 @@ def _operator(result: RunResult) -> str:
 
 
 def _requirements(result: RunResult, link: str) -> str:
+    if not result.results:
+        return ""
     choices = [
         ("all", "all"),
         ("attention", "not met"),
@@ -376,6 +391,20 @@ def _requirements(result: RunResult, link: str) -> str:
             parts.append(f'<h3 class="area-head" id="{_anchor(area)}">{escape(area)}</h3>')
         parts.append(_requirement(need, group, link))
     return f'<section class="every">{"".join(parts)}</section>'
+
+
+def _client(result: RunResult, link: str) -> str:
+    """The requirements about the client; empty where the kit was the client."""
+    if not result.client:
+        return ""
+    rows = "".join(_requirement(need, group, link) for need, group in grouped(result.client))
+    sentence = result.client_sentence()
+    return (
+        '<h2 id="client">The client</h2><p class="dim">Judged by the commands in the recording. '
+        "They say nothing of the hands; what a client at fault does not allow to judge is "
+        f'blocked.</p><p>{escape(sentence[:1].upper() + sentence[1:])}.</p><section class="every">'
+        f"{rows}</section>"
+    )
 
 
 def _requirement(need: Requirement, group: list[Result], link: str) -> str:

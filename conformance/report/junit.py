@@ -7,7 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from dexkit.conformance.report.labels import hand_name
-from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.documents import write_file
 from dexkit.escaping import visible
 
@@ -16,16 +16,28 @@ __all__ = ["write_junit"]
 _SKIPPED = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
 
 
+def _counted(entry: Result, result: RunResult) -> Verdict:
+    """The verdict as it counts for the hands."""
+    about_hand = not entry.requirement.about_client or result.client_only
+    passes = entry.verdict in (Verdict.PASS, Verdict.WARN, *_SKIPPED)
+    return entry.verdict if about_hand or passes else Verdict.NOT_APPLICABLE
+
+
 def write_junit(result: RunResult, path: Path) -> None:
-    """Write the file. A warning passes; an unjudged requirement is skipped; all others fail."""
-    verdicts = [r.verdict for r in result.results]
+    """Write the file. A warning passes; an unjudged requirement is skipped; all others fail.
+
+    What the client does wrong is skipped, too: it fails no hand. Where only requirements about the
+    client were selected, it fails.
+    """
+    entries = [*result.results, *result.client]
+    verdicts = [_counted(r, result) for r in entries]
     suite = ElementTree.Element(
         "testsuite",
         name=f"dexkit conformance: {hand_name(result)}",
         tests=str(len(verdicts)),
         failures=str(verdicts.count(Verdict.FAIL)),
         errors=str(verdicts.count(Verdict.ERROR) + verdicts.count(Verdict.BLOCKED)),
-        skipped=str(sum(v in (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED) for v in verdicts)),
+        skipped=str(sum(v in _SKIPPED for v in verdicts)),
         time=f"{result.duration_s:.3f}",
         timestamp=result.recorded_at,
     )
@@ -38,7 +50,7 @@ def write_junit(result: RunResult, path: Path) -> None:
         "overall": str(result.overall),
     }.items():
         ElementTree.SubElement(properties, "property", name=name, value=value)
-    for entry in result.results:
+    for entry, verdict in zip(entries, verdicts, strict=True):
         case = ElementTree.SubElement(
             suite,
             "testcase",
@@ -46,13 +58,16 @@ def write_junit(result: RunResult, path: Path) -> None:
             name=f"{entry.requirement.id}-{entry.side}",
             time="0",
         )
-        if entry.verdict is Verdict.FAIL:
+        if verdict is Verdict.FAIL:
             failure = ElementTree.SubElement(case, "failure", message=entry.observed)
             failure.text = entry.explain()
-        elif entry.verdict in (Verdict.ERROR, Verdict.BLOCKED):
+        elif verdict in (Verdict.ERROR, Verdict.BLOCKED):
             error = ElementTree.SubElement(case, "error", message=entry.reason)
             error.text = entry.explain()
-        elif entry.verdict in (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED):
+        elif verdict is not entry.verdict:
+            message = f"a fault of the client, not of the hand: {entry.observed or entry.reason}"
+            ElementTree.SubElement(case, "skipped", message=message).text = entry.explain()
+        elif verdict in _SKIPPED:
             ElementTree.SubElement(case, "skipped", message=entry.reason)
         else:
             out = ElementTree.SubElement(case, "system-out")

@@ -19,7 +19,7 @@ from dexkit.conformance.report.labels import (
     part,
     whose,
 )
-from dexkit.conformance.results import RunResult, Verdict, worst
+from dexkit.conformance.results import Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
 __all__ = ["code", "plain", "render_markdown", "table"]
@@ -75,7 +75,10 @@ def render_markdown(result: RunResult) -> str:
         lines.append(f"- test machine: {harness}")
     lines += ["", *_areas(result), ""]
     lines += _troubles(result)
-    lines += _folded("Every requirement", _every(result))
+    lines += _folded("Every requirement", _every(result.results)) if result.results else []
+    if result.client:
+        lines += [f"**{plain(_capital(result.client_sentence()))}**", ""]
+        lines += _folded("Every requirement about the client", _every(result.client))
     about = ", ".join(f"{plain(k)} {plain(v)}" for k, v in result.environment.items())
     lines.append(f"<sub>{plain(result.recorded_at)}, {result.duration_s:.1f} s; {about}</sub>")
     return "\n".join(lines) + "\n"
@@ -129,10 +132,14 @@ def _text(fact: Fact) -> str:
     return f"{code(place.topic)} {when}"
 
 
-def _every(result: RunResult) -> list[str]:
-    sides = list(dict.fromkeys(r.side for r in result.results))
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _every(results: Sequence[Result]) -> list[str]:
+    sides = list(dict.fromkeys(r.side for r in results))
     rows = []
-    for need, group in result.by_requirement():
+    for need, group in grouped(results):
         cells = {
             r.side: f"{VERDICTS[r.verdict].mark} {plain(r.figure or VERDICTS[r.verdict].text)}"
             for r in group

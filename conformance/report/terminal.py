@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 
 import rich.markup
 from rich.table import Table
@@ -10,7 +11,7 @@ from rich.text import Text
 
 from dexkit.conformance.report.card import Card, blocked_groups, cards
 from dexkit.conformance.report.labels import about_harness
-from dexkit.conformance.results import Overall, Result, RunResult, Verdict, worst
+from dexkit.conformance.results import Overall, Result, RunResult, Verdict, grouped, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape
 from dexkit.escaping import REMARK, one_line
@@ -39,31 +40,10 @@ def print_result(
     :param verbose: also list what could not be judged here, and why.
     :param more: where else the reasons are written.
     """
-    sides = list(dict.fromkeys(r.side for r in result.results))
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
-    table.add_column("requirement", no_wrap=True)
-    table.add_column("level", style="dim")
-    table.add_column("what")
-    table.add_column("verdict", no_wrap=True)
-    for side in sides:
-        table.add_column(side)
-    hidden = 0
-    for requirement, group in result.by_requirement():
-        verdict = worst(r.verdict for r in group)
-        if verdict in _UNJUDGED and not verbose:
-            hidden += 1
-            continue
-        mark, style = MARKS[verdict]
-        cells = {r.side: _cell(r) for r in group}
-        table.add_row(
-            # Text objects, because rich parses a string as markup each time it measures it
-            Text(one_line(requirement.id)),
-            Text(str(requirement.level)),
-            Text(one_line(requirement.title)),
-            Text(mark, style),
-            *(cells.get(side, Text()) for side in sides),
-        )
-    console.print(table)
+    hidden = _print_table(result.results, console, verbose)
+    if result.client:
+        console.print("\n[bold]The client that commanded the hands, not the hands:[/bold]")
+        hidden += _print_table(result.client, console, verbose)
     if hidden:
         console.print(
             f"[dim]{hidden} {'requirement' if hidden == 1 else 'requirements'} could not be judged "
@@ -76,7 +56,7 @@ def print_result(
     _print_blocked(result, console)
     if verbose:
         reasons: dict[tuple[str, str], list[str]] = {}
-        for entry in result.results:
+        for entry in [*result.results, *result.client]:
             if entry.verdict in _UNJUDGED:
                 reasons.setdefault((entry.requirement.id, entry.reason), []).append(entry.side)
         if reasons:
@@ -92,12 +72,49 @@ def print_result(
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
-    # one line at any width, so that logs can be searched for it
+    # one line each at any width, so that logs can be searched for it
+    if result.client and not result.client_only:
+        console.print(escape(result.client_sentence()), highlight=False, soft_wrap=True)
     console.print(
         f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]",
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _print_table(results: Sequence[Result], console: Console, verbose: bool) -> int:
+    """Print the table of these results; how many requirements it leaves out.
+
+    :param verbose: leave out none.
+    """
+    if not results:
+        return 0
+    sides = list(dict.fromkeys(r.side for r in results))
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
+    table.add_column("requirement", no_wrap=True)
+    table.add_column("level", style="dim")
+    table.add_column("what")
+    table.add_column("verdict", no_wrap=True)
+    for side in sides:
+        table.add_column(side)
+    hidden = 0
+    for requirement, group in grouped(results):
+        verdict = worst(r.verdict for r in group)
+        if verdict in _UNJUDGED and not verbose:
+            hidden += 1
+            continue
+        mark, style = MARKS[verdict]
+        cells = {r.side: _cell(r) for r in group}
+        table.add_row(
+            # Text objects, because rich parses a string as markup each time it measures it
+            Text(one_line(requirement.id)),
+            Text(str(requirement.level)),
+            Text(one_line(requirement.title)),
+            Text(mark, style),
+            *(cells.get(side, Text()) for side in sides),
+        )
+    console.print(table)
+    return hidden
 
 
 def _print_card(card: Card, console: Console) -> None:

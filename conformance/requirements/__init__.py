@@ -60,11 +60,13 @@ CAPABILITIES: Mapping[str, str] = {
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
-LAYERS = ("dds", "usb", "robot")
-"""Where a requirement is judged: on a hand's topics, on its USB device, or on a robot's topics."""
+LAYERS = ("dds", "usb", "robot", "client")
+"""What a requirement is about: a hand's topics, its USB device, a robot's topics, or the commands
+of the client that drives a hand."""
 _PLOTS: Mapping[str, tuple[Plot, ...]] = {
     "dds": (Plot(PlotKind.POSITION),),
     "robot": (Plot(PlotKind.POSITION),),
+    "client": (Plot(PlotKind.POSITION),),
     "usb": (Plot(PlotKind.ANSWERS), Plot(PlotKind.BYTES)),
 }
 """By layer: what a failure shows where neither the catalogue nor the check names a plot."""
@@ -90,6 +92,7 @@ _KEYS = {
     "repeat",
     "plots",
     "like",
+    "spoils",
 }
 _OPTIONAL = {
     "like",
@@ -103,6 +106,7 @@ _OPTIONAL = {
     "expected",
     "repeat",
     "plots",
+    "spoils",
 }
 
 
@@ -110,6 +114,7 @@ _TYPES: Mapping[str, type] = {
     "after": list,
     "dialects": list,
     "plots": list,
+    "spoils": list,
     "tolerances": dict,
     "realtime": bool,
     "negative": bool,
@@ -165,6 +170,8 @@ class Requirement:
     :param plots: what shows a failure, unless its check names other plots.
     :param like: the requirement of another model that it is taken from, and whose check judges
         it; empty if it stands for itself.
+    :param spoils: of a requirement about the client, how the ids begin of those requirements of
+        the hand that cannot be judged where the client does not meet it.
     """
 
     id: str
@@ -190,6 +197,7 @@ class Requirement:
     repeat: int = 1
     like: str = ""
     plots: tuple[Plot, ...] = ()
+    spoils: tuple[str, ...] = ()
 
     @property
     def phase(self) -> str | None:
@@ -205,6 +213,11 @@ class Requirement:
     def needs_discovery(self) -> bool:
         """Whether it needs what discovery saw of readers and writers."""
         return self.needs == "endpoints"
+
+    @property
+    def about_client(self) -> bool:
+        """Whether it is about the client's commands, and not about the hand."""
+        return self.layer == "client"
 
     @property
     def needs_commands(self) -> bool:
@@ -364,6 +377,8 @@ def _parse(
         for before in entry.get("after", []):
             if before not in found:
                 raise UsageError(f"{where}: {before} does not come before it")
+        if "spoils" in entry and layer != "client":
+            raise UsageError(f"{where}: only a requirement about the client spoils others")
         for name in entry.get("dialects", []):
             if name not in DIALECTS:
                 raise UsageError(f"{where}: no dialect {name!r}")
@@ -395,6 +410,7 @@ def _parse(
             repeat=entry.get("repeat", 1),
             like=entry.get("like", ""),
             plots=_plots(entry["plots"], where) if "plots" in entry else _PLOTS[layer],
+            spoils=tuple(entry.get("spoils", ())),
         )
     return tuple(found.values())
 

@@ -142,4 +142,5 @@ class Session:
 def _cut(c: Commands, begin: float, end: float) -> Commands:
     rows = slice(int(np.searchsorted(c.t, begin)), int(np.searchsorted(c.t, end, "right")))
     columns = {f.name: getattr(c, f.name)[rows] for f in fields(c) if f.name != "topic"}
-    return Commands(c.topic, **{**columns, "t": c.t[rows] - begin})
+    times = {"t": c.t[rows] - begin, "sent": c.sent[rows] - begin}
+    return Commands(c.topic, **{**columns, **times})

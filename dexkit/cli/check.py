@@ -69,10 +69,13 @@ def command(
     """Judge a recording against the requirements of its hand.
 
     Judges what the recording holds: any session recorded with 'dexkit record', a ROS 2 bag, or
-    the recording of a conformance run with all its stimuli.
+    the recording of a conformance run with all its stimuli. In a session the client's commands
+    are judged as well; what the client does wrong fails no hand.
 
-    Exit code: 0 every MUST that could be judged is met, 1 one is not, 2 the recording is not
-    usable or damaged (what is left is judged all the same), or nothing in it could be judged.
+    Exit code, about the hands: 0 every MUST that could be judged is met, 1 one is not, 2 the
+    recording is not usable or damaged (what is left is judged all the same), nothing in it could
+    be judged, or the client did not allow to judge a MUST. With --require DEX1-CLIENT (DEX3-,
+    DEX5-) it is about the client.
     """
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
@@ -103,6 +106,7 @@ def command(
     else:
         every = catalogue(model_name, view.layer)
         every += catalogue(model_name, "usb") if view.usb is not None else ()
+        every += catalogue(model_name, "client") if view.stimulus is None else ()
     requirements = select(claims.apply(every), prefixes=require, level=level)
     if not requirements:
         raise ConformanceError("no requirement is left by --require and --level together")

@@ -26,9 +26,12 @@ Verdicts = dict[str, str]
 
 
 def verdicts_of(name: str) -> Verdicts:
-    """Requirement and side of everything judged in a sample, with verdict and figure."""
+    """Requirement and side of everything judged in a sample, its client included, with verdict and
+    figure.
+    """
     result = judge(recording_of(open_trace(sample_path(name)), None, ()))
-    return {f"{r.requirement.id} {r.side}": f"{r.verdict}: {r.figure}" for r in result.results}
+    every = [*result.results, *result.client]
+    return {f"{r.requirement.id} {r.side}": f"{r.verdict}: {r.figure}" for r in every}
 
 
 def sample_verdicts() -> dict[str, Verdicts]:

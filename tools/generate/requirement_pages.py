@@ -25,6 +25,7 @@ PAGES = {
     "dds": "conformance.md",
     "robot": "conformance-robots.md",
     "usb": "conformance-usb.md",
+    "client": "conformance-client.md",
 }
 """The page of each layer, in docs."""
 

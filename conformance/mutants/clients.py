@@ -1,0 +1,225 @@
+"""Wrong clients: each sends one thing wrong to good hands, and only that must be found.
+
+The hands' requirements that a wrong client spoils are blocked; none of them fails.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from dexkit.conformance.motor_messages import LIMP, Motor
+from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.recording import joints_of
+from dexkit.conformance.virtual.client import ReferenceClient
+from dexkit.hand import Side
+from dexkit.models import ModeByte
+from dexkit.teleop import Dex1Client, Pose, TeleopClient
+
+# ------------------------------------------------------------------------------ form and values
+
+
+@wrong_hand("DEX1-CLIENT-01")
+class OneMotorTooMany(ReferenceClient):
+    """Sends one motor more than the hand has."""
+
+    def encoded(self, hands: Mapping[Side, list[Motor]]) -> list[tuple[str, bytes]]:
+        return self.codec.encode_longer(hands, [LIMP])
+
+
+@wrong_hand("DEX1-CLIENT-01")
+class EmptyNowAndThen(ReferenceClient):
+    """Sends every fiftieth command without a motor in it."""
+
+    def encoded(self, hands: Mapping[Side, list[Motor]]) -> list[tuple[str, bytes]]:
+        if self.turn % 50 == 0:
+            return self.codec.encode_empty(list(hands))
+        return super().encoded(hands)
+
+
+@wrong_hand("DEX1-CLIENT-02")
+class DividesByZero(ReferenceClient):
+    """Sends NaN as the velocity of the last joint when the target rests."""
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        if self.turn % 40:
+            return motors
+        return [*motors[:-1], replace(motors[-1], dq=math.nan)]
+
+
+@wrong_hand("DEX1-CLIENT-03")
+class SendsPercent(ReferenceClient):
+    """Sends q as percent of each joint's range."""
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        joints = joints_of(self.dialect, side)
+        return [
+            replace(m, q=100.0 * (m.q - j.q_min) / j.stroke)
+            for m, j in zip(motors, joints, strict=True)
+        ]
+
+
+@wrong_hand("DEX1-CLIENT-03")
+class SendsDegrees(ReferenceClient):
+    """Sends q in degrees."""
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        return [replace(m, q=math.degrees(m.q)) for m in motors]
+
+
+@wrong_hand("DEX1-CLIENT-04")
+class SendsNormalised(ReferenceClient):
+    """Sends q from 0 to 1, and takes states for the same."""
+
+    course = ((0, 0.0), (0.8, 1.0), (2.3, 0.0), (3.6, 1.0), (5, 0.0))
+
+    def receive(self, now: float, q: Mapping[Side, Pose]) -> None:
+        stroke = self.dialect.q_open
+        super().receive(now, {s: tuple(stroke * x for x in pose) for s, pose in q.items()})
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        return [replace(m, q=m.q / self.dialect.q_open) for m in motors]
+
+
+@wrong_hand("DEX1-CLIENT-09")
+class SoftGains(ReferenceClient):
+    """Sends a tenth of the usual gains."""
+
+    factor = 0.1
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        return [replace(m, kp=self.factor * m.kp, kd=self.factor * m.kd) for m in motors]
+
+
+@wrong_hand("DEX1-CLIENT-09")
+class NoGains(SoftGains):
+    """Leaves the gains 0."""
+
+    factor = 0.0
+
+
+@wrong_hand("DEX1-CLIENT-09")
+class GainsOfTheMotor(SoftGains):
+    """Sends ten times the usual gains."""
+
+    factor = 10.0
+
+
+@wrong_hand("DEX1-CLIENT-14", dialect="unitree_hg")
+class GainsWithoutUse(ReferenceClient):
+    """Sends gains in a dialect whose clients send 0."""
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        return [replace(m, kp=5.0, kd=0.05) for m in motors]
+
+
+@wrong_hand("DEX1-CLIENT-10")
+class ModeOfAnotherProduct(ReferenceClient):
+    """Sends the mode byte of another product."""
+
+    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
+        kind = self.dialect.mode_byte
+        return [
+            replace(m, mode={ModeByte.UNUSED: 10, ModeByte.STATUS: 0x10 | i}.get(kind, 1))
+            for i, m in enumerate(motors)
+        ]
+
+
+# ----------------------------------------------------------------------------------------- time
+
+
+@wrong_hand("DEX1-CLIENT-05")
+class FiveHertz(ReferenceClient):
+    """Sends 5 commands a second."""
+
+    def sends(self, now: float) -> bool:
+        return self.turn % round(self.rate / 5) == 0
+
+
+@wrong_hand("DEX1-CLIENT-05")
+class SlowsDown(ReferenceClient):
+    """Sends 10 commands a second for 1.5 s; the mean of the session is good."""
+
+    def sends(self, now: float) -> bool:
+        return not 2.3 <= now < 3.8 or self.turn % round(self.rate / 10) == 0
+
+
+@wrong_hand("DEX1-CLIENT-06")
+class HalfRateClient(ReferenceClient):
+    """Sends every second command."""
+
+    def sends(self, now: float) -> bool:
+        return self.turn % 2 == 0
+
+
+@wrong_hand("DEX1-CLIENT-07", also=("DEX1-CLIENT-06",))
+class Stutters(ReferenceClient):
+    """Sends nothing for 0.25 s, twice."""
+
+    def sends(self, now: float) -> bool:
+        return not (2.0 <= now < 2.25 or 4.5 <= now < 4.75)
+
+
+# --------------------------------------------------------------------------------------- motion
+
+
+@wrong_hand("DEX1-CLIENT-08")
+class JumpsToTheTarget(ReferenceClient):
+    """Sends the operator's target without a limit to the step."""
+
+    def make_client(self) -> TeleopClient:
+        return Dex1Client(self.dialect, self.sides, simulated=True)
+
+
+@wrong_hand("DEX1-CLIENT-11")
+class TwoClients(ReferenceClient):
+    """A second client commands the same hands to another pose, by turns with the first."""
+
+    def messages(self, now: float) -> list[tuple[str, bytes]]:
+        first = super().messages(now)
+        if not first:
+            return []
+        rival = {
+            side: [
+                # on the other side of the last state
+                replace(m, q=m.q - math.copysign(0.03 * joint.stroke, m.q - state))
+                for m, joint, state in zip(
+                    motors, joints_of(self.dialect, side), self.q[side], strict=True
+                )
+            ]
+            for side, motors in self.motors(now).items()
+        }
+        return [*first, *self.encoded(rival)]
+
+
+# -------------------------------------------------------------------------------- begin and end
+
+
+@wrong_hand("DEX1-CLIENT-12")
+class Blind(ReferenceClient):
+    """Sends to the right hand before that has published a state."""
+
+    right_up_s = 1.5
+
+    def receive(self, now: float, q: Mapping[Side, Pose]) -> None:
+        self.q.update(q)
+        if len(self.q) == len(self.sides):
+            self.client.receive(now, q)
+
+    def motors(self, now: float) -> dict[Side, list[Motor]]:
+        found = super().motors(now)
+        left = self.q.get(Side.LEFT)
+        if found or left is None:
+            return found
+        twin = self.make_client()
+        twin.receive(now, {Side.LEFT: left, Side.RIGHT: left})
+        joints = twin.step(now, {}, {})
+        return {s: [Motor(**j._asdict()) for j in command] for s, command in joints.items()}
+
+
+@wrong_hand("DEX1-CLIENT-13")
+class Killed(ReferenceClient):
+    """Ends while the hands close."""
+
+    seconds = 3.9

@@ -1,0 +1,477 @@
+"""Test the requirements about the client of a recorded session."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.cli.check import command
+from dexkit.conformance.checks import Context, Outcome, check_of
+from dexkit.conformance.checks.client import returns, sessions, slow_stretches
+from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import layer, recording_of
+from dexkit.conformance.motor_messages import Motor, MotorCodec
+from dexkit.conformance.mutants import Mutant, mutants
+from dexkit.conformance.mutants.matrix import Outcome as Trial
+from dexkit.conformance.mutants.matrix import try_one
+from dexkit.conformance.recording import Commands, Recording, SideView, States, joints_of
+from dexkit.conformance.report.html import render
+from dexkit.conformance.report.junit import write_junit
+from dexkit.conformance.report.markdown import render_markdown
+from dexkit.conformance.requirements import Level, catalogue, parse
+from dexkit.conformance.result_file import read_json
+from dexkit.conformance.results import Overall, Result, RunResult, Verdict
+from dexkit.conformance.virtual import MemoryTrace
+from dexkit.conformance.virtual.client import ReferenceClient, run_client
+from dexkit.errors import UsageError
+from dexkit.hand import Floats, Side
+from dexkit.models import DIALECTS, dialect, model
+from dexkit.traces import Recorder, open_trace, sample_path
+from dexkit.traces.samples import SAMPLES
+from tests.conformance_helpers import failed, of, short_run
+from tests.each import each
+
+GOOD = {Verdict.PASS, Verdict.NOT_APPLICABLE}
+BAD = {Verdict.FAIL, Verdict.WARN, Verdict.ERROR}
+BY_ID = {r.id: r for r in catalogue(None, "client")}
+GO = dialect("unitree_go")
+
+
+def bad(results: list[Result]) -> set[tuple[str, str]]:
+    return {(r.requirement.id, r.side) for r in results if r.verdict in BAD}
+
+
+# --------------------------------------------------------------------------------- the catalogue
+
+
+def test_every_prefix_of_spoils_names_requirements_of_the_hand() -> None:
+    for requirement in BY_ID.values():
+        of_hand = [r.id for r in catalogue(requirement.model)]
+        for prefix in requirement.spoils:
+            assert any(name.startswith(prefix) for name in of_hand), (requirement.id, prefix)
+
+
+def test_every_must_of_the_client_spoils_what_follows_its_commands() -> None:
+    for requirement in BY_ID.values():
+        if requirement.level is Level.MUST:
+            prefix = requirement.id.partition("-")[0]
+            assert f"{prefix}-TRACK" in requirement.spoils, requirement.id
+
+
+def test_only_requirements_about_the_client_spoil_others() -> None:
+    text = (
+        'model = "dex1-1"\n[[requirement]]\nid = "DEX1-RATE-01"\narea = "a"\nlevel = "MUST"\n'
+        'title = "t"\nsentence = "s"\nrationale = "r"\nsource = "s"\nconfidence = "inferred"\n'
+        'needs = "state"\nadvice = "a"\nspoils = ["DEX1-TRACK"]\n'
+    )
+    with pytest.raises(UsageError, match="only a requirement about the client"):
+        parse(text)
+    (found,) = parse(f'layer = "client"\n{text}')
+    assert found.spoils == ("DEX1-TRACK",)
+    assert found.about_client
+
+
+# ---------------------------------------------------------------- genuine clients, and good ones
+
+
+@each("name", SAMPLES)
+def test_clients_of_the_samples_meet_every_requirement(name: str) -> None:
+    result = judge(recording_of(open_trace(sample_path(name)), None, ()))
+    assert {r.verdict for r in result.client} <= GOOD, bad(result.client)
+    passed = {r.requirement.id[-9:] for r in result.client if r.verdict is Verdict.PASS}
+    assert len(passed) >= 10
+
+
+@each("name", [n for n, d in DIALECTS.items() if d.is_gripper])
+def test_reference_client_and_hands_meet_every_requirement(name: str) -> None:
+    trace = run_client(ReferenceClient, dialect(name))
+    result = judge(recording_of(trace, name, ()))
+    assert not bad([*result.results, *result.client])
+    applies = {i for i, r in BY_ID.items() if name in r.dialects}
+    assert {r.requirement.id for r in result.client if r.verdict is Verdict.PASS} == applies
+    assert of(result, f"{next(iter(applies)).partition('-')[0]}-TRACK-01").verdict is Verdict.PASS
+
+
+def test_run_of_the_kit_has_no_results_about_the_client() -> None:
+    result = judge(Recording.decode(short_run()))
+    assert result.client == []
+    assert result.client_sentence() == ""
+    assert result.as_dict()["client"] is None
+
+
+def one_of_each_check() -> list[Mutant]:
+    found = {check_of(BY_ID[m.kills]): m for m in reversed(mutants("client"))}
+    return [m for m in found.values() if m.model == "dex1-1"]
+
+
+@pytest.mark.parametrize("given_client", one_of_each_check(), ids=lambda m: m.name)
+def test_wrong_client_fails_its_requirement_and_no_hand(given_client: Mutant) -> None:
+    assert try_one(given_client) == Trial(given_client), given_client.summary
+
+
+# ------------------------------------------- genuine hands with clients that send something wrong
+
+
+@cache
+def genuine() -> MemoryTrace:
+    trace = open_trace(sample_path("dex1_pick_place"))
+    rows = {
+        (topic, found.type_name): list(
+            zip(
+                found.log_time_ns.tolist(),
+                found.publish_time_ns.tolist(),
+                found.payloads,
+                strict=True,
+            )
+        )
+        for topic, found in trace.load().items()
+    }
+    return MemoryTrace(endpoints=list(trace.endpoints), rows=rows)
+
+
+Change = Callable[[int, tuple[Motor, ...]], "list[Motor] | None"]
+
+
+def spoiled(change: Change, side: Side = Side.LEFT) -> MemoryTrace:
+    """The genuine session with changed commands to one hand; None leaves one out."""
+    codec, source = MotorCodec(GO), genuine()
+    trace = MemoryTrace(endpoints=source.endpoints, rows=dict(source.rows))
+    key = (codec.command_topics[side], GO.cmd_type)
+    changed = []
+    for number, (log_ns, sent_ns, payload) in enumerate(source.rows[key]):
+        motors = change(number, codec.read_command(payload, side) or ())
+        if motors is not None:
+            changed.append((log_ns, sent_ns, codec.encode({side: motors})[0][1]))
+    trace.rows[key] = changed
+    return trace
+
+
+def five_hertz(number: int, motors: tuple[Motor, ...]) -> list[Motor] | None:
+    return list(motors) if number % 39 == 0 else None
+
+
+def in_percent(number: int, motors: tuple[Motor, ...]) -> list[Motor]:
+    return [replace(m, q=100.0 * m.q / GO.q_open) for m in motors]
+
+
+def two_motors(number: int, motors: tuple[Motor, ...]) -> list[Motor]:
+    return [*motors, Motor(q=1.0)]
+
+
+@each(
+    ("change", "requirement", "told"),
+    [
+        (five_hertz, "DEX1-CLIENT-05", "5.0[0-9] Hz from 0.95 s on"),
+        (in_percent, "DEX1-CLIENT-03", "up to 100; the range is 0.00 to 5.40 rad"),
+        (two_motors, "DEX1-CLIENT-01", "4026 of 4026 commands hold 2 motors instead of 1"),
+    ],
+)
+def test_fault_of_the_client_fails_no_hand(change: Change, requirement: str, told: str) -> None:
+    result = judge(Recording.decode(spoiled(change)))
+    assert failed(result) == set()
+    assert {name for name, side in bad(result.client)} == {requirement}
+    assert {side for _, side in bad(result.client)} == {"left"}
+    track = of(result, "DEX1-TRACK-01")
+    assert (track.verdict, track.blocked_by) == (Verdict.BLOCKED, requirement)
+    assert track.reason.startswith(f"blocked by {requirement}, a fault of the client: ")
+    (guilty,) = (r for r in result.client if r.verdict is Verdict.FAIL)
+    assert re.search(told, guilty.observed)
+    assert guilty.requirement.advice.startswith("In the client:")
+    # the other hand is judged
+    assert of(result, "DEX1-TRACK-01", "right").verdict is Verdict.PASS
+    assert result.overall is Overall.INCONCLUSIVE
+    assert f"because of the client ({requirement})" in result.sentence()
+
+
+def test_percent_and_degrees_are_named_as_the_cause() -> None:
+    def degrees(number: int, motors: tuple[Motor, ...]) -> list[Motor]:
+        return [replace(m, q=math.degrees(m.q)) for m in motors]
+
+    for change, unit in ((in_percent, "percent or degrees"), (degrees, "degrees")):
+        result = judge(Recording.decode(spoiled(change)))
+        (guilty,) = (r for r in result.client if r.requirement.id == "DEX1-CLIENT-03" and r.cause)
+        assert guilty.cause == f"q is in {unit}, not in radians."
+
+
+def test_rate_that_falls_in_the_middle_is_found_with_its_second() -> None:
+    def slows(number: int, motors: tuple[Motor, ...]) -> list[Motor] | None:
+        return list(motors) if number < 2000 or number % 20 == 0 else None
+
+    result = judge(Recording.decode(spoiled(slows)))
+    slow = next(r for r in result.client if r.requirement.id == "DEX1-CLIENT-05")
+    assert slow.verdict is Verdict.FAIL
+    begin = genuine().rows["rt/dex1/left/cmd", GO.cmd_type][1999][0]
+    assert slow.evidence[0].log_time_ns == pytest.approx(begin, abs=110e6)
+
+
+def test_only_the_client_is_selected() -> None:
+    thin = Recording.decode(spoiled(five_hertz))
+    wanted = [r for r in BY_ID.values() if r.model == "dex1-1"]
+    result = judge(thin, requirements=wanted)
+    assert result.results == []
+    assert result.overall is Overall.FAIL
+    assert result.sentence().startswith("the client: FAIL")
+    good = judge(Recording.decode(genuine()), requirements=wanted)
+    assert good.overall is Overall.PASS
+    assert good.judged == 24
+
+
+def test_what_blocks_a_selected_requirement_is_reported_with_it() -> None:
+    thin = Recording.decode(spoiled(five_hertz))
+    result = judge(thin, requirements=[r for r in catalogue("dex1-1") if r.id == "DEX1-TRACK-01"])
+    assert {r.requirement.id for r in result.client} == {"DEX1-CLIENT-05"}
+
+
+# ----------------------------------------------------------------------------------------- reports
+
+
+@cache
+def thin_result() -> RunResult:
+    return judge(Recording.decode(spoiled(five_hertz)), subject={"recording": "thin.mcap"})
+
+
+def test_check_exits_by_the_hand_and_names_the_client(tmp_path: Path) -> None:
+    path, out = tmp_path / "thin.mcap", tmp_path / "r.json"
+    with Recorder(path) as recorder:
+        for (topic, kind), rows in spoiled(five_hertz).rows.items():
+            for log_ns, sent_ns, payload in rows:
+                recorder.put(topic, kind, payload, log_time_ns=log_ns, publish_time_ns=sent_ns)
+    run = CliRunner().invoke(command, [str(path), "--json", str(out)])
+    assert run.exit_code == Overall.INCONCLUSIVE.exit_code, run.output
+    assert "DEX1-CLIENT-05 (MUST) client, left: fail" in run.output
+    assert "because of the client (DEX1-CLIENT-05)" in run.output
+    assert "the client: FAIL: a MUST is not met" in run.output
+    assert json.loads(out.read_text())["client"]["overall"] == "fail"
+    again = read_json(out)
+    assert again.sentence() in run.output
+    assert again.client_sentence() in run.output
+    assert [r.requirement.id for r in again.client] == [
+        r.requirement.id for r in thin_result().client
+    ]
+    alone = CliRunner().invoke(command, [str(path), "--require", "DEX1-CLIENT"])
+    assert alone.exit_code == Overall.FAIL.exit_code, alone.output
+
+
+def test_reports_call_the_client_by_its_name(tmp_path: Path) -> None:
+    result = thin_result()
+    page, summary = render(result), render_markdown(result)
+    assert "The client that commanded it is at fault" in page
+    assert '<b class="bad">fail</b> of the client' in page
+    assert "`DEX1-CLIENT-05` Least rate (client, left)" in summary
+    assert "The client: FAIL: a MUST is not met" in summary
+    write_junit(result, tmp_path / "r.xml")
+    suite = ElementTree.parse(tmp_path / "r.xml").getroot()
+    assert suite.get("failures") == "0"
+    case = next(c for c in suite.iter("testcase") if c.get("name") == "DEX1-CLIENT-05-left")
+    skipped = case.find("skipped")
+    assert skipped is not None
+    assert str(skipped.get("message")).startswith("a fault of the client, not of the hand: ")
+
+
+# ------------------------------------------------------------- boundaries of the single checks
+
+
+def context(name: str, t: Floats, q: Floats, **columns: Floats) -> Context:
+    """Commands to a left hand, and states of a hand that is always where it is commanded.
+
+    :param q: shape (n, n_joints), as all columns.
+    """
+    requirement = BY_ID[name]
+    spoken = dialect(requirement.dialects[0])
+    joints = joints_of(spoken, Side.LEFT)
+    gains = model(spoken.model).gains
+    kp, kd = (np.tile([g[i] for g in gains], (len(t), 1)) for i in (0, 1))
+    zero, length = np.zeros_like(q), np.full(len(t), spoken.length)
+    given_columns = {"kp": kp, "kd": kd, "dq": zero, "tau": zero, "mode": zero, **columns}
+    count = np.asarray(given_columns.pop("length", length), dtype=np.intp)
+    topic, state = spoken.topics(Side.LEFT)
+    commands = Commands(topic, t, t, count, q, **given_columns)
+    states = States(state, t, t, length, q, zero, zero, zero, zero)
+    view = SideView(Side.LEFT, states, commands, joints)
+    recording = Recording(
+        spoken, 0, float(t[-1]), {Side.LEFT: view}, [], [], None, judged=(Side.LEFT,)
+    )
+    return layer("client").context(recording, view, requirement)
+
+
+def judged(ctx: Context) -> Outcome:
+    return check_of(ctx.requirement)(ctx)
+
+
+def still(count: int, rate: float = 200.0, joints: int = 1) -> tuple[Floats, Floats]:
+    return np.arange(count) / rate, np.zeros((count, joints))
+
+
+@settings(max_examples=30)
+@given(
+    rate=st.floats(1.0, 1000.0),
+    limit=st.sampled_from([25.0, 90.0, 180.0]),
+    window=st.sampled_from([0.5, 1.0]),
+)
+def test_steady_client_passes_from_the_limit_on(rate: float, limit: float, window: float) -> None:
+    t = np.asarray(np.arange(0.0, 3.0, 1.0 / rate), dtype=np.float64)
+    least, found = slow_stretches(t, limit, window)
+    assert bool(found) is (rate < limit * (1.0 - 1e-6))
+    assert least == pytest.approx(rate, rel=1e-6)
+
+
+@settings(max_examples=30)
+@given(pause=st.floats(0.01, 0.9), at=st.integers(100, 700))
+def test_stretch_of_few_commands_is_found_where_it_is(pause: float, at: int) -> None:
+    t = np.arange(1000) / 200.0
+    t[at:] += pause
+    _, found = slow_stretches(t, 25.0, 0.5)
+    # 12 intervals in 0.48 s: 11 of 5 ms beside the pause
+    assert bool(found) is (pause + 12 * 0.005 > 0.48 + 1e-6)
+    for begin, end in found:
+        assert begin <= t[at - 1] < t[at] <= end
+
+
+@settings(max_examples=30)
+@given(pause=st.floats(0.02, 0.95))
+def test_interval_is_a_gap_from_a_tenth_of_a_second_on(pause: float) -> None:
+    t, q = still(400)
+    t[200:] += pause - 0.005
+    assert judged(context("DEX1-CLIENT-07", t, q)).met is (pause <= 0.1)
+
+
+@each(
+    ("run", "pause", "count"),
+    [(200, 0.9, 1), (200, 1.1, 2), (5, 1.1, 1), (1, 2.0, 1)],
+)
+def test_longer_pause_separates_sessions_of_some_length(run: int, pause: float, count: int) -> None:
+    t, q = still(400)
+    late = np.arange(400) // run * pause if run < 20 else (np.arange(400) >= run) * pause
+    found = sessions(context("DEX1-CLIENT-07", t + late, q))
+    assert len(found) == count
+    assert found[0].start == 0
+    assert found[-1].stop == 400
+
+
+@settings(max_examples=30)
+@given(st.data())
+def test_any_value_that_is_not_finite_is_found(data: st.DataObject) -> None:
+    t, q = still(50, joints=7)
+    column = data.draw(st.sampled_from(["q", "dq", "tau", "kp", "kd"]))
+    row, joint = data.draw(st.integers(0, 49)), data.draw(st.integers(0, 6))
+    values = np.ones((50, 7))
+    assert judged(
+        context("DEX3-CLIENT-02", t, q, **({column: values} if column != "q" else {}))
+    ).met
+    values[row, joint] = data.draw(st.sampled_from([math.nan, math.inf, -math.inf]))
+    ctx = (
+        context("DEX3-CLIENT-02", t, values)
+        if column == "q"
+        else context("DEX3-CLIENT-02", t, q, **{column: values})
+    )
+    outcome = judged(ctx)
+    assert outcome.met is False
+    assert outcome.joints == (joint,)
+    assert outcome.evidence[0].time_s == pytest.approx(t[row], abs=1e-4)
+
+
+@settings(max_examples=30)
+@given(st.integers(-1, 40))
+def test_only_the_dialects_length_passes(length: int) -> None:
+    t, q = still(50, joints=7)
+    ctx = context("DEX3-CLIENT-01", t, q, length=np.full(50, float(length)))
+    assert judged(ctx).met is (length == 7)
+
+
+@settings(max_examples=30)
+@given(q=st.floats(-10.0, 400.0), driven=st.booleans())
+def test_driven_q_is_within_stroke_and_margin(q: float, driven: bool) -> None:
+    t, zero = still(50)
+    gains = {} if driven else {"kp": zero, "kd": zero}
+    outcome = judged(context("DEX1-CLIENT-03", t, zero + q, **gains))
+    assert outcome.met is (not driven or -0.25 <= q <= 5.65)
+
+
+@settings(max_examples=30)
+@given(st.floats(-1.0, 1.0))
+def test_step_from_the_states_is_at_most_a_fifth_of_a_radian(step: float) -> None:
+    t, q = still(200)
+    ctx = context("DEX1-CLIENT-08", t, q + 2.0)
+    goal = ctx.commands.q.copy()
+    goal[100] += step
+    ahead = replace(ctx.hand, commands=replace(ctx.commands, q=goal))
+    outcome = judged(replace(ctx, hand=ahead))
+    assert outcome.met is (abs(step) <= 0.0371 * 5.4)
+
+
+@settings(max_examples=30)
+@given(st.floats(0.01, 100.0))
+def test_gains_are_within_the_factor(factor: float) -> None:
+    t, q = still(100, joints=7)
+    ctx = context("DEX3-CLIENT-09", t, q, kp=np.full((100, 7), 1.5 * factor))
+    assert judged(ctx).met is (0.25 * (1 - 1e-6) <= factor <= 4.0 * (1 + 1e-6))
+
+
+def test_zero_gains_stop_a_joint_at_the_end_and_nowhere_else() -> None:
+    t, q = still(100)
+    for rows, met in ((slice(90, 100), True), (slice(0, 10), True), (slice(40, 50), False)):
+        kp, kd = np.full((100, 1), 5.0), np.full((100, 1), 0.05)
+        kp[rows], kd[rows] = 0.0, 0.0
+        assert judged(context("DEX1-CLIENT-09", t, q, kp=kp, kd=kd)).met is met
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 255), st.integers(0, 6))
+def test_mode_byte_of_a_driven_motor_is_its_index_and_status_1(byte: int, joint: int) -> None:
+    t, q = still(60, joints=7)
+    mode = np.tile(0x10 | np.arange(7.0).astype(int), (60, 1)).astype(np.float64)
+    assert judged(context("DEX3-CLIENT-10", t, q, mode=mode)).met
+    mode[30, joint] = byte
+    outcome = judged(context("DEX3-CLIENT-10", t, q, mode=mode))
+    assert outcome.met is (byte & 0x7F == 0x10 | joint)
+
+
+@settings(max_examples=30)
+@given(
+    distance=st.floats(0.2, 3.0),
+    first=st.integers(1, 3),
+    second=st.integers(1, 3),
+)
+def test_two_clients_at_any_two_rates_are_noticed(distance: float, first: int, second: int) -> None:
+    t = np.arange(400) / 200.0
+    by_second = np.arange(400) % (first + second) >= first
+    q = np.where(by_second, distance, 0.0) + np.linspace(1.0, 2.0, 400)
+    assert returns(q, 0.108).any()
+    assert judged(context("DEX1-CLIENT-11", t, q[:, None])).met is False
+
+
+@settings(max_examples=30)
+@given(speed=st.floats(-10.0, 10.0), hold=st.integers(1, 10))
+def test_one_client_at_full_speed_is_not_taken_for_two(speed: float, hold: int) -> None:
+    t = np.arange(800) / 200.0
+    q = 2.7 + 2.5 * np.sin(speed * (np.arange(800) // hold * hold) / 200.0)
+    assert judged(context("DEX1-CLIENT-11", t, q[:, None])).met
+
+
+def test_session_ends_at_rest_or_with_a_stop() -> None:
+    t, q = still(400)
+    moving = np.linspace(0.0, 3.0, 400)[:, None]
+    for goal, stop, met in ((q, False, True), (moving, False, False), (moving, True, True)):
+        kp = np.full((400, 1), 5.0)
+        kd = np.full((400, 1), 0.05)
+        if stop:
+            kp[-1], kd[-1] = 0.0, 0.0
+        ctx = context("DEX1-CLIENT-13", t, goal, kp=kp, kd=kd)
+        assert judged(ctx).reason == "the recording ends before the client does"
+        later = np.append(ctx.states.t, t[-1] + 1.0)
+        at_end = np.append(ctx.states.q, ctx.states.q[-1:], axis=0)
+        states = replace(ctx.states, t=later, sent=later, q=at_end)
+        outcome = judged(replace(ctx, hand=replace(ctx.hand, states=states)))
+        assert outcome.met is met, outcome
