@@ -10,7 +10,7 @@ import os
 import socket
 import struct
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from dexkit.doctor import rtps
 
@@ -46,7 +46,8 @@ class HostilePeer:
         self._socket.bind(("127.0.0.1", 0))
         self._numbers = {rtps.SEDP_PUBLICATIONS: 0, rtps.SEDP_SUBSCRIPTIONS: 0}
         self._entities = 0
-        self._packets: list[bytes] = []
+        self._lock = threading.Lock()
+        self._packets: list[Callable[[], bytes]] = []
         self._ended = threading.Event()
         self._repeater = threading.Thread(target=self._repeat, daemon=True)
 
@@ -65,13 +66,16 @@ class HostilePeer:
         A busy machine may drop one, and this peer does not answer requests for repair.
         """
         packet = rtps.message(self.prefix, *submessages)
-        self._send(packet)
-        self._packets.append(packet)
+        self._send_and_repeat(lambda: packet)
+
+    def _send_and_repeat(self, make: Callable[[], bytes]) -> None:
+        self._send(make())
+        self._packets.append(make)
 
     def _repeat(self) -> None:
         while not self._ended.wait(0.5):
-            for packet in tuple(self._packets):
-                self._send(packet)
+            for make in tuple(self._packets):
+                self._send(make())
 
     def _send(self, packet: bytes) -> None:
         for index in range(_PARTICIPANTS):
@@ -114,9 +118,7 @@ class HostilePeer:
         :param extra: further parameters: policies, type information.
         """
         source = rtps.SEDP_PUBLICATIONS if writer else rtps.SEDP_SUBSCRIPTIONS
-        self._numbers[source] += 1
         self._entities += 1
-        number = self._numbers[source]
         entity = self._entities.to_bytes(3, "big") + (b"\x03" if writer else b"\x04")
         payload = (
             b"\0\x03\0\0"
@@ -129,5 +131,13 @@ class HostilePeer:
             + extra
             + parameter(0x01, b"")
         )
-        self.send(rtps.build_data(source, number, payload))
-        self.send(rtps.build_heartbeat(source, number, number, number))
+
+        def make() -> bytes:
+            # a new number each time: a reader drops those before the first that it has received
+            with self._lock:
+                self._numbers[source] += 1
+                number = self._numbers[source]
+            heartbeat = rtps.build_heartbeat(source, number, number, number)
+            return rtps.message(self.prefix, rtps.build_data(source, number, payload), heartbeat)
+
+        self._send_and_repeat(make)

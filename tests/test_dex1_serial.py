@@ -194,7 +194,7 @@ def test_missing_motor_error_lists_what_was_tried(tmp_path: Path) -> None:
         motors.inject("corrupt")
         wait_for(lambda: len(motors.bus(Side.RIGHT).schedule.active) == 2)
         with pytest.raises(HandNotFound) as garbled:
-            Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, timeout=0.05)).open()
+            Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, timeout=TIMEOUT)).open()
         assert "no intact frames" in garbled.value.hint
 
 

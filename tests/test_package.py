@@ -126,7 +126,11 @@ emulator = subprocess.Popen(
 assert emulator.stdout.readline().startswith(b"ready: ")
 port = d.PortHandler(link)
 assert port.openPort() and port.setBaudRate(1_000_000)
-print(*d.PacketHandler(2.0).ping(port, 1))
+for _ in range(100):  # the SDK waits for some milliseconds only
+    answer = d.PacketHandler(2.0).ping(port, 1)
+    if answer[1] == d.COMM_SUCCESS:
+        break
+print(*answer)
 emulator.terminate()
 assert emulator.wait(10) in (0, 143)
 """
