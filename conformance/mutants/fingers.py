@@ -449,6 +449,20 @@ class OwnStiffness(FingerService):
     hand_fault = _OwnStiffness
 
 
+class _StuckWhenSoft(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[3] = np.where(rows[3] < 0.5 * self.client_kp, 0.0, rows[3])
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-02")
+class StuckWhenSoft(FingerService):
+    """Does not move with less than half of the client's stiffness."""
+
+    hand_fault = _StuckWhenSoft
+
+
 # --------------------------------------------------------------------------------- mode byte
 
 
