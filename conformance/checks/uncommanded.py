@@ -17,7 +17,7 @@ from dexkit.hand import Floats
 
 OWN_RULE = (
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "foreign", "burst"),
-    *("two-writers", "limp", "lock", "drive", "silence", "shutdown"),
+    *("two-writers", "limp", "lock", "drive", "silence"),
     *("guard-drive", "guard", "guard-latch", "guard-clear"),
 )
 """Stimuli during which other requirements say what may move."""
@@ -32,8 +32,9 @@ class _Goals:
     """The position commands to one joint, rad.
 
     :param t: when each was received, s; only those at which ``low`` or ``high`` changes.
-    :param low: the goal; -inf for a command that drives the joint by anything else than a position.
-    :param high: likewise, inf.
+    :param low: the goal; -inf for a command that drives the joint by anything else than a
+        position, inf for one that does not drive it.
+    :param high: likewise, with the other sign.
     """
 
     t: Floats
@@ -50,15 +51,17 @@ def _goals(ctx: Context, joint: int) -> _Goals:
     t, q = commands.t[finite], np.clip(commands.q[finite, joint], spec.q_min, spec.q_max)
     low, high = q.copy(), q.copy()
     if used:
-        free = commands.kp[finite, joint] <= 0
-        free |= (commands.dq[finite, joint] != 0) | (commands.tau[finite, joint] != 0)
-        low[free], high[free] = -np.inf, np.inf
+        driven = (commands.dq[finite, joint] != 0) | (commands.tau[finite, joint] != 0)
+        low[driven], high[driven] = -np.inf, np.inf
+        limp = (commands.kp[finite, joint] <= 0) & ~driven
+        low[limp], high[limp] = np.inf, -np.inf
     changed = np.ones(len(t), dtype=np.bool_)
     changed[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
     return _Goals(t[changed], low[changed], high[changed])
 
 
 def _excluded(ctx: Context) -> list[tuple[float, float]]:
+    """Begin and end of the stretches with rules of their own."""
     return [ctx.span(p) for name in OWN_RULE for p in ctx.recording.phases(name, ctx.side)]
 
 
@@ -203,7 +206,8 @@ def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
     here = np.full(cells, np.nan)
     here[at] = q  # the newest of each cell
     # where there are no states, as while the service restarts, it was where it appears again
-    known = np.flatnonzero(np.isfinite(here))
+    seen = np.isfinite(here)
+    known = np.flatnonzero(seen)
     here = here[known[np.minimum(np.searchsorted(known, np.arange(cells)), len(known) - 1)]]
     low, high = _in_force(goals, origin, cells)
     if cells <= late:
@@ -212,9 +216,11 @@ def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
     high = sliding_window_view(high, late + 1).max(axis=1)
     now, then = here[late:], here[late - before : cells - before]
     away = np.maximum(np.minimum(low, then) - now, now - np.maximum(high, then))
+    away[~seen[late:]] = np.nan
     for begin, end in _excluded(ctx):
+        # what it was moved by there, it may still come back from
         i, j = (round((x - origin) / _GRID) - late for x in (begin, end))
-        away[max(i, 0) : max(j, 0)] = np.nan
+        away[max(i, 0) : max(j + before, 0)] = np.nan
     if not np.isfinite(away).any():
         return None
     i = int(np.nanargmax(away))

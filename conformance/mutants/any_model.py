@@ -304,7 +304,11 @@ class EmptyNowAndThen(Service):
 
 
 # a hand that obeys the other side's topic does not obey its own
-@wrong_hand(("DEX1-SIDE-01", "DEX3-SIDE-01"), also=("DEX1-MOVE-01", "DEX3-JOINT-01"), sides=BOTH)
+@wrong_hand(
+    ("DEX1-SIDE-01", "DEX3-SIDE-01"),
+    also=("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX1-FIELD-05"),
+    sides=BOTH,
+)
 class Swapped(Service):
     """Each side obeys the other side's commands."""
 
@@ -312,7 +316,7 @@ class Swapped(Service):
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
 
 
-@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"))
+@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"), also=("DEX1-CMD-01",))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -322,6 +326,9 @@ class KicksBack(Service):
         self.newest: dict[Side, tuple[Motor, ...]] = {}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
+            super().motors(side, motors)
+            return
         here = self.positions(side)
         before = self.newest.get(side, motors)
         self.newest[side] = motors
@@ -402,26 +409,29 @@ class KicksTheOtherSide(_Moves):
         if any(m.kp < 0 for m in motors):
             for other in self.sides:
                 if other is not side:
-                    self.go(other, 0.1)
+                    self.go(other, 0.07)
 
 
 class _Snaps(Service):
     """Goes to the other end for a quarter of a second when it gets its first command."""
 
-    since = math.inf
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.other: dict[Side, tuple[float, list[float]]] = {}
 
     def snaps(self) -> bool:
         """Whether this service does so at all."""
         raise NotImplementedError
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.since = min(self.since, self.now)
-        if self.snaps() and self.now - self.since < 0.25:
-            here, joints = self.positions(side), joints_of(self.dialect, side)
+        if side not in self.other:
             ends = [
                 j.q_min if q > 0.5 * (j.q_min + j.q_max) else j.q_max
-                for q, j in zip(here, joints, strict=True)
+                for q, j in zip(self.positions(side), joints_of(self.dialect, side), strict=True)
             ]
+            self.other[side] = self.now + 0.25, ends
+        until, ends = self.other[side]
+        if self.snaps() and self.now < until:
             motors = tuple(replace(m, q=q) for m, q in zip(motors, ends, strict=True))
         super().motors(side, motors)
 
@@ -515,7 +525,8 @@ class WeakAfterNan(Service):
 # ----------------------------------------------------------------------------------- safety
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"))
+# in the silence it takes NaN for commands, and stays driven
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05",))
 class NanIsZero(Service):
     """Replaces NaN and infinity by 0."""
 
@@ -537,7 +548,6 @@ def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
     return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
 
 
-# in the silence it takes NaN for commands, and stays driven
 @wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05",))
 class TiresOfNan(Service):
     """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
@@ -661,7 +671,8 @@ class StopsInABurst(Service):
         self.busy_until = 0.0
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.busy_until = max(self.busy_until, self.now) + 0.001 / len(self.sides)
+        busy = max(self.busy_until, self.now) + 0.001 / len(self.sides)
+        self.busy_until = min(busy, self.now + 0.6)  # the socket's buffer drops the others
         super().motors(side, motors)
 
     def publish(self) -> list[Sample]:
@@ -855,7 +866,11 @@ class LeavesItDriven(Service):
 # --------------------------------------------------------------------------------- tracking
 
 
-@wrong_hand(("DEX1-TRACK-01", "DEX3-TRACK-01"))
+# it drops single commands, and goes to goals that are no longer in force
+@wrong_hand(
+    ("DEX1-TRACK-01", "DEX3-TRACK-01"),
+    also=("DEX1-CMD-01", "DEX1-PATH-01", "DEX3-CMD-01"),
+)
 class WaitsForRest(Service):
     """Obeys a new goal only when the goal has not changed for 0.1 s."""
 

@@ -396,7 +396,7 @@ class _IgnoresGains(ReferenceHand):
         return super().accept(Motor(q=motor.q))
 
 
-@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05",))
+@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05", "DEX1-GAIN-02"))
 class IgnoresGains(ReferenceService):
     """Moves to q with any gains."""
 

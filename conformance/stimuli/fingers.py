@@ -399,6 +399,6 @@ class FingerScript(HandScript):
             yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
         if len(sides) > 1 and "silence" in self.plan.phases:
-            for side, broken in zip(sides, (True, False), strict=True):
-                home = self._motors(side, self._home(side)) if broken else []
-                yield from self._silent_alone(side, [replace(m, q=math.nan) for m in home])
+            for side, bad in zip(sides, (math.nan, math.inf), strict=True):
+                home = self._motors(side, self._home(side))
+                yield from self._silent_alone(side, [replace(m, q=bad) for m in home])

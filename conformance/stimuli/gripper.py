@@ -253,9 +253,8 @@ class GripperScript(HandScript):
         yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
         yield from self._everyone("resume", self._other_place())
         if len(sides) > 1 and not self._codec.shared and "silence" in self.plan.phases:
-            rejected: tuple[Motors, ...] = ((Motor(q=math.nan),), ())
-            for side, bad in zip(sides, rejected, strict=True):
-                yield from self._silent_alone(side, bad)
+            for side, bad in zip(sides, (math.nan, math.inf), strict=True):
+                yield from self._silent_alone(side, (Motor(q=bad),))
 
     def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
         """No command to one side but rejected ones, while it moves and the other is commanded."""

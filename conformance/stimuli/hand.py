@@ -73,7 +73,10 @@ class HandScript(Script[Side]):
         if not self._obs.q:
             self._report("no state on any topic: the rest of the script is left out")
             return
-        yield from self._provoke()
+        for done in range(self.plan.rounds):
+            if self.plan.rounds > 1:
+                self._report(f"round {done + 1} of {self.plan.rounds}")
+            yield from self._provoke()
         if OPERATOR in self.plan.phases:
             yield from operate(self)
             yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
@@ -238,6 +241,7 @@ class HandScript(Script[Side]):
         for kind in kinds:
             bad = kind if isinstance(kind, list) else self._codec.encode({**good, **kind})
             yield from self._repeat(each, lambda bad=bad: self._send(bad))  # type: ignore[misc]
+            yield from self._command()  # or it would brake, as it must without good commands
         self._end(phase)
         for other in beside:
             self._end(other)
