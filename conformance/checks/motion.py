@@ -435,9 +435,9 @@ def not_driven(ctx: Context, how: str) -> Outcome:
 @check("DEX1-SIDE-02", "DEX3-SIDE-02")
 def beside(ctx: Context) -> Outcome:
     """The steps of this hand while the other one gets bad commands, or none."""
-    found = steps(ctx)
+    found = [s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)]
     if not found:
-        return ctx.skipped("no state of this hand meanwhile")
+        return ctx.skipped("no state of this hand meanwhile, or it had stopped obeying before")
     worst = max(found, key=lambda s: s.error / s.stroke)
     if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
         return ctx.passed("obeys", f"{len(found)} steps, ending at most {worst.error:.3f} rad off")

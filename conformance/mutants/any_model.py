@@ -87,14 +87,14 @@ class SlowPublisher(Service):
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
 class SlowsDown(Service):
-    """Publishes at 60 Hz from 20 s on, as if it is throttled when warm."""
+    """Publishes at 60 Hz from 6 s on, as if it is throttled when warm."""
 
-    due = 20.0
+    due = 6.0
 
     def publish(self) -> list[Sample]:
         samples = super().publish()
         if self.now < self.due:
-            return samples if self.now < 20.0 else []
+            return samples if self.now < 6.0 else []
         self.due += 1 / 60
         return samples
 
@@ -382,7 +382,7 @@ class HomesAtTheStart(_Moves):
         super().live(dt)
 
 
-@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"))
+@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), whole=True)
 class HomesWhenRestarted(_Moves):
     """Moves by a tenth of its range after a restart of its service, before any command."""
 
@@ -400,7 +400,12 @@ class HomesWhenRestarted(_Moves):
         super().live(dt)
 
 
-@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), sides=BOTH)
+@wrong_hand(
+    ("DEX1-STILL-01", "DEX3-STILL-01"),
+    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX3-SAFE-06"),
+    sides=BOTH,
+    whole=True,
+)
 class KicksTheOtherSide(_Moves):
     """Moves the other hand when one gets a command with a negative gain."""
 
@@ -444,7 +449,7 @@ class SnapsAtFirst(_Snaps):
         return not self.restarted
 
 
-@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"))
+@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"), whole=True)
 class SnapsWhenRestarted(_Snaps):
     """After a restart of its service, first goes to the other end for a quarter of a second."""
 
@@ -493,7 +498,7 @@ class BadCommandsStopBoth(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH)
+@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH, whole=True)
 class OneWatchdogForBoth(Service):
     """Drops the commands to one hand while the other has got none for a second."""
 
@@ -526,7 +531,7 @@ class WeakAfterNan(Service):
 
 
 # in the silence it takes NaN for commands, and stays driven
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05",))
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05", "DEX1-WDOG-01"))
 class NanIsZero(Service):
     """Replaces NaN and infinity by 0."""
 
@@ -548,7 +553,7 @@ def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
     return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05",))
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05", "DEX1-WDOG-01"), whole=True)
 class TiresOfNan(Service):
     """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
 
@@ -560,7 +565,7 @@ class TiresOfNan(Service):
         super().motors(side, motors if self.count <= 100 else _zeroed(motors))
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"))
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), whole=True)
 class TrustsTheNextClient(Service):
     """Checks only the commands of the first client; of others, it replaces NaN by 0."""
 
@@ -866,10 +871,10 @@ class LeavesItDriven(Service):
 # --------------------------------------------------------------------------------- tracking
 
 
-# it drops single commands, and goes to goals that are no longer in force
+# it drops single commands
 @wrong_hand(
     ("DEX1-TRACK-01", "DEX3-TRACK-01"),
-    also=("DEX1-CMD-01", "DEX1-PATH-01", "DEX3-CMD-01"),
+    also=("DEX1-CMD-01", "DEX3-CMD-01"),
 )
 class WaitsForRest(Service):
     """Obeys a new goal only when the goal has not changed for 0.1 s."""

@@ -484,7 +484,7 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
-@wrong_hand("DEX1-SAFE-02")
+@wrong_hand("DEX1-SAFE-02", also=("DEX1-PATH-01",))
 class NoLimits(ReferenceService):
     """Follows a q far outside the stroke."""
 

@@ -449,9 +449,7 @@ class HandScript(Script[Side]):
         self._end(phase)
         self._next_ns = self._obs.now_ns
         yield from self._silence("restarted", 0.4)
-        yield from self._everyone(
-            "service-restart", {s: self._home(s) for s in self.plan.sides}, most=4.0
-        )
+        yield from self._everyone("service-restart", self._other_place(), most=4.0)
         if "silence" in self.plan.phases:
             yield from self._silent_again()
 
