@@ -62,6 +62,7 @@ class LiveOptions:
     :param phases: of the stimulus.
     :param force: go on although somebody else commands the hand.
     :param usb: play the USB script at the devices first, before a service takes them.
+    :param rounds: of the stimulus; see :class:`~dexkit.conformance.stimuli.Plan`.
     """
 
     rig: RigOptions
@@ -69,6 +70,7 @@ class LiveOptions:
     session: Session | None = None
     force: bool = False
     usb: bool = False
+    rounds: int = 1
 
     def plan(self) -> Plan[Subject]:
         """The plan of the stimulus script."""
@@ -79,6 +81,7 @@ class LiveOptions:
             objects=object_places(dialect, self.rig.objects),
             session=self.session,
             phases=self.phases,
+            rounds=self.rounds,
         )
 
 

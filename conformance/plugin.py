@@ -116,6 +116,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="only the MUSTs that need no long observation",
     )
+    add(
+        "thorough",
+        action="store_true",
+        help="every stimulus ten times, some ten minutes: what appears late or only sometimes",
+    )
     add("list", action="store_true", help="print the requirements that are selected, and end")
     add(
         "capabilities",

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 __all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "selection"]
 
 T = TypeVar("T")
+THOROUGH_ROUNDS = 10
+"""Rounds of a thorough run: about ten minutes of stimulus for a pair of grippers."""
 _FILES = 48  # descriptors of a run: DDS, recording, the pipes of its processes
 
 
@@ -52,6 +54,7 @@ class SuiteOptions:
     """The options of a run of the suite.
 
     :param domain: None for a free one.
+    :param thorough: :data:`THOROUGH_ROUNDS` rounds of the stimulus.
     """
 
     backend: str
@@ -65,6 +68,7 @@ class SuiteOptions:
     trace: Path | None
     requirements: tuple[Requirement, ...]
     claims: Claims = field(default_factory=Claims)
+    thorough: bool = False
     json: Path | None = None
     report: Path | None = None
     markdown: Path | None = None
@@ -98,6 +102,7 @@ class SuiteOptions:
             require=get("require"),
             level=get("level"),
             quick=get("quick"),
+            thorough=get("thorough"),
             capabilities=path("capabilities"),
             json=path("json"),
             report=path("report"),
@@ -121,6 +126,7 @@ class SuiteOptions:
         require: Sequence[str] = (),
         level: str | None = None,
         quick: bool = False,
+        thorough: bool = False,
         capabilities: Path | None = None,
         json: Path | None = None,
         report: Path | None = None,
@@ -132,9 +138,18 @@ class SuiteOptions:
         :raises UsageError: options that make no sense together.
         :raises BackendError: no such backend.
         """
+        if quick and thorough:
+            raise UsageError("--quick and --thorough are two runs: choose one")
         of_robot = _robot_of(backend, dialect_name)
         if of_robot:
-            _refuse_for_robots(side=side, device=devices, object=objects, set=settings, trace=trace)
+            _refuse_for_robots(
+                side=side,
+                device=devices,
+                object=objects,
+                set=settings,
+                trace=trace,
+                thorough=thorough,
+            )
         one_device = len(devices) == 1 and "=" not in devices[0]
         hands = sides_of(side or ("left" if one_device else "both"))
         if one_device and len(hands) > 1:
@@ -193,6 +208,7 @@ class SuiteOptions:
             trace=trace,
             requirements=requirements,
             claims=claims,
+            thorough=thorough,
             json=json,
             report=report,
             markdown=markdown,
@@ -336,7 +352,8 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
             Session.load(options.trace) if options.trace else Session.default(options.dialect.model)
         ).for_hand(options.dialect)
     usb = any(r.layer == "usb" for r in options.requirements)
-    return LiveOptions(options.rig(domain), phases, session, usb=usb)
+    rounds = THOROUGH_ROUNDS if options.thorough else 1
+    return LiveOptions(options.rig(domain), phases, session, usb=usb, rounds=rounds)
 
 
 def run_suite(

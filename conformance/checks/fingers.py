@@ -5,7 +5,7 @@ time-out protection.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_driven, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays
 from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
 from dexkit.models import HandModel, JointRoles, model
 
@@ -357,6 +358,13 @@ def stiffness(ctx: Context) -> Outcome:
         reference = stiff.get(step.joint)
         if reference is None:
             continue
+        progress = (step.final - step.start) / step.size if step.size else 0.0
+        if progress < ctx.tolerance("min_progress"):
+            return ctx.failed(
+                f"{progress:.0%}",
+                ctx.named(f"with soft gains it goes {progress:.0%} of its way", step.joint),
+                ctx.at(ctx.states.topic, step.begin, step.end),
+            ).about(step.joint)
         quick, slow = (_half_way(s) for s in (reference, step))
         if quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
@@ -453,18 +461,48 @@ def _moved(ctx: Context, joints: Sequence[int], begin: float, end: float) -> Flo
     return np.asarray(np.ptp(q, axis=0) / [ctx.joints[j].stroke for j in joints])
 
 
-def _silence(ctx: Context) -> tuple[float, float, float]:
-    """(last command, time-out with grace, end) of the phase."""
-    begin, end = ctx.span(ctx.phases()[-1])
-    sent = ctx.commands.t[ctx.commands.t <= end]
-    last = min(float(sent[-1]), begin + 0.05) if len(sent) else begin
-    late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
-    return last, late, end
+@dataclass(frozen=True)
+class _Silence:
+    """A phase without commands to this hand; times in seconds.
+
+    :param last: the last command that was neither empty nor not finite.
+    :param late: the time-out after that, with grace.
+    :param driven: the phase in which joints were set in motion just before, if any were.
+    """
+
+    last: float
+    late: float
+    end: float
+    driven: Phase | None
+
+
+def _silences(ctx: Context) -> list[_Silence]:
+    """The phases without commands."""
+    good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
+    found = []
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        sent = good[good <= end]
+        last = min(float(sent[-1]), begin + 0.05) if len(sent) else begin
+        late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+        drives = [p for name in ("drive", "guard-drive") for p in ctx.phases(name)]
+        just = [p for p in drives if 0 <= phase.begin_ns - p.end_ns < 1e8]
+        found.append(_Silence(last, late, end, just[0] if just else None))
+    return found
 
 
 def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
     """Fail if joints that move when commands end still move after the time-out."""
-    last, late, end = _silence(ctx)
+    outcomes = [_stops_in(ctx, joints, s) for s in _silences(ctx) if s.driven is not None]
+    if not outcomes:
+        return ctx.skipped("this hand held an object when the commands stopped")
+    failed = [o for o in outcomes if o.met is False]
+    passed = [o for o in outcomes if o.met]
+    return (failed or passed or outcomes)[0]
+
+
+def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome:
+    last, late, end = silence.last, silence.late, silence.end
     before = _moved(ctx, joints, last, last + ctx.tolerance("timeout_s"))
     after = _moved(ctx, joints, late, end)
     if np.isnan(after).any() or np.isnan(before).any():
@@ -494,8 +532,6 @@ def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
 @check("DEX3-WDOG-01")
 def nothing_left_moving(ctx: Context) -> Outcome:
     """Motion after the time-out of joints driven by a velocity, without protection."""
-    if ctx.object_at is not None:
-        return ctx.skipped("this hand held an object when the commands stopped")
     return _stops(ctx, _roles(ctx).driven)
 
 
@@ -508,7 +544,8 @@ def brakes(ctx: Context) -> Outcome:
 @check("DEX3-GUARD-02")
 def reports_trip(ctx: Context) -> Outcome:
     """Bit 7 of the state's mode byte before and after the time-out."""
-    last, late, end = _silence(ctx)
+    (silence,) = _silences(ctx)
+    last, late, end = silence.last, silence.late, silence.end
     before = _modes(ctx, ctx.states.between(last - 0.2, last + 0.5)) >> 7
     after = _modes(ctx, ctx.states.between(late, end)) >> 7
     if not len(before) or not len(after):
@@ -542,8 +579,15 @@ def clears(ctx: Context) -> Outcome:
 @check("DEX3-HOLD-01")
 def holds(ctx: Context) -> Outcome:
     """Grip force and motion to a position go on after commands end, without protection."""
-    last, late, end = _silence(ctx)
-    if ctx.object_at is not None:
+    outcomes = [_holds_in(ctx, silence) for silence in _silences(ctx)]
+    failed = [o for o in outcomes if o.met is False]
+    passed = [o for o in outcomes if o.met]
+    return (failed or passed or outcomes)[0]
+
+
+def _holds_in(ctx: Context, silence: _Silence) -> Outcome:
+    last, late, end = silence.last, silence.late, silence.end
+    if ctx.object_at is not None and silence.driven is None:
         before = np.abs(ctx.states.tau[ctx.states.between(last - 0.2, last)])
         after = np.abs(ctx.states.tau[ctx.states.between(late, end)])
         if not len(before) or not len(after):
@@ -555,10 +599,9 @@ def holds(ctx: Context) -> Outcome:
         if still >= ctx.tolerance("min_tau_part") * pressed:
             return ctx.passed("grips on", text, tau_nm=still)
         return ctx.failed("lets go", text, ctx.at(ctx.states.topic, late, end), tau_nm=still)
-    goals = [p for p in ctx.phases("drive") if p.targets.get(ctx.side)]
-    if not goals:
+    target = silence.driven.targets.get(ctx.side) if silence.driven is not None else None
+    if not target:
         return ctx.skipped("no joint was on its way when the commands stopped")
-    target = goals[-1].targets[ctx.side]
     rows = ctx.states.between(late, late + 0.05)
     if not len(ctx.states.q[rows]):
         return ctx.skipped("no state in the silence")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
+from dexkit.models import HandModel
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,28 @@ def steps_of(ctx: Context, phase: Phase) -> list[Step]:
 def steps(ctx: Context) -> list[Step]:
     """The steps of this side's joints."""
     return [s for p in ctx.phases() for s in steps_of(ctx, p)]
+
+
+_PLAIN = ("step", "joint", "recover", "resume", "restart", "service-restart")
+"""Steps with good commands alone, by which a hand shows that it obeys; each has a requirement."""
+_NEWEST = 3  # steps; in a single one it may have been at its target already
+_DISOBEYS = 0.1  # of the stroke
+
+
+def obeyed_before(ctx: Context, phase: Phase) -> bool:
+    """Whether the hand obeyed the newest plain steps before a phase.
+
+    What made it disobey there is judged there, and not once more in each later phase.
+    """
+    assert ctx.recording.stimulus is not None  # a phase is of one
+    earlier = [
+        p
+        for p in ctx.recording.stimulus.phases
+        if p.name in _PLAIN and ctx.side in p.targets and p.end_ns <= phase.begin_ns
+    ]
+    newest = sorted(earlier, key=lambda p: p.end_ns)[-_NEWEST:]
+    found = [steps_of(ctx, p) for p in newest]
+    return all(f and all(s.error <= _DISOBEYS * s.stroke for s in f) for f in found)
 
 
 @check("DEX1-MOVE-01", "DEX3-MOVE-01")
@@ -407,3 +430,161 @@ def not_driven(ctx: Context, how: str) -> Outcome:
         ctx.at(ctx.states.topic, step.begin, step.end),
         motion_rad=towards,
     ).about(step.joint)
+
+
+@check("DEX1-SIDE-02", "DEX3-SIDE-02")
+def beside(ctx: Context) -> Outcome:
+    """The steps of this hand while the other one gets bad commands, or none."""
+    found = [s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)]
+    if not found:
+        return ctx.skipped("no state of this hand meanwhile, or it had stopped obeying before")
+    worst = max(found, key=lambda s: s.error / s.stroke)
+    if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
+        return ctx.passed("obeys", f"{len(found)} steps, ending at most {worst.error:.3f} rad off")
+    return (
+        ctx.failed(
+            "disobeys",
+            f"while the other hand got bad commands, or none: {worst}",
+            ctx.at(ctx.states.topic, worst.begin, worst.end),
+            error_rad=worst.error,
+        )
+        .about(worst.joint)
+        .if_late(STROKE_S * worst.error / worst.stroke)
+    )
+
+
+@check("DEX1-CMD-01", "DEX3-CMD-01")
+def every_command(ctx: Context) -> Outcome:
+    """How far the hand goes towards a goal that was commanded once."""
+    judged, missed = 0, []
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        before = ctx.states.q[ctx.states.between(begin - 0.03, begin)]
+        after = ctx.states.q[ctx.states.between(end - 0.03, end)]
+        if not len(before) or not len(after):
+            continue
+        start, final = np.median(before, axis=0), np.median(after, axis=0)
+        judged += 1
+        for joint, target in phase.targets.get(ctx.side, {}).items():
+            size = target - float(start[joint])
+            if abs(size) < ctx.tolerance("min_step_stroke", joint):
+                continue
+            progress = (float(final[joint]) - float(start[joint])) / size
+            if progress < ctx.tolerance("min_progress"):
+                missed.append((begin, end, joint, target, progress))
+                break
+    if not judged:
+        return ctx.skipped("no state while single commands were sent")
+    if not missed:
+        return ctx.passed(f"{judged} of {judged}", f"{judged} single commands, all obeyed")
+    begin, end, joint, target, progress = missed[0]
+    outcome = ctx.failed(
+        f"{judged - len(missed)} of {judged}",
+        ctx.named(
+            f"{len(missed)} of {judged} commands that were sent once were not obeyed; the first, "
+            f"to {target:.2f} rad, made {progress:.0%} of its way in {end - begin:.2f} s",
+            joint,
+        ),
+        *(ctx.at(ctx.states.topic, a, b) for a, b, *_ in missed),
+        missed=len(missed),
+    )
+    # on a network a single sample may be lost: another run tells
+    return replace(outcome.about(joint).if_late(end - begin), retry=True)
+
+
+@check("DEX1-ABUSE-01", "DEX3-ABUSE-01")
+def unchanged(ctx: Context) -> Outcome:
+    """Duration of good steps after each abuse, compared with those before any, and the errors of
+    the steps between the phases.
+    """
+    for phase in (p for p in ctx.phases("center") if obeyed_before(ctx, p)):
+        for step in steps_of(ctx, phase):
+            if step.error > ctx.tolerance("max_error_stroke", step.joint):
+                return (
+                    ctx.failed(
+                        "disobeys",
+                        f"between two phases: {step}",
+                        ctx.at(ctx.states.topic, step.begin, step.end),
+                        error_rad=step.error,
+                    )
+                    .about(step.joint)
+                    .if_late(STROKE_S * step.error / step.stroke)
+                )
+    first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
+    worst: tuple[float, Step, float, float] | None = None
+    for phase in (p for name in _AFTER_ABUSE for p in ctx.phases(name)):
+        for step in steps_of(ctx, phase):
+            like = [s for s in first if s.joint == step.joint and 0.7 < step.size / s.size < 1.4]
+            seconds = _duration(step)
+            known = [d for d in map(_duration, like) if d is not None]
+            if seconds is None or not known:
+                continue  # whether it arrives at all is judged by other requirements
+            ratio = seconds / (max(known) + ctx.tolerance("slack_s"))
+            if worst is None or ratio > worst[0]:
+                worst = ratio, step, seconds, max(known)
+    if worst is None:
+        return ctx.skipped("no two steps that can be compared")
+    ratio, step, seconds, before = worst
+    text = (
+        f"{step.name}{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {before:.2f} s in the "
+        "same step before any bad command"
+    )
+    if ratio <= ctx.tolerance("max_ratio"):
+        return ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
+    return (
+        ctx.failed(
+            f"x {ratio:.1f}",
+            text,
+            ctx.at(ctx.states.topic, step.begin, step.end),
+            ratio=ratio,
+        )
+        .about(step.joint)
+        .if_late(seconds - ctx.tolerance("max_ratio") * (before + ctx.tolerance("slack_s")))
+    )
+
+
+_AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
+
+
+def _duration(step: Step) -> float | None:
+    """Seconds from 10 to 90 % of a step; None if it does not get there."""
+    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
+    if not (part >= 0.9).any():
+        return None
+    return float(step.t[np.argmax(part >= 0.9)] - step.t[np.argmax(part >= 0.1)])
+
+
+def _driven(ctx: Context) -> list[tuple[int, int]]:
+    """The joints that the stimulus drives by a velocity, and in which direction: a gripper opens,
+    fingers close.
+    """
+    hand = ctx.recording.model
+    roles = hand.roles if isinstance(hand, HandModel) else None
+    if roles is None:
+        return [(0, 1)]
+    return [(i, 1 if ctx.joints[i].closing > 0 else -1) for i in roles.driven]
+
+
+@check("DEX1-GAIN-02", "DEX3-GAIN-03")
+def velocity_drives(ctx: Context) -> Outcome:
+    """Motion by a commanded velocity without a position gain."""
+    far: tuple[float, float, int] | None = None
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        rows = ctx.states.between(*ctx.span(phase))
+        for joint, way in _driven(ctx):
+            q = ctx.states.q[rows, joint]
+            if len(q) < 2 or not np.isfinite(q).all():
+                continue
+            moved = (float(q[-1]) - float(q[0])) * way
+            part = moved / ctx.joints[joint].stroke
+            far = (part, moved, joint) if far is None or part < far[0] else far
+    if far is None:
+        return ctx.skipped("no state while a velocity was commanded")
+    _, moved, joint = far
+    text = ctx.named(f"moved by {moved:.2f} rad while a velocity was commanded", joint)
+    if moved >= ctx.tolerance("min_motion_stroke", joint):
+        return ctx.passed(f"{moved:.2f} rad", text, motion_rad=moved)
+    begin, end = ctx.span(ctx.phases()[0])
+    return ctx.failed(
+        f"{moved:.2f} rad", text, ctx.at(ctx.states.topic, begin, end), motion_rad=moved
+    ).about(joint)

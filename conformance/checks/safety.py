@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
-from dexkit.conformance.checks.motion import Step, steps, steps_of
+from dexkit.conformance.checks.motion import Step, obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gaps, slow, too_slow
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
@@ -26,7 +26,10 @@ def _recovery(ctx: Context, phase: Phase) -> Step | None:
 def unharmed(ctx: Context, what: str) -> Outcome:
     """Fail if state stops or the hand disobeys afterwards; else an outcome with ``met`` None."""
     topic = ctx.states.topic
-    for phase in ctx.phases():
+    judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
+    if not judged:
+        return ctx.skipped(f"the hand had stopped obeying before {what}")
+    for phase in judged:
         begin, end = ctx.span(phase)
         found = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end + 0.2)
         if found:
@@ -109,7 +112,7 @@ def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
     if still.met is False:
         return still
     after = unharmed(ctx, what)
-    if after.met is False:
+    if after.met is False or after.reason:
         return after
     return replace(still, observed=f"{still.observed}, then obeyed")
 
@@ -152,7 +155,7 @@ def out_of_range(ctx: Context) -> Outcome:
             reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} rad")
             values = {"q_min": float(q.min()), "q_max": float(q.max())}
     outcome = unharmed(ctx, "commands far out of range")
-    if outcome.met is False:
+    if outcome.met is False or outcome.reason:
         return outcome
     figure = reached[0] if len(ctx.joints) == 1 and reached else "within limits"
     return ctx.passed(
@@ -169,11 +172,15 @@ def empty(ctx: Context) -> Outcome:
 
 
 def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
-    """(last command, end) of each phase without commands: the requirement's, and ``names``."""
+    """(last command, end) of each phase without commands: the requirement's, and ``names``.
+
+    A command that is empty or not finite is none: it must not keep the hand driven.
+    """
     found = []
+    good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
     for phase in (*ctx.phases(), *(p for name in names for p in ctx.phases(name))):
         begin, end = ctx.span(phase)
-        sent = ctx.commands.t[ctx.commands.t <= end]
+        sent = good[good <= end]
         last = float(sent[-1]) if len(sent) else begin
         found.append((max(last, begin) if last <= begin + 0.05 else last, end))
     return found
@@ -296,7 +303,8 @@ def resumes(ctx: Context) -> Outcome:
     """The step after a pause of commands."""
     limit = ctx.tolerance("max_reaction_s")
     slowest: tuple[float, Step] | None = None
-    for step in steps(ctx):
+    judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
+    for step in (s for p in judged for s in steps_of(ctx, p)):
         if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
             begun = (step.q - step.start) / step.size >= ctx.tolerance("begun_part")
             after = float(step.t[np.argmax(begun)] if begun.any() else step.end) - step.begin
@@ -318,8 +326,11 @@ def resumes(ctx: Context) -> Outcome:
 
 
 def arrival(ctx: Context, when: str) -> Outcome:
-    """Whether the phase's step reaches its target."""
-    found = steps(ctx)
+    """Whether the phase's steps reach their targets."""
+    judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
+    if not judged:
+        return ctx.skipped(f"the hand had stopped obeying before it was {when}")
+    found = [s for p in judged for s in steps_of(ctx, p)]
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
     worst = max(found, key=lambda s: s.error / s.stroke)
@@ -428,7 +439,7 @@ def two_writers(ctx: Context) -> Outcome:
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
                 ).about(joint)
     outcome = unharmed(ctx, "two clients at once")
-    if outcome.met is False:
+    if outcome.met is False or outcome.reason:
         return outcome
     return ctx.passed(
         "between", "stayed between the two positions, and obeyed the remaining client"

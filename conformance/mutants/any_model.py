@@ -7,9 +7,11 @@ from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.hand import Side
 from dexkit.messages import message_type
+from dexkit.models import model
 
 # -------------------------------------------------------------------------------- discovery
 
@@ -83,6 +85,24 @@ class SlowPublisher(Service):
     period = 0.008
 
 
+@wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
+class SlowsDown(Service):
+    """Publishes at 60 Hz from 6 s on, as if it is throttled when warm."""
+
+    due = 6.0
+
+    def publish(self) -> list[Sample]:
+        samples = super().publish()
+        if self.now < self.due:
+            return samples if self.now < 6.0 else []
+        self.due += 1 / 60
+        return samples
+
+    def end(self) -> list[Sample]:
+        self.due = 0.0
+        return super().end()
+
+
 @wrong_hand(("DEX1-RATE-02", "DEX3-RATE-02"))
 class HalfRate(Service):
     """Publishes at 222 Hz: enough for clients, but slower than the vendor's service."""
@@ -96,6 +116,44 @@ class Hiccup(Service):
 
     def publish(self) -> list[Sample]:
         return [] if 2.0 < self.now < 2.3 else super().publish()
+
+
+@wrong_hand(("DEX1-RATE-03", "DEX3-RATE-03"))
+class DeliversLate(Service):
+    """Holds its states back for 0.25 s once, with the source timestamps of when they were made."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.waiting: list[Sample] = []
+
+    def publish(self) -> list[Sample]:
+        self.waiting += super().publish()
+        if 2.0 < self.now < 2.25:
+            return []
+        samples, self.waiting = self.waiting, []
+        return samples
+
+
+@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
+class BurstsWithGoodStamps(Service):
+    """Delivers its states in bursts of ten, with the source timestamps of when they were made."""
+
+    together = 10
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.waiting: list[list[Sample]] = []
+
+    def publish(self) -> list[Sample]:
+        self.waiting.append(super().publish())
+        if len(self.waiting) < self.together:
+            return []
+        waiting, self.waiting = self.waiting, []
+        return [sample for samples in waiting for sample in samples]
+
+    def end(self) -> list[Sample]:
+        self.together = 1
+        return super().end()
 
 
 @wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
@@ -157,6 +215,36 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), whole=True)
+class StaleLater(StaleState):
+    """Measures five times a second from 12 s on."""
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        if self.now < 12.0:
+            self.measured.clear()
+        return super().payload(sides, length)
+
+
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), whole=True)
+class FrozenAtFirst(Service):
+    """Publishes its first measurement until 0.7 s after the first command."""
+
+    until = math.inf
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.first: dict[tuple[Side, ...], bytes] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.until = min(self.until, self.now + 0.7)
+        super().motors(side, motors)
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        newest = super().payload(sides, length)
+        frozen = self.now < self.until and not self.restarted
+        return self.first.setdefault(sides, newest) if frozen else newest
+
+
 @wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), whole=True)
 class FreezesOnce(Service):
     """Publishes the same values for 0.3 s when it first begins to move."""
@@ -216,7 +304,11 @@ class EmptyNowAndThen(Service):
 
 
 # a hand that obeys the other side's topic does not obey its own
-@wrong_hand(("DEX1-SIDE-01", "DEX3-SIDE-01"), also=("DEX1-MOVE-01", "DEX3-JOINT-01"), sides=BOTH)
+@wrong_hand(
+    ("DEX1-SIDE-01", "DEX3-SIDE-01"),
+    also=("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX1-FIELD-05"),
+    sides=BOTH,
+)
 class Swapped(Service):
     """Each side obeys the other side's commands."""
 
@@ -224,7 +316,7 @@ class Swapped(Service):
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
 
 
-@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"))
+@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"), also=("DEX1-CMD-01",))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -234,6 +326,9 @@ class KicksBack(Service):
         self.newest: dict[Side, tuple[Motor, ...]] = {}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
+            super().motors(side, motors)
+            return
         here = self.positions(side)
         before = self.newest.get(side, motors)
         self.newest[side] = motors
@@ -248,10 +343,195 @@ class KicksBack(Service):
         super().motors(side, back if self.now < until else motors)
 
 
+class _Moves(Service):
+    """Sometimes goes to a place of its own."""
+
+    def go(self, side: Side, part: float) -> None:
+        """Command a part of each joint's range from here, towards the middle."""
+        every = zip(self.positions(side), joints_of(self.dialect, side), strict=True)
+        gains = model(self.dialect.model).gains
+        super().motors(
+            side,
+            tuple(
+                Motor(
+                    q + math.copysign(part * j.stroke, 0.5 * (j.q_min + j.q_max) - q),
+                    kp=kp,
+                    kd=kd,
+                    mode=self.codec.mode(i),
+                )
+                for i, ((q, j), (kp, kd)) in enumerate(zip(every, gains, strict=True))
+            ),
+        )
+
+
+@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"))
+class HomesAtTheStart(_Moves):
+    """Moves by a tenth of its range before the first command."""
+
+    homed = commanded = False
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.commanded = True
+        super().motors(side, motors)
+
+    def live(self, dt: float) -> None:
+        if not self.homed and not self.commanded and not self.restarted and self.now > 0.5:
+            self.homed = True
+            for side in self.sides:
+                self.go(side, 0.1)
+        super().live(dt)
+
+
+@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), whole=True)
+class HomesWhenRestarted(_Moves):
+    """Moves by a tenth of its range after a restart of its service, before any command."""
+
+    due = math.inf
+
+    def begin(self, now: float) -> None:
+        super().begin(now)
+        self.due = now + 0.2
+
+    def live(self, dt: float) -> None:
+        if self.now > self.due:
+            self.due = math.inf
+            for side in self.sides:
+                self.go(side, 0.1)
+        super().live(dt)
+
+
+@wrong_hand(
+    ("DEX1-STILL-01", "DEX3-STILL-01"),
+    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX3-SAFE-06"),
+    sides=BOTH,
+    whole=True,
+)
+class KicksTheOtherSide(_Moves):
+    """Moves the other hand when one gets a command with a negative gain."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(side, motors)
+        if any(m.kp < 0 for m in motors):
+            for other in self.sides:
+                if other is not side:
+                    self.go(other, 0.07)
+
+
+class _Snaps(Service):
+    """Goes to the other end for a quarter of a second when it gets its first command."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.other: dict[Side, tuple[float, list[float]]] = {}
+
+    def snaps(self) -> bool:
+        """Whether this service does so at all."""
+        raise NotImplementedError
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if side not in self.other:
+            ends = [
+                j.q_min if q > 0.5 * (j.q_min + j.q_max) else j.q_max
+                for q, j in zip(self.positions(side), joints_of(self.dialect, side), strict=True)
+            ]
+            self.other[side] = self.now + 0.25, ends
+        until, ends = self.other[side]
+        if self.snaps() and self.now < until:
+            motors = tuple(replace(m, q=q) for m, q in zip(motors, ends, strict=True))
+        super().motors(side, motors)
+
+
+@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"))
+class SnapsAtFirst(_Snaps):
+    """Goes to the other end for a quarter of a second when it gets its first command."""
+
+    def snaps(self) -> bool:
+        return not self.restarted
+
+
+@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"), whole=True)
+class SnapsWhenRestarted(_Snaps):
+    """After a restart of its service, first goes to the other end for a quarter of a second."""
+
+    def snaps(self) -> bool:
+        return self.restarted
+
+
+@wrong_hand(("DEX1-CMD-01", "DEX3-CMD-01"))
+class DropsEverySecond(Service):
+    """Obeys every second command to a side."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.count = dict.fromkeys(self.sides, 0)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.count[side] += 1
+        if self.count[side] % 2:
+            super().motors(side, motors)
+
+
+@wrong_hand(("DEX1-CMD-01", "DEX3-CMD-01"))
+class OneBehind(Service):
+    """Obeys each command when the next one arrives."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.newest: dict[Side, tuple[Motor, ...]] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        before = self.newest.get(side, motors)
+        self.newest[side] = motors
+        super().motors(side, before)
+
+
+@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH)
+class BadCommandsStopBoth(Service):
+    """Drops the commands to both hands for half a second after a bad one."""
+
+    deaf_until = -math.inf
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
+            self.deaf_until = self.now + 0.5
+        if self.now >= self.deaf_until:
+            super().motors(side, motors)
+
+
+@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH, whole=True)
+class OneWatchdogForBoth(Service):
+    """Drops the commands to one hand while the other has got none for a second."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.heard: dict[Side, float] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if all(math.isfinite(m.q) for m in motors):
+            self.heard[side] = self.now
+        if all(self.now - self.heard.get(s, self.now) < 1.0 for s in self.sides):
+            super().motors(side, motors)
+
+
+@wrong_hand(("DEX1-ABUSE-01", "DEX3-ABUSE-01"), also=("DEX1-TRACK-02",))
+class WeakAfterNan(Service):
+    """Uses a quarter of the stiffness since it has got a command that is not finite."""
+
+    weak = False
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(m.q) for m in motors):
+            self.weak = True
+        if self.weak:
+            motors = tuple(replace(m, kp=0.25 * m.kp) for m in motors)
+        super().motors(side, motors)
+
+
 # ----------------------------------------------------------------------------------- safety
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"))
+# in the silence it takes NaN for commands, and stays driven
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05", "DEX1-WDOG-01"))
 class NanIsZero(Service):
     """Replaces NaN and infinity by 0."""
 
@@ -266,6 +546,37 @@ class NanIsZero(Service):
                 for m in motors
             ),
         )
+
+
+def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
+    """The motors with 0 for each q that is not finite."""
+    return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
+
+
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05", "DEX1-WDOG-01"), whole=True)
+class TiresOfNan(Service):
+    """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
+
+    count = 0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
+            self.count += 1
+        super().motors(side, motors if self.count <= 100 else _zeroed(motors))
+
+
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), whole=True)
+class TrustsTheNextClient(Service):
+    """Checks only the commands of the first client; of others, it replaces NaN by 0."""
+
+    client = 0
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.client = client
+        super().receive(topic, payload, client)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(side, _zeroed(motors) if self.client else motors)
 
 
 @wrong_hand(("DEX1-SAFE-03", "DEX3-SAFE-03"))
@@ -340,14 +651,14 @@ class DiesOfAnyType(Service):
 
 @wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
 class QueuesCommands(Service):
-    """Queues all commands and carries out at most two of them in each cycle."""
+    """Queues up to 600 commands and carries out at most two of them in each cycle."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
         self.queues: dict[Side, list[tuple[Motor, ...]]] = {s: [] for s in self.sides}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.queues[side].append(motors)
+        self.queues[side] = [*self.queues[side][-599:], motors]
 
     def live(self, dt: float) -> None:
         for side, queue in self.queues.items():
@@ -356,7 +667,7 @@ class QueuesCommands(Service):
         super().live(dt)
 
 
-@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"), also=("DEX1-LOAD-01", "DEX3-LOAD-01"))
 class StopsInABurst(Service):
     """Receives in its publishing thread: each waiting command delays the next state."""
 
@@ -365,7 +676,8 @@ class StopsInABurst(Service):
         self.busy_until = 0.0
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.busy_until = max(self.busy_until, self.now) + 0.001 / len(self.sides)
+        busy = max(self.busy_until, self.now) + 0.001 / len(self.sides)
+        self.busy_until = min(busy, self.now + 0.6)  # the socket's buffer drops the others
         super().motors(side, motors)
 
     def publish(self) -> list[Sample]:
@@ -439,6 +751,31 @@ class StuttersUnderLoad(Service):
             for times in self.came.values()
         )
         return [] if busy and self.cycle % 3 else super().publish()
+
+
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"))
+class ChokesOnThousands(Service):
+    """Publishes one state in three while more than 1000 commands a second arrive."""
+
+    tick = period = 0.002
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.came: dict[Side, int] = dict.fromkeys(self.sides, 0)
+        self.busy_until = self.second = 0.0
+        self.cycle = 0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if self.now >= self.second + 0.1:
+            self.second, self.came = self.now, dict.fromkeys(self.sides, 0)
+        self.came[side] += 1
+        if self.loaded and self.came[side] > 100:
+            self.busy_until = self.now + 0.1
+        super().motors(side, motors)
+
+    def publish(self) -> list[Sample]:
+        self.cycle += 1
+        return [] if self.now < self.busy_until and self.cycle % 3 else super().publish()
 
 
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"))
@@ -534,7 +871,11 @@ class LeavesItDriven(Service):
 # --------------------------------------------------------------------------------- tracking
 
 
-@wrong_hand(("DEX1-TRACK-01", "DEX3-TRACK-01"))
+# it drops single commands
+@wrong_hand(
+    ("DEX1-TRACK-01", "DEX3-TRACK-01"),
+    also=("DEX1-CMD-01", "DEX3-CMD-01"),
+)
 class WaitsForRest(Service):
     """Obeys a new goal only when the goal has not changed for 0.1 s."""
 

@@ -449,6 +449,35 @@ class OwnStiffness(FingerService):
     hand_fault = _OwnStiffness
 
 
+class _Deaf(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[1] = np.where(rows[3] > 0, rows[1], 0.0)
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-03")
+class DeafToVelocity(FingerService):
+    """Ignores dq without a position gain."""
+
+    hand_fault = _Deaf
+
+
+class _StuckWhenSoft(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[3] = np.where(rows[3] < 0.5 * self.client_kp, 0.0, rows[3])
+        super().take(own, mode)
+
+
+# two joints of the silence are on their way with soft gains
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01",))
+class StuckWhenSoft(FingerService):
+    """Does not move with less than half of the client's stiffness."""
+
+    hand_fault = _StuckWhenSoft
+
+
 # --------------------------------------------------------------------------------- mode byte
 
 

@@ -396,11 +396,24 @@ class _IgnoresGains(ReferenceHand):
         return super().accept(Motor(q=motor.q))
 
 
-@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05",))
+@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05", "DEX1-GAIN-02"))
 class IgnoresGains(ReferenceService):
     """Moves to q with any gains."""
 
     hand = _IgnoresGains
+
+
+class _Deaf(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return accepted if accepted.kp > 0 else replace(accepted, dq=0.0)
+
+
+@wrong_hand("DEX1-GAIN-02")
+class DeafToVelocity(ReferenceService):
+    """Ignores dq without a position gain."""
+
+    hand = _Deaf
 
 
 # ------------------------------------------------------------------------------------ force
@@ -471,7 +484,7 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
-@wrong_hand("DEX1-SAFE-02")
+@wrong_hand("DEX1-SAFE-02", also=("DEX1-PATH-01",))
 class NoLimits(ReferenceService):
     """Follows a q far outside the stroke."""
 
@@ -488,6 +501,47 @@ class NoWatchdog(ReferenceService):
     """Follows the last command for ever."""
 
     hand = _NoWatchdog
+
+
+class _FedByAnything(ReferenceHand):
+    def command(self, motor: Motor) -> None:
+        super().command(motor)
+        self.heard = self.now
+
+
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+class FedByRejected(ReferenceService):
+    """Does not brake while commands arrive that it rejects."""
+
+    hand = _FedByAnything
+
+
+class _BrakesOnce(ReferenceHand):
+    braked = 0.0
+
+    @property
+    def braking(self) -> bool:
+        if self.goal is None or self.now - self.heard <= self.timeout:
+            return self.goal is None
+        self.braked = self.braked or self.now
+        return self.now - self.braked < 2.0
+
+
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+class BrakesOnce(ReferenceService):
+    """Brakes at the first time-out and at none after it."""
+
+    hand = _BrakesOnce
+
+
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+class NoWatchdogWhenRestarted(ReferenceService):
+    """Follows the last command for ever after a restart of its service."""
+
+    def begin(self, now: float) -> None:
+        super().begin(now)
+        for hand in self.hands.values():
+            hand.timeout = math.inf
 
 
 class _SnapsOpen(ReferenceHand):

@@ -27,7 +27,7 @@ class _PerJoint(Service):
         self.obeyed: dict[tuple[Side, int], tuple[float, float]] = {}
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if all(math.isfinite(m.q) for m in motors):
+        if all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
             here = self.positions(side)
             motors = tuple(
                 replace(m, q=self.change((side, i), m.q, here[i])) for i, m in enumerate(motors)
@@ -162,7 +162,8 @@ class _SlowToWake(_PerJoint):
         return before
 
 
-@wrong_hand("DEX1-OPER-05")
+# nothing wakes it but a second command
+@wrong_hand("DEX1-OPER-05", also=("DEX1-CMD-01",))
 class SlowToWake(_SlowToWake, ReferenceService):
     """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
 

@@ -10,17 +10,20 @@ approach       slowly to nearly open
 joint          one joint after the other closes and opens again; where there are many, all of
                them open together at the end. Joints that share a motor are one.
 step           one hand closes and opens again, the other holds
+fingerprint    steps to compare the ``recover`` steps with
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
 range, empty,  limits, no motors, one too few, one and more too many, two mode bytes with each
-short, long,   other's id, negative gains; and a client of another type on the topic
-wrong-id,
+short, long,   other's id, negative gains; and a client of another type on the topic. Each kind
+wrong-id,      stands for a while, on each side alone.
 negative,
 foreign
+beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
 stiff, soft    the same step with the client's gains and with a tenth of its stiffness
 limp           zero gains, with a q far towards closed
 lock           the same with the client's gains and status 0 or mode 0
 replay         a recorded session, as recorded
+single         commands that are sent once
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
@@ -31,13 +34,15 @@ guard-latch    commands to elsewhere that still have bit 7 set
 guard-clear    the same without it
 squeeze        close on the object, if there is one
 drive          without protection: as guard-drive
-silence        the commands stop for longer than the time-out
+silence        the commands stop for longer than the time-out; then on each side alone, while
+               rejected commands arrive
 resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
-restart        the client goes away, another comes, and makes a step
+restart        the client goes away, another comes, and makes a step; bad commands again
 shutdown       the service is stopped and started again
-service-       a step after that
+restarted      no commands
+service-       a step after that; silence again
 restart
 ============== =====================================================================================
 """
@@ -92,6 +97,9 @@ class FingerScript(HandScript):
         if "step" in phases:
             for side in sides:
                 yield from self._alone(side)
+        if "fingerprint" in phases:
+            for _ in range(2):
+                yield from self._everyone("fingerprint", self._other_place(), most=1.5)
         for name in _BAD:
             if name in phases:
                 yield from self._bad(name)
@@ -107,6 +115,8 @@ class FingerScript(HandScript):
         if "replay" in phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
+        if "single" in phases:
+            yield from self._single()
         if "load" in phases:
             yield from self._load()
         if "old-stamps" in phases:
@@ -197,53 +207,82 @@ class FingerScript(HandScript):
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
         yield from self._hold(0.1)
-        good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
-        bursts: list[dict[Side, Motors]]
         if name == "nan":
-            last = len(self._model.gains) - 1
-            bursts = [self._broken(i, *bad) for bad in NOT_FINITE for i in (last, 0, last // 2)]
+            for side in self.plan.sides:
+                kinds = [{side: motors} for motors in self._not_finite(side)]
+                yield from self._bad_commands(name, (side,), kinds, 0.08)
         elif name == "out-of-range":
-            bursts = [self._all(OPEN, q=q) for q in (1000.0, -1000.0)]
-        elif name == "empty":
-            bursts = [{s: [] for s in good}]
-        elif name == "short":
-            bursts = [{s: motors[:-1] for s, motors in good.items()}]
-        elif name == "long":
-            bursts = [
-                {s: [*motors, *[replace(motors[0], q=1.0)] * more] for s, motors in good.items()}
-                for more in (1, 13)
+            far = [
+                {s: self._at(s, [end] * len(self._joints[s])) for s in self.plan.sides}
+                for end in (1000.0, -1000.0)
             ]
-        elif name == "negative":
-            near = {s: self._motors(s, self._aside(s)) for s in good}
-            bursts = [
-                {s: [replace(m, kp=-m.kp, kd=-m.kd) for m in motors] for s, motors in near.items()}
-            ]
+            for way in (0.3, -0.3):
+                ends = {
+                    s: [(j.q_max if way > 0 else j.q_min) + way * j.stroke for j in joints]
+                    for s, joints in self._joints.items()
+                }
+                far.append({s: self._at(s, ends[s]) for s in self.plan.sides})
+            yield from self._bad_commands(name, self.plan.sides, far, 0.3)
         else:
-            bursts = [{s: self._crossed(s, motors) for s, motors in good.items()}]
-        payloads = [self._codec.encode(hands) for hands in bursts]
-        if name == "out-of-range":
-            yield from self._burst(name, payloads, 0.8, each=0.4)
-        else:
-            yield from self._burst(name, payloads, 0.4)
-        places = self._other_place()
-        yield from self._everyone("recover", places, most=1.5, after=name)
+            for alone in self._each_alone():
+                kinds_by_side = {s: self._malformed(name, s) for s in alone}
+                for i in range(len(kinds_by_side[alone[0]])):
+                    kind = {s: kinds_by_side[s][i] for s in alone}
+                    yield from self._bad_commands(name, alone, [kind], 0.25)
+        yield from self._everyone("recover", self._other_place(), most=1.5, after=name)
 
-    def _aside(self, side: Side) -> Pose:
-        """A tenth of each joint's range from its goal, away from the nearer end."""
-        return tuple(
-            q + math.copysign(0.1 * j.stroke, 0.5 * (j.q_min + j.q_max) - q)
-            for q, j in zip(self._goal[side], self._joints[side], strict=True)
-        )
+    def _at(self, side: Side, q: Sequence[float]) -> Motors:
+        return [replace(m, q=x) for m, x in zip(self._motors(side, tuple(q)), q, strict=True)]
 
-    def _broken(self, joint: int, field: str, value: float) -> dict[Side, Motors]:
+    def _malformed(self, name: str, side: Side) -> list[Motors]:
+        """The bad commands of a phase to one side."""
+        good = self._motors(side, self._goal[side])
+        if name == "empty":
+            return [[]]
+        if name == "short":
+            return [good[:-1]]
+        if name == "long":
+            return [[*good, *[replace(good[0], q=1.0)] * more] for more in (1, 13)]
+        if name == "negative":
+            near = self._motors(side, self._aside(side, 0.1))
+            return [[replace(m, kp=-m.kp, kd=-m.kd) for m in near]]
+        return [self._crossed(side, good)]
+
+    def _not_finite(self, side: Side) -> list[Motors]:
+        """One bad field in one joint each: the last, the first and a middle one in turn."""
+        last = len(self._model.gains) - 1
+        joints = (last, 0, last // 2)
+        return [
+            self._broken(side, joints[(i + i // 3) % 3], field, value)
+            for i, (field, value) in enumerate(NOT_FINITE)
+        ]
+
+    def _broken(self, side: Side, joint: int, field: str, value: float) -> Motors:
         """One bad field in one joint; all joints have far goals, to show if one is obeyed."""
-        far = self._other_place()
-        hands: dict[Side, Motors] = {}
-        for s, pose in far.items():
-            motors = list(self._motors(s, pose))
-            motors[joint] = replace(motors[joint], **{field: value})  # type: ignore[arg-type]
-            hands[s] = motors
-        return hands
+        motors = list(self._motors(side, self._other_place()[side]))
+        motors[joint] = replace(motors[joint], **{field: value})  # type: ignore[arg-type]
+        return motors
+
+    def _again(self) -> Steps:
+        self._report("bad commands of the new client: nothing may move")
+        sides = self.plan.sides
+        every = {s: self._not_finite(s) for s in sides}
+        kinds = [{s: every[s][i] for s in sides} for i in range(0, len(NOT_FINITE), 2)]
+        yield from self._bad_commands("nan", sides, kinds, 0.08)
+        yield from self._everyone("recover", self._other_place(), most=1.5, after="nan")
+
+    def _silent_again(self) -> Steps:
+        yield from self._to("center", OPEN)
+        yield from self._drive("drive", self.plan.sides, {}, guard=False)
+        yield from self._silence("silence", self._model.command_timeout + 0.7)
+        yield from self._to("resume", CLOSED - 5.0)
+
+    def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
+        """No command to one side but rejected ones, while it moves and the other is commanded."""
+        self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
+        yield from self._drive("drive", (side,), {}, guard=False)
+        yield from self._silence_alone(side, {side: rejected})
+        yield from self._everyone("resume", {s: self._home(s) for s in self.plan.sides}, most=1.5)
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
         """Two motors with each other's id, and a goal elsewhere for the first."""
@@ -359,3 +398,7 @@ class FingerScript(HandScript):
             self._report("... silence: nothing may be left driven by a velocity, a grip is kept")
             yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
+        if len(sides) > 1 and "silence" in self.plan.phases:
+            for side, bad in zip(sides, (math.nan, math.inf), strict=True):
+                home = self._motors(side, self._home(side))
+                yield from self._silent_alone(side, [replace(m, q=bad) for m in home])

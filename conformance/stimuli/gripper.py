@@ -7,26 +7,31 @@ listen         no commands; state must flow
 approach       slowly to mid stroke
 step           large steps of one side, the others hold
 ends           fully open, and fully closed where there is no object
+fingerprint    steps to compare the ``recover`` steps with
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
 range, empty,  stroke, no motor, motors too many, negative gains; and a client of another type on
-long,          the topic
+long,          the topic. Each kind stands for a while, on each side alone.
 negative,
 foreign
+beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
 limp           zero gains, with a q far towards closed
 replay         a recorded session, as recorded
+single         commands that are sent once
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 squeeze        close on the object, if there is one, by xr_teleoperate's lead
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
-silence        ... the commands stop for two command time-outs
+silence        ... the commands stop for two command time-outs; then on each side alone, while
+               rejected commands arrive
 resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
-restart        the client goes away, another comes, and makes a step
+restart        the client goes away, another comes, and makes a step; bad commands again
 shutdown       the service is stopped and started again
-service-       a step after that
+restarted      no commands
+service-       a step after that; silence again
 restart
 ============== =====================================================================================
 """
@@ -71,6 +76,9 @@ class GripperScript(HandScript):
                 yield from self._steps(side)
         if "ends" in self.plan.phases:
             yield from self._ends()
+        if "fingerprint" in self.plan.phases:
+            for _ in range(2):
+                yield from self._everyone("fingerprint", self._other_place())
         for name in _BAD:
             if name in self.plan.phases and (name != "negative" or self._gains_used):
                 yield from self._bad(name)
@@ -83,6 +91,8 @@ class GripperScript(HandScript):
         if "replay" in self.plan.phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
+        if "single" in self.plan.phases:
+            yield from self._single()
         if "load" in self.plan.phases:
             yield from self._load()
         if "old-stamps" in self.plan.phases:
@@ -148,37 +158,68 @@ class GripperScript(HandScript):
         sides = self.plan.sides
         yield from self._hold(0.2)
         if name == "nan":
-            yield from self._burst(name, [self._all(m) for m in self._not_finite()], 0.5)
+            for side in sides:
+                kinds = [{side: (m,)} for m in self._not_finite(side)]
+                yield from self._bad_commands(name, (side,), kinds, max(0.1, 1.2 / len(kinds)))
         elif name == "out-of-range":
-            far = [self._all(Motor(q=q)) for q in (1000.0, -1000.0)]
-            yield from self._burst(name, far, 1.0, each=0.5)
+            places = (1000.0, -1000.0, 1.3 * self._stroke, -0.3 * self._stroke)
+            far = [dict.fromkeys(sides, (Motor(q=q),)) for q in places]
+            yield from self._bad_commands(name, sides, far, 0.35)
         elif name == "long":
             good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
-            far = [
-                self._codec.encode_longer(good, [Motor(q=self._high())] * more) for more in (1, 19)
-            ]
-            yield from self._burst(name, far, 0.5)
+            for alone in self._each_alone():
+                mine = {s: good[s] for s in alone}
+                others = {s: m for s, m in good.items() if s not in alone}
+                rest = self._codec.encode(others) if others else []
+                longer = [
+                    self._codec.encode_longer(mine, [Motor(q=self._far(alone[0]))] * more) + rest
+                    for more in (1, 19)
+                ]
+                yield from self._bad_commands(name, alone, longer, 0.15)
         elif name == "negative":
             kp, kd = self._model.client_gains
-            aside = {s: self._middle(s) + 0.1 * self._stroke for s in sides}
-            wrong = {s: (Motor(q=q, kp=-kp, kd=-kd),) for s, q in aside.items()}
-            yield from self._burst(name, [self._codec.encode(wrong)], 0.4)
+            for alone in self._each_alone():
+                wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in alone}
+                yield from self._bad_commands(name, alone, [wrong], 0.3)
         else:
-            yield from self._burst(name, [self._codec.encode_empty(sides)], 0.5)
+            for alone in self._each_alone():
+                yield from self._bad_commands(name, alone, [self._empty(alone)], 0.3)
         yield from self._everyone("recover", self._other_place(), after=name)
-        yield from self._everyone("center", {s: self._home(s) for s in sides})
 
-    def _all(self, motor: Motor) -> Payloads:
-        return self._codec.encode(dict.fromkeys(self.plan.sides, (motor,)))
+    def _empty(self, sides: Sequence[Side]) -> Mapping[Side, Motors] | Payloads:
+        if self._codec.shared:
+            return self._codec.encode_empty(sides)
+        return dict.fromkeys(sides, ())
 
-    def _not_finite(self) -> list[Motor]:
+    def _far(self, side: Side) -> float:
+        """A q far from the goal."""
+        return self._low(side) if self._goal[side][0] > 0.6 * self._stroke else self._high()
+
+    def _not_finite(self, side: Side) -> list[Motor]:
         """One bad field each; where it is not q, q is far away, to show whether it was taken."""
-        far = self._high()
+        far = self._far(side)
         return [
             replace(Motor(q=far), **{field: value})  # type: ignore[arg-type]
             for field, value in NOT_FINITE
             if field == "q" or self._gains_used
         ]
+
+    def _again(self) -> Steps:
+        self._report("bad commands of the new client: nothing may move")
+        sides = self.plan.sides
+        every = {s: self._not_finite(s) for s in sides}
+        kinds = [{s: (every[s][i],) for s in sides} for i in range(0, len(every[sides[0]]), 2)]
+        yield from self._bad_commands("nan", sides, kinds, 0.1)
+        yield from self._everyone("recover", self._other_place(), after="nan")
+
+    def _silent_again(self) -> Steps:
+        if not self._gains_used:
+            return
+        sides = self.plan.sides
+        yield from self._everyone("center", {s: (self._low(s),) for s in sides})
+        yield from self._drive(sides, {})
+        yield from self._silence("silence", self._model.command_timeout + 0.6)
+        yield from self._everyone("resume", self._other_place())
 
     def _limp(self) -> Steps:
         self._report("commands without force (zero gains): the hand must not be pulled")
@@ -210,6 +251,18 @@ class GripperScript(HandScript):
             yield from self._drive(free, squeeze)
         self._report("... silence: after a second the hand must brake")
         yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
+        yield from self._everyone("resume", self._other_place())
+        if len(sides) > 1 and not self._codec.shared and "silence" in self.plan.phases:
+            for side, bad in zip(sides, (math.nan, math.inf), strict=True):
+                yield from self._silent_alone(side, (Motor(q=bad),))
+
+    def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
+        """No command to one side but rejected ones, while it moves and the other is commanded."""
+        self._report(f"no good commands to the {side} hand alone: it must brake")
+        if self._gains_used:
+            yield from self._everyone("center", {side: (self._low(side),)})
+            yield from self._drive((side,), {})
+        yield from self._silence_alone(side, {side: rejected})
         yield from self._everyone("resume", self._other_place())
 
     def _drive(self, sides: Sequence[Side], others: Mapping[Side, Motors]) -> Steps:

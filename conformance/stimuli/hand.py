@@ -39,8 +39,15 @@ PATIENCE = 6.0
 """Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
 FLOOD = 500
 """Commands of a burst."""
-LOAD_RATE, LOAD_SECONDS = 400.0, 2.5
-"""Commands a second under load, twice and more what official clients send, and for how long."""
+LOADS = ((400.0, 2.0, 1), (2500.0, 1.0, 10))
+"""Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation
+sends, the second what Unitree's C++ example sends (docs/sources/unitree-dex.md#b1)."""
+ASIDE = 0.15
+"""Part of a joint's range of a step that one side makes while the other gets bad commands."""
+ASIDE_SECONDS = 1.0
+"""Least time, s, in which a side is asked to make such a step."""
+SINGLES, SINGLE_SECONDS = 10, 0.25
+"""Commands that are sent once, and how long none follows, s: less than any time-out."""
 
 
 class HandScript(Script[Side]):
@@ -66,7 +73,10 @@ class HandScript(Script[Side]):
         if not self._obs.q:
             self._report("no state on any topic: the rest of the script is left out")
             return
-        yield from self._provoke()
+        for done in range(self.plan.rounds):
+            if self.plan.rounds > 1:
+                self._report(f"round {done + 1} of {self.plan.rounds}")
+            yield from self._provoke()
         if OPERATOR in self.plan.phases:
             yield from operate(self)
             yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
@@ -76,6 +86,8 @@ class HandScript(Script[Side]):
             self._report("the commanding program is restarted: the new one must be obeyed")
             yield Restart()
             yield from self._everyone("restart", self._other_place())
+            if "nan" in self.plan.phases:
+                yield from self._again()
         yield from self._hold(0.2)
         if self.plan.phases & {"shutdown", "service-restart"}:
             yield from self._service_restart()
@@ -83,6 +95,14 @@ class HandScript(Script[Side]):
     @abstractmethod
     def _provoke(self) -> Steps:
         """Every phase between the first motion and the operator."""
+
+    @abstractmethod
+    def _again(self) -> Steps:
+        """Bad commands once more, of another client."""
+
+    @abstractmethod
+    def _silent_again(self) -> Steps:
+        """Missing commands once more, after a restart of the service."""
 
     @abstractmethod
     def _home(self, side: Side) -> Pose:
@@ -201,17 +221,90 @@ class HandScript(Script[Side]):
             yield from self._command()
         yield from self._until_settled(phase, self.plan.sides, least=0.3, most=2.0)
 
-    def _burst(
-        self, name: str, bursts: Sequence[Payloads], seconds: float, *, each: float = 0.0
+    def _bad_commands(
+        self,
+        name: str,
+        sides: Sequence[Side],
+        kinds: Sequence[Mapping[Side, Motors] | Payloads],
+        each: float,
     ) -> Steps:
-        """Bad commands, as a phase: in turn, or each for a while."""
-        phase = self._begin(name, self.plan.sides)
-        count = 0
-        while self._elapsed(phase) < seconds:
-            at = int(self._elapsed(phase) / each) if each else count
-            count += 1
-            yield from self._send(bursts[min(at, len(bursts) - 1) if each else at % len(bursts)])
+        """Bad commands to some sides, as a phase: each kind long enough to show what it does.
+
+        The other sides go on being commanded; where there is time, they make a step.
+
+        :param kinds: motors of each of these sides, or whole messages.
+        :param each: seconds of each kind.
+        """
+        beside = self._beside_others(sides, len(kinds) * each)
+        good = {s: self._motors(s, q) for s, q in self._goal.items() if s not in sides}
+        phase = self._begin(name, sides)
+        for kind in kinds:
+            bad = kind if isinstance(kind, list) else self._codec.encode({**good, **kind})
+            yield from self._repeat(each, lambda bad=bad: self._send(bad))  # type: ignore[misc]
+            yield from self._command()  # or it would brake, as it must without good commands
         self._end(phase)
+        for other in beside:
+            self._end(other)
+
+    def _beside_others(self, sides: Sequence[Side], seconds: float) -> list[Phase]:
+        """Begin a step of the sides that are not among these, where that takes no longer."""
+        others = [s for s in self.plan.sides if s not in sides]
+        if not others or self._codec.shared or seconds < ASIDE_SECONDS:
+            return []
+        self._goal.update({s: self._aside(s) for s in others})
+        return [
+            self._begin("beside", (s,), targets={s: dict(enumerate(self._goal[s]))}) for s in others
+        ]
+
+    def _aside(self, side: Side, part: float = ASIDE) -> Pose:
+        """A part of each joint's range from its goal, away from the nearer end."""
+        return tuple(
+            q + math.copysign(part * j.stroke, 0.5 * (j.q_min + j.q_max) - q)
+            for q, j in zip(self._goal[side], self._joints[side], strict=True)
+        )
+
+    def _each_alone(self) -> list[tuple[Side, ...]]:
+        """Each side by itself; both where they share a message."""
+        if self._codec.shared:
+            return [self.plan.sides]
+        return [(s,) for s in self.plan.sides]
+
+    def _single(self) -> Steps:
+        """Commands that are not repeated: every one counts, and the newest most of all."""
+        self._report("commands that are sent once: each must be obeyed")
+        yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
+        home = dict(self._goal)
+        away = {s: self._aside(s, 0.4 * ASIDE) for s in home}
+        decoy = {s: self._aside(s, -0.2 * ASIDE) for s in home}
+        encode = self._codec.encode
+        for i in range(SINGLES):
+            goal = home if i % 2 else away
+            if i % 3 == 2:  # a newer command replaces one that has just arrived
+                yield from self._send(encode({s: self._motors(s, q) for s, q in decoy.items()}))
+            self._goal.update(goal)
+            targets = {s: dict(enumerate(pose)) for s, pose in goal.items()}
+            phase = self._begin("single", self.plan.sides, targets=targets)
+            yield from self._command()
+            yield from self._through(phase, SINGLE_SECONDS, lambda: self._wait(0.01))
+
+    def _silence_alone(self, side: Side, rejected: Mapping[Side, Motors]) -> Steps:
+        """No good command to one side, as a phase; the others make a step after the time-out.
+
+        :param rejected: what the side gets instead: it must not count as a command.
+        """
+        phase = self._begin("silence", (side,))
+        beside: list[Phase] = []
+        for seconds in (self._model.command_timeout + 0.1, ASIDE_SECONDS):
+            good = {s: self._motors(s, q) for s, q in self._goal.items() if s != side}
+            payloads = self._codec.encode({**good, **rejected})
+            yield from self._repeat(
+                seconds,
+                lambda payloads=payloads: self._send(payloads),  # type: ignore[misc]
+            )
+            if not beside:
+                beside = self._beside_others((side,), ASIDE_SECONDS)
+        for ended in (phase, *beside):
+            self._end(ended)
 
     def _replay(self, session: Session) -> Steps:
         sides = [s for s in self.plan.sides if s in session.sides]
@@ -293,7 +386,6 @@ class HandScript(Script[Side]):
 
     def _load(self) -> Steps:
         """Many commands, and a reliable subscriber that hardly ever reads."""
-        self._report(f"{LOAD_RATE:g} commands a second and a slow reader: state must keep its rate")
         here, there = dict(self._goal), self._other_place()
         count = 40  # points of the way there and back
         parts = [0.3 * (1 - abs(2 * i / count - 1)) for i in range(count + 1)]
@@ -309,11 +401,14 @@ class HandScript(Script[Side]):
             for part in parts
         ]
         yield from self._do(Join(Role.LAGGARD))
-        period, self._period_ns = self._period_ns, round(1e9 / LOAD_RATE)
-        phase = self._begin("load", self.plan.sides)
-        while (at := self._elapsed(phase) / LOAD_SECONDS) < 1.0:
-            yield from self._send(points[int(at * count)])
-        self._end(phase)
+        period = self._period_ns
+        for rate, seconds, at_a_time in LOADS:
+            self._report(f"{rate:g} commands a second and a slow reader: state must keep its rate")
+            self._period_ns = round(at_a_time * 1e9 / rate)
+            phase = self._begin("load", self.plan.sides)
+            while (at := self._elapsed(phase) / seconds) < 1.0:
+                yield from self._send(points[int(at * count)] * at_a_time)
+            self._end(phase)
         self._period_ns = period
         yield from self._do(Leave(Role.LAGGARD))
 
@@ -353,9 +448,10 @@ class HandScript(Script[Side]):
         yield from self._do(StartService())
         self._end(phase)
         self._next_ns = self._obs.now_ns
-        yield from self._everyone(
-            "service-restart", {s: self._home(s) for s in self.plan.sides}, most=4.0
-        )
+        yield from self._silence("restarted", 0.4)
+        yield from self._everyone("service-restart", self._other_place(), most=4.0)
+        if "silence" in self.plan.phases:
+            yield from self._silent_again()
 
     def _silence(self, name: str, seconds: float) -> Steps:
         """No command at all, as a phase."""

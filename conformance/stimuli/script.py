@@ -138,6 +138,7 @@ class Plan(Generic[S_co]):
         joint, percent of closing for others.
     :param phases: names of the phases to go through; see
         :func:`dexkit.conformance.stimuli.phases_for`.
+    :param rounds: how often a hand goes through those between the first motion and the operator.
     """
 
     dialect: Dialect
@@ -145,6 +146,7 @@ class Plan(Generic[S_co]):
     objects: Mapping[Subject, float] = field(default_factory=dict)
     session: Session | None = None
     phases: frozenset[str] = frozenset()
+    rounds: int = 1
 
 
 def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Subject, float]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.virtual.service import Sample, Service
+from dexkit.conformance.virtual.service import Sample, Service, TopicDevice
 from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
@@ -274,6 +274,13 @@ class FingerService(Service):
         self._sent: dict[Side, tuple[object, bytes]] = {}
         units = dialect.torque_units or (1.0,) * dialect.length
         self.torque_units: Floats = np.array(units)
+
+    def take_over(self, before: TopicDevice) -> None:
+        """Find the hands where the service before it has left them."""
+        assert isinstance(before, FingerService)
+        for side, hand in self.hands.items():
+            hand.q = list(before.hands[side].q)
+            hand.changed()
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         """Take one side's part of a command message."""

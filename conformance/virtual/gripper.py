@@ -8,7 +8,7 @@ from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.virtual.service import Service
+from dexkit.conformance.virtual.service import Service, TopicDevice
 from dexkit.hand import Side, Subject
 from dexkit.models import DEX1_1, Dialect
 
@@ -119,6 +119,12 @@ class ReferenceService(Service):
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(dialect.q_open, touch.get(s)) for s in self.sides}
+
+    def take_over(self, before: TopicDevice) -> None:
+        """Find the grippers where the service before it has left them."""
+        assert isinstance(before, ReferenceService)
+        for side, hand in self.hands.items():
+            hand.q = before.hands[side].q
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         """Take one side's part of a command message."""

@@ -101,6 +101,10 @@ class TopicDevice(ABC):
         self.restarted = True
         self.now = self._due = now
 
+    def take_over(self, before: TopicDevice) -> None:
+        """Find the mechanics where the service before it has left them."""
+        return
+
     def brake(self) -> None:
         """Stop driving the motors: the program ends."""
         return

@@ -103,8 +103,9 @@ class _Player:
             self._stopped = {"exit_s": self._service.exit_s, "gone_s": self._service.gone_s}
         elif isinstance(action, StartService):
             self.now += 0.5
-            plan = self._plan
+            plan, before = self._plan, self._service
             self._service = self._service_class(plan.dialect, plan.sides, plan.objects)
+            self._service.take_over(before)
             self._service.begin(self.now)
             self._newest.clear()
         return self._observe()

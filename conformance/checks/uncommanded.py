@@ -1,0 +1,241 @@
+"""Motion that no command explains: of a hand at rest, and outside of where it is commanded to.
+
+Both checks look at the whole run, not at the ends of steps. Stretches that other requirements are
+about (bad commands, missing commands, commands without a position gain) are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.hand import Floats
+
+OWN_RULE = (
+    *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "foreign", "burst"),
+    *("two-writers", "limp", "lock", "drive", "silence"),
+    *("guard-drive", "guard", "guard-latch", "guard-clear"),
+)
+"""Stimuli during which other requirements say what may move."""
+_GRID = 0.01  # s, of the cells in which extremes of q and of goals are compared
+_AT_REST_S = 0.3  # s without motion after which a joint is at rest
+_UNDRIVEN_S = 0.1  # the same before a command: nothing has been asked to move
+_AT_REST_PART = 0.01  # of the stroke by which q may vary meanwhile
+
+
+@dataclass(frozen=True)
+class _Goals:
+    """The position commands to one joint, rad.
+
+    :param t: when each was received, s; only those at which ``low`` or ``high`` changes.
+    :param low: the goal; -inf for a command that drives the joint by anything else than a
+        position, inf for one that does not drive it.
+    :param high: likewise, with the other sign.
+    """
+
+    t: Floats
+    low: Floats
+    high: Floats
+
+
+def _goals(ctx: Context, joint: int) -> _Goals:
+    """The goals of one joint; a command that is not finite is none."""
+    commands, spec = ctx.commands, ctx.joints[joint]
+    used = ctx.recording.dialect.gains_are_used
+    fields = (commands.q, commands.dq, commands.tau, commands.kp, commands.kd)
+    finite = np.isfinite(np.stack(fields if used else fields[:1])).all(axis=(0, 2))
+    t, q = commands.t[finite], np.clip(commands.q[finite, joint], spec.q_min, spec.q_max)
+    low, high = q.copy(), q.copy()
+    if used:
+        driven = (commands.dq[finite, joint] != 0) | (commands.tau[finite, joint] != 0)
+        low[driven], high[driven] = -np.inf, np.inf
+        limp = (commands.kp[finite, joint] <= 0) & ~driven
+        low[limp], high[limp] = np.inf, -np.inf
+    changed = np.ones(len(t), dtype=np.bool_)
+    changed[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+    return _Goals(t[changed], low[changed], high[changed])
+
+
+def _excluded(ctx: Context) -> list[tuple[float, float]]:
+    """Begin and end of the stretches with rules of their own."""
+    return [ctx.span(p) for name in OWN_RULE for p in ctx.recording.phases(name, ctx.side)]
+
+
+@check("DEX1-STILL-01", "DEX3-STILL-01")
+def still(ctx: Context) -> Outcome:
+    """The largest motion of a joint that had come to rest, while its goal stayed the same."""
+    if not len(ctx.commands):
+        return ctx.skipped("no commands to this hand in the recording")
+    excluded = _excluded(ctx)
+    worst: tuple[float, float, int, float, str] = (-1.0, 0.0, 0, 0.0, "")
+    for joint, spec in enumerate(ctx.joints):
+        goals = _goals(ctx, joint)
+        for begin, end, goal in _stretches(ctx, goals, excluded):
+            moved = _leaves(ctx, joint, begin, end, goal)
+            if moved is not None and moved[0] / spec.stroke > worst[0]:
+                when = "before the first command" if goal is None else f"at its goal {goal:.2f} rad"
+                worst = moved[0] / spec.stroke, moved[0], joint, moved[1], when
+    part, rad, joint, at, when = worst
+    if part < 0:
+        return ctx.skipped("no joint came to rest while its command stayed the same")
+    text = ctx.named(f"moved by at most {rad:.3f} rad at rest", joint)
+    if rad <= ctx.tolerance("max_motion_stroke", joint):
+        return ctx.passed(f"{rad:.3f} rad", text, motion_rad=rad)
+    return (
+        ctx.failed(
+            f"{rad:.2f} rad",
+            ctx.named(f"at rest {when}, it moved by {rad:.2f} rad at {at:.2f} s", joint),
+            ctx.at(ctx.states.topic, at),
+            motion_rad=rad,
+        )
+        .about(joint)
+        .if_late(STROKE_S * rad / ctx.joints[joint].stroke)
+    )
+
+
+def _stretches(
+    ctx: Context, goals: _Goals, excluded: list[tuple[float, float]]
+) -> list[tuple[float, float, float | None]]:
+    """Begin, end and goal of each stretch with one goal, outside of the excluded ones.
+
+    The goal of the stretches before the first command, and after a restart of the service, is None.
+    """
+    found: list[tuple[float, float, float | None]] = []
+    starts = [float(ctx.states.t[0])]
+    starts += [ctx.span(p)[0] for p in ctx.phases("restarted")]
+    for begin in starts:
+        later = ctx.commands.t[ctx.commands.t >= begin]
+        found.append((begin, float(later[0]) if len(later) else ctx.recording.duration, None))
+    ends = np.append(goals.t[1:], ctx.recording.duration)
+    for begin, end, low, high in zip(goals.t, ends, goals.low, goals.high, strict=True):
+        a, b = float(begin), float(end)
+        if low != high or b - a < 2 * _AT_REST_S:
+            continue
+        for x, y in sorted(excluded):
+            if x <= a < y:
+                a = y
+            elif a < x < b:
+                found.append((a, x, float(low)))
+                a = y
+        if b > a:
+            found.append((a, b, float(low)))
+    return found
+
+
+def _leaves(
+    ctx: Context, joint: int, begin: float, end: float, goal: float | None
+) -> tuple[float, float] | None:
+    """How far a joint leaves the place where it came to rest, rad, and when.
+
+    Motion from there to the goal is none: a slow joint may still arrive. None if it does not come
+    to rest in [begin, end].
+    """
+    rows = ctx.states.between(begin, end)
+    t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
+    good = np.isfinite(q)
+    t, q = t[good], q[good]
+    rest = _UNDRIVEN_S if goal is None else _AT_REST_S
+    count = int(np.searchsorted(t, t[0] + rest)) if len(t) else 0
+    if count < 5 or len(t) < 2 * count:
+        return None
+    windows = sliding_window_view(q, count)
+    calm = np.ptp(windows, axis=1) <= _AT_REST_PART * ctx.joints[joint].stroke
+    if not calm.any():
+        return None
+    first = int(np.argmax(calm))
+    here = float(np.median(windows[first]))
+    low, high = (here, here) if goal is None else (min(here, goal), max(here, goal))
+    away = np.maximum(low - q[first:], q[first:] - high)
+    i = int(np.argmax(away))
+    return max(0.0, float(away[i])), float(t[first + i])
+
+
+@check("DEX1-PATH-01", "DEX3-PATH-01")
+def path(ctx: Context) -> Outcome:
+    """How far q goes beyond where the joint was and where it was commanded to go.
+
+    At each time q must lie between the position of ``before_s`` ago and the goals that were in
+    force since then, or up to ``max_delay_s`` before.
+    """
+    worst: tuple[float, float, int, float] = (-1.0, 0.0, 0, 0.0)
+    for joint, spec in enumerate(ctx.joints):
+        found = _beyond(ctx, joint)
+        if found is not None and found[0] / spec.stroke > worst[0]:
+            worst = found[0] / spec.stroke, found[0], joint, found[1]
+    part, rad, joint, at = worst
+    if part < 0:
+        return ctx.skipped("too few states while positions were commanded")
+    if rad <= ctx.tolerance("max_beyond_stroke", joint):
+        return ctx.passed(
+            f"{rad:.3f} rad",
+            ctx.named(f"at most {rad:.3f} rad beyond its start and its goal", joint),
+            beyond_rad=rad,
+        )
+    return (
+        ctx.failed(
+            f"{rad:.2f} rad",
+            ctx.named(
+                f"at {at:.2f} s it was {rad:.2f} rad outside of where it had been "
+                f"{ctx.tolerance('before_s'):g} s before and where it was commanded to go",
+                joint,
+            ),
+            ctx.at(ctx.states.topic, at),
+            beyond_rad=rad,
+        )
+        .about(joint)
+        .if_late(STROKE_S * rad / ctx.joints[joint].stroke)
+    )
+
+
+def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
+    """How far q is outside of the hull of its earlier position and its goals, rad, and when."""
+    good = np.isfinite(ctx.states.q[:, joint])
+    t, q = ctx.states.t[good], ctx.states.q[good, joint]
+    goals = _goals(ctx, joint)
+    before = round(ctx.tolerance("before_s") / _GRID)
+    late = before + round(ctx.tolerance("max_delay_s") / _GRID)
+    if len(t) < 2 or not len(goals.t):
+        return None
+    origin = min(float(t[0]), float(goals.t[0]))
+    cells = int((float(t[-1]) - origin) / _GRID) + 1
+    at = ((t - origin) / _GRID).astype(np.intp)
+    here = np.full(cells, np.nan)
+    here[at] = q  # the newest of each cell
+    # where there are no states, as while the service restarts, it was where it appears again
+    seen = np.isfinite(here)
+    known = np.flatnonzero(seen)
+    here = here[known[np.minimum(np.searchsorted(known, np.arange(cells)), len(known) - 1)]]
+    low, high = _in_force(goals, origin, cells)
+    if cells <= late:
+        return None
+    low = sliding_window_view(low, late + 1).min(axis=1)
+    high = sliding_window_view(high, late + 1).max(axis=1)
+    now, then = here[late:], here[late - before : cells - before]
+    away = np.maximum(np.minimum(low, then) - now, now - np.maximum(high, then))
+    away[~seen[late:]] = np.nan
+    for begin, end in _excluded(ctx):
+        # what it was moved by there, it may still come back from
+        i, j = (round((x - origin) / _GRID) - late for x in (begin, end))
+        away[max(i, 0) : max(j + before, 0)] = np.nan
+    if not np.isfinite(away).any():
+        return None
+    i = int(np.nanargmax(away))
+    return max(0.0, float(away[i])), origin + (i + late) * _GRID
+
+
+def _in_force(goals: _Goals, origin: float, cells: int) -> tuple[Floats, Floats]:
+    """The least and the largest goal in each cell; what was in force at its begin counts."""
+    at: NDArray[np.intp] = ((goals.t - origin) / _GRID).astype(np.intp)
+    known = at < cells
+    begins = origin + _GRID * np.arange(cells)
+    newest = np.searchsorted(goals.t, begins, "right") - 1
+    # before the first command nothing may move: the hull is where the hand is
+    low = np.where(newest >= 0, goals.low[np.maximum(newest, 0)], np.inf)
+    high = np.where(newest >= 0, goals.high[np.maximum(newest, 0)], -np.inf)
+    np.minimum.at(low, at[known], goals.low[known])
+    np.maximum.at(high, at[known], goals.high[known])
+    return low, high

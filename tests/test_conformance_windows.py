@@ -1,0 +1,86 @@
+"""Requirements that are judged in sliding windows, over the whole recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
+from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
+from dexkit.conformance.virtual.memory_trace import MemoryTrace
+from dexkit.hand import Side
+from dexkit.models import dialect
+
+ORIGIN = 1_700_000_000_000_000_000
+
+
+def _recorded(
+    sent: Sequence[float], received: Sequence[float] | None = None, *, kit: bool = False
+) -> MemoryTrace:
+    """A recording of states that were sent and received at these times, s.
+
+    :param kit: with the record of a stimulus, as a run of the kit has.
+    """
+    go = dialect("unitree_go")
+    payload = MotorCodec(go).state_payload({Side.LEFT: [{"q": 1.0}]})
+    trace = MemoryTrace()
+    times = np.array([sent, sent if received is None else received])
+    for at, arrived in (ORIGIN + np.round(times * 1e9).astype(np.int64)).T.tolist():
+        trace.put(go.topics(Side.LEFT)[1], go.state_type, arrived, at, payload)
+    if kit:
+        phase = Phase("listen", (Side.LEFT,), ORIGIN, ORIGIN + 10**9)
+        trace.metadata[RECORD] = Stimulus(phases=[phase]).to_metadata()
+    return trace
+
+
+def _result(trace: MemoryTrace, requirement: str) -> Result:
+    every = judge(recording_of(trace, "unitree_go", (Side.LEFT,))).results
+    return next(r for r in every if r.requirement.id == requirement)
+
+
+def _at(rate: float, begin: float, end: float) -> list[float]:
+    return np.arange(begin, end, 1 / rate).tolist()
+
+
+def test_rate_that_falls_for_the_second_half_fails_with_the_second_in_which_it_began() -> None:
+    result = _result(_recorded(_at(500, 0, 10) + _at(60, 10, 20)), "DEX1-RATE-01")
+    assert result.verdict is Verdict.FAIL
+    assert result.values["rate_hz"] == pytest.approx(60, abs=1)
+    assert result.evidence[0].time_s == pytest.approx(10.0, abs=0.02)
+    assert "60.0 Hz from 10.00 s" in result.observed
+
+
+def test_rate_that_falls_for_two_seconds_fails_with_both_ends() -> None:
+    times = _at(500, 0, 6) + _at(100, 6, 8) + _at(500, 8, 14)
+    (place,) = _result(_recorded(times), "DEX1-RATE-01").evidence
+    assert (place.time_s, place.end_s) == pytest.approx((6.0, 8.0), abs=0.1)
+
+
+def test_one_late_state_does_not_fail_the_rate() -> None:
+    times = _at(210, 0, 5) + _at(210, 5.09, 10)
+    assert _result(_recorded(times), "DEX1-RATE-01").verdict is Verdict.PASS
+
+
+def test_states_that_arrive_late_are_a_gap_in_a_run_of_the_kit_alone() -> None:
+    sent = np.array(_at(500, 0, 6))
+    received = np.where((sent > 3.0) & (sent < 3.3), 3.3, sent)
+    late = _recorded(sent.tolist(), received.tolist(), kit=True)
+    result = _result(late, "DEX1-RATE-03")
+    assert result.verdict is Verdict.FAIL
+    assert result.evidence[0].time_s == pytest.approx(3.0, abs=0.01)
+    # another recorder may have been late itself
+    offline = _recorded(sent.tolist(), received.tolist())
+    assert _result(offline, "DEX1-RATE-03").verdict is Verdict.PASS
+
+
+def test_bursts_with_good_stamps_are_irregular_in_a_run_of_the_kit() -> None:
+    sent = np.array(_at(500, 0, 6))
+    received = np.ceil(sent / 0.03) * 0.03
+    result = _result(_recorded(sent.tolist(), received.tolist(), kit=True), "DEX1-RATE-04")
+    assert result.verdict is Verdict.WARN
+    assert result.values["p99_s"] == pytest.approx(0.03, abs=0.002)
