@@ -128,6 +128,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="what the vendor claims; the rest is reported as not claimed (docs/capabilities.md)",
     )
     add("level", choices=["must", "should", "info"], help="only requirements at least this binding")
+    add(
+        "grade",
+        choices=["drop-in", "safety"],
+        help="which grade decides the exit code (default: both); all requirements are judged",
+    )
     add("json", metavar="FILE", help="write the result file")
     add("report", metavar="FILE.html", help="write the report page")
     add("markdown", metavar="FILE.md", help="write a summary in Markdown, for a comment or a wiki")
@@ -195,7 +200,8 @@ def _items(session: pytest.Session) -> list[pytest.Item]:
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     """Set the exit code: a run in which nothing was judged, or a MUST is open, does not pass.
 
-    The suite's exit codes are those of ``dexkit check``: 0 pass, 1 fail, 2 not usable.
+    The suite's exit codes are those of ``dexkit check``: 0 pass, 1 fail, 2 not usable. With
+    ``--grade`` the requirements of that kind decide; the others' failures are still reported.
     """
     config = session.config
     usual = (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.NO_TESTS_COLLECTED)
@@ -203,9 +209,14 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
         return
     if not _items(session) and config.stash[OPTIONS_KEY] is None:
         return  # a pytest run without the suite
-    from dexkit.conformance.results import Overall, overall_of
+    from dexkit.conformance.requirements import Kind
+    from dexkit.conformance.results import Grade, Overall, overall_of
 
     reported: list[Result] = config.stash[REPORTED_KEY]
+    grade = config.getoption("dexkit_grade")
+    if grade and len(_items(session)) == len(session.items):
+        session.exitstatus = Grade.of(Kind(grade), reported).overall.exit_code
+        return
     if overall_of(reported) is Overall.INCONCLUSIVE:
         session.exitstatus = Overall.INCONCLUSIVE.exit_code
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from dexkit import documents
 from dexkit.conformance.plots import Plot
-from dexkit.conformance.requirements import Level, Requirement
+from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
 from dexkit.conformance.result_file_v2 import converted
 from dexkit.conformance.results import (
     FORMAT,
@@ -137,13 +137,24 @@ def _expected(rule: str, value: Any, found: Any) -> str:
     return f"is not as it should be ({rule})"
 
 
+def _kind_of(name: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Kind of a requirement, and what the original does.
+
+    A file that was written before there were kinds has none: then those of today's catalogue.
+    """
+    if "kind" in data:
+        return {"kind": Kind(data["kind"]), "original": data.get("original", "")}
+    known = next((r for r in catalogue(None, None) if r.id == name), None)
+    return {"kind": known.kind, "original": known.original} if known else {}
+
+
 def _result_of(entry: dict[str, Any]) -> Result:
     data = dict(entry["requirement"])
     data["level"] = Level(data["level"])
     data["after"] = tuple(data["after"])
     data["dialects"] = tuple(data["dialects"])
     data["plots"] = _plots(data["plots"])
-    entry["disturbance"]
+    data |= _kind_of(entry["id"], data)
     return Result(
         requirement=Requirement(**data),
         side=entry["side"],

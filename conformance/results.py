@@ -28,7 +28,7 @@ from typing import Any
 
 from dexkit import __version__, documents
 from dexkit.conformance.plots import Plot
-from dexkit.conformance.requirements import Level, Requirement
+from dexkit.conformance.requirements import Kind, Level, Requirement
 
 __all__ = [
     "FORMAT",
@@ -36,12 +36,14 @@ __all__ = [
     "VERSION",
     "Disturbance",
     "Evidence",
+    "Grade",
     "Load",
     "Overall",
     "Result",
     "RunResult",
     "Stage",
     "Verdict",
+    "counts_of",
     "environment",
     "grouped",
     "overall_of",
@@ -241,6 +243,60 @@ def grouped(results: Iterable[Result]) -> list[tuple[Requirement, list[Result]]]
     return [(group[0].requirement, group) for group in groups.values()]
 
 
+def counts_of(results: Iterable[Result]) -> dict[Verdict, int]:
+    """Requirements by verdict, sides taken together."""
+    rows = [worst(r.verdict for r in group) for _, group in grouped(results)]
+    return {v: rows.count(v) for v in Verdict}
+
+
+@dataclass(frozen=True)
+class Grade:
+    """The verdict on the requirements of one kind: drop-in, or safety.
+
+    :param counts: those requirements by verdict, sides taken together.
+    """
+
+    kind: Kind
+    overall: Overall
+    counts: Mapping[Verdict, int]
+
+    @classmethod
+    def of(cls, kind: Kind, results: Iterable[Result]) -> Grade:
+        """The grade of the results of that kind."""
+        found = [r for r in results if r.requirement.kind is kind]
+        return cls(kind, overall_of(found), counts_of(found))
+
+    @property
+    def total(self) -> int:
+        """How many requirements of the kind the run has."""
+        return sum(self.counts.values())
+
+    @property
+    def judged(self) -> bool:
+        """Whether the run has anything to say of the kind; a blocked requirement counts."""
+        left_out = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
+        return any(n for v, n in self.counts.items() if v not in left_out)
+
+    def sentence(self) -> str:
+        """The grade in one sentence."""
+        heads = {
+            Overall.PASS: "PASS: every MUST that could be judged is met",
+            Overall.FAIL: "FAIL: a MUST is not met",
+            Overall.INCONCLUSIVE: "INCONCLUSIVE: a MUST could not be judged",
+        }
+        head = heads[self.overall] if self.judged else "NOT JUDGED: nothing of this kind was tested"
+        parts = [f"{n} {v}" for v, n in self.counts.items() if n]
+        return f"{self.kind}: {head} ({self.total} requirements{''.join(f', {p}' for p in parts)})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The grade as plain data."""
+        return {
+            "overall": str(self.overall),
+            "sentence": self.sentence(),
+            "counts": {str(v): n for v, n in self.counts.items()},
+        }
+
+
 @dataclass
 class RunResult:
     """A whole run.
@@ -284,8 +340,15 @@ class RunResult:
 
     def counts(self) -> dict[Verdict, int]:
         """Requirements by verdict, sides taken together."""
-        rows = [worst(r.verdict for r in group) for _, group in self.by_requirement()]
-        return {v: rows.count(v) for v in Verdict}
+        return counts_of(self.results)
+
+    def grade(self, kind: Kind) -> Grade:
+        """The verdict on the requirements of that kind."""
+        return Grade.of(kind, self.results)
+
+    def exit_code(self, kind: Kind | None = None) -> int:
+        """0 pass, 1 fail, 2 not usable: of one kind, or of the whole run."""
+        return (self.overall if kind is None else self.grade(kind).overall).exit_code
 
     def by_requirement(self) -> list[tuple[Requirement, list[Result]]]:
         """Results about the hands by requirement, in the catalogue's order."""
@@ -375,6 +438,7 @@ class RunResult:
             "version": VERSION,
             "overall": str(self.overall),
             "sentence": self.sentence(),
+            "grades": {str(kind): self.grade(kind).as_dict() for kind in Kind},
             "subject": dict(self.subject),
             "claims": None if self.claims is None else dict(self.claims),
             "stage": {side: str(stage) for side, stage in self.stage.items()},
@@ -405,6 +469,7 @@ def _result_dict(result: Result) -> dict[str, Any]:
     for name in ("negative", "spoils"):  # about the catalogue, no part of the format
         del requirement[name]
     requirement["level"] = str(result.requirement.level)
+    requirement["kind"] = str(result.requirement.kind)
     requirement["plots"] = [str(plot) for plot in result.requirement.plots]
     return {
         "id": result.requirement.id,

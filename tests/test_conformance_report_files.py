@@ -26,6 +26,7 @@ from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import VERDICTS
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
+from dexkit.conformance.requirements import Kind
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
@@ -130,7 +131,7 @@ def test_the_badge_is_an_image_with_its_text() -> None:
     assert root.attrib["role"] == "img"
     title = root.find("{http://www.w3.org/2000/svg}title")
     assert title is not None
-    assert title.text == "Dex1-1 drop-in: fail, 1 of 6 not met"
+    assert title.text == "Dex1-1 drop-in: fail, 1 of 6 not met; Dex1-1 safety: not judged"
     assert "http" not in svg.replace("http://www.w3.org/2000/svg", "")
     width = float(root.attrib["width"])
     ends = [
@@ -318,7 +319,8 @@ def test_terminal_prints_facts_of_both_hands_once() -> None:
     out = io.StringIO()
     print_result(result, Console(file=out, width=80), verbose=True)
     lines = [line.rstrip() for line in out.getvalue().splitlines()]
-    assert max(map(len, lines[:-1])) <= 80
+    assert max(map(len, lines[:-3])) <= 80
+    assert lines[-3:-1] == [result.grade(kind).sentence() for kind in Kind]
     assert lines[-1] == result.sentence()
     failed = next(r.requirement for r in result.results if r.verdict is Verdict.FAIL)
     begin = lines.index(f"{failed.id} ({failed.level}) left and right: fail")

@@ -13,7 +13,7 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.plots import PlotKind
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Level
+from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Kind, Level
 from dexkit.conformance.results import VERSION, Load, Overall, Stage, Verdict
 from dexkit.hand import ROBOT, Side
 from dexkit.traces import open_trace, sample_path
@@ -72,3 +72,5 @@ def test_schema_lists_every_enumeration_value() -> None:
     assert kinds == [str(k) if k is not PlotKind.MEMBER else "member:.+" for k in PlotKind]
     assert defs["requirement"]["properties"]["confidence"]["enum"] == list(CONFIDENCE)
     assert defs["requirement"]["properties"]["layer"]["enum"] == list(LAYERS)
+    assert defs["requirement"]["properties"]["kind"]["enum"] == [str(kind) for kind in Kind]
+    assert list(properties["grades"]["properties"]) == [str(kind) for kind in Kind]

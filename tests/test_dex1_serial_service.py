@@ -115,3 +115,22 @@ def test_two_hands_on_one_line_in_one_process(tmp_path: Path) -> None:
         for side in Side:
             with hand_at(str(link), side) as hand:  # the port is free again
                 hand.exchange(HandCommand.brake(1))
+
+
+def test_it_goes_as_far_as_the_furthest_client_commands() -> None:
+    node = FakeNode()
+    side = Side.LEFT
+    with Dex1Motors() as motors:
+        hand = hand_at(motors.path, side)
+        with HandService(hand, node=node, state_rate=200.0) as service:  # type: ignore[arg-type]
+            wait_until(lambda: node.sent)
+            core = service.cores[side]
+            for asked in (5.5, 5.62, 100.0):
+
+                def there(q: float = asked) -> bool:
+                    node.deliver(GO.topics(side)[0], message(q))
+                    time.sleep(0.01)
+                    return abs(newest(node, side).q - 5.5) < 0.02
+
+                wait_until(there)
+            assert core.counters.clamped > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -290,3 +291,14 @@ def test_another_model_is_refused() -> None:
     spec = HandSpec(model="other-hand", side=LEFT, joints=DEX1_1.joints[LEFT], io_rate=100.0)
     with pytest.raises(UsageError, match="other-hand does not speak unitree_go"):
         dialect_map(dialect("unitree_go"), {LEFT: spec})
+
+
+def test_a_hand_that_opens_wider_than_its_model_keeps_the_scale_of_the_specification() -> None:
+    spec = SPECS[LEFT]
+    wider = replace(spec, joints=tuple(replace(j, q_max=5.5) for j in spec.joints))
+    mapping = dialect_map(dialect("unitree_hg"), {LEFT: wider})
+    for asked, expected in ((math.pi, 2.7), (6.2, 5.4)):
+        command = mapping.command(hg_cmd(asked), LEFT)
+        assert command is not None
+        assert command.q[0] == pytest.approx(expected)
+    assert mapping.state({LEFT: view(5.4)}).motor_state[0].q == pytest.approx(math.tau)

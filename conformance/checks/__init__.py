@@ -25,6 +25,7 @@ from dexkit.hand import JointSpec, Side, Subject
 __all__ = [
     "CHECK_MODULES",
     "REGISTRY",
+    "ROUNDING",
     "BaseContext",
     "Check",
     "Context",
@@ -48,6 +49,11 @@ CHECK_MODULES: Mapping[str, Sequence[str]] = {
 }
 """The modules that register the checks of each layer."""
 
+ROUNDING = 1e-3
+"""Part of a limit by which a saturated value may be above it: a drive that is clamped at the limit
+reports it as float32 and in its own counts, which round (docs/sources/unitree-dex.md#g: 15 N m are
+1536 counts of 0.0098 N m, and come back as 15.000001). Used where a limit is that of the hand's
+own clamp; other limits have a tolerance of their own."""
 STROKE_S = 1.0
 """Seconds that a hand driven by Unitree's client takes for a stroke."""
 

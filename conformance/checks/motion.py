@@ -83,6 +83,15 @@ def steps_of(ctx: Context, phase: Phase) -> list[Step]:
     return found
 
 
+def speed_of(step: Step) -> float | None:
+    """Mean speed from 10 to 90 % of a step's way, rad/s; None if it did not get there."""
+    part = (step.q - step.start) / step.size
+    low, high = np.argmax(part >= 0.1), np.argmax(part >= 0.9)
+    if part[high] < 0.9 or high <= low:
+        return None
+    return 0.8 * abs(step.size) / max(float(step.t[high] - step.t[low]), 1e-3)
+
+
 def steps(ctx: Context) -> list[Step]:
     """The steps of this side's joints."""
     return [s for p in ctx.phases() for s in steps_of(ctx, p)]
@@ -217,12 +226,9 @@ def speed(ctx: Context) -> Outcome:
     for step in steps(ctx):
         if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
             continue
-        part = (step.q - step.start) / step.size
-        low, high = np.argmax(part >= 0.1), np.argmax(part >= 0.9)
-        if part[high] < 0.9 or high <= low:
-            continue
-        seconds = max(float(step.t[high] - step.t[low]), 1e-3)
-        found.append((0.8 * abs(step.size) / seconds, step))
+        shown = speed_of(step)
+        if shown is not None:
+            found.append((shown, step))
     if not found:
         return ctx.skipped("no step of that size was finished")
     slowest, step = min(found, key=lambda f: f[0])

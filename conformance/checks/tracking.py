@@ -9,6 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks.motion import speed_of, steps_of
 from dexkit.hand import Floats
 
 _GRID = 0.005  # seconds; clients send commands at 200 Hz
@@ -19,7 +20,7 @@ class Tracking:
     """Error figures of one joint in one session.
 
     :param delay: seconds by which the command has to be shifted for the least error.
-    :param rms: error at that delay, rad.
+    :param rms: error at that delay, rad; see :func:`_within_reach` for a slow hand.
     :param peak: likewise.
     :param raw: RMS without shifting, rad.
     """
@@ -104,11 +105,14 @@ def _measure(
     # Delays are steps of the grid: the commands are sampled once, on a grid that begins earlier.
     most = round(search / _GRID)
     longer = np.concatenate([grid[0] - _GRID * np.arange(most, 0, -1), grid])
-    asked = cq[rows.of_commands(longer, good)]
+    asked = commanded = cq[rows.of_commands(longer, good)]
+    top_speed = _top_speed(ctx, joint)
+    if top_speed is not None:
+        asked = _within_reach(commanded, top_speed * _GRID)
     # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
     weight = free.astype(np.float64)
     middle = float(q[free].mean())
-    seen, asked = np.where(free, q - middle, 0.0), asked - middle
+    seen, asked, commanded = np.where(free, q - middle, 0.0), asked - middle, commanded - middle
     n = len(grid)
     late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, asked**2))  # by delay
     # einsum, for BLAS would start threads for this
@@ -116,19 +120,52 @@ def _measure(
     errors -= 2.0 * np.einsum("ki,i->k", late, seen)
     rms = np.sqrt(np.maximum(errors, 0.0) / weight.sum())
     best = int(np.argmin(rms))
-    error = np.abs((seen - late[best])[free])
+    # a hand that is faster at times than it showed lies between what it reaches and the command
+    reached, wanted = late[best][free], commanded[most - best : most - best + n][free]
+    low, high = np.minimum(reached, wanted), np.maximum(reached, wanted)
+    error = np.abs(seen[free] - np.clip(seen[free], low, high))
     worst = int(np.argmax(error))
     return Tracking(
         joint=joint,
         begin=begin,
         end=end,
         delay=best * _GRID,
-        rms=float(rms[best]),
+        rms=float(rms[best]) if top_speed is None else float(np.sqrt(np.mean(error**2))),
         peak=float(error[worst]),
         peak_at=float(grid[free][worst]),
         raw=float(rms[0]),
         blocked=float((~free).mean()),
     )
+
+
+def _top_speed(ctx: Context, joint: int) -> float | None:
+    """Speed that a joint is judged with, rad/s: its slowest in large steps of the run, and no less
+    than the least that is required. None where the requirement does not allow for it, or without
+    such steps: a session from outside was commanded by a client that knew the state.
+    """
+    if "min_speed_rad_s" not in ctx.requirement.tolerances:
+        return None
+    shown = [
+        speed_of(step)
+        for phase in ctx.phases("step")
+        for step in steps_of(ctx, phase)
+        if step.joint == joint and abs(step.size) >= ctx.tolerance("min_step_stroke", joint)
+    ]
+    speeds = [speed for speed in shown if speed is not None]
+    return max(min(speeds), ctx.tolerance("min_speed_rad_s")) if speeds else None
+
+
+def _within_reach(goal: Floats, most: float) -> Floats:
+    """The goal that a hand of limited speed can follow.
+
+    :param goal: rad, at equal intervals.
+    :param most: largest change in one interval, rad.
+    """
+    reached = goal.copy()
+    for i in range(1, len(goal)):
+        step = goal[i] - reached[i - 1]
+        reached[i] = reached[i - 1] + min(max(step, -most), most)
+    return reached
 
 
 def _free(ctx: Context, joint: int, at: NDArray[np.intp], goal: Floats) -> NDArray[np.bool_]:

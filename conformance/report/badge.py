@@ -1,31 +1,35 @@
-"""Render a badge: the verdict in one line, as an SVG without external files."""
+"""Render badges: the verdict of each grade in one line, as an SVG without external files."""
 
 from __future__ import annotations
 
 from dexkit.conformance.report.labels import model_title, nature, tally
+from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Overall, RunResult
 from dexkit.escaping import html as escape
 
-__all__ = ["badge_text", "render_badge"]
+__all__ = ["badge_text", "badges", "render_badge"]
 
 _COLOURS = {Overall.PASS: "#14734a", Overall.FAIL: "#b3261e", Overall.INCONCLUSIVE: "#6b3fa0"}
 _PARTIAL = "#7a5a00"
 _NARROW, _WIDE = "fijlrtI.,:;'|/()1 ", "mwMW%@"
+_GAP = 4  # pixels between two badges of one image
 
 
-def badge_text(result: RunResult) -> tuple[str, str]:
-    """The two parts of the badge: the subject and the verdict.
+def badge_text(result: RunResult, kind: Kind = Kind.DROP_IN) -> tuple[str, str]:
+    """The two parts of the badge of one grade: the subject and the verdict.
 
     Only judged requirements count as passed. The text shows whether the hand was real, and whether
     only a part of the requirements was selected.
     """
-    found = tally(result)
     name = model_title(result).removesuffix(" gripper")
     if result.client_only:
         return f"{name} client", str(result.overall)
-    if result.overall is Overall.INCONCLUSIVE:
+    grade, found = result.grade(kind), tally(result, kind)
+    if not grade.judged and kind is Kind.SAFETY:
+        text = "not judged"
+    elif grade.overall is Overall.INCONCLUSIVE:
         text = f"inconclusive, {found.passed} of {found.applicable} pass"
-    elif result.overall is Overall.FAIL:
+    elif grade.overall is Overall.FAIL:
         text = f"fail, {found.failed} of {found.applicable} not met"
     else:
         text = f"{found.passed}/{found.applicable} pass"
@@ -37,7 +41,21 @@ def badge_text(result: RunResult) -> tuple[str, str]:
         ]
         text += "".join(f", {n} {what}" for n, what in rest if n)
     real = nature(result)
-    return f"{name} drop-in", (f"{text} ({real})" if real else text)
+    return f"{name} {kind}", (f"{text} ({real})" if real else text)
+
+
+def badges(kind: Kind | None, result: RunResult) -> tuple[Kind, ...]:
+    """The grades that an image shows.
+
+    :param kind: the one that was asked for; None for both. The badge as a drop-in never stands
+        alone where the grade in safety has failed.
+    """
+    if result.client_only:
+        return (Kind.DROP_IN,)
+    failed = result.grade(Kind.SAFETY).overall is Overall.FAIL
+    if kind is None or (kind is Kind.DROP_IN and failed):
+        return tuple(Kind)
+    return (kind,)
 
 
 def _width(text: str) -> int:
@@ -45,23 +63,44 @@ def _width(text: str) -> int:
     return round(sum(4.2 if c in _NARROW else 9.6 if c in _WIDE else 6.9 for c in text))
 
 
-def render_badge(result: RunResult) -> str:
-    """Return the badge as SVG."""
-    left, right = badge_text(result)
+def render_badge(result: RunResult, kind: Kind | None = None) -> str:
+    """Return the badges as one SVG, side by side.
+
+    :param kind: as for :func:`badges`.
+    """
+    x, titles, drawn = 0, [], []
+    for number, grade in enumerate(badges(kind, result)):
+        left, right = badge_text(result, grade)
+        titles.append(f"{left}: {right}")
+        width, content = _badge(left, right, _colour(result, grade), x, number)
+        drawn.append(content)
+        x += width + _GAP
+    title = escape("; ".join(titles))
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{x - _GAP}" height="20" role="img" '
+        f'aria-label="{title}"><title>{title}</title>{"".join(drawn)}</svg>\n'
+    )
+
+
+def _colour(result: RunResult, kind: Kind) -> str:
+    overall = result.grade(kind).overall
+    return _PARTIAL if result.partial and overall is Overall.PASS else _COLOURS[overall]
+
+
+def _badge(left: str, right: str, colour: str, x: int, number: int) -> tuple[int, str]:
+    """Width and SVG elements of one badge at ``x``, pixels.
+
+    :param number: makes the id of its clip path unique in the image.
+    """
     a, b = _width(left) + 14, _width(right) + 14
-    title = escape(f"{left}: {right}")
-    passed_in_part = result.partial and result.overall is Overall.PASS
-    colour = _PARTIAL if passed_in_part else _COLOURS[result.overall]
 
     def text(words: str, at: int, width: int) -> str:
         return f'<text x="{at}" y="14" textLength="{width}">{escape(words)}</text>'
 
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{a + b}" height="20" role="img" '
-        f'aria-label="{title}"><title>{title}</title>'
-        f'<clipPath id="r"><rect width="{a + b}" height="20" rx="4"/></clipPath>'
-        f'<g clip-path="url(#r)"><rect width="{a}" height="20" fill="#3b424c"/>'
-        f'<rect x="{a}" width="{b}" height="20" fill="{colour}"/></g>'
+    return a + b, (
+        f'<clipPath id="r{number}"><rect x="{x}" width="{a + b}" height="20" rx="4"/></clipPath>'
+        f'<g clip-path="url(#r{number})"><rect x="{x}" width="{a}" height="20" fill="#3b424c"/>'
+        f'<rect x="{x + a}" width="{b}" height="20" fill="{colour}"/></g>'
         '<g fill="#fff" font-family="Verdana,DejaVu Sans,sans-serif" font-size="11">'
-        f"{text(left, 7, a - 14)}{text(right, a + 7, b - 14)}</g></svg>\n"
+        f"{text(left, x + 7, a - 14)}{text(right, x + a + 7, b - 14)}</g>"
     )

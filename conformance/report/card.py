@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from dexkit.conformance.requirements import Requirement
+from dexkit.conformance.requirements import Kind, Requirement
 from dexkit.conformance.results import Evidence, Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
@@ -23,6 +23,7 @@ class Item(str, Enum):
 
     REQUIRED = "required"
     EXPECTED = "expected"
+    ORIGINAL = "original"
     OBSERVED = "observed"
     REASON = "reason"
     WHERE = "where"
@@ -36,7 +37,12 @@ class Item(str, Enum):
     @property
     def label(self) -> str:
         """Its label on a page, of up to two words."""
-        return {Item.CAUSE: "likely cause", Item.TRY: "what to try"}.get(self, self.value)
+        labels = {
+            Item.ORIGINAL: "the original",
+            Item.CAUSE: "likely cause",
+            Item.TRY: "what to try",
+        }
+        return labels.get(self, self.value)
 
 
 @dataclass(frozen=True)
@@ -105,9 +111,13 @@ class Card:
 
     def facts(self) -> Iterator[Fact]:
         """All lines of the card, in order; a fact of all sides appears once."""
-        yield Fact(Item.REQUIRED, f"{self.requirement.sentence} ({self.requirement.level})")
+        need = self.requirement
+        kind = f", {need.kind}" if need.kind is Kind.SAFETY else ""
+        yield Fact(Item.REQUIRED, f"{need.sentence} ({need.level}{kind})")
         if self.expected:
             yield Fact(Item.EXPECTED, self.expected)
+        if need.original:
+            yield Fact(Item.ORIGINAL, need.original)
         for result in self.results:
             side = result.side if len(self.results) > 1 else ""
             if result.observed:

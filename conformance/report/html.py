@@ -18,6 +18,7 @@ from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,
+    answer_of,
     hand_name,
     model_title,
     nature,
@@ -29,9 +30,10 @@ from dexkit.conformance.report.labels import (
 )
 from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.report.run_plots import run_plots
-from dexkit.conformance.requirements import CAPABILITIES, Requirement
+from dexkit.conformance.requirements import CAPABILITIES, Kind, Requirement
 from dexkit.conformance.results import (
     Evidence,
+    Grade,
     Overall,
     Result,
     RunResult,
@@ -108,26 +110,21 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _glossary(result),
         _environment(result),
     ]
-    answer = ANSWERS[result.overall].text
-    return document(f"{answer}: {hand_name(result)} as {model_title(result)}", "".join(sections))
+    answers = ", ".join(f"{k} {answer_of(result.grade(k)).text.lower()}" for k in Kind)
+    about = "client" if result.client_only else answers
+    title = f"{ANSWERS[result.overall].text} ({about}): {hand_name(result)}"
+    return document(f"{title} as {model_title(result)}", "".join(sections))
 
 
 # ------------------------------------------------------------------------------- the verdict
 
 
 def _verdict(result: RunResult) -> str:
-    answer = ANSWERS[result.overall]
-    counts, what = result.counts(), subject(result)
-    sentence = {
-        Overall.PASS: f"This {what} did everything that it must and that could be tested here.",
-        Overall.FAIL: f"This {what} broke at least one rule that it must keep.",
-        Overall.INCONCLUSIVE: "A rule that must be kept could not be tested: this is not a pass."
-        if result.judged
-        else f"Nothing could be tested, so nothing can be said of the {what}: this is not a pass.",
-    }[result.overall]
-    if result.overall is Overall.PASS and counts[Verdict.WARN]:
-        n = counts[Verdict.WARN]
-        sentence += f" {n} recommendation{'s are' if n > 1 else ' is'} not met."
+    """The grade as a drop-in, then that in safety: one header each."""
+    grade = result.grade(Kind.DROP_IN)
+    answer = ANSWERS[result.overall] if result.client_only else answer_of(grade)
+    counts = result.counts()
+    sentence = _sentence(grade, subject(result))
     real = nature(result)
     badge = f' <span class="chip real">{real}</span>' if real else ""
     chips = "".join(
@@ -150,7 +147,7 @@ def _verdict(result: RunResult) -> str:
     elif overall_of(result.client) is Overall.FAIL or result.spoiled_by:
         caution += (
             "<p><b>The client that commanded it is at fault</b>, which is no failure of the "
-            f'{what}: see <a href="#client">the client</a>.</p>'
+            f'{subject(result)}: see <a href="#client">the client</a>.</p>'
         )
     stages = "".join(_stage(side, stage) for side, stage in result.stage.items())
     return (
@@ -158,8 +155,47 @@ def _verdict(result: RunResult) -> str:
         f"<p class='question'>{question}</p>"
         f"<h1>{answer.text}<small>{escape(hand_name(result))}{badge}</small></h1>"
         f"<p>{escape(sentence)}</p>{caution}</header>"
+        f"{'' if result.client_only else _safety(result)}"
         f'<div class="chips">{chips}</div><div class="stages">{stages}</div>'
     )
+
+
+def _safety(result: RunResult) -> str:
+    """The grade in safety, and what was not met there, beside what the original does."""
+    grade, what = result.grade(Kind.SAFETY), subject(result)
+    answer = answer_of(grade)
+    rows = "".join(
+        f"<li><a href='#{escape(need.id)}'>{escape(need.title)}</a>: "
+        f"{escape(', '.join(f'{r.side} {r.figure or r.verdict}' for r in group))}. "
+        f"The original: {escape(need.original)}</li>"
+        for need, group in result.by_requirement()
+        if need.kind is Kind.SAFETY
+        and worst(r.verdict for r in group) in (Verdict.FAIL, Verdict.WARN)
+    )
+    return (
+        f'<section class="verdict {answer.css}">'
+        f"<p class='question'>Is it safer than the original with bad input and when it ends?</p>"
+        f"<h1>{answer.text}<small>safety</small></h1><p>{escape(_sentence(grade, what))}</p>"
+        + (f"<ul>{rows}</ul>" if rows else "")
+        + "</section>"
+    )
+
+
+def _sentence(grade: Grade, what: str) -> str:
+    """A grade in words, for readers who do not know the kit.
+
+    :param what: hand or robot.
+    """
+    if not grade.judged:
+        return f"Nothing of this could be tested, so nothing can be said of the {what} here."
+    text = {
+        Overall.PASS: f"This {what} did everything that it must and that could be tested here.",
+        Overall.FAIL: f"This {what} broke at least one rule that it must keep.",
+        Overall.INCONCLUSIVE: "A rule that must be kept could not be tested: this is not a pass.",
+    }[grade.overall]
+    if grade.overall is Overall.PASS and (n := grade.counts[Verdict.WARN]):
+        text += f" {n} recommendation{'s are' if n > 1 else ' is'} not met."
+    return text
 
 
 def _stage(side: str, stage: Stage) -> str:
@@ -417,13 +453,16 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         if any(r.verdict in _TROUBLE and not r.blocked_by for r in group)
         else ""
     )
+    kind = f", {need.kind}" if need.kind is Kind.SAFETY else ""
+    original = f"<p>The original: {escape(need.original)}</p>" if need.original else ""
     return (
         f'<details class="req {css}" id="{escape(need.id)}"><summary>'
         f'<span class="id {css}">{escape(need.id)}</span>'
-        f'<span class="title">{escape(need.title)} <span class="dim">{need.level}</span></span>'
+        f'<span class="title">{escape(need.title)} '
+        f'<span class="dim">{need.level}{kind}</span></span>'
         f"{cells}</summary>"
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
-        f"<p>{escape(need.rationale)}</p>"
+        f"<p>{escape(need.rationale)}</p>{original}"
         f'<p class="dim">Source: {escape(Card.of(group).source)}</p>'
         "</div></details>"
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from dexkit.conformance.report.labels import hand_name
+from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.documents import write_file
 from dexkit.escaping import visible
@@ -48,6 +49,7 @@ def write_junit(result: RunResult, path: Path) -> None:
         **{f"stage.{side}": str(stage) for side, stage in result.stage.items()},
         **{f"harness.{name}": f"{value:g}" for name, value in result.harness.items()},
         "overall": str(result.overall),
+        **{f"grade.{kind}": result.grade(kind).sentence() for kind in Kind},
     }.items():
         ElementTree.SubElement(properties, "property", name=name, value=value)
     for entry, verdict in zip(entries, verdicts, strict=True):

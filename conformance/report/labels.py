@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from dexkit.conformance.known_backends import ROBOT_EMULATORS, SIMULATED
-from dexkit.conformance.results import Overall, RunResult, Verdict, worst
+from dexkit.conformance.requirements import Kind
+from dexkit.conformance.results import Grade, Overall, RunResult, Verdict, worst
 from dexkit.hand import ROBOT
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
@@ -17,6 +18,7 @@ __all__ = [
     "Tally",
     "Word",
     "about_harness",
+    "answer_of",
     "hand_name",
     "model_title",
     "nature",
@@ -56,6 +58,7 @@ ANSWERS = {
     Overall.FAIL: Word("Fail", "bad", "❌"),
     Overall.INCONCLUSIVE: Word("Inconclusive", "open", "❔"),
 }
+_NOT_JUDGED = Word("Not judged", "open", "❔")
 _UNITS = {
     "s": "s",
     "ms": "ms",
@@ -88,13 +91,21 @@ class Tally:
         return self.passed + self.failed + self.warned + self.open + self.not_judged
 
 
-def tally(result: RunResult) -> Tally:
-    """Count the requirements of a run."""
+def answer_of(grade: Grade) -> Word:
+    """How a grade is written; *not judged* where the run tested nothing of its kind."""
+    return ANSWERS[grade.overall] if grade.judged else _NOT_JUDGED
+
+
+def tally(result: RunResult, kind: Kind | None = None) -> Tally:
+    """Count the requirements of a run.
+
+    :param kind: only those of that kind.
+    """
     spoken = result.subject.get("dialect")
     found = [
         worst(r.verdict for r in group)
         for requirement, group in result.by_requirement()
-        if not spoken or spoken in requirement.dialects
+        if (not spoken or spoken in requirement.dialects) and kind in (None, requirement.kind)
     ]
     return Tally(
         passed=found.count(Verdict.PASS),

@@ -13,12 +13,14 @@ from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
     about_harness,
+    answer_of,
     hand_name,
     model_title,
     nature,
     part,
     whose,
 )
+from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
@@ -54,7 +56,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def render_markdown(result: RunResult) -> str:
-    """The summary: verdict, areas, failures, and all requirements folded."""
+    """The summary: verdict, the two grades, areas, failures, and all requirements folded."""
     answer = ANSWERS[result.overall]
     real = nature(result)
     counts = ", ".join(f"{n} {VERDICTS[v].text}" for v, n in result.counts().items() if n)
@@ -66,6 +68,10 @@ def render_markdown(result: RunResult) -> str:
         + (" A recording was judged, not a live hand." if real == "recorded" else ""),
         "",
     ]
+    kinds = () if result.client_only else tuple(Kind)
+    grades = [(answer_of(grade), grade) for grade in map(result.grade, kinds)]
+    lines += [f"- {word.mark} **{plain(grade.sentence())}**" for word, grade in grades]
+    lines.append("")
     if of := part(result):
         lines += [f"**{of}: this does not prove a drop-in.**", ""]
     lines += [

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from dexkit.conformance.report.card import Card, blocked_groups, cards
 from dexkit.conformance.report.labels import about_harness
+from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, grouped, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape
@@ -35,7 +36,7 @@ _STYLE = {Overall.PASS: "green", Overall.FAIL: "red", Overall.INCONCLUSIVE: "mag
 def print_result(
     result: RunResult, console: Console, *, verbose: bool = False, more: str = ""
 ) -> None:
-    """Print the table, then the failures with advice.
+    """Print the table, then the failures with advice, the two grades, and the verdict of the run.
 
     :param verbose: also list what could not be judged here, and why.
     :param more: where else the reasons are written.
@@ -72,9 +73,12 @@ def print_result(
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
-    # one line each at any width, so that logs can be searched for it
+    # one line each at any width, so that logs can be searched for them
     if result.client and not result.client_only:
         console.print(escape(result.client_sentence()), highlight=False, soft_wrap=True)
+    for grade in () if result.client_only else map(result.grade, Kind):
+        style = _STYLE[grade.overall] if grade.judged else "dim"
+        console.print(f"[{style}]{escape(grade.sentence())}[/]", highlight=False, soft_wrap=True)
     console.print(
         f"[bold {_STYLE[result.overall]}]{escape(result.sentence())}[/]",
         highlight=False,

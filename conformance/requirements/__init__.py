@@ -31,6 +31,7 @@ __all__ = [
     "CAPABILITIES",
     "CONFIDENCE",
     "LAYERS",
+    "Kind",
     "Level",
     "Requirement",
     "catalogue",
@@ -93,9 +94,13 @@ _KEYS = {
     "plots",
     "like",
     "spoils",
+    "kind",
+    "original",
 }
 _OPTIONAL = {
     "like",
+    "kind",
+    "original",
     "negative",
     "after",
     "dialects",
@@ -141,6 +146,18 @@ class Level(str, Enum):
         return self.value
 
 
+class Kind(str, Enum):
+    """What a requirement is for; each kind has a grade of its own in every report."""
+
+    DROP_IN = "drop-in"
+    """A client that was built for the original relies on it, and the original meets it."""
+    SAFETY = "safety"
+    """It asks for more than the original does, so that bad input or an end does no harm."""
+
+    def __str__(self) -> str:
+        return self.value
+
+
 @dataclass(frozen=True)
 class Requirement:
     """One requirement.
@@ -172,6 +189,9 @@ class Requirement:
         it; empty if it stands for itself.
     :param spoils: of a requirement about the client, how the ids begin of those requirements of
         the hand that cannot be judged where the client does not meet it.
+    :param kind: drop-in, unless the catalogue says safety.
+    :param original: of a safety requirement, what the original does instead, with its source;
+        empty for drop-in.
     """
 
     id: str
@@ -198,6 +218,8 @@ class Requirement:
     like: str = ""
     plots: tuple[Plot, ...] = ()
     spoils: tuple[str, ...] = ()
+    kind: Kind = Kind.DROP_IN
+    original: str = ""
 
     @property
     def phase(self) -> str | None:
@@ -240,7 +262,12 @@ def _model_of(document: Mapping[str, Any]) -> HandModel | RobotModel:
     return robot(name) if document.get("layer") == "robot" else model(name)
 
 
-def _resolve(value: Any, hand: HandModel | RobotModel, where: str) -> float:
+def _resolve(
+    value: Any, hand: HandModel | RobotModel, before: Mapping[str, Requirement], where: str
+) -> float:
+    """A tolerance: a number, a figure of the model, or a tolerance of a requirement before it."""
+    if isinstance(value, str) and (name := value.partition(":")[0]) in before:
+        return before[name].tolerance(value.partition(":")[2])
     if isinstance(value, str) and value.startswith("model:"):
         fact = getattr(hand, value.removeprefix("model:"), None)
         if isinstance(fact, int | float):
@@ -248,7 +275,7 @@ def _resolve(value: Any, hand: HandModel | RobotModel, where: str) -> float:
         raise UsageError(f"{where}: {hand.name} has no figure {value!r}")
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
-    raise UsageError(f"{where}: a tolerance is a number or 'model:NAME', not {value!r}")
+    raise UsageError(f"{where}: a tolerance is a number, 'model:NAME' or 'ID:NAME', not {value!r}")
 
 
 def renamed(text: str, theirs: str, ours: str) -> str:
@@ -324,6 +351,22 @@ def _plots(names: Iterable[str], where: str) -> tuple[Plot, ...]:
         raise UsageError(f"{where}: {error.message}", hint=error.hint) from error
 
 
+def _kind(entry: Mapping[str, Any], where: str) -> Kind:
+    """The kind of an entry; a safety requirement also says what the original does.
+
+    :raises UsageError: there is no such kind, or ``original`` is missing or has no place.
+    """
+    name = entry.get("kind", str(Kind.DROP_IN))
+    if name not in {str(kind) for kind in Kind}:
+        raise UsageError(f"{where}: kind is one of {', '.join(map(str, Kind))}")
+    kind = Kind(name)
+    if kind is Kind.SAFETY and not entry.get("original"):
+        raise UsageError(f"{where}: a safety requirement says what the original does: original")
+    if kind is Kind.DROP_IN and entry.get("original"):
+        raise UsageError(f"{where}: original is for safety requirements: the original meets others")
+    return kind
+
+
 def parse(
     text: str, origin: str = "requirements", others: Mapping[str, Any] | None = None
 ) -> tuple[Requirement, ...]:
@@ -331,8 +374,8 @@ def parse(
 
     :param others: entries of other texts, by id, for what is ``like`` them.
     :raises UsageError: a key is unknown or missing, a value is not one of those allowed, an id
-        occurs twice or is retired, ``after`` names what does not come before, or ``like`` what
-        there is not.
+        occurs twice or is retired, ``after`` names what does not come before, ``like`` what
+        there is not, or ``kind`` and ``original`` contradict each other.
     """
     return _parse(parse_toml(text, origin), origin, others or {})
 
@@ -374,16 +417,19 @@ def _parse(
             raise UsageError(f"{where}: capability is one of {', '.join(CAPABILITIES)}")
         if entry.get("repeat", 1) not in range(1, 100):
             raise UsageError(f"{where}: repeat is a number from 1 on")
+        kind = _kind(entry, where)
         for before in entry.get("after", []):
             if before not in found:
                 raise UsageError(f"{where}: {before} does not come before it")
+            if kind is Kind.DROP_IN and found[before].kind is Kind.SAFETY:
+                raise UsageError(f"{where}: is drop-in, and cannot come after {before}: safety")
         if "spoils" in entry and layer != "client":
             raise UsageError(f"{where}: only a requirement about the client spoils others")
         for name in entry.get("dialects", []):
             if name not in DIALECTS:
                 raise UsageError(f"{where}: no dialect {name!r}")
         tolerances = {
-            name: _resolve(value, hand, where)
+            name: _resolve(value, hand, found, where)
             for name, value in entry.get("tolerances", {}).items()
         }
         found[entry["id"]] = Requirement(
@@ -411,6 +457,8 @@ def _parse(
             like=entry.get("like", ""),
             plots=_plots(entry["plots"], where) if "plots" in entry else _PLOTS[layer],
             spoils=tuple(entry.get("spoils", ())),
+            kind=kind,
+            original=entry.get("original", ""),
         )
     return tuple(found.values())
 

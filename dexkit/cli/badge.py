@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.options import grade_option
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
 
@@ -21,17 +22,24 @@ from dexkit.documents import check_output_paths
     metavar="FILE.svg",
     help="Where to write it; - prints it.",
 )
-def command(result: Path, output: Path) -> None:
-    """Draw a badge of a result: what it is a drop-in for, and how much of that was proved.
+@grade_option(
+    "Draw only the badge of this grade. That of drop-in is never drawn alone where safety failed.  "
+    "[default: both, side by side]"
+)
+def command(result: Path, output: Path, grade: str | None) -> None:
+    """Draw the badges of a result: what it is a drop-in for, and how safe it is beside that.
 
-    The badge shows when the hand was emulated, simulated or only recorded, and how many
+    A badge shows when the hand was emulated, simulated or only recorded, and how many
     requirements could not be judged.
     """
-    from dexkit.conformance.report.badge import badge_text, render_badge
+    from dexkit.conformance.report.badge import badge_text, badges, render_badge
+    from dexkit.conformance.requirements import Kind
     from dexkit.conformance.result_file import read_json
 
     check_output_paths([output], [result])
     found = read_json(result)
-    write_text(output, render_badge(found))
+    kind = None if grade is None else Kind(grade)
+    write_text(output, render_badge(found, kind))
     if str(output) != "-":
-        click.echo(f"{output}: {' | '.join(badge_text(found))}")
+        for drawn in badges(kind, found):
+            click.echo(f"{output}: {' | '.join(badge_text(found, drawn))}")

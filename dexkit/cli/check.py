@@ -7,7 +7,14 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import FILE, html_option, junit_option, require_option, verbose_option
+from dexkit.cli.options import (
+    FILE,
+    grade_option,
+    html_option,
+    junit_option,
+    require_option,
+    verbose_option,
+)
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
 from dexkit.errors import ConformanceError, UsageError
@@ -40,6 +47,9 @@ from dexkit.robots import ROBOTS
     type=click.Choice(["must", "should", "info"], case_sensitive=False),
     help="Only requirements at least this binding.",
 )
+@grade_option(
+    "Which grade decides the exit code. Default: both. All requirements are judged and shown."
+)
 @click.option(
     "--capabilities",
     type=click.Path(path_type=Path),
@@ -59,6 +69,7 @@ def command(
     dialect: str,
     require: tuple[str, ...],
     level: str | None,
+    grade: str | None,
     capabilities: Path | None,
     list_only: bool,
     json_path: Path | None,
@@ -75,14 +86,14 @@ def command(
     Exit code, about the hands: 0 every MUST that could be judged is met, 1 one is not, 2 the
     recording is not usable or damaged (what is left is judged all the same), nothing in it could
     be judged, or the client did not allow to judge a MUST. With --require DEX1-CLIENT (DEX3-,
-    DEX5-) it is about the client.
+    DEX5-) it is about the client. With --grade, only the requirements of that kind decide.
     """
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.layers import recording_of
     from dexkit.conformance.recording import sides_of
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.requirements import catalogue, select
+    from dexkit.conformance.requirements import Kind, catalogue, select
     from dexkit.conformance.robot import robot_in
     from dexkit.traces import open_trace
 
@@ -145,4 +156,4 @@ def command(
             f"the recording is damaged, and the verdict is of what is left: {trace.damage[0]}",
             hint="'dexkit info' names all of the damage; record again, or copy the file again",
         )
-    sys.exit(result.overall.exit_code)
+    sys.exit(result.exit_code(None if grade is None else Kind(grade)))

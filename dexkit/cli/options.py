@@ -26,6 +26,7 @@ __all__ = [
     "duration_option",
     "fault_options",
     "force_option",
+    "grade_option",
     "html_option",
     "json_option",
     "junit_option",
@@ -135,6 +136,15 @@ def force_option() -> Callable[[F], F]:
         is_flag=True,
         help="Publish even if another program publishes the same topics.",
     )
+
+
+# ------------------------------------------------------------------------------ conformance
+
+
+def grade_option(help: str) -> Callable[[F], F]:
+    """``--grade``: one of the two grades, as text, or None."""
+    # literal, because the conformance package is imported only when a command runs
+    return click.option("--grade", type=click.Choice(["drop-in", "safety"]), help=help)
 
 
 # ------------------------------------------------------------------------------ hands

@@ -250,8 +250,8 @@ class InterfaceSpecificationMap(DialectMap):
         s, spec = view.state, self._specs[side]
         known = self.fill is Fill.KNOWN
         motors = []
-        for joint, limits in enumerate(spec.joints):
-            scale = self._scale(limits.q_max)
+        scale = self._scale()
+        for joint in range(len(spec.joints)):
             m = unitree_hg.MotorState_(
                 q=_known(s.q[joint] * scale),
                 tau_est=abs(_known(s.tau_est[joint])),
@@ -289,8 +289,13 @@ class InterfaceSpecificationMap(DialectMap):
                 for sensor in s.pressure
             ]
 
-    def _scale(self, q_max: float) -> float:
-        return self.dialect.q_open / q_max
+    def _scale(self) -> float:
+        """2 pi over the model's stroke; a hand that opens wider goes beyond 2 pi."""
+        return self.dialect.q_open / self._fully_open()
+
+    def _fully_open(self) -> float:
+        (joint,) = model(self.dialect.model).joints[Side.LEFT]  # the same on both sides
+        return joint.q_max
 
     def _q_in(self, q: float, joint: JointSpec) -> float:
         if not math.isfinite(q):
@@ -298,8 +303,8 @@ class InterfaceSpecificationMap(DialectMap):
         if q <= HG_CLOSED:
             return 0.0
         if q >= HG_OPEN:
-            return joint.q_max
-        return q / self._scale(joint.q_max)
+            return self._fully_open()
+        return q / self._scale()
 
     def _feed_forward(self, values: list[float]) -> Floats:
         return _zero_where_finite(values)

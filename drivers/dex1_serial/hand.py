@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,9 @@ __all__ = ["Dex1Serial", "Dex1Statistics", "backend"]
 
 log = logging.getLogger(__name__)
 
+_FURTHEST = 5.5
+"""rad: the furthest that a client of Unitree's commands, its test_gripper
+(docs/sources/unitree-dex.md#d2). The jaws meet their stop at 5.62."""
 _IO_RATE = 500.0  # docs/sources/unitree-dex.md#b2: 2000 us loop
 _BRAKE_ATTEMPTS = 3
 """Brake commands that ``close`` sends at most to a motor that does not answer."""
@@ -79,11 +82,14 @@ class Dex1Serial:
         self._line: MotorLine | None = None
         self._tripped = False
         self._error = 0
-        self._spec = DEX1_1.spec(
+        spec = DEX1_1.spec(
             side,
             io_rate=_IO_RATE,
             # an exchange with the other motor on the line may come first
             exchange_timeout=2 * (self.configuration.timeout + LATE) + LATE,
+        )
+        self._spec = replace(
+            spec, joints=tuple(replace(joint, q_max=_FURTHEST) for joint in spec.joints)
         )
 
     @property

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dexkit.conformance.mutants import mutants
-from dexkit.conformance.requirements import Requirement, catalogue, renamed
+from dexkit.conformance.requirements import Kind, Requirement, catalogue, renamed
 from tools.generate import DOCS
 
 __all__ = ["PAGES", "catalogue_page", "files"]
@@ -59,7 +59,8 @@ def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list
     """
     unit = f", if `{requirement.capability}` is claimed" if requirement.capability else ""
     proof = ", ".join(f"`{name}`" for name in killers)
-    lines = [f"**{requirement.id}** ({requirement.level}{unit}) {requirement.sentence}  "]
+    kind = f", {requirement.kind}" if requirement.kind is Kind.SAFETY else ""
+    lines = [f"**{requirement.id}** ({requirement.level}{kind}{unit}) {requirement.sentence}  "]
     known: set[str] = set()
     if requirement.like:
         lines.append(f"Like {requirement.like}.  ")
@@ -72,10 +73,10 @@ def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list
         lines.append(
             f"*Likely cause of a failure:* {requirement.cause} *Try:* {requirement.advice}  "
         )
-    lines.append(
-        f"*Source:* {_source(requirement)} ({requirement.confidence}). *Judged from:* {where}. "
-        f"*Proven by:* {proof}."
-    )
+    if requirement.original and requirement.original not in known:
+        lines.append(f"*The original:* {_linked(requirement.original)}  ")
+    source = f"{_linked(requirement.source)} ({requirement.confidence})"
+    lines.append(f"*Source:* {source}. *Judged from:* {where}. *Proven by:* {proof}.")
     return [*lines, ""]
 
 
@@ -83,18 +84,19 @@ def _inherited_texts(requirement: Requirement) -> set[str]:
     """Texts of the requirement that this one is like, with its id replaced by this one's."""
     theirs = next(r for r in catalogue(None, None) if r.id == requirement.like)
     ours, others = (name.partition("-")[0] for name in (requirement.id, theirs.id))
-    texts = (theirs.rationale, theirs.expected, theirs.cause, theirs.advice)
+    advice = (theirs.cause, theirs.advice)
+    texts = (theirs.rationale, theirs.expected, *advice, theirs.original)
     return {renamed(text, others, ours) for text in texts}
 
 
-def _source(requirement: Requirement) -> str:
-    """Who says so, with a link for each citation of docs/sources."""
+def _linked(text: str) -> str:
+    """``text`` with a link for each citation of docs/sources."""
 
     def link(match: re.Match[str]) -> str:
         target, letter, number = match.groups()
         return f"[{letter.upper()}{'.' if number else ''}{number}]({target})"
 
-    return _CITED.sub(link, requirement.source)
+    return _CITED.sub(link, text)
 
 
 def _judged_from(requirement: Requirement) -> str:

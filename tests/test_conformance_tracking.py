@@ -1,0 +1,60 @@
+"""Test that DEX1-TRACK allows for the top speed of a hand that meets DEX1-MOVE-04."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.mutants.any_model import WaitsForRest
+from dexkit.conformance.mutants.gripper import Slow
+from dexkit.conformance.mutants.registry import mix
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.virtual.gripper import ReferenceService
+from dexkit.hand import Side
+from tests.each import each
+
+JUDGED = ("DEX1-MOVE-04", "DEX1-TRACK-01", "DEX1-TRACK-02")
+
+
+class SlowGripper(ReferenceService):
+    """Moves at :attr:`top` rad/s at most, and is right in all else."""
+
+    top: ClassVar[float]
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        for side, hand in self.hands.items():
+            hand = Slow.hand(hand.stroke, hand.touch)
+            hand.top = self.top  # type: ignore[attr-defined]
+            self.hands[side] = hand
+
+
+def verdicts(service: type[ReferenceService]) -> list[Verdict]:
+    plan = plan_for("unitree_go", sides=(Side.LEFT,))
+    plan = replace(plan, phases=frozenset({"step", "replay"}))
+    found = {r.requirement.id: r.verdict for r in run_mutant(service, plan).results}
+    return [found[name] for name in JUDGED]
+
+
+@each("top", [3.1, 3.6])
+def test_a_gripper_that_is_as_fast_as_required_follows_a_session(top: float) -> None:
+    service = type("AsFastAsRequired", (SlowGripper,), {"top": top})
+    assert verdicts(service) == [Verdict.PASS] * 3
+
+
+def test_a_gripper_that_is_too_slow_is_caught_by_both() -> None:
+    service = type("TooSlow", (SlowGripper,), {"top": 2.0})
+    assert verdicts(service)[:2] == [Verdict.WARN, Verdict.FAIL]
+
+
+def test_a_slow_gripper_that_waits_for_rest_does_not_follow_a_session() -> None:
+    service = mix(WaitsForRest, type("AsFastAsRequired", (SlowGripper,), {"top": 3.6}))
+    assert verdicts(service)[:2] == [Verdict.PASS, Verdict.FAIL]
+
+
+def test_the_required_speed_is_stated_once() -> None:
+    by_id = {r.id: r for r in catalogue("dex1-1")}
+    for name in ("min_speed_rad_s", "min_step_stroke"):
+        assert len({by_id[i].tolerances[name] for i in JUDGED}) == 1
