@@ -186,7 +186,7 @@ def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
     return found
 
 
-@check("DEX1-WDOG-01")
+@check("DEX1-WDOG-01", "DEX1-WDOG-04")
 def brakes(ctx: Context) -> Outcome:
     """Motion and force after the time-out, of a hand that moved or pressed when silence began.
 

@@ -530,8 +530,8 @@ class WeakAfterNan(Service):
 # ----------------------------------------------------------------------------------- safety
 
 
-# in the silence it takes NaN for commands, and stays driven
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05", "DEX1-WDOG-01"))
+# it takes NaN for commands, and stays driven by them
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-WDOG-04",))
 class NanIsZero(Service):
     """Replaces NaN and infinity by 0."""
 
@@ -553,7 +553,7 @@ def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
     return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-FIELD-05", "DEX1-WDOG-01"), whole=True)
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-WDOG-04",), whole=True)
 class TiresOfNan(Service):
     """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
 

@@ -510,7 +510,7 @@ class _FedByAnything(ReferenceHand):
         self.heard = self.now
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+@wrong_hand("DEX1-WDOG-04")
 class FedByRejected(ReferenceService):
     """Does not brake while commands arrive that it rejects."""
 
@@ -528,7 +528,8 @@ class _BrakesOnce(ReferenceHand):
         return self.now - self.braked < 2.0
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+# its second time-out comes in the stimulus of that requirement
+@wrong_hand("DEX1-WDOG-04")
 class BrakesOnce(ReferenceService):
     """Brakes at the first time-out and at none after it."""
 

@@ -281,7 +281,7 @@ class FingerScript(HandScript):
         """No command to one side but rejected ones, while it moves and the other is commanded."""
         self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
         yield from self._drive("drive", (side,), {}, guard=False)
-        yield from self._silence_alone(side, {side: rejected})
+        yield from self._silence_alone("silence", side, {side: rejected})
         yield from self._everyone("resume", {s: self._home(s) for s in self.plan.sides}, most=1.5)
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:

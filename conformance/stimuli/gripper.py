@@ -23,8 +23,8 @@ old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 squeeze        close on the object, if there is one, by xr_teleoperate's lead
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
-silence        ... the commands stop for two command time-outs; then on each side alone, while
-               rejected commands arrive
+silence        ... the commands stop for two command time-outs
+rejected       only commands that are not finite, to each side alone
 resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands as well, and goes
@@ -99,7 +99,7 @@ class GripperScript(HandScript):
             yield from self._old_stamps()
         if "late-joiner" in self.plan.phases:
             yield from self._late_joiner()
-        if self.plan.phases & {"squeeze", "silence", "resume"}:
+        if self.plan.phases & {"squeeze", "silence", "resume", "rejected"}:
             yield from self._squeeze_and_silence()
 
     # -- places -----------------------------------------------------------------------------
@@ -245,14 +245,14 @@ class GripperScript(HandScript):
             phase = self._begin("squeeze", pressing, targets={s: {0: q} for s, q in beyond.items()})
             yield from self._hold(1.5, squeeze)
             self._end(phase)
-        if not self.plan.phases & {"silence", "resume"}:
+        if not self.plan.phases & {"silence", "resume", "rejected"}:
             return
         if free and self._gains_used:
             yield from self._drive(free, squeeze)
         self._report("... silence: after a second the hand must brake")
         yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
         yield from self._everyone("resume", self._other_place())
-        if len(sides) > 1 and not self._codec.shared and "silence" in self.plan.phases:
+        if len(sides) > 1 and not self._codec.shared and "rejected" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 yield from self._silent_alone(side, (Motor(q=bad),))
 
@@ -262,7 +262,7 @@ class GripperScript(HandScript):
         if self._gains_used:
             yield from self._everyone("center", {side: (self._low(side),)})
             yield from self._drive((side,), {})
-        yield from self._silence_alone(side, {side: rejected})
+        yield from self._silence_alone("rejected", side, {side: rejected})
         yield from self._everyone("resume", self._other_place())
 
     def _drive(self, sides: Sequence[Side], others: Mapping[Side, Motors]) -> Steps:

@@ -287,12 +287,13 @@ class HandScript(Script[Side]):
             yield from self._command()
             yield from self._through(phase, SINGLE_SECONDS, lambda: self._wait(0.01))
 
-    def _silence_alone(self, side: Side, rejected: Mapping[Side, Motors]) -> Steps:
+    def _silence_alone(self, name: str, side: Side, rejected: Mapping[Side, Motors]) -> Steps:
         """No good command to one side, as a phase; the others make a step after the time-out.
 
+        :param name: of the phase.
         :param rejected: what the side gets instead: it must not count as a command.
         """
-        phase = self._begin("silence", (side,))
+        phase = self._begin(name, (side,))
         beside: list[Phase] = []
         for seconds in (self._model.command_timeout + 0.1, ASIDE_SECONDS):
             good = {s: self._motors(s, q) for s, q in self._goal.items() if s != side}
