@@ -32,7 +32,7 @@ GO = dialect("unitree_go")
 # ----------------------------------------------------------------------------- composition
 
 
-@pytest.mark.parametrize("name", ["unitree_go", "unitree_actuator", "dex3", "dex5"])
+@pytest.mark.parametrize("name", ["unitree_go", "dex3"])
 def test_names_of_all_hands_of_the_first_order_round_trip(name: str) -> None:
     every = list(generated.first_order(dialect(name)))
     assert len({h.name for h in every}) == len(every) > 3000
@@ -49,7 +49,7 @@ def test_names_of_samples_round_trip() -> None:
     assert not any(h.good for h in wrong)
     assert all(h.good for h in good)
     assert {h.kind for h in wrong} == {*KINDS, "two faults"}
-    assert {h.dialect for h in wrong} == set(spoken)
+    assert {h.dialect.name for h in wrong} == {d.name for d in spoken}
 
 
 def test_a_seed_gives_the_same_sample_again() -> None:
@@ -101,7 +101,7 @@ def test_a_reference_without_known_mechanics_is_refused() -> None:
 
 def test_without_faults_the_reference_behaves_as_before() -> None:
     service = compose("x", "", model("dex1-1").reference.load(), ())
-    assert oracle.examine(service, GO, (Side.LEFT,)).effects == ()
+    assert oracle.examine(service, GO, BOTH).effects == ()
 
 
 # ------------------------------------------------------------------------------ properties
@@ -127,13 +127,26 @@ def changes(what: type[What], name: str) -> bool:
     ) or not bool((seen.driven == reference.driven).all())
 
 
-# one of each hook and kind; the soak run has all of them
-_FEW = ("q-echo", "dq-sign", "cmd-late", "rate-60", "guard-late", "kicks", "side-leak")
+# the soak run has all of them
+_FEW = ("q-echo", "cmd-late", "rate-60")
 
 
 @pytest.mark.parametrize("title", _FEW)
 def test_a_fault_does_something_under_always(title: str) -> None:
     assert changes(FAULTS[title], "unitree_go")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    ("name", "severity"),
+    [
+        ("dex1-1/unitree_go:dq-sign@left,joint0,always", "lesser"),
+        ("dex3-1/dex3:q-mirror@left,joint0,always", "must-breaking"),
+    ],
+)
+def test_faults_of_other_kinds_are_caught(name: str, severity: str) -> None:
+    found = try_generated(parse(name))
+    assert (found.severity, found.caught) == (severity, True), found
 
 
 @pytest.mark.soak
@@ -150,9 +163,11 @@ class _Watches(What):
     """Notes at each step which conditions hold."""
 
     seen: dict[str, set[bool]]
+    count = 0
 
     def tick(self, dt: float, active: bool) -> None:
-        for when in WHENS.values():
+        self.count += 1
+        for when in WHENS.values() if self.count % 8 == 0 else ():
             self.seen.setdefault(when.title, set()).add(when.test(self.rig, self.side))
 
 
@@ -175,10 +190,8 @@ def test_every_condition_is_true_and_false_at_some_time() -> None:
     ("name", "severity", "caught"),
     [
         ("dex1-1/unitree_go:q-mirror@left,joint0,always", "must-breaking", True),
-        ("dex1-1/unitree_go:dq-sign@left,joint0,always", "lesser", True),
         ("dex1-1/unitree_go:nan-is-zero@left,joint0,unled", "equivalent", False),
         ("dex1-1/unitree_go:noise-q-small", "good", True),
-        ("dex3-1/dex3:q-mirror@left,joint0,always", "must-breaking", True),
     ],
 )
 def test_a_generated_hand_is_graded_and_judged(name: str, severity: str, caught: bool) -> None:
@@ -188,13 +201,11 @@ def test_a_generated_hand_is_graded_and_judged(name: str, severity: str, caught:
 
 
 def test_the_effect_of_a_fault_that_the_run_does_not_provoke_is_shown_by_another_stimulus() -> None:
-    hand = parse("dex1-1/unitree_go:nan-is-high@left,joint0,after-restart")
+    hand = parse("dex1-1/unitree_go:nan-is-high@left,joint0,after-brake")
     opinion = oracle.examine(hand.service(), hand.dialect, hand.sides)
-    assert opinion.effects == () or opinion.effects[0].stimulus == "random"
-    hand = parse("dex1-1/unitree_go:cmd-offset@left,joint0,after-nan")
-    opinion = oracle.examine(hand.service(), hand.dialect, hand.sides)
-    assert opinion.severity is not oracle.Severity.EQUIVALENT
-    assert oracle.shortest(hand, opinion).startswith("phase ")
+    assert opinion.severity is oracle.Severity.BREAKING
+    assert opinion.in_kit is oracle.Severity.EQUIVALENT
+    assert oracle.shortest(hand, opinion).startswith("random: ")
 
 
 def trial(**changes: object) -> Trial:

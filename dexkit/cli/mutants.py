@@ -75,7 +75,12 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None) -> Non
 @click.option(
     "--good", is_flag=True, help="With --generated: good hands, which must not be blamed."
 )
-@click.option("--seed", type=int, default=1, help="With --generated: which of them.  [default: 1]")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**31),
+    default=1,
+    help="With --generated: which of them.  [default: 1]",
+)
 @click.option("--dialect", help="With --generated: only hands that speak it.")
 @click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
 @click.option(

@@ -207,8 +207,9 @@ class _Servo(What):
 
     def command(self, motors: Motors) -> Motors | None:
         def stiff(joint: int, motor: Motor) -> Motor:
-            if not 0 < motor.kp < math.inf:
-                return motor
+            values = (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
+            if not all(map(math.isfinite, values)) or motor.kp <= 0 or motor.kd < 0:
+                return motor  # the guards of the reference are for it
             kp, kd = self.rig.gains(joint)
             return replace(motor, kp=self.times * kp, kd=max(motor.kd, self.times * kd))
 
