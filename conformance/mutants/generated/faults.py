@@ -38,7 +38,8 @@ KINDS: Mapping[str, frozenset[str]] = {
     "motion": frozenset(
         ("MOVE", "JOINT", "SAFE", "SIDE", "WDOG", "START", "HOLD", "GAIN", "TRACK", "LIFE")
     ),
-    "force": frozenset(("FORCE", "HOLD", "SENS", "TRACK", "MOVE")),
+    # a hand that does not let go disobeys after a silence in which it pressed
+    "force": frozenset(("FORCE", "HOLD", "SENS", "TRACK", "MOVE", "WDOG", "OPER")),
     "sides": frozenset(("SIDE", "MOVE", "JOINT", "START", "FIELD", "TRACK", "FRESH", "WDOG")),
 }
 """The classes of faults, and the requirement areas that are a right reason for each."""
