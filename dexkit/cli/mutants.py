@@ -5,15 +5,58 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from dexkit.cli.options import FILE, require_option, verbose_option
 from dexkit.console import Console
+from dexkit.documents import check_output_paths
+from dexkit.errors import UsageError
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import stop_on_signals
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from dexkit.conformance.mutants.generated.campaign import Trial
+    from dexkit.conformance.mutants.matrix import Outcome
+    from dexkit.conformance.mutants.outsiders import Verdicts
+
+
+def _follow(total: int, found: Iterator[Outcome | Trial | Verdicts]) -> None:
+    """Show the progress of trials."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(f"{total} hands", total=total)
+        for done, outcome in enumerate(found, 1):
+            text = f"{done} of {total}: {escape(outcome.name)}"
+            progress.update(task, advance=1, description=text)
+
+
+def _try_outsiders(source: str, console: Console, json_path: Path | None) -> None:
+    """Try the hands of a file or module, and end with the exit code."""
+    from dexkit.conformance.mutants import outsiders
+
+    hands = outsiders.load(source)
+    found: list[Verdicts] = []
+
+    def each() -> Iterator[Verdicts]:
+        for verdicts in outsiders.try_all(hands, stop):
+            found.append(verdicts)
+            yield verdicts
+
+    with stop_on_signals() as stop:
+        _follow(len(hands), each())
+        if stop:
+            raise click.Abort
+    outsiders.print_verdicts(console, found)
+    if json_path:
+        outsiders.write_verdicts(json_path, found)
+    sys.exit(0 if all(v.right for v in found) else 1)
 
 
 @click.command("mutants")
@@ -23,6 +66,32 @@ from dexkit.stop_signals import stop_on_signals
     help="Only wrong hands, or robots, of this model.",
 )
 @require_option("DEX1-SAFE")
+@click.option(
+    "--generated",
+    type=click.IntRange(1, 1_000_000),
+    metavar="N",
+    help="Try N hands that are put together from faults, places and conditions.",
+)
+@click.option(
+    "--good", is_flag=True, help="With --generated: good hands, which must not be blamed."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**31),
+    default=1,
+    help="With --generated: which of them.  [default: 1]",
+)
+@click.option("--dialect", help="With --generated: only hands that speak it.")
+@click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
+@click.option(
+    "--resume",
+    type=FILE,
+    metavar="FILE",
+    help="With --generated: keep what is done in this file, and do not do it again.",
+)
+@click.option(
+    "--from", "source", metavar="FILE_OR_MODULE", help="Try the hands of a Python file or module."
+)
 @click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the score as JSON.")
 @click.option(
     "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
@@ -31,6 +100,13 @@ from dexkit.stop_signals import stop_on_signals
 def command(
     model: str | None,
     require: tuple[str, ...],
+    generated: int | None,
+    good: bool,
+    seed: int,
+    dialect: str | None,
+    names: tuple[str, ...],
+    resume: Path | None,
+    source: str | None,
     json_path: Path | None,
     jobs: int | None,
     verbose: bool,
@@ -41,28 +117,55 @@ def command(
     must catch it by the requirement that it breaks, and find no other fault with it. It runs on a
     virtual clock: no device, no DDS.
 
-    Exit code: 0 every requirement is proven by a wrong hand, 1 one is missed, wrongly blamed or
-    has no wrong hand, 2 there is nothing to try.
-    """
-    from dexkit.conformance.mutants.matrix import Score, chosen
+    With --generated the hands are put together from faults, places and conditions that the checks'
+    authors have not seen together; with --from they are yours (docs/mutants.md).
 
+    Exit code: 0 every requirement is proven by a wrong hand, 1 one is missed, wrongly blamed or
+    has no wrong hand, 2 there is nothing to try. With --generated and --from: 0 every wrong hand is
+    caught and no good one is blamed, 1 otherwise.
+    """
+    if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:
+        raise UsageError("--generated, --hand, --from and --require do not go together")
+    if generated is None and not names and (good or dialect or resume):
+        raise UsageError("--good, --dialect and --resume go with --generated")
+    if source is not None and model is not None:
+        raise UsageError("--from says which models its hands are of", hint="leave out --model")
     if json_path:
         json_path = json_path.absolute()
+    if resume:
+        resume = resume.absolute()
+    check_output_paths([json_path, resume])
+    console = Console()
+    if source is not None:
+        _try_outsiders(source, console, json_path)
+        return
     # Python's worker processes begin with the working folder in front of their import path
     os.chdir("/")
-    console = Console()
+    if generated is not None or names:
+        from dexkit.conformance.mutants.generated import dialects, parse, sample, sample_good
+        from dexkit.conformance.mutants.generated.campaign import Campaign
+
+        if model in ROBOTS:
+            raise UsageError(f"{model} is a robot; only hands are generated")
+        hands = [parse(name) for name in names]
+        if generated is not None:
+            spoken = dialects(model, dialect)
+            hands += (sample_good if good else sample)(generated, seed, spoken)
+        campaign = Campaign(seed, resume)
+        with stop_on_signals() as stop:
+            _follow(len(hands), campaign.run(hands, stop, jobs))
+            if stop:
+                raise click.Abort
+        campaign.print(console, verbose=verbose)
+        if json_path:
+            campaign.write_json(json_path)
+        sys.exit(0 if campaign.perfect else 1)
+    from dexkit.conformance.mutants.matrix import Score, chosen
+
     requirements, trials = chosen(model, require)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with (
-        stop_on_signals() as stop,
-        Progress(*columns, console=Console(stderr=True), transient=True) as progress,
-    ):
-        task = progress.add_task(f"{len(trials)} wrong hands", total=len(trials))
-        score = Score(requirements)
-        for outcome in score.run(trials, stop, jobs):
-            done = len(score.outcomes)
-            text = f"{done} of {len(trials)}: {outcome.name}"
-            progress.update(task, advance=1, description=text)
+    score = Score(requirements)
+    with stop_on_signals() as stop:
+        _follow(len(trials), score.run(trials, stop, jobs))
         if stop:
             raise click.Abort
     score.print(console, verbose=verbose)

@@ -1,0 +1,270 @@
+"""Wrong and good hands by construction: a fault is what, where and when.
+
+A hand has a name that says all of it, so that it can be made again::
+
+    dex1-1/unitree_go:q-offset@left,joint0,after-brake
+    dex3-1/dex3:cmd-late@both,all,moving&warm+gaps@left,all,always
+
+Before the colon are model and dialect. Each fault is its name, the side, the joint and the
+conditions that must hold together. A good hand's deviations are written in the same way, without a
+place.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
+from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
+from dexkit.conformance.mutants.generated.rig import Faulty, Part, What, When, compose
+from dexkit.conformance.mutants.generated.times import WHENS
+from dexkit.errors import UsageError
+from dexkit.hand import Side
+from dexkit.models import MODELS, Dialect, HandModel, dialect, model
+
+__all__ = ["Fault", "Generated", "dialects", "first_order", "parse", "sample", "sample_good"]
+
+_SIDES = {"left": (Side.LEFT,), "right": (Side.RIGHT,), "both": tuple(Side)}
+_SECOND = 0.2
+"""Part of a sample that has two faults, or one with two conditions."""
+_LAST = "latency"
+"""The group that acts on commands when the others have changed them."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a hand, by names.
+
+    :param side: ``left``, ``right`` or ``both``.
+    :param joint: ``joint0`` and so on, or ``all``.
+    :param whens: names of the conditions that must hold together.
+    """
+
+    what: str
+    side: str = "both"
+    joint: str = "all"
+    whens: tuple[str, ...] = ("always",)
+
+    def __str__(self) -> str:
+        if self.what in DEVIATIONS:
+            return self.what
+        return f"{self.what}@{self.side},{self.joint},{'&'.join(self.whens)}"
+
+    @property
+    def made(self) -> type[What]:
+        """The class of the fault."""
+        return FAULTS.get(self.what) or DEVIATIONS[self.what]
+
+    @property
+    def conditions(self) -> tuple[When, ...]:
+        """The conditions."""
+        return tuple(WHENS[w] for w in self.whens)
+
+    @property
+    def summary(self) -> str:
+        """What, where and when, in words."""
+        where = "" if self.joint == "all" else f", {self.joint}"
+        when = " and ".join(w.summary for w in self.conditions)
+        return f"{self.made.summary} ({self.side}{where}; {when})"
+
+    def part(self) -> Part:
+        """The fault itself."""
+        joint = None if self.joint == "all" else int(self.joint.removeprefix("joint"))
+        return Part(self.made, _SIDES[self.side], joint, self.conditions)
+
+
+@dataclass(frozen=True)
+class Generated:
+    """A hand that was put together from the reference of a model and some faults."""
+
+    dialect: Dialect
+    faults: tuple[Fault, ...]
+
+    @property
+    def name(self) -> str:
+        """Its name, from which :func:`parse` makes it again."""
+        faults = "+".join(map(str, self.faults))
+        return f"{self.dialect.model}/{self.dialect.name}:{faults}"
+
+    @property
+    def good(self) -> bool:
+        """Whether it is a good hand."""
+        return all(f.made.good for f in self.faults)
+
+    @property
+    def kind(self) -> str:
+        """The class in which its score is counted."""
+        kinds = dict.fromkeys(f.made.kind for f in self.faults)
+        return next(iter(kinds)) if len(self.faults) == 1 else "good" if self.good else "two faults"
+
+    @property
+    def summary(self) -> str:
+        """What it does, in words."""
+        if self.good:
+            return "; ".join(f.made.summary for f in self.faults)
+        return "; ".join(f.summary for f in self.faults)
+
+    @property
+    def areas(self) -> frozenset[str]:
+        """The requirement areas that are a right reason to fail it."""
+        parts = [f.made.areas for f in self.faults]
+        parts += [w.areas for f in self.faults for w in f.conditions]
+        return frozenset().union(*parts)
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """The hands of a run that shows it. Hands of many joints take long: only those needed."""
+        if self.dialect.is_gripper or self.good:
+            return tuple(Side) if self.dialect.is_gripper else (Side.RIGHT,)
+        needs_both = any(f.made.both or any(w.both for w in f.conditions) for f in self.faults)
+        named = {s for f in self.faults for s in _SIDES[f.side]}
+        return tuple(s for s in Side if needs_both or s in named)
+
+    def service(self) -> type[Faulty]:
+        """Its service.
+
+        :raises ModelBroken: the model's reference has no place for faults.
+        """
+        reference = model(self.dialect.model).reference.load()
+        name = re.sub(r"\W+", "_", self.name)
+        return compose(name, self.summary, reference, [f.part() for f in self.faults])
+
+
+def parse(name: str) -> Generated:
+    """The hand of that name.
+
+    :raises UsageError: the name says no hand, and why.
+    """
+    match = re.fullmatch(r"([^/:]+)/([^/:]+):(.+)", name)
+    if not match:
+        raise UsageError(
+            f"{name!r} names no generated hand",
+            hint="MODEL/DIALECT:WHAT@SIDE,JOINT,WHEN, as dexkit mutants prints it",
+        )
+    of = model(match[1])
+    spoken = dialect(match[2])
+    if spoken not in of.dialects:
+        raise UsageError(f"{of.name} does not speak {spoken.name}")
+    return Generated(spoken, tuple(_fault(text, of) for text in match[3].split("+")))
+
+
+def _fault(text: str, of: HandModel) -> Fault:
+    what, at, where = text.partition("@")
+    if not at:
+        if what not in DEVIATIONS:
+            raise UsageError(f"{what!r} is no deviation of a good hand", hint=", ".join(DEVIATIONS))
+        return Fault(what)
+    side, _, rest = where.partition(",")
+    joint, _, whens = rest.partition(",")
+    fault = Fault(what, side, joint, tuple(whens.split("&")))
+    count = len(of.joints[Side.LEFT])
+    known: list[tuple[str, Sequence[str]]] = [
+        (what, tuple(FAULTS)),
+        (side, tuple(_SIDES)),
+        (joint, ("all", *(f"joint{i}" for i in range(count)))),
+        *((w, tuple(WHENS)) for w in fault.whens),
+    ]
+    for given, allowed in known:
+        if given not in allowed:
+            raise UsageError(f"{given!r} in {text!r} is not known", hint=", ".join(allowed))
+    return fault
+
+
+def dialects(model_name: str | None = None, dialect_name: str | None = None) -> tuple[Dialect, ...]:
+    """The dialects of a model, one of them, or those of all models.
+
+    :raises UsageError: there is none of that name, or the model does not speak it.
+    """
+    of = [model(model_name)] if model_name else list(MODELS.values())
+    found = tuple(
+        d for m in of for d in m.dialects if dialect_name is None or d.name == dialect_name
+    )
+    if not found:
+        raise UsageError(
+            f"{model_name or 'no model'} does not speak {dialect_name}",
+            hint=", ".join(d.name for m in of for d in m.dialects),
+        )
+    return found
+
+
+def _joints(spoken: Dialect) -> tuple[str, ...]:
+    """Where on a side a fault can be: its first joint, its last one, all."""
+    count = len(model(spoken.model).joints[Side.LEFT])
+    return ("joint0",) if count == 1 else ("joint0", f"joint{count - 1}", "all")
+
+
+def _whats(spoken: Dialect, kind: str | None = None) -> list[str]:
+    several = len(_joints(spoken)) > 1
+    return [
+        name
+        for name, what in FAULTS.items()
+        if (several or not what.several) and (kind is None or what.kind == kind)
+    ]
+
+
+def first_order(spoken: Dialect) -> Iterator[Generated]:
+    """Every hand of a dialect with one fault under one condition."""
+    for what in _whats(spoken):
+        for side in _SIDES:
+            for joint in _joints(spoken):
+                for when in WHENS:
+                    yield Generated(spoken, (Fault(what, side, joint, (when,)),))
+
+
+def sample(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:
+    """So many different wrong hands: each class of faults and each dialect in turn.
+
+    A fifth of them is of the second order: two faults, or one with two conditions.
+    """
+    draw = random.Random(seed)
+    kinds = list(KINDS)
+    found: dict[str, Generated] = {}
+    turn = 0
+    while len(found) < count and turn < 20 * count + 100:
+        d = spoken[turn % len(spoken)]
+        kind = kinds[(turn // len(spoken)) % len(kinds)]
+        turn += 1
+        fault = _drawn(draw, d, kind)
+        faults: tuple[Fault, ...] = (fault,)
+        if draw.random() < _SECOND:
+            other = _drawn(draw, d, draw.choice(kinds))
+            if draw.random() < 0.5 and other.whens != fault.whens:
+                whens = tuple(w for w in (*fault.whens, *other.whens) if w != "always")
+                faults = (Fault(fault.what, fault.side, fault.joint, whens),)
+            elif other.what != fault.what:
+                faults = (fault, other)
+        hand = Generated(d, faults)
+        found.setdefault(hand.name, hand)
+    return list(found.values())
+
+
+def _drawn(draw: random.Random, spoken: Dialect, kind: str) -> Fault:
+    return Fault(
+        draw.choice(_whats(spoken, kind)),
+        draw.choice(list(_SIDES)),
+        draw.choice(_joints(spoken)),
+        (draw.choice(list(WHENS)),),
+    )
+
+
+def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:
+    """So many different good hands, with one to four deviations of different groups."""
+    draw = random.Random(seed)
+    found: dict[str, Generated] = {}
+    turn = 0
+    while len(found) < count and turn < 20 * count + 100:
+        d = spoken[turn % len(spoken)]
+        turn += 1
+        one_joint = len(_joints(d)) == 1
+        groups = draw.sample(list(GROUPS), draw.choice((1, 2, 3, 4)))
+        chosen = [draw.choice(GROUPS[g]) for g in sorted(groups, key=lambda g: (g == _LAST, g))]
+        faults = [
+            Fault(w) for w in chosen if one_joint or not getattr(DEVIATIONS[w], "one_joint", False)
+        ]
+        if faults:
+            hand = Generated(d, tuple(faults))
+            found.setdefault(hand.name, hand)
+    return list(found.values())

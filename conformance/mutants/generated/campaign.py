@@ -1,0 +1,324 @@
+"""Try generated hands on the conformance checks and score the checks by them.
+
+Each wrong hand is examined by the oracle first. What it finds equivalent to the reference is listed
+and not counted. A must-breaking hand is caught if it fails a MUST, a lesser one if anything fails
+or warns, of an area that its faults declare: anything else is a find for the wrong reason. A good
+hand must not be blamed for anything.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import signal
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from dexkit.conformance.mutants.generated import Generated, parse
+from dexkit.conformance.mutants.generated.oracle import Severity, examine, shortest
+from dexkit.conformance.mutants.generated.rig import Faulty
+from dexkit.conformance.mutants.outsiders import blame
+from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.conformance.stimuli import Plan
+from dexkit.console import Console
+from dexkit.documents import parse_json, write_file
+from dexkit.errors import UsageError
+from dexkit.hand import Subject
+
+__all__ = ["Campaign", "Trial", "try_generated", "wilson"]
+
+GOOD = "good"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What became of one hand.
+
+    :param severity: ``must-breaking``, ``lesser``, ``equivalent``, or ``good``.
+    :param in_kit: the severity of what shows under the kit's own stimulus alone.
+    :param effect: what an observer can tell, gravest first.
+    :param shown_by: the shortest stimulus that shows it; of survivors.
+    :param failed: ids of MUSTs that fail, ``warned`` of other requirements that fail or warn, and
+        ``errors`` of those that could not be judged for a fault of the kit.
+    """
+
+    name: str
+    kind: str
+    summary: str
+    severity: str
+    in_kit: str = ""
+    effect: str = ""
+    shown_by: str = ""
+    areas: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+    warned: tuple[str, ...] = ()
+    errors: tuple[str, ...] = ()
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Trial:
+        """Read it back from JSON.
+
+        :raises TypeError: it is no trial.
+        """
+        fields: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
+        }
+        return cls(**fields)
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is part of the score."""
+        return self.severity != Severity.EQUIVALENT.value
+
+    @property
+    def _finds(self) -> tuple[str, ...]:
+        if self.severity == Severity.BREAKING.value:
+            return self.failed
+        return self.failed + self.warned
+
+    @property
+    def caught(self) -> bool:
+        """Whether the checks were right about it, for a right reason."""
+        if self.severity == GOOD:
+            return not (self.failed or self.warned or self.errors)
+        return any(area_of(r) in self.areas for r in self._finds)
+
+    @property
+    def wrong_reason(self) -> bool:
+        """Whether a wrong hand was found for other reasons only."""
+        return self.severity != GOOD and not self.caught and bool(self._finds)
+
+
+def area_of(requirement: str) -> str:
+    """The second word of a requirement's id: ``MOVE`` of ``DEX1-MOVE-02``."""
+    return requirement.split("-")[-2]
+
+
+def try_generated(hand: Generated, seed: int = 1) -> Trial:
+    """Examine a hand, and judge it by a whole conformance run on the virtual clock.
+
+    :param seed: of the oracle's random stimulus.
+    """
+    service = hand.service()
+    plan = plan_for(hand.dialect.name, sides=hand.sides)
+    trial = Trial(hand.name, hand.kind, hand.summary, GOOD, areas=tuple(sorted(hand.areas)))
+    if hand.good:
+        return _judged(trial, service, plan)
+    opinion = examine(service, hand.dialect, hand.sides, seed)
+    trial = replace(trial, severity=opinion.severity.value, in_kit=opinion.in_kit.value)
+    if opinion.severity is Severity.EQUIVALENT:
+        return trial
+    worst = opinion.effects[0]
+    effect = f"{worst.text} ({worst.stimulus}: {worst.stretch}, {worst.at:.2f} s)"
+    trial = _judged(replace(trial, effect=effect), service, plan)
+    return trial if trial.caught else replace(trial, shown_by=shortest(hand, opinion, seed))
+
+
+def _judged(trial: Trial, service: type[Faulty], plan: Plan[Subject]) -> Trial:
+    failed, warned, errors = blame(run_mutant(service, plan))
+    return replace(trial, failed=failed, warned=warned, errors=errors)
+
+
+def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """The confidence interval of a proportion by Wilson's score, 95 % by default.
+
+    :returns: lower and upper bound, 0 to 1; the whole range where there is nothing to count.
+    """
+    if not count:
+        return 0.0, 1.0
+    p = hits / count
+    scale = 1.0 + z * z / count
+    middle = (p + z * z / (2 * count)) / scale
+    half = z * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count)) / scale
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def _work(name: str, seed: int) -> dict[str, Any]:
+    return asdict(try_generated(parse(name), seed))
+
+
+def _ignore_interrupts() -> None:
+    # Ctrl-C goes to every process of the terminal; the first one ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@dataclass
+class Campaign:
+    """The trials of many hands.
+
+    :param file: where each is added as a line of JSON when it is done; those that are there
+        already are not tried again. None for none.
+    """
+
+    seed: int
+    file: Path | None = None
+    trials: list[Trial] = field(default_factory=list)
+
+    def run(
+        self, hands: Sequence[Generated], stop: object = None, jobs: int | None = None
+    ) -> Iterator[Trial]:
+        """Try the hands in worker processes; yield each trial when it is done.
+
+        :param stop: ends it early when it becomes true.
+        :param jobs: processes; one per processor by default.
+        :raises UsageError: the file holds something else than trials of this seed.
+        """
+        done = self._done()
+        for hand in hands:
+            if hand.name in done:
+                self.trials.append(done[hand.name])
+                yield self.trials[-1]
+        todo = [h for h in hands if h.name not in done]
+        pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _ignore_interrupts)
+        try:
+            waiting = {pool.submit(_work, h.name, self.seed) for h in todo}
+            while waiting and not stop:
+                ready = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done
+                waiting -= ready
+                for future in ready:
+                    yield self._add(Trial.from_dict(future.result()))
+        finally:
+            # not as a context manager, which would run the waiting trials
+            pool.shutdown(cancel_futures=True)
+
+    def run_here(self, hands: Iterable[Generated]) -> None:
+        """Try the hands in this process."""
+        for hand in hands:
+            self._add(try_generated(hand, self.seed))
+
+    def _add(self, trial: Trial) -> Trial:
+        self.trials.append(trial)
+        if self.file is not None:
+            with self.file.open("a", encoding="utf-8") as out:
+                out.write(json.dumps({"seed": self.seed, **asdict(trial)}) + "\n")
+        return trial
+
+    def _done(self) -> dict[str, Trial]:
+        if self.file is None or not self.file.exists():
+            return {}
+        found = {}
+        lines = self.file.read_text(encoding="utf-8").splitlines()
+        for number, line in enumerate(lines, 1):
+            try:
+                values = parse_json(line, f"{self.file}:{number}")
+                seed = values.pop("seed")
+                trial = Trial.from_dict(values)
+            except (UsageError, TypeError, KeyError, AttributeError) as error:
+                if number == len(lines):
+                    break  # the line that was being written when the program was stopped
+                raise UsageError(
+                    f"{self.file}:{number}: no trial of generated hands",
+                    hint="give a file of an earlier campaign, or a new one",
+                ) from error
+            if seed != self.seed:
+                raise UsageError(
+                    f"{self.file} is of seed {seed}, not {self.seed}", hint="give its seed"
+                )
+            found[trial.name] = trial
+        return found
+
+    # -- the score ---------------------------------------------------------------------------
+
+    def of(self, severity: str, kind: str | None = None) -> list[Trial]:
+        """The trials of a severity, and of a class."""
+        return [t for t in self.trials if t.severity == severity and kind in (None, t.kind)]
+
+    @property
+    def survivors(self) -> list[Trial]:
+        """Wrong hands that were not caught for a right reason, the gravest first."""
+        order = [Severity.BREAKING.value, Severity.LESSER.value]
+        missed = [t for t in self.trials if t.severity in order and not t.caught]
+        return sorted(missed, key=lambda t: (order.index(t.severity), t.kind, t.name))
+
+    @property
+    def blamed(self) -> list[Trial]:
+        """Good hands that were blamed."""
+        return [t for t in self.of(GOOD) if not t.caught]
+
+    @property
+    def perfect(self) -> bool:
+        """Whether no wrong hand survived and no good one was blamed."""
+        return not self.survivors and not self.blamed
+
+    def score(self, severity: str, kind: str | None = None) -> dict[str, object]:
+        """Count, hits and confidence interval."""
+        those = self.of(severity, kind)
+        hits = sum(t.caught for t in those)
+        low, high = wilson(hits, len(those))
+        return {
+            "count": len(those),
+            "caught": hits,
+            "wrong_reason": sum(t.wrong_reason for t in those),
+            "interval": [round(low, 4), round(high, 4)],
+        }
+
+    def as_dict(self) -> dict[str, object]:
+        """The campaign as plain data."""
+        kinds = list(dict.fromkeys(t.kind for t in self.trials if t.severity != GOOD))
+        grades = [Severity.BREAKING.value, Severity.LESSER.value]
+        return {
+            "seed": self.seed,
+            "perfect": self.perfect,
+            "score": {
+                **{g: self.score(g) for g in grades},
+                GOOD: {
+                    **self.score(GOOD),
+                    "failed": sum(bool(t.failed) for t in self.of(GOOD)),
+                    "warned": sum(bool(t.warned) for t in self.of(GOOD)),
+                },
+                "equivalent": len(self.of(Severity.EQUIVALENT.value)),
+            },
+            "classes": {k: {g: self.score(g, k) for g in grades} for k in kinds},
+            "hands": [
+                {**asdict(t), "caught": t.caught, "wrong_reason": t.wrong_reason}
+                for t in sorted(self.trials, key=lambda t: t.name)
+            ],
+        }
+
+    def write_json(self, path: Path) -> None:
+        """Write it to a file."""
+        write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
+
+    def print(self, console: Console, *, verbose: bool = False) -> None:
+        """Print survivors, blamed good hands, and the score by class."""
+        for t in self.survivors:
+            reason = f"; blamed for {', '.join(t.failed + t.warned)}" if t.wrong_reason else ""
+            console.print(f"[red]survived[/]  {escape(t.name)} ({t.severity})", soft_wrap=True)
+            console.print(f"          {escape(t.effect)}{reason}", soft_wrap=True)
+            console.print(f"          shown by: {escape(t.shown_by)}", soft_wrap=True)
+        for t in self.blamed:
+            ids = ", ".join(t.failed + t.warned + t.errors)
+            console.print(f"[red]blamed[/]    {escape(t.name)}: {ids}", soft_wrap=True)
+        if verbose:
+            for t in self.trials:
+                state = "caught" if t.caught else "equivalent" if not t.counts else "not caught"
+                console.print(f"{state:10} {escape(t.name)}: {escape(t.summary)}", soft_wrap=True)
+        table = Table(box=None, pad_edge=False)
+        for name in ("class", "must-breaking fail a MUST", "95 %", "lesser are seen", "95 %"):
+            table.add_column(name, justify="left" if name == "class" else "right")
+        kinds = dict.fromkeys(t.kind for t in self.trials if t.severity != GOOD)
+        for kind in (*kinds, None):
+            cells = []
+            for grade in (Severity.BREAKING.value, Severity.LESSER.value):
+                those = self.of(grade, kind)
+                hits = sum(t.caught for t in those)
+                low, high = wilson(hits, len(those))
+                cells += [f"{hits}/{len(those)}", f"{100 * low:.0f} to {100 * high:.0f} %"]
+            table.add_row(kind or "all", *(cells if self.survivors or kinds else []))
+        if kinds:
+            console.print(table)
+            count = len(self.of(Severity.EQUIVALENT.value))
+            console.print(f"{count} hands cannot be told from the reference, and are not counted")
+        if good := self.of(GOOD):
+            console.print(
+                f"{len(good)} good hands: {sum(bool(t.failed) for t in good)} fail a MUST, "
+                f"{sum(bool(t.warned) for t in good)} are warned",
+                style="red" if self.blamed else "green",
+            )

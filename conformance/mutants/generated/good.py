@@ -1,0 +1,371 @@
+"""What good hands may do differently: deviations that no client notices, for generated good hands.
+
+Each stays within what the sources allow (docs/sources/unitree-dex.md#b2, #b4 of the same page): a
+vendor may measure more coarsely, have more friction, answer some milliseconds later, brake in
+another way. One of each group can be in a hand; a hand with two slow gears is no good one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.mutants.generated.rig import Faulty, Motors, Report, What
+from dexkit.conformance.virtual import Sample
+from dexkit.hand import Side
+
+__all__ = ["DEVIATIONS", "GROUPS"]
+
+W = TypeVar("W", bound=type[What])
+_found: dict[str, type[What]] = {}
+_groups: dict[str, list[str]] = {}
+
+
+def _add(group: str, base: type[What], title: str, summary: str, **values: object) -> None:
+    made: type[What] = type(base.__name__, (base,), {"good": True, "kind": "good", **values})
+    made.title, made.summary = title, summary
+    _found[title] = made
+    _groups.setdefault(group, []).append(title)
+
+
+# ----------------------------------------------------------------------------- measurement
+
+
+class _Noise(What):
+    q = dq = tau = 0.0
+
+    def report(self, joint: int, values: Report) -> None:
+        span = self.rig.spans[self.side][joint]
+        values.q += self.random.gauss(0.0, self.q * span) if self.q else 0.0
+        values.dq += self.random.gauss(0.0, self.dq * span) if self.dq else 0.0
+        if self.tau:
+            values.tau += self.random.gauss(0.0, self.tau * self.rig.strength(self.side, joint))
+
+
+_add("noise", _Noise, "noise-q-small", "has noise of 0.02 % of the range on q", q=2e-4)
+_add("noise", _Noise, "noise-q", "has noise of 0.06 % of the range on q", q=6e-4)
+_add("noise", _Noise, "noise-dq", "has noise of 1 % of the range in a second on dq", dq=0.01)
+_add("noise", _Noise, "noise-tau", "has noise of 3 % of a soft grip on tau_est", tau=0.03)
+
+
+class _Counts(What):
+    per_turn = 4096
+
+    def report(self, joint: int, values: Report) -> None:
+        step = 2 * math.pi / self.per_turn
+        values.q = step * round(values.q / step)
+
+
+_add("resolution", _Counts, "counts-4096", "measures q in 4096 steps of a turn", per_turn=4096)
+_add("resolution", _Counts, "counts-16384", "measures q in 16384 steps of a turn", per_turn=16384)
+
+
+class _Predicted(What):
+    """Measures 100 times a second and extrapolates by its velocity in between."""
+
+    period = 0.01
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.measured: dict[int, tuple[float, float, float]] = {}
+
+    def report(self, joint: int, values: Report) -> None:
+        now = self.rig.now
+        at, q, dq = self.measured.get(joint, (-math.inf, 0.0, 0.0))
+        if now - at >= self.period - 1e-9:
+            at, q, dq = now, values.q, values.dq
+            self.measured[joint] = at, q, dq
+        values.q, values.dq = q + dq * (now - at), dq
+
+
+_add("prediction", _Predicted, "predicts-100", "measures 100 times a second, and predicts")
+_add("prediction", _Predicted, "predicts-150", "measures 150 times a second", period=1 / 150)
+
+
+class _Backlash(What):
+    """Its sensor is behind a gear with play."""
+
+    play = 0.002
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.seen: dict[int, float] = {}
+
+    def report(self, joint: int, values: Report) -> None:
+        half = 0.5 * self.play * self.rig.spans[self.side][joint]
+        q = self.seen.get(joint, values.q)
+        self.seen[joint] = values.q = min(max(q, values.q - half), values.q + half)
+
+
+_add("backlash", _Backlash, "backlash", "has play of 0.2 % of the range before its sensor")
+_add("backlash", _Backlash, "backlash-more", "has play of 0.5 % of the range", play=0.005)
+
+
+# ------------------------------------------------------------------------------- mechanics
+
+
+class _Mechanics(What):
+    """Has other constants of its mechanics."""
+
+    factors: Mapping[str, float] = {}
+    done = False
+
+    def tick(self, dt: float, active: bool) -> None:
+        if not self.done:
+            self.done = True
+            hand = self.rig.hand_of(self.side)
+            for name, factor in self.factors.items():
+                setattr(hand, name, factor * getattr(hand, name))
+
+
+_add("mechanics", _Mechanics, "heavier", "has 1.5 times the inertia", factors={"inertia": 1.5})
+_add("mechanics", _Mechanics, "heavier-more", "has twice the inertia", factors={"inertia": 2.0})
+_add("mechanics", _Mechanics, "lighter", "has half of the inertia", factors={"inertia": 0.5})
+_add("mechanics", _Mechanics, "slower", "has 1.15 times the friction", factors={"viscous": 1.15})
+_add("mechanics", _Mechanics, "faster", "has 0.8 times the friction", factors={"viscous": 0.8})
+_add("mechanics", _Mechanics, "sticky", "has 1.5 times the dry friction", factors={"coulomb": 1.5})
+_add("mechanics", _Mechanics, "soft-stops", "has stops half as stiff", factors={"stiffness": 0.5})
+
+
+class _WarmsUp(What):
+    """Has twice the dry friction at first, which falls within 20 s of motion."""
+
+    own: float | None = None
+
+    def tick(self, dt: float, active: bool) -> None:
+        hand = self.rig.hand_of(self.side)
+        if self.own is None:
+            self.own = hand.coulomb
+        hand.coulomb = self.own * (1.0 + max(0.0, 1.0 - self.rig.tracks[self.side].moved / 20.0))
+
+
+_add("mechanics", _WarmsUp, "warms-up", "has twice the dry friction until it is warm")
+
+
+class _Weight(What):
+    """A constant weight pulls at the joint."""
+
+    part = 0.05
+
+    def torque(self, joint: int, tau: float, dt: float) -> float:
+        if not self.rig.driven(self.side):
+            return tau  # a hand at rest is balanced: its gear holds it
+        return tau + self.part * self.rig.strength(self.side, joint)
+
+
+_add("weight", _Weight, "sags-up", "is pulled open by a weight", part=0.05)
+_add("weight", _Weight, "sags-down", "is pulled closed by a weight", part=-0.05)
+
+
+class _SoftStart(What):
+    """Raises the torque within 0.15 s when it begins to be driven."""
+
+    seconds = 0.15
+    since: float | None
+    driven_at: float | None = None
+
+    def torque(self, joint: int, tau: float, dt: float) -> float:
+        if not self.rig.driven(self.side):
+            self.driven_at = None
+            return tau
+        if self.driven_at is None:
+            self.driven_at = self.rig.now
+        return tau * min(1.0, 0.1 + (self.rig.now - self.driven_at) / self.seconds)
+
+
+_add("start", _SoftStart, "soft-start", "raises its torque within 0.15 s when it is driven")
+
+
+class _TopSpeed(What):
+    """Moves at no more than a speed, as a servo with a profile velocity does."""
+
+    rads = 4.0
+
+    def torque(self, joint: int, tau: float, dt: float) -> float:
+        hand = self.rig.hand_of(self.side)
+        if not self.rig.driven(self.side):
+            return tau
+        drag, dry, dq = float(hand.viscous), float(hand.coulomb), float(hand.dq)
+        high = drag * self.rads + dry + 0.3 * (self.rads - dq)
+        low = -drag * self.rads - dry - 0.3 * (self.rads + dq)
+        return min(max(tau, low), high)
+
+
+_ONE = {"one_joint": True}
+_add("speed", _TopSpeed, "top-speed-4.5", "moves at 4.5 rad/s at most", rads=4.5, **_ONE)
+_add("speed", _TopSpeed, "top-speed-3.6", "moves at 3.6 rad/s at most", rads=3.6, **_ONE)
+
+
+class _Servo(What):
+    """A position servo: follows q with its own stiffness whenever kp is not 0."""
+
+    times = 4.0
+
+    def command(self, motors: Motors) -> Motors | None:
+        def stiff(joint: int, motor: Motor) -> Motor:
+            values = (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
+            if not all(map(math.isfinite, values)) or motor.kp <= 0 or motor.kd < 0:
+                return motor  # the guards of the reference are for it
+            kp, kd = self.rig.gains(joint)
+            return replace(motor, kp=self.times * kp, kd=max(motor.kd, self.times * kd))
+
+        return self.replaced(motors, stiff)
+
+
+_add("servo", _Servo, "servo-stiff", "is a position servo of four times the stiffness", **_ONE)
+_add("servo", _Servo, "servo-own", "is a position servo of its own stiffness", times=1.5, **_ONE)
+
+
+# ---------------------------------------------------------------------------------- timing
+
+
+class _Latency(What):
+    seconds = 0.02
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.queue: deque[tuple[float, Motors]] = deque()
+
+    def command(self, motors: Motors) -> Motors | None:
+        self.queue.append((self.rig.now, motors))
+        return None
+
+    def tick(self, dt: float, active: bool) -> None:
+        if self.rig.ended:
+            self.queue.clear()
+        while self.queue and self.queue[0][0] <= self.rig.now - self.seconds:
+            _, motors = self.queue.popleft()
+            hand = self.rig.hand_of(self.side)
+            if self.rig.codec.joints > 1:
+                hand.command(motors)
+            else:
+                self.rig.command(self.side, motors[0])  # type: ignore[attr-defined]
+
+
+for _ms in (5, 10, 20):
+    _add(
+        "latency",
+        _Latency,
+        f"latency-{_ms}",
+        f"obeys each command {_ms} ms late",
+        seconds=_ms / 1000,
+    )
+
+
+class _StateLatency(What):
+    seconds = 0.01
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.queue: deque[Sample] = deque()
+
+    def publish(self, samples: list[Sample]) -> list[Sample]:
+        if self.rig.ended:
+            return samples
+        self.queue.extend(samples)
+        out = []
+        while self.queue and self.queue[0].sent <= self.rig.now - self.seconds + 1e-9:
+            out.append(replace(self.queue.popleft(), sent=self.rig.now))
+        return out
+
+
+_add("state", _StateLatency, "state-late-6", "publishes 6 ms after it measured", seconds=0.006)
+_add("state", _StateLatency, "state-late-10", "publishes 10 ms after it measured", seconds=0.01)
+
+
+class _Jitters(What):
+    """Holds some states back until the next one."""
+
+    part = 0.05
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.held: list[Sample] = []
+
+    def publish(self, samples: list[Sample]) -> list[Sample]:
+        out, self.held = self.held + samples, []
+        if len(out) == 1 and not self.rig.ended and self.random.random() < self.part:
+            out, self.held = [], out
+        return out
+
+
+_add("state", _Jitters, "jitter-2", "publishes 2 % of its states a period late", part=0.02)
+_add("state", _Jitters, "jitter-5", "publishes 5 % of its states a period late", part=0.05)
+
+
+# --------------------------------------------------------------------------------- braking
+
+
+class _Coasts(What):
+    """Opens its windings when it brakes: only friction slows it."""
+
+    def tick(self, dt: float, active: bool) -> None:
+        hand = self.rig.hand_of(self.side)
+        if hand.brake:
+            hand.brake = 0.0
+            if self.rig.codec.joints > 1:
+                hand.changed()
+
+
+_add("brake", _Coasts, "brake-coast", "coasts when it brakes")
+
+
+class _Holds(What):
+    """Holds the position that it has when the commands have stopped, as a servo does."""
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.at: dict[int, float] = {}
+
+    def torque(self, joint: int, tau: float, dt: float) -> float:
+        if self.rig.driven(self.side) or not self.rig.tracks[self.side].commands:
+            self.at.pop(joint, None)
+            return tau
+        q = self.rig.positions(self.side)[joint]
+        kp, kd = self.rig.gains(joint)
+        dq = self.rig.velocities(self.side)[joint]
+        return kp * (self.at.setdefault(joint, q) - q) - kd * dq
+
+
+_add("brake", _Holds, "brake-hold", "holds its position when it brakes")
+
+
+class _Releases(What):
+    """Lets its torque go within 0.3 s when it brakes."""
+
+    seconds = 0.3
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.last: dict[int, float] = {}
+        self.since_brake: float | None = None
+
+    def torque(self, joint: int, tau: float, dt: float) -> float:
+        if self.rig.driven(self.side):
+            self.since_brake = None
+            self.last[joint] = tau
+            return tau
+        if self.since_brake is None:
+            self.since_brake = self.rig.now
+        left = 1.0 - (self.rig.now - self.since_brake) / self.seconds
+        return tau + self.last.get(joint, 0.0) * max(0.0, left)
+
+
+_add("brake", _Releases, "brake-release", "lets its torque go within 0.3 s when it brakes")
+_add("brake", _Releases, "brake-release-fast", "lets its torque go within 0.1 s", seconds=0.1)
+
+
+class _StrongBrake(_Mechanics):
+    factors: Mapping[str, float] = {"brake": 3.0}
+
+
+_add("brake", _StrongBrake, "brake-short", "brakes three times as hard")
+
+DEVIATIONS: Mapping[str, type[What]] = _found
+"""Every deviation, by name."""
+GROUPS: Mapping[str, tuple[str, ...]] = {k: tuple(v) for k, v in _groups.items()}
+"""The names of the deviations of which a hand has one at most."""

@@ -1,0 +1,278 @@
+"""Wrong and good hands of other people, from a file or module of theirs.
+
+A hand is a class with the decorator :func:`hand`: a change of a model's reference service. It is
+judged by every requirement in a whole conformance run on the virtual clock.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple, TypeVar
+
+from rich.markup import escape
+
+from dexkit.conformance.mutants.registry import mix
+from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.conformance.requirements import Level, catalogue
+from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.virtual import Service
+from dexkit.console import Console
+from dexkit.documents import write_file
+from dexkit.errors import ConformanceError, DexkitError, ModelBroken, UsageError
+from dexkit.hand import Side
+from dexkit.models import MODELS, Dialect, dialect, model
+from dexkit.plugins import import_object, where
+
+__all__ = [
+    "GRADES",
+    "Blame",
+    "Outsider",
+    "Verdicts",
+    "blame",
+    "hand",
+    "load",
+    "print_verdicts",
+    "try_all",
+    "write_verdicts",
+]
+
+GRADES = ("must-breaking", "lesser", "good")
+"""What a hand is: it breaks what clients rely on, it has a fault that they can live with, or it is
+good."""
+
+C = TypeVar("C", bound=type[Any])
+_MARK = "_dexkit_hand"
+
+
+@dataclass(frozen=True)
+class _Declared:
+    grade: str
+    expects: tuple[str, ...]
+    dialects: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Outsider:
+    """One hand of other people.
+
+    :param made: its service.
+    :param grade: one of :data:`GRADES`.
+    :param expects: prefixes of the ids of requirements, one of which is the right reason.
+    """
+
+    name: str
+    made: type[Service]
+    dialect: Dialect
+    grade: str
+    expects: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What the checks say of a hand.
+
+    :param failed: ids of MUSTs that fail; ``warned`` of other requirements that fail or warn;
+        ``errors`` of those that could not be judged for a fault of the kit.
+    """
+
+    name: str
+    summary: str
+    dialect: str
+    grade: str
+    expects: tuple[str, ...]
+    failed: tuple[str, ...]
+    warned: tuple[str, ...]
+    errors: tuple[str, ...]
+
+    @property
+    def right(self) -> bool:
+        """Whether the checks agree: a good hand is not blamed, a wrong one for a right reason."""
+        if self.errors:
+            return False
+        if self.grade == "good":
+            return not self.failed and not self.warned
+        found = self.failed if self.grade == "must-breaking" else self.failed + self.warned
+        return any(r.startswith(self.expects or "") for r in found)
+
+
+def hand(
+    grade: str, *, expects: str | tuple[str, ...] = (), dialects: str | tuple[str, ...] = ()
+) -> Callable[[C], C]:
+    """Mark a class as a hand to be tried.
+
+    :param grade: one of :data:`GRADES`.
+    :param expects: requirement ids, or their beginnings (``DEX1-MOVE``), of which one is the right
+        reason to find it; none for any.
+    :param dialects: those that it is tried in; none for the first of each model whose reference it
+        changes.
+    :raises ConformanceError: the grade is not known, or what it decorates is no class.
+    """
+    if grade not in GRADES:
+        raise ConformanceError(f"{grade!r} is no grade of a hand", hint=", ".join(GRADES))
+
+    def declare(made: C) -> C:
+        if not isinstance(made, type) or not issubclass(made, Service):
+            raise ConformanceError(
+                f"{getattr(made, '__name__', made)!r} is no service of hands",
+                hint="derive it from a reference service; see docs/mutants.md",
+            )
+        setattr(made, _MARK, _Declared(grade, _tuple(expects), _tuple(dialects)))
+        return made
+
+    return declare
+
+
+def _tuple(value: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (value,) if isinstance(value, str) else tuple(value)
+
+
+def load(source: str) -> tuple[Outsider, ...]:
+    """Every marked hand of a Python file or of a module.
+
+    :param source: path of a ``.py`` file, or a module's name.
+    :raises UsageError: there is no such file, or nothing in it is marked.
+    :raises ConformanceError: it cannot be imported, or a hand in it cannot be used.
+    """
+    module = _file(Path(source)) if source.endswith(".py") else _module(source)
+    found = [o for made in _marked(module) for o in _outsiders(made)]
+    if not found:
+        raise UsageError(
+            f"no hand in {source} is marked",
+            hint='mark classes with @hand("must-breaking") or others; see docs/mutants.md',
+        )
+    return tuple(found)
+
+
+def _file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise UsageError(f"no such file: {path}")
+    name = f"dexkit_hands_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None, "a .py file always has a loader"
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except DexkitError:
+        raise
+    except Exception as error:  # a file of others may raise anything
+        raise ConformanceError(
+            f"cannot load {path}: {type(error).__name__}: {error}", hint=where(error)
+        ) from error
+    return module
+
+
+def _module(name: str) -> ModuleType:
+    found = import_object(name, ConformanceError, hint="name a module or a .py file")
+    assert isinstance(found, ModuleType)
+    return found
+
+
+def _marked(module: ModuleType) -> list[type[Any]]:
+    return [
+        value
+        for value in vars(module).values()
+        if inspect.isclass(value) and _MARK in vars(value) and value.__module__ == module.__name__
+    ]
+
+
+def _outsiders(made: type[Any]) -> Iterator[Outsider]:
+    declared: _Declared = vars(made)[_MARK]
+    named = [dialect(d) for d in declared.dialects]
+    spoken = named or [m.dialects[0] for m in MODELS.values() if _fits(made, m.name)]
+    if not spoken:
+        raise ConformanceError(
+            f"{made.__name__} fits no model", hint="derive it from a model's reference service"
+        )
+    for each in spoken:
+        if not _fits(made, each.model):
+            raise ConformanceError(
+                f"{made.__name__} does not change the reference of {each.model}, whose dialect "
+                f"{each.name} it is tried in"
+            )
+        known = [r.id for r in catalogue(each.model)]
+        lost = [e for e in declared.expects if not any(r.startswith(e) for r in known)]
+        if lost and (named or len(lost) == len(declared.expects)):
+            raise ConformanceError(f"{made.__name__} expects {lost[0]}: {each.model} has none")
+        name = made.__name__ if len(spoken) == 1 else f"{made.__name__} ({each.name})"
+        reference: type[Any] = model(each.model).reference.load()
+        yield Outsider(name, mix(made, reference), each, declared.grade, declared.expects)
+
+
+def _fits(made: type[Any], model_name: str) -> bool:
+    """Whether a class changes that model's reference service, or a base of it."""
+    try:
+        reference = model(model_name).reference.load()
+    except ModelBroken:
+        return False
+    base = next(c for c in made.__mro__[1:] if c.__module__.startswith("dexkit.") or c is reference)
+    return issubclass(reference, base) or issubclass(made, reference)
+
+
+class Blame(NamedTuple):
+    """Ids of MUSTs that fail, of other requirements that fail or warn, and of errors of the kit."""
+
+    failed: tuple[str, ...]
+    warned: tuple[str, ...]
+    errors: tuple[str, ...]
+
+
+def blame(result: RunResult) -> Blame:
+    """What a hand is blamed for in a result."""
+    found: dict[str, set[str]] = {"failed": set(), "warned": set(), "errors": set()}
+    for r in result.results:
+        if r.verdict is Verdict.ERROR:
+            found["errors"].add(r.requirement.id)
+        elif r.verdict in (Verdict.FAIL, Verdict.WARN):
+            must = r.requirement.level is Level.MUST
+            found["failed" if must else "warned"].add(r.requirement.id)
+    return Blame(**{key: tuple(sorted(ids)) for key, ids in found.items()})
+
+
+def try_all(hands: Sequence[Outsider], stop: object = None) -> Iterator[Verdicts]:
+    """Judge each hand by every requirement, in a run of both sides with an object in the right one.
+
+    :param stop: ends it early when it becomes true.
+    :raises ConformanceError: a hand's own code failed.
+    """
+    for each in hands:
+        if stop:
+            return
+        plan = plan_for(each.dialect.name, sides=tuple(Side))
+        try:
+            result = run_mutant(each.made, plan)
+        except Exception as error:  # the code of others may raise anything
+            raise ConformanceError(
+                f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
+            ) from error
+        summary = (each.made.__doc__ or "").strip().partition("\n")[0]
+        yield Verdicts(
+            each.name, summary, each.dialect.name, each.grade, each.expects, *blame(result)
+        )
+
+
+def print_verdicts(console: Console, found: Sequence[Verdicts]) -> None:
+    """Print what became of each hand, those that the checks are wrong about first."""
+    for v in sorted(found, key=lambda v: v.right):
+        ids = ", ".join(v.failed + v.warned + v.errors) or "nothing"
+        state = "right" if v.right else "wrong"
+        color = "green" if v.right else "red"
+        console.print(
+            f"[{color}]{state}[/]  {escape(v.name)} ({v.grade}): {ids} found", soft_wrap=True
+        )
+    right = sum(v.right for v in found)
+    console.print(f"the checks are right about {right} of {len(found)} hands")
+
+
+def write_verdicts(path: Path, found: Sequence[Verdicts]) -> None:
+    """Write them to a file as JSON."""
+    hands = [{**asdict(v), "right": v.right} for v in found]
+    write_file(path, json.dumps({"hands": hands}, indent=2) + "\n")
