@@ -517,7 +517,7 @@ def unchanged(ctx: Context) -> Outcome:
                     .if_late(STROKE_S * step.error / step.stroke)
                 )
     first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
-    worst: tuple[float, Step, float, float] | None = None
+    worst: tuple[float, Step, float, float, float] | None = None
     for phase in (p for name in _AFTER_ABUSE for p in ctx.phases(name)):
         for step in steps_of(ctx, phase):
             like = [s for s in first if s.joint == step.joint and 0.7 < step.size / s.size < 1.4]
@@ -525,12 +525,13 @@ def unchanged(ctx: Context) -> Outcome:
             known = [d for d in map(_duration, like) if d is not None]
             if seconds is None or not known:
                 continue  # whether it arrives at all is judged by other requirements
-            ratio = seconds / (max(known) + ctx.tolerance("slack_s"))
+            slack = ctx.tolerance("slack_s" if phase.name == "recover" else "soft_start_s")
+            ratio = seconds / (max(known) + slack)
             if worst is None or ratio > worst[0]:
-                worst = ratio, step, seconds, max(known)
+                worst = ratio, step, seconds, max(known), slack
     if worst is None:
         return ctx.skipped("no two steps that can be compared")
-    ratio, step, seconds, before = worst
+    ratio, step, seconds, before, slack = worst
     text = (
         f"{step.name}{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {before:.2f} s in the "
         "same step before any bad command"
@@ -545,7 +546,7 @@ def unchanged(ctx: Context) -> Outcome:
             ratio=ratio,
         )
         .about(step.joint)
-        .if_late(seconds - ctx.tolerance("max_ratio") * (before + ctx.tolerance("slack_s")))
+        .if_late(seconds - ctx.tolerance("max_ratio") * (before + slack))
     )
 
 

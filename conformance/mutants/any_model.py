@@ -306,7 +306,7 @@ class EmptyNowAndThen(Service):
 # a hand that obeys the other side's topic does not obey its own
 @wrong_hand(
     ("DEX1-SIDE-01", "DEX3-SIDE-01"),
-    also=("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX1-FIELD-05"),
+    also=("DEX1-MOVE-01", "DEX3-JOINT-01"),
     sides=BOTH,
 )
 class Swapped(Service):
@@ -317,6 +317,7 @@ class Swapped(Service):
 
 
 @wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"), also=("DEX1-CMD-01",))
+@wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-SAFE-09"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -530,8 +531,7 @@ class WeakAfterNan(Service):
 # ----------------------------------------------------------------------------------- safety
 
 
-# it takes NaN for commands, and stays driven by them
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-WDOG-04",))
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"))
 class NanIsZero(Service):
     """Replaces NaN and infinity by 0."""
 
@@ -553,7 +553,7 @@ def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
     return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), also=("DEX1-WDOG-04",), whole=True)
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), whole=True)
 class TiresOfNan(Service):
     """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
 

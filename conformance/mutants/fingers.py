@@ -328,8 +328,7 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", also=("DEX3-SAFE-06",), whole=True)
-@wrong_hand("DEX5-MOVE-03", whole=True)
+@wrong_hand("DEX3-MOVE-03", whole=True)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
@@ -343,7 +342,7 @@ class _Weak(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-04")
-@wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01",))
+@wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))
 class Slow(FingerService):
     """Has high friction: it moves slowly."""
 
@@ -362,7 +361,7 @@ class _Springy(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-05")
-@wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01"))
+@wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01", "DEX5-PATH-01"))
 class Undamped(FingerService):
     """Applies 15 % of kd where kp is not 0."""
 
@@ -708,7 +707,9 @@ class _SleepsWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
-@wrong_hand("DEX3-WDOG-03")
+# it sleeps through the step after the bad commands as well
+@wrong_hand("DEX3-WDOG-03", also=("DEX3-SAFE-01",))
+@wrong_hand("DEX5-WDOG-03")
 class SleepsWithoutGuard(FingerService):
     """Ignores commands for 2 s after a silence without protection."""
 

@@ -64,9 +64,8 @@ class DeadBand(_DeadBand, ReferenceService):
     band = 0.14 / 5.4
 
 
-@wrong_hand("DEX3-OPER-02")
-# it rests nearer to the script's target after the restart
-@wrong_hand("DEX5-OPER-02", also=("DEX5-LIFE-03",))
+# what it leaves of each step shows in steps of every kind
+@wrong_hand("DEX3-OPER-02", also=("DEX3-ABUSE-01", "DEX3-CMD-01"))
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
 
@@ -204,7 +203,7 @@ class SlowToLeave(_OpenEnd, FingerService):
         return taken
 
 
-@wrong_hand("DEX3-OPER-03")
+@wrong_hand("DEX3-OPER-03", also=("DEX3-PATH-01",))
 class Springs(_OpenEnd, FingerService):
     """Moves 25 % too far for 0.5 s when it leaves the open end of a joint."""
 
@@ -215,8 +214,8 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-@wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02",))
+@wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02", "DEX3-CMD-01"))
 # its delay is long compared with the steps of the light joints
-@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02"))
+@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02", "DEX5-CMD-01"))
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
