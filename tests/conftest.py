@@ -19,11 +19,6 @@ def pytest_configure(config: pytest.Config) -> None:
     config.add_cleanup(surroundings.settle())
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """One worker more than processors (``-n auto``): many tests wait for another program."""
-    return len(os.sched_getaffinity(0)) + 1
-
-
 def pytest_report_header() -> str | None:
     # the workers of a distributed run print none
     return None if "PYTEST_XDIST_WORKER" in os.environ else header()

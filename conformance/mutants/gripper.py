@@ -397,7 +397,7 @@ class _IgnoresGains(ReferenceHand):
         return super().accept(Motor(q=motor.q))
 
 
-@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05", "DEX1-GAIN-02"))
+@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05", "DEX1-GAIN-02"), whole=True)
 class IgnoresGains(ReferenceService):
     """Moves to q with any gains."""
 
@@ -485,7 +485,7 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
-@wrong_hand("DEX1-SAFE-02", also=("DEX1-PATH-01",))
+@wrong_hand("DEX1-SAFE-02", also=("DEX1-PATH-01",), whole=True)
 class NoLimits(ReferenceService):
     """Follows a q far outside the stroke."""
 
