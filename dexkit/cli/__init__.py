@@ -29,7 +29,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("dexkit.cli.calibrate", "Measure and store a gripper's zero and speed."),
     "check": ("dexkit.cli.check", "Check a recording against the requirements."),
     "compare": ("dexkit.cli.compare", "Compare several results."),
-    "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (75 s)."),
+    "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (90 s)."),
     "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
     "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),

@@ -1,4 +1,4 @@
-"""``dexkit demo``: the conformance suite on two emulated EZGrippers, in some 75 seconds."""
+"""``dexkit demo``: the conformance suite on two emulated EZGrippers, in some 90 seconds."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _INTRO = (
 )
 @click.option("--domain", type=DOMAIN, help="DDS domain.  [default: a free one]")
 def command(out: Path, backend: str, domain: int | None) -> None:
-    """Run the conformance suite on two emulated EZGrippers, in some 75 seconds.
+    """Run the conformance suite on two emulated EZGrippers, in some 90 seconds.
 
     Traffic stays on this machine, on a DDS domain of its own. Exit code: 0 the hands passed,
     1 they did not, 2 they could not be judged.
