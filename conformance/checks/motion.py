@@ -103,6 +103,20 @@ _NEWEST = 3  # steps; in a single one it may have been at its target already
 _DISOBEYS = 0.1  # of the stroke
 
 
+def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
+    """The failure of a hand that ends a step elsewhere than commanded."""
+    return (
+        ctx.failed(
+            "disobeys",
+            f"{when}: {step}",
+            ctx.at(ctx.states.topic, step.begin, step.end),
+            error_rad=step.error,
+        )
+        .about(step.joint)
+        .if_late(STROKE_S * step.error / step.stroke)
+    )
+
+
 def obeyed_before(ctx: Context, phase: Phase) -> bool:
     """Whether the hand obeyed the newest plain steps before a phase.
 
@@ -438,27 +452,6 @@ def not_driven(ctx: Context, how: str) -> Outcome:
     ).about(step.joint)
 
 
-@check("DEX1-SIDE-02", "DEX3-SIDE-02")
-def beside(ctx: Context) -> Outcome:
-    """The steps of this hand while the other one gets bad commands, or none."""
-    found = [s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)]
-    if not found:
-        return ctx.skipped("no state of this hand meanwhile, or it had stopped obeying before")
-    worst = max(found, key=lambda s: s.error / s.stroke)
-    if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
-        return ctx.passed("obeys", f"{len(found)} steps, ending at most {worst.error:.3f} rad off")
-    return (
-        ctx.failed(
-            "disobeys",
-            f"while the other hand got bad commands, or none: {worst}",
-            ctx.at(ctx.states.topic, worst.begin, worst.end),
-            error_rad=worst.error,
-        )
-        .about(worst.joint)
-        .if_late(STROKE_S * worst.error / worst.stroke)
-    )
-
-
 @check("DEX1-CMD-01", "DEX3-CMD-01")
 def every_command(ctx: Context) -> Outcome:
     """How far the hand goes towards a goal that was commanded once."""
@@ -506,16 +499,7 @@ def unchanged(ctx: Context) -> Outcome:
     for phase in (p for p in ctx.phases("center") if obeyed_before(ctx, p)):
         for step in steps_of(ctx, phase):
             if step.error > ctx.tolerance("max_error_stroke", step.joint):
-                return (
-                    ctx.failed(
-                        "disobeys",
-                        f"between two phases: {step}",
-                        ctx.at(ctx.states.topic, step.begin, step.end),
-                        error_rad=step.error,
-                    )
-                    .about(step.joint)
-                    .if_late(STROKE_S * step.error / step.stroke)
-                )
+                return disobeyed(ctx, "between two phases", step)
     first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
     worst: tuple[float, Step, float, float, float] | None = None
     for phase in (p for name in _AFTER_ABUSE for p in ctx.phases(name)):

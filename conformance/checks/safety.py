@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
-from dexkit.conformance.checks.motion import Step, obeyed_before, steps_of
+from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gaps, slow, too_slow
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
@@ -329,23 +329,20 @@ def arrival(ctx: Context, when: str) -> Outcome:
     """Whether the phase's steps reach their targets."""
     judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
     if not judged:
-        return ctx.skipped(f"the hand had stopped obeying before it was {when}")
+        return ctx.skipped("the hand had stopped obeying before this stimulus")
     found = [s for p in judged for s in steps_of(ctx, p)]
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
     worst = max(found, key=lambda s: s.error / s.stroke)
     if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
         return ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
-    return (
-        ctx.failed(
-            "disobeys",
-            f"{when}: {worst}",
-            ctx.at(ctx.states.topic, worst.begin, worst.end),
-            error_rad=worst.error,
-        )
-        .about(worst.joint)
-        .if_late(STROKE_S * worst.error / worst.stroke)
-    )
+    return disobeyed(ctx, when, worst)
+
+
+@check("DEX1-SIDE-02", "DEX3-SIDE-02")
+def beside(ctx: Context) -> Outcome:
+    """The steps of this hand while the other one gets bad commands, or none."""
+    return arrival(ctx, "while the other hand got bad commands, or none")
 
 
 # ------------------------------------------------------------------------------ crowded topics

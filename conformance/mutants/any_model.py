@@ -157,30 +157,12 @@ class BurstsWithGoodStamps(Service):
 
 
 @wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
-class Bursts(Service):
+class Bursts(BurstsWithGoodStamps):
     """Publishes states in bursts of ten."""
 
-    together = 10
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.waiting: list[list[Sample]] = []
-
     def publish(self) -> list[Sample]:
-        self.waiting.append(super().publish())
-        if len(self.waiting) < self.together:
-            return []
-        burst = [
-            replace(sample, sent=self.now + i * 1e-6)
-            for i, samples in enumerate(self.waiting)
-            for sample in samples
-        ]
-        self.waiting = []
-        return burst
-
-    def end(self) -> list[Sample]:
-        self.together = 1
-        return super().end()
+        burst = super().publish()
+        return [replace(sample, sent=self.now + i * 1e-6) for i, sample in enumerate(burst)]
 
 
 @wrong_hand(("DEX1-ORDER-01", "DEX3-ORDER-01"))

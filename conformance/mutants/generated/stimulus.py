@@ -204,16 +204,21 @@ def _end(c: _Client) -> None:
     c.keep(1.0)
 
 
-def _ramp(c: _Client) -> None:
+def _towards(c: _Client, seconds: float) -> Callable[[float], dict[Side, Sequence[Motor]]]:
+    """Commands for a straight way to a random pose, by the time since it began."""
     start, there = dict(c.goal), {s: c.anywhere(s) for s in c.sides}
 
     def pose(at: float) -> dict[Side, Sequence[Motor]]:
-        part = min(at / 1.0, 1.0)
+        part = min(at / seconds, 1.0)
         for s in c.sides:
             c.goal[s] = tuple(a + part * (b - a) for a, b in zip(start[s], there[s], strict=True))
         return {s: c.motors(s) for s in c.sides}
 
-    c.keep(1.3, pose)
+    return pose
+
+
+def _ramp(c: _Client) -> None:
+    c.keep(1.3, _towards(c, 1.0))
 
 
 def _hold(c: _Client) -> None:
@@ -400,15 +405,7 @@ def _flood(c: _Client) -> None:
 
 
 def _load(c: _Client) -> None:
-    start, there = dict(c.goal), {s: c.anywhere(s) for s in c.sides}
-
-    def pose(at: float) -> dict[Side, Sequence[Motor]]:
-        part = min(at / 0.6, 1.0)
-        for s in c.sides:
-            c.goal[s] = tuple(a + part * (b - a) for a, b in zip(start[s], there[s], strict=True))
-        return {s: c.motors(s) for s in c.sides}
-
-    c.keep(0.8, pose, rate=600.0)
+    c.keep(0.8, _towards(c, 0.6), rate=600.0)
 
 
 def _restart(c: _Client) -> None:
