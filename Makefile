@@ -34,7 +34,7 @@ setup: $(STAMP) ## create the environment
 demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
 	@$(RUN) dexkit demo --out demo-out
 
-test: $(STAMP) ## the tests, on all cores (ARGS="-k name" is passed on)
+test: $(STAMP) ## the tests, two workers a core (ARGS="-k name" is passed on)
 	$(RUN) pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
 soak: $(STAMP) ## the long tests

@@ -39,8 +39,10 @@ class Emulation:
 
 _CLOSED_AT = "1510"  # encoder tick of the zero, given to emulator and driver: no calibration run
 EMULATED: dict[str, Emulation] = {
-    "ezgripper": Emulation(("mx64", "--closed-at", _CLOSED_AT), True, {"zero": _CLOSED_AT}),
-    # an emulated motor shares the machine with all other processes, and may answer late
+    # an emulated servo or motor shares the machine with all other processes, and may answer late
+    "ezgripper": Emulation(
+        ("mx64", "--closed-at", _CLOSED_AT), True, {"timeout": "0.1", "zero": _CLOSED_AT}
+    ),
     "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.1"}),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }

@@ -19,6 +19,11 @@ def pytest_configure(config: pytest.Config) -> None:
     config.add_cleanup(surroundings.settle())
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Two workers a core: a test waits for other processes for almost half of its time."""
+    return 2 * (os.cpu_count() or 1)
+
+
 def pytest_report_header() -> str | None:
     # the workers of a distributed run print none
     return None if "PYTEST_XDIST_WORKER" in os.environ else header()

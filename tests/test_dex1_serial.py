@@ -35,7 +35,8 @@ BRAKE = HandCommand.brake(1)
 OPEN = HandCommand.position(5.4)
 CLOSE = HandCommand.position(0.3)
 LIMP = HandCommand.position(5.0, kp=0.0, kd=0.0)
-TIMEOUT = 0.3  # s; this machine may be busy with other tests
+TIMEOUT = 1.0  # s, the longest; this machine may be busy with other tests
+SEARCH_TIMEOUT = 0.3  # s, where most ids and ports do not answer
 
 
 @contextmanager
@@ -166,7 +167,7 @@ def test_auto_device_searches_every_port(tmp_path: Path) -> None:
     ports = (str(tmp_path / "tty*"), str(tmp_path / "none*"))
     with Dex1Motors(tuple(Side), links=links):
         for side, link in links.items():
-            with Dex1Serial(side, Dex1Settings(ports=ports, timeout=TIMEOUT)) as hand:
+            with Dex1Serial(side, Dex1Settings(ports=ports, timeout=SEARCH_TIMEOUT)) as hand:
                 assert hand.path == str(link)
         assert line_module._lines == {}
 
@@ -184,7 +185,7 @@ def test_missing_motor_error_lists_what_was_tried(tmp_path: Path) -> None:
         assert "motor 0 answers, which is the right one" in found.value.hint
         with pytest.raises(HandNotFound):
             Dex1Serial(Side.RIGHT, Dex1Settings(device=motors.path, id=7, timeout=0.02)).open()
-        with Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, id=0, timeout=TIMEOUT)):
+        with Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, id=0, timeout=SEARCH_TIMEOUT)):
             pass  # the user may allow it
         motors.inject("stray:before=3")
         wait_for(lambda: motors.bus(Side.RIGHT).schedule.active)
@@ -194,14 +195,14 @@ def test_missing_motor_error_lists_what_was_tried(tmp_path: Path) -> None:
         motors.inject("corrupt")
         wait_for(lambda: len(motors.bus(Side.RIGHT).schedule.active) == 2)
         with pytest.raises(HandNotFound) as garbled:
-            Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, timeout=TIMEOUT)).open()
+            Dex1Serial(Side.LEFT, Dex1Settings(device=motors.path, timeout=SEARCH_TIMEOUT)).open()
         assert "no intact frames" in garbled.value.hint
 
 
 def test_two_motors_with_one_id_are_refused(tmp_path: Path) -> None:
     link, other = {Side.LEFT: tmp_path / "tty1"}, {Side.LEFT: tmp_path / "tty2"}
     with Dex1Motors(links=link), Dex1Motors(links=other):
-        settings = Dex1Settings(ports=(str(tmp_path / "tty*"),), timeout=TIMEOUT)
+        settings = Dex1Settings(ports=(str(tmp_path / "tty*"),), timeout=SEARCH_TIMEOUT)
         with pytest.raises(HandRefused, match="more than one port") as found:
             Dex1Serial(Side.LEFT, settings).open()
         assert "tty1, " in found.value.message

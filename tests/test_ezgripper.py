@@ -93,7 +93,7 @@ def emulated(**options: object) -> Iterator[EmulatedThread]:
 def configured(tmp_path: Path, **changes: object) -> GripperSettings:
     base = GripperSettings(zero=ZERO, control=QUICK, config=tmp_path / "ezgripper.json")
     # the emulator shares the interpreter with the driver here: give it time
-    return replace(base, **{"timeout": 0.2, **changes})  # type: ignore[arg-type]
+    return replace(base, **{"timeout": 1.0, **changes})  # type: ignore[arg-type]
 
 
 @contextmanager

@@ -157,9 +157,9 @@ def test_a_sample_is_read_as_the_table_encodes_it(sample: Sample) -> None:
         mx64.PRESENT_TEMPERATURE: sample.temperature,
     }
     data = b"".join(item.encode(values[item]) for item in block.MAPPED[1:])
-    assert block.decode(data, 1.5) == sample
+    assert block.decode(data, sample.time, sample.received) == sample
     with pytest.raises(TruncatedError):
-        block.decode(data[:-1], 1.5)
+        block.decode(data[:-1], 1.5, 1.6)
 
 
 def test_mapping_lists_every_byte_once_in_order() -> None:
@@ -219,6 +219,29 @@ def test_free_motion_is_never_contact(
         ContactDetector(), position_at, goal, duration=duration, rate=rate, noise=tuple(noise)
     )
     assert found is None
+
+
+@fewer
+@given(
+    speed=st.floats(MIN_FREE_SPEED, 220.0),
+    exchanges=st.lists(
+        st.tuples(st.sampled_from([0.002, 0.002, 0.02, 0.15, 0.4]), st.floats(0.0, 1.0)),
+        min_size=1,
+        max_size=9,
+    ),
+)
+def test_late_answers_in_free_motion_are_never_contact(
+    speed: float, exchanges: list[tuple[float, float]]
+) -> None:
+    """Each exchange takes its time, and the position is of any moment in it."""
+    detector = ContactDetector()
+    now = 0.05
+    while now * speed * 25 < 2400:
+        for duration, share in exchanges:
+            position = round(min((now + share * duration) * speed * 25, 2500.0))
+            received = now + duration
+            assert detector.update(now, position, 2500, received=received) is None
+            now = received
 
 
 @fewer
@@ -295,6 +318,7 @@ def test_new_motion_starts_a_new_contact_window() -> None:
 def _sample(now: float, position: int, **changes: object) -> Sample:
     base = Sample(
         time=now,
+        received=now,
         goal_current=0,
         goal_position=0,
         torque=True,

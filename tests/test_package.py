@@ -84,10 +84,16 @@ def test_command_line_of_the_wheel(installed: Installed) -> None:
 
 
 def test_every_command_has_help(installed: Installed) -> None:
-    from dexkit.cli import _COMMANDS
-
-    for name in _COMMANDS:
-        assert "Usage: dexkit" in installed("dexkit", name, "--help").stdout
+    code = (
+        "from click.testing import CliRunner\n"
+        "from dexkit.cli import _COMMANDS, cli\n"
+        "for name in _COMMANDS:\n"
+        "    shown = CliRunner().invoke(cli, [name, '--help'], prog_name='dexkit')\n"
+        "    assert shown.exit_code == 0 and shown.output.startswith('Usage: dexkit'), name\n"
+        "print(len(_COMMANDS))"
+    )
+    assert int(installed("python", "-c", code).stdout) > 10
+    assert "Usage: dexkit" in installed("dexkit", "check", "--help").stdout
 
 
 def test_conformance_suite_of_the_wheel_lists_its_requirements(installed: Installed) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.recording import Recording
@@ -46,10 +46,15 @@ def _felt(recording: Recording, side: Side) -> _Felt | str:
         )
     operator = operator_of(phase, recording.dialect)
     joints = {}
+
+    @cache  # every joint asks for the same times
+    def pose_at(t: float) -> tuple[float, ...] | None:
+        return operator.intent(t - begin, side)
+
     for i, joint in enumerate(hand.joints):
 
         def wanted(t: float, i: int = i) -> float | None:
-            pose = operator.intent(t - begin, side)
+            pose = pose_at(t)
             return None if pose is None else pose[i]
 
         figures = tracking_figures(

@@ -87,11 +87,13 @@ class Goal:
 class Sample:
     """Registers read in one exchange, in register units; positions in the multi-turn count.
 
-    :param time: monotonic time of the measurement, seconds.
+    :param time: monotonic time of the measurement, seconds: the earliest that it can be.
+    :param received: monotonic time at which the answer was there, seconds: the latest.
     :param error: bits of :class:`~dexkit.wire.mx64.HardwareError`.
     """
 
     time: float
+    received: float
     goal_current: int
     goal_position: int
     torque: bool
@@ -131,12 +133,14 @@ def encode(goal: Goal) -> bytes:
     return _WRITE_LAYOUT.pack(goal.profile_velocity, goal.current, goal.position)
 
 
-def decode(data: bytes, time: float) -> Sample:
+def decode(data: bytes, time: float, received: float) -> Sample:
     """Decode the bytes read at :data:`READ_ADDRESS`.
 
+    :param time: and ``received``: bounds of the time of measurement, as in :class:`Sample`.
     :raises TruncatedError: there are not :data:`READ_SIZE` bytes.
     """
     if len(data) != READ_SIZE:
         raise TruncatedError(f"a sample has {READ_SIZE} bytes, not {len(data)}")
     goal_current, goal_position, torque, error, *rest = _READ_LAYOUT.unpack(data)
-    return Sample(time, goal_current, goal_position, bool(torque), mx64.HardwareError(error), *rest)
+    error_bits = mx64.HardwareError(error)
+    return Sample(time, received, goal_current, goal_position, bool(torque), error_bits, *rest)

@@ -153,12 +153,12 @@ def move(
             samples.append(sample)
             if cancelled():
                 raise CalibrationFailed("interrupted")
-            if detector.update(sample.time, sample.position, position):
+            if detector.update(sample.time, sample.position, position, received=sample.received):
                 return Track(tuple(samples), stopped=True)
             if abs(sample.position - position) > detector.outstanding:
                 settled = None
             elif settled is None:
-                settled = sample.time
+                settled = sample.received
             elif sample.time - settled >= detector.window:
                 return Track(tuple(samples), stopped=False)
             if sample.time - samples[0].time > timeout:

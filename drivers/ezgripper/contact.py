@@ -53,6 +53,7 @@ class ContactDetector:
     release: float = 25.0
 
     def __post_init__(self) -> None:
+        # latest possible time of measurement, position
         self._history: deque[tuple[float, float]] = deque()
         self._direction = 0
         self._contact: Contact | None = None
@@ -69,29 +70,37 @@ class ContactDetector:
         self._direction = 0
         self._contact = None
 
-    def update(self, now: float, position: float, goal: float) -> Contact | None:
+    def update(
+        self, now: float, position: float, goal: float, *, received: float | None = None
+    ) -> Contact | None:
         """Process one sample; return the present contact, or None.
 
-        :param now: time of measurement, seconds; never earlier than the previous sample's.
+        :param now: time of measurement, seconds, the earliest possible; never earlier than the
+            previous sample's.
         :param position: measured position, ticks.
         :param goal: goal position of the servo, ticks.
+        :param received: the latest possible time of measurement; None: ``now``. After a late
+            answer two positions can be much closer in time than their requests.
         """
+        latest = now if received is None else received
         ahead = goal - position
         direction = 0 if abs(ahead) <= self.outstanding else (1 if ahead > 0 else -1)
         if self._contact is not None:
-            return self._update_contact(now, position, direction)
+            return self._update_contact(now, latest, position, direction)
         if direction != self._direction or direction == 0:
             # a new motion may take a whole window to begin
             self._history.clear()
             self._direction = direction
         if direction == 0:
             return None
-        if self._is_still(now, position):
+        if self._is_still(now, latest, position):
             self._contact = Contact(position, direction, now)
             self._anchor = position
         return self._contact
 
-    def _update_contact(self, now: float, position: float, direction: int) -> Contact | None:
+    def _update_contact(
+        self, now: float, latest: float, position: float, direction: int
+    ) -> Contact | None:
         contact = self._contact
         assert contact is not None
         moved_on = (position - self._anchor) * contact.direction
@@ -100,18 +109,18 @@ class ContactDetector:
             self._history.clear()
             self._direction = direction
             if direction:
-                self._history.append((now, position))
+                self._history.append((latest, position))
             return None
         # slow creep, or fingers pushed back when the current is lowered, keep the same contact;
         # the anchor moves only when the position is still
-        if self._is_still(now, position):
+        if self._is_still(now, latest, position):
             self._anchor = position
         return contact
 
-    def _is_still(self, now: float, position: float) -> bool:
+    def _is_still(self, now: float, latest: float, position: float) -> bool:
         history = self._history
-        history.append((now, position))
-        # keep one sample at or before the start of the window: the window must be covered whole
+        history.append((latest, position))
+        # keep one sample certainly before the start of the window: it must be covered whole
         while len(history) > 1 and now - history[1][0] >= self.window:
             history.popleft()
         if now - history[0][0] < self.window:

@@ -223,7 +223,7 @@ class Control:
         self._braked_at = None
         target = ticks_of_joint(float(command.q[0]))
         held = self.detector.contact
-        contact = self.detector.update(now, position, target)
+        contact = self.detector.update(now, position, target, received=sample.received)
         self._end_startup(now, abs(target - position) <= _AT_GOAL)
         self._warm = sample.temperature >= settings.warm - (_COOL_HYSTERESIS if self._warm else 0.0)
         if self._overloaded_at is not None and target > self._overloaded_at + _AT_GOAL:

@@ -108,8 +108,9 @@ class Servo:
 
     def _read(self, measured_at: float) -> Sample:
         data, _ = self.bus.read(self.id, block.READ_ADDRESS, block.READ_SIZE)
-        # a retried read was measured later than assumed; the time must not be in the future
-        sample = block.decode(data, min(measured_at, self._clock.now()))
+        received = self._clock.now()
+        # the time must not be in the future
+        sample = block.decode(data, min(measured_at, received), received)
         if sample.tick == self._tick:
             self.statistics.stale += 1
         self._tick = sample.tick
