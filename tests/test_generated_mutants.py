@@ -205,6 +205,7 @@ def test_a_generated_hand_is_graded_and_judged(name: str, severity: str, caught:
     assert (trial.effect == "") is (severity in ("equivalent", "good"))
 
 
+@pytest.mark.soak
 def test_the_effect_of_a_fault_that_the_run_does_not_provoke_is_shown_by_another_stimulus() -> None:
     hand = parse("dex1-1/unitree_hg:force-fades@right,joint0,at-first")
     opinion = oracle.examine(hand.service(), hand.dialect, hand.sides)
