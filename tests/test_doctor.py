@@ -38,8 +38,8 @@ CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "Mot
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
 
 
-_FIRST_DOMAIN = 215
-"""Beyond those that free_domain() gives away: thirteen at random would meet somebody."""
+_FIRST_DOMAIN = 80
+"""Below those that programs and free_domain() choose: these would meet somebody."""
 
 
 class _World:
