@@ -252,7 +252,7 @@ def test_servo_with_factory_settings_is_found(tmp_path: Path) -> None:
 def test_protocol_1_firmware_is_refused_with_hint(tmp_path: Path) -> None:
     with Port(Bus([], protocol_1=[Protocol1Servo(1)])) as port:
         port.start()
-        hand = EZGripper(port.path, configuration=configured(tmp_path, timeout=0.05))
+        hand = EZGripper(port.path, configuration=configured(tmp_path, timeout=0.5))
         with pytest.raises(HandRefused, match=r"Protocol 1\.0") as refused:
             hand.open()
         assert "Wizard" in refused.value.hint

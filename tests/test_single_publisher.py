@@ -290,6 +290,7 @@ def test_service_that_discovers_an_earlier_one_late_brakes_and_ends() -> None:
                 wait_until(lambda: not core.driving)
                 assert served.snapshot()["rivals"] == 0
         # it left without a last state, which would be the other one's
+        wait_until(lambda: not any(e.topic == TOPIC for e in near.endpoints()))
         with service(near) as served, far.writer(TOPIC, GO.state_type):
             wait_until(lambda: served.snapshot()["rivals"] == 1)
             assert served.failure is None  # the vendor's came later: only logged

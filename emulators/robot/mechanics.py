@@ -301,10 +301,10 @@ class RobotMechanics:
 
     def paused(self) -> None:
         """Drop all commands: the program was paused, so they are stale."""
-        self.counters.pauses += 1
         for order in (self._active_command, self._active_arm_command):
             if order is not None:
                 self._expire(order)
+        self.counters.pauses += 1
         self._report_once(
             "paused",
             "this program stood still (stopped, suspended, or a machine that is too busy); the "
