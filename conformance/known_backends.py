@@ -41,9 +41,9 @@ _CLOSED_AT = "1510"  # encoder tick of the zero, given to emulator and driver: n
 EMULATED: dict[str, Emulation] = {
     # an emulated servo or motor shares the machine with all other processes, and may answer late
     "ezgripper": Emulation(
-        ("mx64", "--closed-at", _CLOSED_AT), True, {"timeout": "0.1", "zero": _CLOSED_AT}
+        ("mx64", "--closed-at", _CLOSED_AT), True, {"timeout": "0.3", "zero": _CLOSED_AT}
     ),
-    "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.1"}),
+    "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.3"}),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
 }
 """Backends whose device the kit can start itself."""

@@ -165,7 +165,7 @@ def test_a_recorder_goes_on_recording(tmp_path: Path) -> None:
                 peer.announce(properties)
                 for topic, type_name in ENDPOINTS:
                     peer.endpoint(topic, type_name)
-        wait_until(lambda: "not a name!" in recording.unknown)
+                wait_until(lambda: "not a name!" in recording.unknown)
         writer = hand.writer(STATE, STATE_TYPE)
         assert writer.wait_matched(10)
         for n in range(5):

@@ -329,8 +329,9 @@ class TestBridge:
             counts = bridge.commands.counts
             began = time.monotonic()
             wait_until(lambda: send(1.0) or (arrived.take() and time.monotonic() - began > 0.4))  # type: ignore[func-returns-value]
+            pauses = counts.pauses  # a busy machine may have paused it before
             clock.away += 100.0
-            wait_until(lambda: counts.pauses)
+            wait_until(lambda: counts.pauses > pauses)
             arrived.take()
             stale = counts.stale
             send(5.0, ago=50.0)
@@ -371,8 +372,9 @@ def test_suspended_robot_obeys_only_later_commands() -> None:
         command, counters = encode_with_crc(low_cmd(G1)), robot.robot.counters
         began = time.monotonic()
         wait_until(lambda: send() or (robot.robot.driven and time.monotonic() - began > 0.4))  # type: ignore[func-returns-value]
+        pauses = counters.pauses  # a busy machine may have paused it before
         clock.away += 100.0
-        wait_until(lambda: counters.pauses)
+        wait_until(lambda: counters.pauses > pauses)
         assert not robot.robot.driven
         stale = counters.stale
         send(ago=50.0)
