@@ -232,3 +232,18 @@ def test_wrong_clock_of_the_hand_does_not_change_verdicts(off_s: float) -> None:
     assert [r.verdict for r in found.results] == [r.verdict for r in right.results]
     gap, was = of(found, "DEX1-WDOG-02"), of(right, "DEX1-WDOG-02")
     assert gap.values["max_gap_s"] == pytest.approx(was.values["max_gap_s"], abs=1e-6)
+
+
+@pytest.mark.parametrize(("lead_s", "verdict"), [(0.001, Verdict.FAIL), (0.5, Verdict.PASS)])
+def test_state_that_leads_the_first_command_by_less_than_the_kit_can_tell(
+    lead_s: float, verdict: Verdict
+) -> None:
+    """A busy kit receives its first command after the state that this command has set off."""
+    trace = copy_of(short_run())
+    command, state = (
+        (f"rt/dex1/left/{kind}", f"unitree_go::msg::dds_::{name}")
+        for kind, name in (("cmd", "MotorCmds_"), ("state", "MotorStates_"))
+    )
+    first = trace.rows[command][0][0]
+    trace.rows[state] = [row for row in trace.rows[state] if row[0] > first - lead_s * 1e9]
+    assert of(judge(Recording.decode(trace)), "DEX1-START-01").verdict is verdict
