@@ -188,7 +188,8 @@ def _check_ssh(
             if _run(SSH_KEYGEN, "-l", "-f", str(bare)).returncode:
                 raise UsageError("ssh-keygen cannot read the public key")
     else:
-        command = ("-Y", "find-principals", "-s", str(signature), "-f", str(signers))
+        command: tuple[str, ...] = ("-Y", "find-principals", "-s", str(signature))
+        command += ("-f", str(signers))
         names = _run(SSH_KEYGEN, *command).stdout.splitlines()[:_MOST_PRINCIPALS]
     words = "no line of the allowed_signers file has the key that signed"
     for name in names:
