@@ -584,7 +584,7 @@ def test_unknown_manifest_that_is_well_signed_is_an_error(signed: Signed, tmp_pa
 # -------------------------------------------------------------------------------- codecs
 
 texts = st.text(max_size=8)
-digests = st.text("0123456789abcdef", min_size=64, max_size=64)
+digests = st.binary(min_size=32, max_size=32).map(bytes.hex)
 letters = st.text("aZ09._+=@,() -", max_size=20)
 names = st.builds("{}{}{}".format, st.sampled_from("fF_7"), letters, st.sampled_from("xX9_"))
 
