@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dexkit import documents
+from dexkit.conformance.report.labels import nature
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Grade, RunResult
 from dexkit.errors import ArchiveError
@@ -40,7 +41,18 @@ SIGNATURES = {"manifest.json.sig": SSH_KEYGEN, "manifest.json.minisig": MINISIGN
 ROLES = ("result", "recording", "page")
 _LONGEST = 1000  # characters of a text
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_ABOUT = ("model", "dialect", "sides", "hand", "backend", "device", "recorded_at", "dexkit")
+_ABOUT = (
+    "model",
+    "dialect",
+    "sides",
+    "hand",
+    "backend",
+    "device",
+    "nature",
+    "requirements",
+    "recorded_at",
+    "dexkit",
+)
 
 
 @dataclass(frozen=True)
@@ -62,8 +74,9 @@ class File:
 class Judged:
     """What was judged, as the result says.
 
-    :param about: model, dialect, sides, hand, backend, device, recorded_at, and ``dexkit``: the
-        version that judged; empty where the result does not say.
+    :param about: model, dialect, sides, hand, backend, device; ``nature``: emulated, simulated,
+        recorded or empty; ``requirements``: how many of how many; recorded_at; ``dexkit``: the
+        version that judged. Empty where the result does not say.
     :param overall: pass, fail or inconclusive.
     :param grades: likewise of each kind of requirement; or "not judged".
     """
@@ -75,8 +88,11 @@ class Judged:
     @classmethod
     def of(cls, result: RunResult) -> Judged:
         """What a result says; long texts are cut."""
+        count = sum(result.counts().values())
         known = {
             **result.subject,
+            "nature": nature(result),
+            "requirements": f"{count} of {result.catalogue}" if result.partial else str(count),
             "recorded_at": result.recorded_at,
             "dexkit": result.environment.get("dexkit", ""),
         }

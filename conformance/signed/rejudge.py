@@ -28,7 +28,7 @@ def judged_again(found: RunResult, recording: Path) -> tuple[RunResult, list[str
     """
     about = found.subject
     names = about.get("sides", "").split(", ")
-    sides = [side for side in Side if str(side) in names]
+    sides = tuple(side for side in Side if str(side) in names)
     trace = open_trace(recording)
     view = recording_of(trace, about.get("dialect"), sides)
     claims = Claims()

@@ -54,8 +54,10 @@ def command(archive: Path, public_key: Path, rejudge: bool) -> None:
     judged = found.manifest.judged
     grades = ", ".join(f"{kind} {word}" for kind, word in judged.grades.items())
     about = judged.about
-    who = about["hand"] or about["backend"] or "a recorded hand"
-    what = f"{who} as {about['model']} ({about['dialect']}), {about['sides']}"
-    click.echo(f"  signed result: {one_line(what)}, recorded at {one_line(about['recorded_at'])}")
-    click.echo(f"  grades: {one_line(grades)}")
+    who = about["hand"] or about["backend"] or "a hand without a name"
+    real = f", {about['nature']}" if about["nature"] else ""
+    what = f"{who}{real}, as {about['model']} ({about['dialect']}), {about['sides']}"
+    click.echo(f"  signed result: {one_line(what)}; recorded at {one_line(about['recorded_at'])}")
+    verdict = f"{judged.overall} ({about['requirements']} requirements); {grades}"
+    click.echo(f"  its verdict: {one_line(verdict)}")
     click.echo("The signature says who vouches for this result, not that the hand is good.")
