@@ -20,17 +20,26 @@ from hypothesis import strategies as st
 
 from dexkit import signatures
 from dexkit.cli import report as report_command
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.result_file import read_json
+from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.signed import manifest as manifests
 from dexkit.conformance.signed import sign as signing
 from dexkit.conformance.signed.manifest import MANIFEST, File, Judged, Manifest
 from dexkit.conformance.signed.rejudge import judged_again, verdict_differences
+from dexkit.conformance.stimuli import Plan
+from dexkit.conformance.virtual import run_virtual
+from dexkit.conformance.virtual.robot import ReferenceRobot
 from dexkit.digests import digest_of, sha256_of_file
 from dexkit.errors import ArchiveError, DexkitError, UsageError
+from dexkit.hand import ROBOT, Side
 from dexkit.stored_zip import Content, is_safe_name, member_pieces, pack, read_directory
 from dexkit.traces import sample_path
 from tests import hostile
+from tests.conformance_helpers import short_run
 from tests.each import each
 from tests.optional import minisign, ssh_keygen
 
@@ -375,6 +384,28 @@ def test_verdicts_of_another_recording_differ(judged: Path) -> None:
     lines = verdict_differences(found, again)
     assert lines[0].startswith("recorded at: ")
     assert lines[1].endswith("not judged when judged again")
+
+
+@each("name", ["hand with claims", "robot"])
+def test_runs_of_the_kit_are_judged_again_as_they_were(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claims = Claims()
+    if name == "robot":
+        plan = Plan(robot_dialect("h1"), (ROBOT,), phases=frozenset())
+        trace = run_virtual(plan, ReferenceRobot)
+        view = recording_of(trace, "h1", (ROBOT,))
+    else:
+        trace = short_run()
+        view = recording_of(trace, "unitree_go", (Side.LEFT,))
+        claims = Claims.parse("[claims]\nforce = true")
+    judge(view, claims=claims, subject={"backend": "x"}).write_json(tmp_path / "r.json")
+    monkeypatch.setattr(trace, "damage", (), raising=False)
+    monkeypatch.setattr("dexkit.conformance.signed.rejudge.open_trace", lambda path: trace)
+    found = read_json(tmp_path / "r.json")
+    again, _ = judged_again(found, tmp_path)
+    assert verdict_differences(found, again) == []
+    assert len(again.results) == len(found.results) > 10
 
 
 @needs_ssh
