@@ -26,7 +26,7 @@ from dexkit.conformance.results import (
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 
-__all__ = ["read_json"]
+__all__ = ["parse_result", "read_json"]
 
 
 def read_json(path: Path) -> RunResult:
@@ -35,7 +35,14 @@ def read_json(path: Path) -> RunResult:
     :raises UsageError: it is not a result file, its version is unknown, or it does not match
         ``result.schema.json``: the error names the place.
     """
-    data = documents.read_json(path)
+    return parse_result(documents.read_json(path), path)
+
+
+def parse_result(data: Any, path: object) -> RunResult:
+    """The result in a document; raises as :func:`read_json`.
+
+    :param path: what to call it.
+    """
     about = data if isinstance(data, dict) else {}
     if about.get("format") != FORMAT:
         raise UsageError(
@@ -71,7 +78,7 @@ def _validator() -> Any:
     return jsonschema.Draft202012Validator(json.loads(text))
 
 
-def _validate(data: Any, path: Path) -> None:
+def _validate(data: Any, path: object) -> None:
     """Validate a document against the schema that is published with dexkit.
 
     :raises UsageError: naming the first place that does not match.

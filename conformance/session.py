@@ -28,6 +28,7 @@ from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import quick as quick_ones
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.recorded_session import Session
+from dexkit.digests import sha256_of_file
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import ROBOT, Side, Subject
@@ -405,6 +406,8 @@ def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
     subject = dict(options.subject)
     if options.recording:
         subject["recording"] = options.recording.name
+        if options.recording.is_file():
+            subject["recording_sha256"] = sha256_of_file(options.recording)
     result = judge(view, requirements=options.requirements, claims=options.claims, subject=subject)
     if options.json:
         result.write_json(options.json)

@@ -222,14 +222,17 @@ def _identity(path: Path) -> object:
     return status.st_dev, status.st_ino
 
 
-def write_file(path: Path, content: str | bytes) -> None:
+def write_file(path: Path, content: str | bytes | Iterable[bytes]) -> None:
     """Write a file in one step: until it is whole, and on any error, what was there stays.
 
     A device or a pipe is written as it is, and a link keeps leading to the file.
 
+    :param content: text, bytes, or pieces of bytes, for what is too large for the memory.
+
     :raises OutputError: it cannot be written.
     """
     data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+    pieces = [data] if isinstance(data, bytes) else data
     try:
         target = Path(os.path.realpath(path))
         mode = target.stat().st_mode if target.exists() else None
@@ -237,17 +240,17 @@ def write_file(path: Path, content: str | bytes) -> None:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if mode is not None and not stat.S_ISREG(mode):
             with target.open("wb", buffering=0) as file:
-                _write_all(file.fileno(), data)
+                _write_all(file.fileno(), pieces)
             return
         if mode is not None and not os.access(target, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        _replace(target, data)
+        _replace(target, pieces)
     except (OSError, ValueError) as why:
         found = why if isinstance(why, OSError) else OSError(errno.EINVAL, str(why))
         raise output_error(path, found) from why
 
 
-def _replace(target: Path, data: bytes) -> None:
+def _replace(target: Path, pieces: Iterable[bytes]) -> None:
     """Write beside a file, flush to the disk and rename; permissions and, as far as permitted, the
     owner stay.
     """
@@ -261,7 +264,7 @@ def _replace(target: Path, data: bytes) -> None:
                 with contextlib.suppress(PermissionError):
                     os.fchown(descriptor, known.st_uid, known.st_gid)
                 os.fchmod(descriptor, stat.S_IMODE(known.st_mode))
-            _write_all(descriptor, data)
+            _write_all(descriptor, pieces)
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
@@ -278,10 +281,11 @@ def _replace(target: Path, data: bytes) -> None:
             os.close(folder)
 
 
-def _write_all(descriptor: int, data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[os.write(descriptor, view) :]
+def _write_all(descriptor: int, pieces: Iterable[bytes]) -> None:
+    for piece in pieces:
+        view = memoryview(piece)
+        while view:
+            view = view[os.write(descriptor, view) :]
 
 
 def update_file(path: Path, change: Callable[[str | None], str]) -> None:
@@ -306,7 +310,7 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
                 before = None
             after = change(before)
             if after != before:
-                _replace(target, after.encode())
+                _replace(target, [after.encode()])
     except UnicodeDecodeError as error:
         raise UsageError(f"cannot read {path}: it is not UTF-8 text") from error
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links (Python 3.10)

@@ -13,7 +13,17 @@ from typing import NamedTuple
 
 from uv import find_uv_bin
 
-__all__ = ["OPTIONAL", "UNSHARE", "Optional", "chromium", "header", "namespaces", "python"]
+__all__ = [
+    "OPTIONAL",
+    "UNSHARE",
+    "Optional",
+    "chromium",
+    "header",
+    "minisign",
+    "namespaces",
+    "python",
+    "ssh_keygen",
+]
 
 UNSHARE = ["unshare", "--user", "--map-root-user", "--net"]
 UV = find_uv_bin()  # of the dev group, wherever the tests were started from
@@ -37,6 +47,16 @@ def chromium() -> str | None:
     """A browser."""
     names = ("chromium", "chromium-browser", "chrome", "google-chrome")
     return next(filter(None, map(shutil.which, names)), None)
+
+
+def ssh_keygen() -> str | None:
+    """OpenSSH's tool that signs."""
+    return shutil.which("ssh-keygen")
+
+
+def minisign() -> str | None:
+    """The other tool that signs."""
+    return shutil.which("minisign")
 
 
 @functools.cache
@@ -84,6 +104,8 @@ OPTIONAL = (
         ("dds_multicast", "dds_sdk", "dds_types", "service_sdk"),
     ),
     Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
+    Optional("ssh-keygen", ssh_keygen, ("signing",)),
+    Optional("minisign", minisign, ("signing",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 

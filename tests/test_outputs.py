@@ -28,9 +28,18 @@ _WRITERS: dict[tuple[str, ...], list[str]] = {
     ("mutants",): [],
 }
 """Commands that write files by options, with what they need for it."""
-_INPUTS = {"--capabilities", "--recording", "--eeprom", "--config"}
+_INPUTS = {
+    "--capabilities",
+    "--recording",
+    "--eeprom",
+    "--config",
+    "--key",
+    "--page",
+    "--public-key",
+}
 _ELSEWHERE = {
     ("demo", "--out"),  # a folder, made before anything starts
+    ("sign", "-o"),  # tests/test_signing.py, which has a key
     ("teleop", "--record"),  # as 'record' writes
 }
 

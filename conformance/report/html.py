@@ -217,7 +217,7 @@ def _stage(side: str, stage: Stage) -> str:
 
 def _facts(result: RunResult) -> str:
     about = dict(result.subject)
-    rows = [(k.replace("_", " "), v) for k, v in about.items() if v]
+    rows = [(k.replace("_", " ").replace("sha256", "SHA-256"), v) for k, v in about.items() if v]
     rows.append(("recorded", f"{_utc(result.recorded_at)}, {result.duration_s:.1f} s"))
     if result.claims is not None:
         has = [name for name, claimed in result.claims.items() if claimed]

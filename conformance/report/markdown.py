@@ -86,6 +86,8 @@ def render_markdown(result: RunResult) -> str:
         lines += [f"**{plain(_capital(result.client_sentence()))}**", ""]
         lines += _folded("Every requirement about the client", _every(result.client))
     about = ", ".join(f"{plain(k)} {plain(v)}" for k, v in result.environment.items())
+    if digest := result.subject.get("recording_sha256"):
+        about += f"; SHA-256 of the recording {plain(digest)}"
     lines.append(f"<sub>{plain(result.recorded_at)}, {result.duration_s:.1f} s; {about}</sub>")
     return "\n".join(lines) + "\n"
 

@@ -70,6 +70,9 @@ def print_result(
         console.print(f"[dim]stage reached: {escape(stages)}[/dim]", highlight=False)
     if harness := about_harness(result):
         console.print(f"[dim]test machine: {escape(harness)}[/dim]", highlight=False)
+    if digest := result.subject.get("recording_sha256"):
+        text = f"recording judged: SHA-256 {digest}"
+        console.print(f"[dim]{escape(text)}[/dim]", highlight=False, soft_wrap=True)
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()

@@ -95,6 +95,7 @@ def command(
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import Kind, catalogue, select
     from dexkit.conformance.robot import robot_in
+    from dexkit.digests import sha256_of_file
     from dexkit.traces import open_trace
 
     check_output_paths([json_path, junit_path, html_path], [recording, capabilities])
@@ -128,9 +129,8 @@ def command(
         return
     if view is None or recording is None:
         raise UsageError("which recording is to be judged?", hint="dexkit check RECORDING.mcap")
-    result = judge(
-        view, requirements=requirements, claims=claims, subject={"recording": recording.name}
-    )
+    subject = {"recording": recording.name, "recording_sha256": sha256_of_file(trace.path)}
+    result = judge(view, requirements=requirements, claims=claims, subject=subject)
     console = Console()
     print_result(result, console, verbose=verbose, more="-v shows why")
     if also:

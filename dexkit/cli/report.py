@@ -63,7 +63,7 @@ def command(
     from dexkit.console import Console
 
     found = read_json(result)
-    file = recording or _recording_beside(result, found.subject.get("recording", ""))
+    file = recording or recording_beside(result, found.subject.get("recording", ""))
     check_output_paths([html_path, markdown_path, junit_path], [result, file])
     if html_path:
         view = None
@@ -81,7 +81,7 @@ def command(
             click.echo(f"report: {path}", err=True)
 
 
-def _recording_beside(result: Path, name: str) -> Path | None:
+def recording_beside(result: Path, name: str) -> Path | None:
     """The recording that the result names, where it lies in the same folder."""
     if not name or Path(name).name != name:
         return None

@@ -1,0 +1,1 @@
+"""Signed archives of results: :mod:`~.manifest`, :mod:`~.sign`, :mod:`~.verify`."""

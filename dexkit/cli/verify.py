@@ -1,0 +1,63 @@
+"""``dexkit verify``: check a signed archive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from dexkit.escaping import REMARK, one_line
+
+
+@click.command("verify")
+@click.argument("archive", type=click.Path(exists=True, path_type=Path), metavar="ARCHIVE.zip")
+@click.option(
+    "--public-key",
+    type=click.Path(exists=True, path_type=Path),
+    required=True,
+    metavar="FILE",
+    help="Whose signature is accepted: an ssh public key, an allowed_signers file, or a public key "
+    "of minisign.",
+)
+@click.option(
+    "--rejudge/--no-rejudge",
+    default=True,
+    show_default=True,
+    help="Judge the recording again, and compare the verdicts.",
+)
+def command(archive: Path, public_key: Path, rejudge: bool) -> None:
+    """Verify an archive of 'dexkit sign', and judge its recording again.
+
+    Checks the signature, the digest of every file, and that none is missing or added; then judges
+    the recording as 'dexkit check' does and compares all verdicts with those of the result.
+
+    A signature says who vouches for the result, not that the hand is good.
+
+    Exit code: 0 all of that is right, whatever the verdict on the hand; 1 something differs, one
+    line each; 2 the archive, the key or the tool cannot be used.
+    """
+    from dexkit.conformance.signed.verify import verify_archive
+    from dexkit.signatures import PublicKey
+
+    found = verify_archive(archive, PublicKey.read(public_key), rejudge=rejudge)
+    if found.differences:
+        click.echo(f"NOT VERIFIED: {archive}")
+        for line in found.differences:
+            click.echo(f"  {one_line(line, REMARK)}")
+    else:
+        click.echo(f"verified: {archive}")
+    for line in found.notes:
+        click.echo(f"  {one_line(line, REMARK)}")
+    if found.differences:
+        raise click.exceptions.Exit(1)
+    assert found.manifest is not None, "what is verified has a manifest"
+    judged = found.manifest.judged
+    grades = ", ".join(f"{kind} {word}" for kind, word in judged.grades.items())
+    about = judged.about
+    who = about["hand"] or about["backend"] or "a hand without a name"
+    real = f", {about['nature']}" if about["nature"] else ""
+    what = f"{who}{real}, as {about['model']} ({about['dialect']}), {about['sides']}"
+    click.echo(f"  signed result: {one_line(what)}; recorded at {one_line(about['recorded_at'])}")
+    verdict = f"{judged.overall} ({about['requirements']} requirements); {grades}"
+    click.echo(f"  its verdict: {one_line(verdict)}")
+    click.echo("The signature says who vouches for this result, not that the hand is good.")

@@ -1,0 +1,72 @@
+"""Measure a file as it will be named in a manifest or a result: size, SHA-256 and CRC-32.
+
+The file is read in pieces, so that a recording of any size needs little memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dexkit.errors import DexkitError, UsageError
+
+__all__ = ["Digest", "digest_of", "file_pieces", "sha256_of_file"]
+
+_PIECE = 1 << 20  # bytes
+
+
+@dataclass(frozen=True)
+class Digest:
+    """What a content is known by.
+
+    :param size: bytes.
+    :param sha256: 64 hexadecimal digits, lower case.
+    :param crc: CRC-32 as zip archives have it.
+    """
+
+    size: int
+    sha256: str
+    crc: int
+
+
+def digest_of(pieces: Iterable[bytes]) -> Digest:
+    """The digest of a content that comes in pieces."""
+    size, crc, sha = 0, 0, hashlib.sha256()
+    for piece in pieces:
+        size += len(piece)
+        crc = zlib.crc32(piece, crc)
+        sha.update(piece)
+    return Digest(size, sha.hexdigest(), crc)
+
+
+def file_pieces(path: Path, *, error: type[DexkitError] = UsageError) -> Iterator[bytes]:
+    """The content of an ordinary file in pieces of at most 1 MiB.
+
+    :param error: what is raised when it cannot be read, or is no ordinary file.
+    """
+    try:
+        # a pipe without a writer is not waited for
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb", buffering=0) as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise error(f"cannot read {path}: it is not an ordinary file")
+            while piece := file.read(_PIECE):
+                yield piece
+    except (OSError, ValueError) as why:  # ValueError: a null character in the name
+        if isinstance(why, DexkitError):
+            raise
+        reason = why.strerror if isinstance(why, OSError) else str(why)
+        raise error(f"cannot read {path}: {reason}") from why
+
+
+def sha256_of_file(path: Path) -> str:
+    """SHA-256 of an ordinary file, as hexadecimal digits.
+
+    :raises UsageError: it cannot be read.
+    """
+    return digest_of(file_pieces(path)).sha256
