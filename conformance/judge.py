@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.checks import check_of
+from dexkit.conformance.checks import Outcome, check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
+from dexkit.conformance.measure import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
@@ -22,6 +23,9 @@ from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
 __all__ = ["judge", "judge_layer"]
+
+_ANY_TIME = 0.0, 1e6
+"""Begin and end, seconds, of a recording whose layer does not say how long it is."""
 
 
 def judge(
@@ -116,7 +120,13 @@ def _judge_one(
     return judgement.run_check(
         lambda: layer.refine(context, check_of(requirement)(context)),
         lambda outcome: excuse(context.recording, requirement, outcome, whole),
+        lambda outcome: _weighed(context.recording, outcome, whole),
     )
+
+
+def _weighed(recording: Any, outcome: Outcome, whole: tuple[float, float] | None) -> Measure | None:
+    places = [(e.time_s, e.end_s) for e in outcome.evidence]
+    return weigh(recording, outcome.measures, places, whole or _ANY_TIME)
 
 
 def _harness(recording: Recording) -> dict[str, float]:

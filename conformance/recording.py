@@ -289,6 +289,12 @@ class Recording:
             return None
         return self.stimulus.beats.lateness(self.log_time(begin), self.log_time(end))
 
+    def time_error(self, begin: float, end: float) -> float | None:
+        """The kit's error of a time in [begin, end], seconds; None if it is not known."""
+        if self.stimulus is None:
+            return None
+        return self.stimulus.time_error(self.log_time(begin), self.log_time(end))
+
     def lost(self, begin: float, end: float) -> Lost | None:
         """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
         if self.stimulus is None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import documents
+from dexkit.conformance.measure import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
 from dexkit.conformance.result_file_v2 import converted
@@ -172,6 +173,8 @@ def _result_of(entry: dict[str, Any]) -> Result:
         ),
         plots=_plots(entry["plots"]),
         retry=entry["retry"],
+        # files of the first programs that wrote version 3 have none
+        measure=Measure.of_dict(entry["measure"]) if entry.get("measure") else None,
     )
 
 

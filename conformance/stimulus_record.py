@@ -33,6 +33,7 @@ _LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
+_VIRTUAL = "virtual"
 _EARLIER_ROBOT = "body"
 """The name of the subject ``robot`` in recordings of earlier versions."""
 IDLE = 1e-3
@@ -141,12 +142,24 @@ class Stimulus:
         hand of one joint, percent of closing for others.
     :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
+    :param virtual: whether the run was on a virtual clock, which is never late.
     """
 
     phases: list[Phase] = field(default_factory=list)
     objects: dict[Subject, float | None] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
+    virtual: bool = False
+
+    def time_error(self, begin_ns: int, end_ns: int) -> float | None:
+        """The kit's error of a time in [begin, end], seconds; None if it is not known.
+
+        The 99th percentile by which its timer was late then; 0 on a virtual clock.
+        """
+        late = self.beats.lateness(begin_ns, end_ns)
+        if late is not None:
+            return late[1]
+        return 0.0 if self.virtual and not self.beats.t_us else None
 
     def to_metadata(self) -> dict[str, str]:
         """The record's content."""
@@ -172,6 +185,7 @@ class Stimulus:
             "objects": json.dumps({str(s): q for s, q in self.objects.items()}),
             "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
             "beats": json.dumps(asdict(self.beats)),
+            **({"clock": _VIRTUAL} if self.virtual else {}),
         }
 
     @classmethod
@@ -206,6 +220,7 @@ class Stimulus:
                 },
                 stalls=parse_stalls(record["stalls"]),
                 beats=Beats.parse(record.get("beats", "{}")),
+                virtual=record.get("clock") == _VIRTUAL,
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error

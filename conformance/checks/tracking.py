@@ -203,8 +203,9 @@ def follows(ctx: Context) -> Outcome:
     values = {"rms_rad": found.rms, "peak_rad": found.peak, "delay_s": found.delay}
     if len(ctx.joints) > 1:
         values |= {f"rms_rad_{ctx.joints[f.joint].name}": f.rms for f in figures}
-    if found.rms <= ctx.tolerance("max_rms_stroke", found.joint):
-        return ctx.passed(f"rms {found.rms:.3f} rad", text, **values)
+    limit = ctx.tolerance("max_rms_stroke", found.joint)
+    if found.rms <= limit:
+        return ctx.passed(f"rms {found.rms:.3f} rad", text, **values).placed(found.rms, limit)
     worst_first = sorted(figures, key=lambda f: -f.rms)
     size = STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin)
     outcome = ctx.failed(
@@ -213,7 +214,7 @@ def follows(ctx: Context) -> Outcome:
         ctx.at(ctx.states.topic, found.peak_at),
         ctx.at(ctx.states.topic, found.begin, found.end),
         **values,
-    )
+    ).placed(found.rms, limit)
     return outcome.about(*(f.joint for f in worst_first)).if_late(size)
 
 
@@ -225,11 +226,14 @@ def delay(ctx: Context) -> Outcome:
         return ctx.skipped(figures)
     found = sorted(figures, key=lambda f: f.delay)[len(figures) // 2]
     text = f"the position follows the command by {found.delay * 1e3:.0f} ms"
-    if found.delay <= ctx.tolerance("max_delay_s"):
-        return ctx.passed(f"{found.delay * 1e3:.0f} ms", text, delay_s=found.delay)
-    return ctx.failed(
+    limit = ctx.tolerance("max_delay_s")
+    if found.delay <= limit:
+        met = ctx.passed(f"{found.delay * 1e3:.0f} ms", text, delay_s=found.delay)
+        return met.timed(found.delay, limit, span=(found.begin, found.end))
+    outcome = ctx.failed(
         f"{found.delay * 1e3:.0f} ms",
         text,
         ctx.at(ctx.states.topic, found.begin, found.end),
         delay_s=found.delay,
-    ).if_late(found.delay - ctx.tolerance("max_delay_s"), how="mean")
+    )
+    return outcome.timed(found.delay, limit).if_late(found.delay - limit, how="mean")

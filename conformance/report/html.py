@@ -13,7 +13,14 @@ from pathlib import Path
 from urllib.parse import quote
 
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.report.card import Blocked, Card, Fact, blocked_groups, cards
+from dexkit.conformance.report.card import (
+    Blocked,
+    Card,
+    Fact,
+    blocked_groups,
+    cards,
+    near_limits,
+)
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -138,6 +145,9 @@ def _verdict(result: RunResult) -> str:
             f"<p><b>The testing machine was busy</b>: {escape(about_harness(result))}. What "
             "this can have caused is blocked, not failed; run again on an idle machine.</p>"
         )
+    if near := near_limits(result):
+        items = "".join(f"<li>{escape(text)}</li>" for text in near)
+        caution += f"<p><b>Nearer to a limit than the kit can measure</b>:</p><ul>{items}</ul>"
     if of := part(result):
         caution = f"<p><b>{of}</b>: this does not prove a drop-in.</p>{caution}"
     question = f"Is this a drop-in for Unitree's {escape(model_title(result))}?"
@@ -477,7 +487,9 @@ def _cell(result: Result) -> str:
 
 
 def _seen(result: Result, link: str) -> str:
-    text = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
+    told = result.measure.told() if result.measure is not None else ""
+    told = "" if told in result.reason else told
+    text = ". ".join(t for t in (result.observed, told, result.reason) if t) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
