@@ -74,6 +74,7 @@ def judge(
         claims=None if claims.units is None else dict(claims.units),
         catalogue=len({r.requirement.id for r in results}),
         recorded_at=when.isoformat(timespec="seconds"),
+        run=dict(recording.run),
     )
 
 

@@ -16,11 +16,15 @@ from pathlib import Path
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import Rig, RigOptions
+from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.known_backends import EXTERNAL
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
+from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.robot import codec_for
+from dexkit.conformance.run_record import RECORD as RUN
+from dexkit.conformance.run_record import run_record
 from dexkit.conformance.stimuli import (
     Action,
     Join,
@@ -63,6 +67,8 @@ class LiveOptions:
     :param force: go on although somebody else commands the hand.
     :param usb: play the USB script at the devices first, before a service takes them.
     :param rounds: of the stimulus; see :class:`~dexkit.conformance.stimuli.Plan`.
+    :param requirements: those that the run is judged by, for the run record.
+    :param claims: likewise.
     """
 
     rig: RigOptions
@@ -71,6 +77,8 @@ class LiveOptions:
     force: bool = False
     usb: bool = False
     rounds: int = 1
+    requirements: tuple[Requirement, ...] = ()
+    claims: Claims = field(default_factory=Claims)
 
     def plan(self) -> Plan[Subject]:
         """The plan of the stimulus script."""
@@ -108,6 +116,16 @@ def record_run(
             Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})
         )
         dialect = rig_options.dialect
+        about = run_record(
+            backend=rig_options.backend,
+            dialect=dialect.name,
+            sides=rig_options.sides,
+            phases=options.phases,
+            rounds=options.rounds,
+            requirements=options.requirements,
+            claims=options.claims,
+        )
+        recorder.add_metadata(RUN, about)
         topics = {
             t
             for s in Side

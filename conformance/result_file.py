@@ -54,6 +54,7 @@ def read_json(path: Path) -> RunResult:
         duration_s=data["duration_s"],
         notes=data["notes"],
         environment=data["environment"],
+        run=data.get("run", {}),  # files of the first programs that wrote version 3 have none
         harness=data["harness"],
         claims=data["claims"],
         catalogue=data["catalogue"],

@@ -319,6 +319,7 @@ class RunResult:
     :param client: results of the requirements about the client that commands the hands, each for
         the hand of that side. They do not count in the verdict on the hands. Empty in a run of
         the kit, which is its own client.
+    :param run: the run record (:mod:`~.run_record`); empty where no live run was made.
     """
 
     subject: dict[str, str]
@@ -332,6 +333,7 @@ class RunResult:
     claims: dict[str, bool] | None = None
     catalogue: int = 0
     client: list[Result] = field(default_factory=list)
+    run: dict[str, str] = field(default_factory=dict)
 
     @property
     def partial(self) -> bool:
@@ -453,6 +455,7 @@ class RunResult:
             "counts": {str(v): n for v, n in self.counts().items()},
             "harness": {name: round(value, 4) for name, value in self.harness.items()},
             "environment": dict(self.environment),
+            "run": dict(self.run),
             "notes": list(self.notes),
             "results": [_result_dict(r) for r in self.results],
             "client": {

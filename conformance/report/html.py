@@ -61,6 +61,7 @@ _PLOT_BUDGET = 1_000_000
 """Bytes of plots on a page; the failures after that have none."""
 _BUSY = 0.2
 """Part of a run with programs waiting for a processor from which on the page reports it."""
+_RECORDED_WITH = ("dexkit", "python", "numpy", "cyclonedds", "processor", "kernel", "seed")
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
 _REALITY = {
     "emulated": "No real hand was involved: the device was an emulator at the far end of a wire. "
@@ -562,8 +563,10 @@ def _glossary(result: RunResult) -> str:
 
 def _environment(result: RunResult) -> str:
     notes = "".join(f"<li>{escape(n)}</li>" for n in result.notes)
+    rows = list(result.environment.items())
+    rows += [(f"recorded with {k}", result.run[k]) for k in _RECORDED_WITH if k in result.run]
     return (
-        f"<h2>Made with</h2>{_definitions(list(result.environment.items()))}"
+        f"<h2>Made with</h2>{_definitions(rows)}"
         + (f"<p>Notes on the recording:</p><ul>{notes}</ul>" if notes else "")
         + '<p class="dim">Times are seconds of the recording; log times are nanoseconds since '
         "1970, as the recording has them. It opens in Foxglove and PlotJuggler, and "
