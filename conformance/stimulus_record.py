@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.sums import mean, total
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import ROBOT, Floats, Side, Subject
@@ -124,7 +125,7 @@ class Beats:
         if not len(there):
             return None
         best, p99 = np.percentile(there, [25, 99])
-        return Lost(float(there.sum()), float(there.mean()), float(p99), float(best))
+        return Lost(total(there), mean(there), float(p99), float(best))
 
     def _in(self, begin_ns: int, end_ns: int) -> Floats:
         """Lateness, seconds, of the beats that were due before the end and came after the begin."""

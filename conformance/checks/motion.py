@@ -9,6 +9,7 @@ import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
 from dexkit.models import HandModel
 
@@ -406,7 +407,7 @@ def independent(ctx: Context) -> Outcome:
         counts = np.bincount(bins)
         for joint, spec in enumerate(ctx.joints):
             means = np.bincount(bins, positions[:, joint])[counts > 0] / counts[counts > 0]
-            most = float(np.abs(means - before[:, joint].mean()).max())
+            most = float(np.abs(means - mean(before[:, joint])).max())
             moved.append((most / spec.stroke, most, joint, begin, end))
     if not moved:
         return ctx.skipped("no state of this hand while the other one moved")

@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
 from dexkit.conformance.measure import Measure
 from dexkit.conformance.median import median
+from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 
 # stimuli with separate requirements for the state's rate
@@ -73,7 +74,7 @@ def gap_measures(found: Iterable[tuple[float, float]], limit: float) -> list[Mea
 def _observed(ctx: Context) -> tuple[Floats, float]:
     """Intervals between states, and the seconds that they add up to."""
     intervals = np.diff(ctx.states.clock)
-    return intervals, float(intervals.sum())
+    return intervals, total(intervals)
 
 
 def _spans(ctx: Context, names: tuple[str, ...]) -> list[tuple[float, float]]:
@@ -94,11 +95,11 @@ def _slow_stretches(ctx: Context) -> list[tuple[float, float, Floats]]:
         keep &= (clock[1:] <= begin) | (starts >= end)
     lengths, starts = lengths[keep], starts[keep]
     window = ctx.tolerance("window_s")
-    total = np.concatenate(([0.0], np.cumsum(lengths)))
+    passed = np.concatenate(([0.0], np.cumsum(lengths)))
     found: list[tuple[int, int]] = []
-    for at in np.arange(0.0, float(total[-1]) - window, _STRIDE):
-        i, j = (int(k) for k in np.searchsorted(total, (at, at + window)))
-        seconds = float(total[j] - total[i]) - float(lengths[i:j].max(initial=0.0))
+    for at in np.arange(0.0, float(passed[-1]) - window, _STRIDE):
+        i, j = (int(k) for k in np.searchsorted(passed, (at, at + window)))
+        seconds = float(passed[j] - passed[i]) - float(lengths[i:j].max(initial=0.0))
         if j - i < 2 or not slow(ctx, (j - i - 1) / seconds):
             continue
         if found and i <= found[-1][1]:
@@ -113,7 +114,8 @@ def _exactly(
 ) -> tuple[float, float, Floats]:
     """The stretch between the first and the last slow intervals of [first, last)."""
     several = round(_STRIDE * ctx.tolerance("min_rate_hz"))
-    mean = np.convolve(lengths[first:last], np.full(several, 1 / several), "valid")
+    passed = np.concatenate(([0.0], np.cumsum(lengths[first:last])))
+    mean = (passed[several:] - passed[:-several]) / several
     late = np.flatnonzero(mean * ctx.tolerance("min_rate_hz") > 1.0)
     if len(late):
         # the mean over [k, k + several) rises when slow intervals enter at its end
@@ -129,7 +131,7 @@ def _rate(ctx: Context) -> tuple[float, float] | None:
     """(mean rate outside of gaps, seconds observed), or None if that is too short."""
     intervals, _ = _observed(ctx)
     steady = intervals[intervals <= _GAP]
-    seconds = float(steady.sum())
+    seconds = total(steady)
     if seconds < ctx.tolerance("min_observed_s"):
         return None
     return len(steady) / seconds, seconds
@@ -191,7 +193,7 @@ def rate(ctx: Context) -> Outcome:
         text = f"{mean:.1f} Hz over {seconds:.1f} s"
         met = ctx.passed(f"{mean:.1f} Hz", text, rate_hz=mean)
         return met.rated(mean, least_rate(ctx), seconds)
-    rates = [len(intervals) / float(intervals.sum()) for _, _, intervals in slowed]
+    rates = [len(intervals) / total(intervals) for _, _, intervals in slowed]
     begin, end, _ = slowed[0]
     many = "" if len(slowed) == 1 else f", the first of {len(slowed)} such stretches"
     period = 1 / ctx.tolerance("min_rate_hz")
