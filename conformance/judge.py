@@ -19,6 +19,7 @@ from dexkit.conformance.measure import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
+from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
@@ -154,6 +155,7 @@ def _stage(recording: Recording, side: Subject) -> Stage:
     dialect = recording.dialect
     clients = {(dialect.topics(s)[0], "writer") for s in Side}
     clients |= {(dialect.topics(s)[1], "reader") for s in Side}
+    clients.add((CALIBRATION_TOPIC, "writer"))
     present = [(e.topic, e.kind, e.type_name) for e in recording.endpoints]
     present += [(c.topic, "writer", c.type_name) for c in recording.channels]
     seen = {(topic, kind) for topic, role, kind in present if (topic, role) not in clients}

@@ -1,7 +1,8 @@
 """Do a live run: start the backend, play the stimulus script on DDS, record all topics.
 
 The kit creates three DDS participants: the commanding client, the recorder, and later a monitor
-that joins during the run.
+that joins during the run. A fourth one sends the messages of the calibration, and leaves before
+the stimulus begins.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import Rig, RigOptions
+from dexkit.conformance.calibration import Loopback
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.known_backends import EXTERNAL
@@ -144,6 +146,9 @@ def record_run(
             return False
         if rig_options.backend == EXTERNAL:
             _require_hand(recorder_node, options)
+        loopback = stack.enter_context(
+            Loopback(recorder_node, domain=rig_options.domain, interface=rig_options.interface)
+        )
         # a second client would interfere, and a real hand may hold something
         sole = SolePublisher(
             [NodeTopics(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
@@ -158,6 +163,7 @@ def record_run(
         player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
         _wait_for_endpoints(recorder_node, plan)
+        calibration = loopback.result()
         finished = player.play_script(script, stop)
         recording.stop()
         player.close()
@@ -169,6 +175,7 @@ def record_run(
             objects={s: plan.objects.get(s) for s in plan.sides},
             stalls=heart.stalls,
             beats=heart.beats,
+            calibration=calibration,
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished

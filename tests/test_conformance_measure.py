@@ -20,7 +20,10 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import Evidence, Result, RunResult, Verdict
+from dexkit.conformance.stimulus_record import RECORD, Calibration, Stimulus
 from dexkit.conformance.verdicts import Excuse, Judgement
+from dexkit.conformance.virtual import MemoryTrace
+from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run, with_beats
 from tests.each import each
@@ -160,6 +163,34 @@ def test_virtual_run_measures_without_error_and_others_do_not_know() -> None:
     assert unknown is not None
     assert unknown.error is None
     assert unknown.told().endswith("the kit's measurement error is not known here")
+
+
+def test_calibration_is_the_least_error_of_times() -> None:
+    trace = copy_of(short_run())
+    stimulus = Stimulus.from_metadata(with_beats_record(trace))
+    assert stimulus.time_error(stimulus.beats.begin_ns, 2**62) == pytest.approx(0.001)
+    stimulus.calibration = Calibration(4, [100, 200, 300, 9_000], [0, 0, 0, 0], 2)
+    again = Stimulus.from_metadata(stimulus.to_metadata())
+    assert again == stimulus
+    error = again.time_error(stimulus.beats.begin_ns, 2**62)
+    assert error == pytest.approx(0.009, rel=0.05)
+    assert Calibration(4, [100], [0] * 4).time_error is None  # most messages were lost
+    assert Calibration(2, [100, 100], [0, 0], clock_us=500).time_error == pytest.approx(0.0005)
+
+
+def with_beats_record(trace: MemoryTrace) -> dict[str, str]:
+    with_beats(trace, usual_us=1_000)
+    return trace.metadata[RECORD]
+
+
+@each(
+    "text",
+    ["[]", "3", '{"sent": 1.5}', '{"delay_us": ["x"]}', '{"delay_us": 3}', '{"strange": 1}'],
+)
+def test_damaged_calibration_is_refused(text: str) -> None:
+    record = {**short_run().metadata[RECORD], "calibration": text}
+    with pytest.raises(TraceUnsupported):
+        Stimulus.from_metadata(record)
 
 
 def test_result_file_keeps_measures(tmp_path: Path) -> None:

@@ -21,20 +21,20 @@ def state_first(ctx: Context) -> Outcome:
     if first_command - begin < ctx.tolerance("min_lead_s"):
         return ctx.skipped("the recording begins after the first commands")
     lead = first_command - first_state
-    place = min(first_state, first_command), max(first_state, first_command)
     if lead > 0:
         return ctx.passed(
             f"{lead:.2f} s before",
             f"first state {lead:.2f} s before the first command",
             lead_s=lead,
-        ).timed(lead, 0.0, at_least=True, span=place)
+        ).timed(lead, 0.0, at_least=True, span=(first_state, first_command))
     return ctx.failed(
         "silent",
         f"no state for {first_command - begin:.2f} s; the first came {-lead:.3f} s after the "
         "first command",
         ctx.at(ctx.commands.topic, first_command),
         lead_s=lead,
-    ).timed(lead, 0.0, at_least=True, span=place)
+        # by how little it came too late says nothing: it had all that time
+    ).timed(first_command - begin, ctx.tolerance("min_lead_s"), span=(begin, first_command))
 
 
 @check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")
