@@ -36,7 +36,7 @@ _LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
-_VIRTUAL = "virtual"
+_VIRTUAL = json.dumps("virtual")  # as every value of the record: JSON
 _EARLIER_ROBOT = "body"
 """The name of the subject ``robot`` in recordings of earlier versions."""
 CALIBRATION_TOPIC = "rt/dexkit/calibration"
