@@ -52,10 +52,11 @@ class Claims:
         :raises UsageError: it is no TOML, or holds what is not known: a misspelt claim must not
             silently be none.
         """
-        return cls._from_document(documents.parse_toml(text, origin), origin)
+        return cls.of_document(documents.parse_toml(text, origin), origin)
 
     @classmethod
-    def _from_document(cls, document: Mapping[str, Any], origin: str) -> Claims:
+    def of_document(cls, document: Mapping[str, Any], origin: str) -> Claims:
+        """The claims of a document that was parsed; raises as :meth:`parse`."""
         hand, units = document.get("hand", {}), document.get("claims", {})
         unknown = sorted(set(document) - {"hand", "claims"})
         if unknown or not isinstance(hand, dict) or not isinstance(units, dict):
@@ -90,7 +91,7 @@ class Claims:
         """
         if path is None:
             return cls()
-        claims = cls._from_document(documents.read_toml(path), path.name)
+        claims = cls.of_document(documents.read_toml(path), path.name)
         about = claims.hand.get("model")
         if about and model_name and about != model_name:
             raise UsageError(

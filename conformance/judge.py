@@ -12,16 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.checks import check_of
+from dexkit.conformance.checks import Outcome, check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
+from dexkit.conformance.measure import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
+from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
 __all__ = ["judge", "judge_layer"]
+
+_ANY_TIME = 0.0, 1e6
+"""Begin and end, seconds, of a recording whose layer does not say how long it is."""
 
 
 def judge(
@@ -70,6 +75,7 @@ def judge(
         claims=None if claims.units is None else dict(claims.units),
         catalogue=len({r.requirement.id for r in results}),
         recorded_at=when.isoformat(timespec="seconds"),
+        run=dict(recording.run),
     )
 
 
@@ -116,7 +122,13 @@ def _judge_one(
     return judgement.run_check(
         lambda: layer.refine(context, check_of(requirement)(context)),
         lambda outcome: excuse(context.recording, requirement, outcome, whole),
+        lambda outcome: _weighed(context.recording, outcome, whole),
     )
+
+
+def _weighed(recording: Any, outcome: Outcome, whole: tuple[float, float] | None) -> Measure | None:
+    places = [(e.time_s, e.end_s) for e in outcome.evidence]
+    return weigh(recording, outcome.measures, places, whole or _ANY_TIME)
 
 
 def _harness(recording: Recording) -> dict[str, float]:
@@ -143,6 +155,7 @@ def _stage(recording: Recording, side: Subject) -> Stage:
     dialect = recording.dialect
     clients = {(dialect.topics(s)[0], "writer") for s in Side}
     clients |= {(dialect.topics(s)[1], "reader") for s in Side}
+    clients.add((CALIBRATION_TOPIC, "writer"))
     present = [(e.topic, e.kind, e.type_name) for e in recording.endpoints]
     present += [(c.topic, "writer", c.type_name) for c in recording.channels]
     seen = {(topic, kind) for topic, role, kind in present if (topic, role) not in clients}

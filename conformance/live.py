@@ -1,7 +1,8 @@
 """Do a live run: start the backend, play the stimulus script on DDS, record all topics.
 
 The kit creates three DDS participants: the commanding client, the recorder, and later a monitor
-that joins during the run.
+that joins during the run. A fourth one sends the messages of the calibration, and leaves before
+the stimulus begins.
 """
 
 from __future__ import annotations
@@ -16,11 +17,16 @@ from pathlib import Path
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import Rig, RigOptions
+from dexkit.conformance.calibration import Loopback
+from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.known_backends import EXTERNAL
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
+from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.robot import codec_for
+from dexkit.conformance.run_record import RECORD as RUN
+from dexkit.conformance.run_record import run_record
 from dexkit.conformance.stimuli import (
     Action,
     Join,
@@ -63,6 +69,8 @@ class LiveOptions:
     :param force: go on although somebody else commands the hand.
     :param usb: play the USB script at the devices first, before a service takes them.
     :param rounds: of the stimulus; see :class:`~dexkit.conformance.stimuli.Plan`.
+    :param requirements: those that the run is judged by, for the run record.
+    :param claims: likewise.
     """
 
     rig: RigOptions
@@ -71,6 +79,8 @@ class LiveOptions:
     force: bool = False
     usb: bool = False
     rounds: int = 1
+    requirements: tuple[Requirement, ...] = ()
+    claims: Claims = field(default_factory=Claims)
 
     def plan(self) -> Plan[Subject]:
         """The plan of the stimulus script."""
@@ -108,6 +118,16 @@ def record_run(
             Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})
         )
         dialect = rig_options.dialect
+        about = run_record(
+            backend=rig_options.backend,
+            dialect=dialect.name,
+            sides=rig_options.sides,
+            phases=options.phases,
+            rounds=options.rounds,
+            requirements=options.requirements,
+            claims=options.claims,
+        )
+        recorder.add_metadata(RUN, about)
         topics = {
             t
             for s in Side
@@ -126,6 +146,9 @@ def record_run(
             return False
         if rig_options.backend == EXTERNAL:
             _require_hand(recorder_node, options)
+        loopback = stack.enter_context(
+            Loopback(recorder_node, domain=rig_options.domain, interface=rig_options.interface)
+        )
         # a second client would interfere, and a real hand may hold something
         sole = SolePublisher(
             [NodeTopics(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
@@ -140,6 +163,7 @@ def record_run(
         player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
         _wait_for_endpoints(recorder_node, plan)
+        calibration = loopback.result()
         finished = player.play_script(script, stop)
         recording.stop()
         player.close()
@@ -151,6 +175,7 @@ def record_run(
             objects={s: plan.objects.get(s) for s in plan.sides},
             stalls=heart.stalls,
             beats=heart.beats,
+            calibration=calibration,
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished

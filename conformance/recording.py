@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
 from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.errors import ConformanceError, UsageError
@@ -153,6 +154,7 @@ class Recording:
     :param sides: every subject that has a topic; ``judged`` names those to be judged.
     :param stimulus: the phases of the stimulus, or None in a recording that no live run made.
     :param usb: what was transferred on USB, where the kit did that.
+    :param run: the run record; empty in a recording that no live run made.
     """
 
     dialect: Dialect
@@ -165,6 +167,7 @@ class Recording:
     judged: tuple[Subject, ...]
     notes: Sequence[str] = ()
     usb: UsbRecording | None = None
+    run: Mapping[str, str] = field(default_factory=dict)
 
     layer = "dds"
     """Which layer's requirements it is judged by."""
@@ -248,6 +251,7 @@ class Recording:
             judged=judged,
             notes=notes,
             usb=usb.since(origin) if usb is not None else None,
+            run=trace.metadata.get(RUN, {}),
         )
 
     @property
@@ -288,6 +292,12 @@ class Recording:
         if self.stimulus is None:
             return None
         return self.stimulus.beats.lateness(self.log_time(begin), self.log_time(end))
+
+    def time_error(self, begin: float, end: float) -> float | None:
+        """The kit's error of a time in [begin, end], seconds; None if it is not known."""
+        if self.stimulus is None:
+            return None
+        return self.stimulus.time_error(self.log_time(begin), self.log_time(end))
 
     def lost(self, begin: float, end: float) -> Lost | None:
         """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""

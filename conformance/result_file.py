@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import documents
+from dexkit.conformance.measure import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
 from dexkit.conformance.result_file_v2 import converted
@@ -60,6 +61,7 @@ def parse_result(data: Any, path: object) -> RunResult:
         duration_s=data["duration_s"],
         notes=data["notes"],
         environment=data["environment"],
+        run=data.get("run", {}),  # files of the first programs that wrote version 3 have none
         harness=data["harness"],
         claims=data["claims"],
         catalogue=data["catalogue"],
@@ -179,6 +181,8 @@ def _result_of(entry: dict[str, Any]) -> Result:
         ),
         plots=_plots(entry["plots"]),
         retry=entry["retry"],
+        # files of the first programs that wrote version 3 have none
+        measure=Measure.of_dict(entry["measure"]) if entry.get("measure") else None,
     )
 
 

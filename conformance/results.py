@@ -10,7 +10,8 @@ fail           a MUST that is not met
 warn           a SHOULD that is not met; does not fail the hand
 not claimed    about a unit that the vendor does not claim (:mod:`~.claims`)
 not applicable cannot be judged here, with the reason; never counts as a pass
-blocked        another requirement failed first, or the kit's own machine was too busy
+blocked        another requirement failed first, the kit's own machine was too busy, or a MUST
+               fails by less than the kit's measurement error (:mod:`~.measure`)
 error          the kit's own fault
 ============== ============================================================================
 """
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import __version__, documents
+from dexkit.conformance.measure import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
 
@@ -184,6 +186,8 @@ class Result:
     :param disturbance: what the load of the machine has to do with a failure.
     :param plots: what shows the finding.
     :param retry: whether another run may come to another finding.
+    :param measure: the figure that it rests on, with its limit and the kit's error; None if it
+        rests on none.
     """
 
     requirement: Requirement
@@ -200,6 +204,7 @@ class Result:
     disturbance: Disturbance = UNDISTURBED
     plots: tuple[Plot, ...] = ()
     retry: bool = False
+    measure: Measure | None = None
 
     @property
     def expected(self) -> str:
@@ -314,6 +319,7 @@ class RunResult:
     :param client: results of the requirements about the client that commands the hands, each for
         the hand of that side. They do not count in the verdict on the hands. Empty in a run of
         the kit, which is its own client.
+    :param run: the run record (:mod:`~.run_record`); empty where no live run was made.
     """
 
     subject: dict[str, str]
@@ -327,6 +333,7 @@ class RunResult:
     claims: dict[str, bool] | None = None
     catalogue: int = 0
     client: list[Result] = field(default_factory=list)
+    run: dict[str, str] = field(default_factory=dict)
 
     @property
     def partial(self) -> bool:
@@ -448,6 +455,7 @@ class RunResult:
             "counts": {str(v): n for v, n in self.counts().items()},
             "harness": {name: round(value, 4) for name, value in self.harness.items()},
             "environment": dict(self.environment),
+            "run": dict(self.run),
             "notes": list(self.notes),
             "results": [_result_dict(r) for r in self.results],
             "client": {
@@ -487,5 +495,6 @@ def _result_dict(result: Result) -> dict[str, Any]:
         "disturbance": {**asdict(result.disturbance), "load": str(result.disturbance.load)},
         "plots": [str(plot) for plot in result.plots],
         "retry": result.retry,
+        "measure": None if result.measure is None else result.measure.as_dict(),
         "requirement": requirement,
     }

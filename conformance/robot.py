@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.motor_messages import Motor, MotorCodec, Motors
 from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
+from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import ROBOT, Floats, Subject
@@ -230,6 +231,7 @@ def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
         low=low,
         payloads=states.payloads if states is not None else (),
         command_payloads=commands.payloads if commands is not None else (),
+        run=trace.metadata.get(RUN, {}),
     )
 
 

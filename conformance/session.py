@@ -354,7 +354,15 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
         ).for_hand(options.dialect)
     usb = any(r.layer == "usb" for r in options.requirements)
     rounds = THOROUGH_ROUNDS if options.thorough else 1
-    return LiveOptions(options.rig(domain), phases, session, usb=usb, rounds=rounds)
+    return LiveOptions(
+        options.rig(domain),
+        phases,
+        session,
+        usb=usb,
+        rounds=rounds,
+        requirements=options.requirements,
+        claims=options.claims,
+    )
 
 
 def run_suite(

@@ -13,14 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.sums import mean, total
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import ROBOT, Floats, Side, Subject
 
 __all__ = [
+    "CALIBRATION_TOPIC",
     "IDLE",
     "RECORD",
     "Beats",
+    "Calibration",
     "Lost",
     "Phase",
     "Stall",
@@ -33,8 +36,11 @@ _LATEST = 2**62  # ns since 1970: the year 2116
 
 RECORD = "dexkit.stimulus"
 VERSION = 1
+_VIRTUAL = json.dumps("virtual")  # as every value of the record: JSON
 _EARLIER_ROBOT = "body"
 """The name of the subject ``robot`` in recordings of earlier versions."""
+CALIBRATION_TOPIC = "rt/dexkit/calibration"
+"""The topic on which the kit measures itself; no hand's and no robot's."""
 IDLE = 1e-3
 """Seconds by which timers are late on an idle machine."""
 
@@ -123,13 +129,52 @@ class Beats:
         if not len(there):
             return None
         best, p99 = np.percentile(there, [25, 99])
-        return Lost(float(there.sum()), float(there.mean()), float(p99), float(best))
+        return Lost(total(there), mean(there), float(p99), float(best))
 
     def _in(self, begin_ns: int, end_ns: int) -> Floats:
         """Lateness, seconds, of the beats that were due before the end and came after the begin."""
         t, late = np.array(self.t_us), np.array(self.late_us)
         begin, end = (begin_ns - self.begin_ns) / 1e3, (end_ns - self.begin_ns) / 1e3
         return np.asarray(late[(t >= begin) & (t - late <= end)] / 1e6)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The kit measured against itself at the begin of a run; see :mod:`~.calibration`.
+
+    :param sent: messages, each at a known instant.
+    :param delay_us: from writing to taking each that arrived, microseconds, rising.
+    :param late_us: by how much each was written too late, microseconds, rising.
+    :param clock_us: by how much the wall clock, which stamps samples, strayed from the monotonic
+        one meanwhile, microseconds.
+    """
+
+    sent: int = 0
+    delay_us: list[int] = field(default_factory=list)
+    late_us: list[int] = field(default_factory=list)
+    clock_us: int = 0
+
+    @classmethod
+    def parse(cls, text: str) -> Calibration | None:
+        """Parse the record's content; None for an empty text.
+
+        :raises TypeError, ValueError, TraceUnsupported: it is damaged.
+        """
+        if not text:
+            return None
+        found = cls(**_json(text))
+        delays, late = ([parse_time(t) for t in x] for x in (found.delay_us, found.late_us))
+        return cls(parse_time(found.sent), delays, late, parse_time(found.clock_us))
+
+    @property
+    def time_error(self) -> float | None:
+        """The 99th percentile of the delay, or the clock's error if that is larger, seconds.
+
+        None if fewer than half of the messages arrived.
+        """
+        if not self.delay_us or 2 * len(self.delay_us) < self.sent:
+            return None
+        return max(float(np.percentile(self.delay_us, 99)), float(self.clock_us)) / 1e6
 
 
 @dataclass
@@ -141,12 +186,28 @@ class Stimulus:
         hand of one joint, percent of closing for others.
     :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
+    :param calibration: the kit measured against itself; None in a run without.
+    :param virtual: whether the run was on a virtual clock, which is never late.
     """
 
     phases: list[Phase] = field(default_factory=list)
     objects: dict[Subject, float | None] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
+    calibration: Calibration | None = None
+    virtual: bool = False
+
+    def time_error(self, begin_ns: int, end_ns: int) -> float | None:
+        """The kit's error of a time in [begin, end], seconds; None if it is not known.
+
+        The 99th percentile by which its timer was late then, or what it measured against itself
+        if that is larger; 0 on a virtual clock.
+        """
+        late = self.beats.lateness(begin_ns, end_ns)
+        if late is not None:
+            own = self.calibration.time_error if self.calibration is not None else None
+            return max(late[1], own or 0.0)
+        return 0.0 if self.virtual and not self.beats.t_us else None
 
     def to_metadata(self) -> dict[str, str]:
         """The record's content."""
@@ -172,6 +233,8 @@ class Stimulus:
             "objects": json.dumps({str(s): q for s, q in self.objects.items()}),
             "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
             "beats": json.dumps(asdict(self.beats)),
+            **({"calibration": json.dumps(asdict(self.calibration))} if self.calibration else {}),
+            **({"clock": _VIRTUAL} if self.virtual else {}),
         }
 
     @classmethod
@@ -206,6 +269,8 @@ class Stimulus:
                 },
                 stalls=parse_stalls(record["stalls"]),
                 beats=Beats.parse(record.get("beats", "{}")),
+                calibration=Calibration.parse(record.get("calibration", "")),
+                virtual=record.get("clock") == _VIRTUAL,
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error

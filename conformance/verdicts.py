@@ -23,6 +23,10 @@ late while it was judged:
    A larger one is the hand's, and its result says what the machine does not explain. A run that
    fails by nothing but such results is done again as well, and then believed.
 
+7. Apart from load, a MUST that fails by less than the kit's measurement error
+   (:mod:`~dexkit.conformance.measure`) is *blocked* as well: its figure is nearer to the limit than
+   the kit can tell. A pass by less than that remains a pass, and says so.
+
 So a gross failure fails on a busy machine, too; one at the border is blocked there; every failure
 fails on an idle machine.
 """
@@ -36,6 +40,7 @@ from typing import Protocol
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.measure import Measure
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
 from dexkit.conformance.stimulus_record import IDLE, Lost
@@ -214,6 +219,7 @@ class Judgement:
         outcome: Outcome,
         blocked_by: str = "",
         disturbance: Disturbance = UNDISTURBED,
+        measure: Measure | None = None,
     ) -> Result:
         """The result of that verdict."""
         cause = outcome.cause or self.requirement.cause
@@ -232,6 +238,7 @@ class Judgement:
             disturbance=disturbance,
             plots=outcome.plots or self.requirement.plots,
             retry=outcome.retry or disturbance.load is not Load.NONE,
+            measure=measure,
         )
 
     def not_applicable(self, reason: str) -> Result:
@@ -265,11 +272,15 @@ class Judgement:
         return None
 
     def run_check(
-        self, check: Callable[[], Outcome], excuse: Callable[[Outcome], Excuse]
+        self,
+        check: Callable[[], Outcome],
+        excuse: Callable[[Outcome], Excuse],
+        weigh: Callable[[Outcome], Measure | None] = lambda _: None,
     ) -> Result:
         """Call the check and make a result of its outcome.
 
         :param excuse: decides whether load of the machine explains a failure.
+        :param weigh: finds the figure that decides, and the kit's error of it.
         """
         try:
             outcome = check()
@@ -285,11 +296,16 @@ class Judgement:
         if outcome.met is None:
             return self.result(Verdict.NOT_APPLICABLE, outcome)
         if outcome.met:
-            return self.result(Verdict.PASS, outcome)
+            return self.result(Verdict.PASS, outcome, measure=weigh(outcome))
         busy = excuse(outcome)
         if busy.text:
             outcome = replace(outcome, reason=busy.text)
         must = self.requirement.level is Level.MUST
         failed = Verdict.FAIL if must else Verdict.WARN
         verdict = Verdict.BLOCKED if busy.excused else failed
-        return self.result(verdict, outcome, disturbance=busy.disturbance)
+        measure = weigh(outcome)
+        if verdict is Verdict.FAIL and measure is not None and measure.uncertain:
+            verdict = Verdict.BLOCKED
+            told = f"{measure.told()}; a quieter machine or another run may tell"
+            outcome = replace(outcome, reason=told, retry=True)
+        return self.result(verdict, outcome, disturbance=busy.disturbance, measure=measure)

@@ -35,6 +35,7 @@ from dexkit.models import dialect, model
 from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import failed
 from tests.dds_helpers import DdsNode, free_domain
+from tests.reproduction_helpers import checked
 
 ROOT = Path(__file__).parent.parent
 
@@ -344,8 +345,9 @@ def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None
     }
     assert files[1].read_text().startswith("<!doctype html>")
     assert "DEX1-FORCE-01-right" in files[3].read_text()
-    # the recording alone gives the same verdicts
-    again = judge(Recording.decode(open_trace(files[2])))
-    expected = {r["id"]: r["verdict"] for r in result["results"]}
-    found = {r.requirement.id: str(r.verdict) for r in again.results}
-    assert {name: found[name] for name in expected} == expected
+    # the recording alone gives the same verdicts, with all of their data
+    again = checked(files[2], tmp_path / "again.json")
+    found = {r["id"]: r for r in again["results"]}
+    assert [found[r["id"]] for r in result["results"]] == result["results"]
+    assert again["run"] == result["run"]
+    assert json.loads(result["run"]["requirements"]) == [r["id"] for r in result["results"]]

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+from dexkit.conformance.measure import Measure, Quantity
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement
@@ -33,6 +34,7 @@ __all__ = [
     "Outcome",
     "check",
     "check_of",
+    "rate_measure",
 ]
 
 _HAND = (
@@ -56,6 +58,29 @@ reports it as float32 and in its own counts, which round (docs/sources/unitree-d
 own clamp; other limits have a tolerance of their own."""
 STROKE_S = 1.0
 """Seconds that a hand driven by Unitree's client takes for a stroke."""
+
+
+Span = tuple[float, float]
+"""Begin and end, seconds of the recording."""
+
+
+def rate_measure(
+    hertz: float,
+    limit: float,
+    seconds: float,
+    *,
+    at_most: bool = False,
+    span: Span | None = None,
+) -> Measure:
+    """A rate, Hz, that was observed for that many seconds.
+
+    Both ends of that time may be wrong by the kit's error, each of which changes the rate by its
+    part of the time.
+    """
+    per_second = 2 * hertz / seconds if seconds > 0 else 0.0
+    return Measure(
+        float(hertz), float(limit), "Hz", Quantity.TIME, at_most, per_second=per_second, span=span
+    )
 
 
 @dataclass(frozen=True)
@@ -89,6 +114,8 @@ class Outcome:
         about no particular joint.
     :param plots: the plots that show it, where they differ from the requirement's.
     :param retry: another run may give another outcome.
+    :param measures: the figures with a limit that it rests on, one for each place; empty if it
+        rests on none.
     """
 
     met: bool | None
@@ -103,6 +130,7 @@ class Outcome:
     joints: tuple[int, ...] = ()
     plots: tuple[Plot, ...] = ()
     retry: bool = False
+    measures: tuple[Measure, ...] = ()
 
     def about(self, *joints: int) -> Outcome:
         """Return a copy that is about these joints (indices)."""
@@ -116,6 +144,41 @@ class Outcome:
     def because(self, cause: str) -> Outcome:
         """Return a copy with a cause that the check has determined."""
         return replace(self, cause=cause)
+
+    def resting_on(self, *measures: Measure) -> Outcome:
+        """Return a copy with the figures that it rests on."""
+        return replace(self, measures=measures)
+
+    def timed(
+        self, seconds: float, limit: float, *, at_least: bool = False, span: Span | None = None
+    ) -> Outcome:
+        """Return a copy that rests on a time, seconds.
+
+        :param at_least: the limit is the least that is asked for.
+        :param span: begin and end of its place; None for the outcome's first one.
+        """
+        measure = Measure(float(seconds), float(limit), larger_is_worse=not at_least, span=span)
+        return self.resting_on(measure)
+
+    def rated(
+        self, hertz: float, limit: float, seconds: float, *, at_most: bool = False
+    ) -> Outcome:
+        """Return a copy that rests on a rate, Hz.
+
+        :param seconds: how long it was observed.
+        :param at_most: the limit is the most that is allowed.
+        """
+        return self.resting_on(rate_measure(hertz, limit, seconds, at_most=at_most))
+
+    def placed(self, rad: float, limit: float, *, at_least: bool = False) -> Outcome:
+        """Return a copy that rests on a distance, rad."""
+        measure = Measure(float(rad), float(limit), "rad", Quantity.POSITION, not at_least)
+        return self.resting_on(measure)
+
+    def pressed(self, torque: float, limit: float, *, at_least: bool = False) -> Outcome:
+        """Return a copy that rests on a torque, N m."""
+        measure = Measure(float(torque), float(limit), "N m", Quantity.TORQUE, not at_least)
+        return self.resting_on(measure)
 
     def if_late(self, *seconds: float, how: str = "total", best: float = 0.0) -> Outcome:
         """Return a copy with the size of the failure; see :class:`Late`."""

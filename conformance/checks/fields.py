@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import joints_of
@@ -216,15 +218,15 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     moving = np.abs(slope) > 0.5
     if moving.sum() < 50:
         return ctx.skipped("the hand hardly moves in this recording")
-    size = float(np.sqrt(np.mean(slope[moving] ** 2)))
-    error = float(np.sqrt(np.mean((mean - slope)[moving] ** 2))) / size
+    size = math.sqrt(sums.mean(slope[moving] ** 2))
+    error = math.sqrt(sums.mean((mean - slope)[moving] ** 2)) / size
     text = ctx.named(
         f"dq differs from the slope of q by {error:.0%} of its size ({size:.2f} rad/s RMS)", joint
     )
     if error <= ctx.tolerance("max_relative_rms"):
         return ctx.passed(f"{error:.0%} off", text, relative_rms=error)
     worst = starts[np.argmax(np.abs(mean - slope))]
-    turned = float(np.mean(mean[moving] * slope[moving])) < 0
+    turned = sums.mean(mean[moving] * slope[moving]) < 0
     return (
         ctx.failed(
             f"{error:.0%} off",

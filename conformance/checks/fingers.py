@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.motion import Step, not_driven, steps, steps_of
-from dexkit.conformance.checks.safety import arrival, stays
+from dexkit.conformance.checks.safety import arrival, stays, stopped
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
@@ -353,7 +353,7 @@ def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) ->
 def stiffness(ctx: Context) -> Outcome:
     """Time to half-way of a step with low gains, compared with one with the client's gains."""
     stiff = {s.joint: s for p in ctx.recording.phases("stiff", ctx.side) for s in steps_of(ctx, p)}
-    worst: tuple[float, int] | None = None
+    worst: tuple[float, int, float, float] | None = None
     for step in steps(ctx):
         reference = stiff.get(step.joint)
         if reference is None:
@@ -369,16 +369,18 @@ def stiffness(ctx: Context) -> Outcome:
         if quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
         # a step that never gets half-way took at least as long as its phase
-        ratio = (slow if slow is not None else step.end - step.begin) / max(quick, 1e-3)
-        if worst is None or ratio < worst[0]:
-            worst = (ratio, step.joint)
+        took, quick = slow if slow is not None else step.end - step.begin, max(quick, 1e-3)
+        if worst is None or took / quick < worst[0]:
+            worst = took / quick, step.joint, took, quick
     if worst is None:
         return ctx.skipped("no state during the steps")
-    ratio, joint = worst
+    ratio, joint, took, quick = worst
+    least = ctx.tolerance("min_ratio") * quick
     text = ctx.named(f"a soft step takes {ratio:.1f} times as long to half-way", joint)
     if ratio >= ctx.tolerance("min_ratio"):
-        return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio)
-    return ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
+        return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
+    outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
+    return outcome.timed(took, least, at_least=True)
 
 
 def _half_way(step: Step) -> float | None:
@@ -510,8 +512,15 @@ def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome
     worst = int(np.argmax(after))
     joint = joints[worst]
     rad = float(after[worst]) * ctx.joints[joint].stroke
+    rows = ctx.states.between(last, end)
+    stop = stopped(
+        *(ctx.states.t[rows], ctx.states.q[rows, joint]),
+        last,
+        ctx.tolerance("max_motion_stroke", joint),
+        late - last,
+    )
     if after[worst] > ctx.requirement.tolerance("max_motion_stroke"):
-        return ctx.failed(
+        outcome = ctx.failed(
             f"{rad:.2f} rad",
             ctx.named(
                 f"moved by {rad:.2f} rad more than {ctx.tolerance('timeout_s'):g} s after the "
@@ -520,13 +529,15 @@ def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome
             ),
             ctx.at(ctx.states.topic, late, end),
             motion_rad=rad,
-        ).about(joint)
+        )
+        return outcome.about(joint).resting_on(stop)
     if before.min() < ctx.requirement.tolerance("min_travel_stroke"):
         return ctx.skipped(
             "not every joint that was set in motion still moved when the commands stopped: "
             "a braked joint cannot be distinguished from one at rest"
         )
-    return ctx.passed("stops", f"moving, then still ({rad:.3f} rad)", motion_rad=rad)
+    met = ctx.passed("stops", f"moving, then still ({rad:.3f} rad)", motion_rad=rad)
+    return met.resting_on(stop)
 
 
 @check("DEX3-WDOG-01")

@@ -45,9 +45,13 @@ def in_contact(ctx: Context) -> Outcome:
         return ctx.skipped("no state while it squeezed")
     tau, begin, end = found
     text = f"tau_est {tau:.3f} N m while squeezing"
-    if abs(tau) >= ctx.tolerance("min_tau_nm"):
-        return ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
-    return ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
+    limit = ctx.tolerance("min_tau_nm")
+    if abs(tau) >= limit:
+        met = ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
+        return met.pressed(abs(tau), limit, at_least=True)
+    place = ctx.at(ctx.states.topic, begin, end)
+    outcome = ctx.failed(f"{tau:.2f} N m", text, place, tau_nm=tau)
+    return outcome.pressed(abs(tau), limit, at_least=True)
 
 
 def _ranges(t: Floats, begins: Floats, ends: Floats, side: Literal["left", "right"]) -> Ranges:
@@ -108,11 +112,12 @@ def at_rest(ctx: Context) -> Outcome:
     # the median of all rests: one of them may be an unannounced contact
     level, begin = sorted(taus)[len(taus) // 2]
     text = f"tau_est {level:.3f} N m at rest (median of {len(taus)} rests)"
-    if level <= ctx.tolerance("max_tau_nm"):
-        return ctx.passed(f"{level:.3f} N m", text, tau_nm=level)
+    limit = ctx.tolerance("max_tau_nm")
+    if level <= limit:
+        return ctx.passed(f"{level:.3f} N m", text, tau_nm=level).pressed(level, limit)
     return ctx.failed(
         f"{level:.2f} N m", text, ctx.at(states.topic, begin, begin + window), tau_nm=level
-    )
+    ).pressed(level, limit)
 
 
 @check("DEX1-FORCE-03")

@@ -6,6 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival
+from dexkit.conformance.measure import Measure
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.hand import JointMode
 
@@ -22,19 +23,20 @@ def state_first(ctx: Context) -> Outcome:
     lead = first_command - first_state
     # the kit's client, unlike a genuine one, does not wait for state, so its first command may be
     # received after the state that it has set off
-    if lead > (ctx.tolerance("min_lead_s") if listening else 0.0):
+    least = ctx.tolerance("min_lead_s") if listening else 0.0
+    if lead > least:
         return ctx.passed(
             f"{lead:.2f} s before",
             f"first state {lead:.2f} s before the first command",
             lead_s=lead,
-        )
+        ).timed(lead, least, at_least=True, span=(first_state, first_command))
     return ctx.failed(
         "silent",
         f"no state for {min(first_command, first_state) - begin:.2f} s; the first came "
         f"{abs(lead):.3f} s {'before' if lead > 0 else 'after'} the first command was received",
         ctx.at(ctx.commands.topic, first_command),
         lead_s=lead,
-    )
+    )  # no measure: by how little it came too late says nothing, for it had all that time
 
 
 @check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")
@@ -49,13 +51,15 @@ def late_joiner(ctx: Context) -> Outcome:
             f"{waited * 1e3:.0f} ms",
             f"first state {waited * 1e3:.0f} ms after it was discovered",
             wait_s=waited,
-        )
+        ).timed(waited, limit, span=(begin, end))
     text = "nothing" if waited is None else f"the first state only after {waited:.2f} s"
-    return ctx.failed(
+    outcome = ctx.failed(
         "nothing" if waited is None else f"{waited:.2f} s",
         f"a subscriber that joined at {begin:.2f} s received {text}",
         ctx.at(ctx.states.topic, begin, end),
-    ).if_late((end - begin if waited is None else waited) - limit)
+    )
+    least = end - begin if waited is None else waited
+    return outcome.timed(least, limit).if_late(least - limit)
 
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
@@ -72,12 +76,19 @@ def restarted_service(ctx: Context) -> Outcome:
     waited = float(later[0]) - begin if len(later) else np.inf
     if waited > ctx.tolerance("max_wait_s"):
         what = "no state" if not len(later) else f"no state for {waited:.2f} s"
-        return ctx.failed(
+        outcome = ctx.failed(
             "no state",
             f"{what} after the service was ready again",
             ctx.at(ctx.states.topic, begin, min(begin + waited, end)),
-        ).if_late(waited - ctx.tolerance("max_wait_s"))
-    return arrival(ctx, "after a restart of its service")
+        )
+        least = min(waited, end - begin)
+        outcome = outcome.timed(least, ctx.tolerance("max_wait_s"))
+        return outcome.if_late(waited - ctx.tolerance("max_wait_s"))
+    outcome = arrival(ctx, "after a restart of its service")
+    if not outcome.met:
+        return outcome
+    again = Measure(waited, ctx.tolerance("max_wait_s"), span=(begin, begin + waited))
+    return outcome.resting_on(*outcome.measures, again)
 
 
 @check("DEX1-LIFE-04", "DEX3-LIFE-04")
@@ -90,17 +101,15 @@ def shutdown(ctx: Context) -> Outcome:
     if ended is None or ended > ctx.tolerance("max_exit_s"):
         seen = "had to be killed" if ended is None else f"took {ended:.1f} s to end"
         outcome = ctx.failed("does not end", f"after SIGTERM the service {seen}", place)
-        return outcome.if_late(
-            (end - begin if ended is None else ended) - ctx.tolerance("max_exit_s")
-        )
+        least, limit = end - begin if ended is None else ended, ctx.tolerance("max_exit_s")
+        return outcome.timed(least, limit).if_late(least - limit)
     if gone is None or gone > ctx.tolerance("max_gone_s"):
         seen = "is still announced" if gone is None else f"was announced for {gone:.1f} s"
         outcome = ctx.failed(
             "still announced", f"the state's publisher {seen} after the service had ended", place
         )
-        outcome = outcome.if_late(
-            (end - begin if gone is None else gone) - ctx.tolerance("max_gone_s")
-        )
+        least, limit = end - begin if gone is None else gone, ctx.tolerance("max_gone_s")
+        outcome = outcome.timed(least, limit).if_late(least - limit)
         return outcome.because(
             "the process ends without deleting its participant, so that its peers wait for the "
             "lease to run out"
@@ -109,6 +118,9 @@ def shutdown(ctx: Context) -> Outcome:
         f"{ended:.2f} s",
         f"ended after {ended:.2f} s, and its publisher disappeared {gone:.2f} s later",
         exit_s=ended,
+    ).resting_on(
+        Measure(ended, ctx.tolerance("max_exit_s"), span=(begin, end)),
+        Measure(gone, ctx.tolerance("max_gone_s"), span=(begin, end)),
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
 from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 
 __all__: list[str] = []
@@ -166,7 +167,7 @@ def acceleration(ctx: Context) -> Outcome:
         if busy.sum() < 20:
             continue
         judged = True
-        ratio = float(np.sum(reported[busy] * seen[busy]) / np.sum(seen[busy] ** 2))
+        ratio = total(reported[busy] * seen[busy]) / total(seen[busy] ** 2)
         worst = max(worst, (ratio, joint), key=lambda w: abs(w[0] - 1.0))
     if not judged:
         return ctx.skipped("the hand hardly accelerates where its states arrive regularly")

@@ -9,6 +9,7 @@ import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
 from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
 from dexkit.models import HandModel
 
@@ -105,6 +106,7 @@ _DISOBEYS = 0.1  # of the stroke
 
 def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
     """The failure of a hand that ends a step elsewhere than commanded."""
+    limit = ctx.tolerance("max_error_stroke", step.joint)
     return (
         ctx.failed(
             "disobeys",
@@ -113,6 +115,7 @@ def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
             error_rad=step.error,
         )
         .about(step.joint)
+        .placed(step.error, limit)
         .if_late(STROKE_S * step.error / step.stroke)
     )
 
@@ -175,12 +178,13 @@ def arrives(ctx: Context) -> Outcome:
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand during the steps")
     worst = max(found, key=lambda s: s.error / s.stroke)
-    if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
+    limit = ctx.tolerance("max_error_stroke", worst.joint)
+    if worst.error <= limit:
         return ctx.passed(
             f"{worst.error:.3f} rad",
             f"{len(found)} steps, ending at most {worst.error:.3f} rad off",
             error_rad=worst.error,
-        )
+        ).placed(worst.error, limit)
     return (
         ctx.failed(
             f"{worst.error:.2f} rad",
@@ -189,6 +193,7 @@ def arrives(ctx: Context) -> Outcome:
             error_rad=worst.error,
         )
         .about(worst.joint)
+        .placed(worst.error, limit)
         .because(_cause(found))
     )
 
@@ -220,17 +225,19 @@ def settles(ctx: Context) -> Outcome:
     if not ripples:
         return ctx.skipped("too few states at the end of the steps")
     ripple, step = max(ripples, key=lambda r: r[0] / r[1].stroke)
-    if ripple <= ctx.tolerance("max_ripple_stroke", step.joint):
+    limit = ctx.tolerance("max_ripple_stroke", step.joint)
+    if ripple <= limit:
         return ctx.passed(
             f"{ripple:.3f} rad", f"ripple of at most {ripple:.3f} rad", ripple_rad=ripple
-        )
-    return ctx.failed(
+        ).placed(ripple, limit)
+    outcome = ctx.failed(
         f"{ripple:.2f} rad",
         f"{step.name}at the target {step.target:.2f} rad q still moves by {ripple:.2f} rad, peak "
         "to peak",
         ctx.at(ctx.states.topic, step.end - window, step.end),
         ripple_rad=ripple,
-    ).about(step.joint)
+    )
+    return outcome.about(step.joint).placed(ripple, limit)
 
 
 @check("DEX1-MOVE-04", "DEX3-MOVE-04")
@@ -337,8 +344,9 @@ def settling(ctx: Context) -> Outcome:
         return ctx.skipped("no step of that size")
     longest, step = max(found, key=lambda f: f[0])
     text = f"{step.name}{longest:.2f} s in the slowest of {len(found)} steps"
-    if longest <= ctx.tolerance("max_settle_s"):
-        return ctx.passed(f"{longest:.2f} s", text, settle_s=longest)
+    limit = ctx.tolerance("max_settle_s")
+    if longest <= limit:
+        return ctx.passed(f"{longest:.2f} s", text, settle_s=longest).timed(longest, limit)
     return (
         ctx.failed(
             f"{longest:.2f} s",
@@ -347,7 +355,8 @@ def settling(ctx: Context) -> Outcome:
             settle_s=longest,
         )
         .about(step.joint)
-        .if_late(longest - ctx.tolerance("max_settle_s"))
+        .timed(longest, limit)
+        .if_late(longest - limit)
     )
 
 
@@ -359,14 +368,16 @@ def ends(ctx: Context) -> Outcome:
         return ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
     worst = max(found, key=lambda s: s.error)
     text = "; ".join(f"commanded to {s.target:.2f} rad, q went to {s.final:.2f}" for s in found)
-    if worst.error <= ctx.tolerance("max_error_stroke"):
-        return ctx.passed(f"{worst.error:.3f} rad", text, error_rad=worst.error)
+    limit = ctx.tolerance("max_error_stroke")
+    if worst.error <= limit:
+        met = ctx.passed(f"{worst.error:.3f} rad", text, error_rad=worst.error)
+        return met.placed(worst.error, limit)
     outcome = ctx.failed(
         f"{worst.error:.2f} rad",
         text,
         ctx.at(ctx.states.topic, worst.begin, worst.end),
         error_rad=worst.error,
-    )
+    ).placed(worst.error, limit)
     reached = max(s.final for s in found) / max(s.target for s in found)
     if abs(reached - 5.4 / (2 * np.pi)) < 0.02 or abs(reached - 2 * np.pi / 5.4) < 0.02:
         return outcome.because(
@@ -396,26 +407,28 @@ def independent(ctx: Context) -> Outcome:
         counts = np.bincount(bins)
         for joint, spec in enumerate(ctx.joints):
             means = np.bincount(bins, positions[:, joint])[counts > 0] / counts[counts > 0]
-            most = float(np.abs(means - before[:, joint].mean()).max())
+            most = float(np.abs(means - mean(before[:, joint])).max())
             moved.append((most / spec.stroke, most, joint, begin, end))
     if not moved:
         return ctx.skipped("no state of this hand while the other one moved")
     _, most, joint, begin, end = max(moved)
     other = "right" if ctx.side == "left" else "left"
-    if most <= ctx.tolerance("max_motion_stroke", joint):
+    limit = ctx.tolerance("max_motion_stroke", joint)
+    if most <= limit:
         return ctx.passed(
             f"{most:.3f} rad",
             f"moved by {most:.3f} rad in {len(others)} steps of the {other} hand",
             motion_rad=most,
-        )
-    return ctx.failed(
+        ).placed(most, limit)
+    outcome = ctx.failed(
         f"{most:.2f} rad",
         ctx.named(
             f"moved by {most:.2f} rad while only the {other} hand was commanded to move", joint
         ),
         ctx.at(ctx.states.topic, begin, end),
         motion_rad=most,
-    ).about(joint)
+    )
+    return outcome.about(joint).placed(most, limit)
 
 
 @check("DEX1-GAIN-01", "DEX3-GAIN-01")
@@ -437,19 +450,21 @@ def not_driven(ctx: Context, how: str) -> Outcome:
         return ctx.skipped("the hand was already at the q that must have no effect")
     towards, step = max(found, key=lambda f: f[0] / f[1].stroke)
     towards = max(0.0, towards)
-    if towards <= ctx.tolerance("max_motion_stroke", step.joint):
+    most = ctx.tolerance("max_motion_stroke", step.joint)
+    if towards <= most:
         return ctx.passed(
             f"{towards:.3f} rad",
             f"{step.name}moved {towards:.3f} rad towards a q that was {abs(step.size):.2f} rad "
             "away",
             motion_rad=towards,
-        )
-    return ctx.failed(
+        ).placed(towards, most)
+    outcome = ctx.failed(
         f"{towards:.2f} rad",
         f"{step.name}moved {towards:.2f} rad towards q = {step.target:.2f} {how}",
         ctx.at(ctx.states.topic, step.begin, step.end),
         motion_rad=towards,
-    ).about(step.joint)
+    )
+    return outcome.about(step.joint).placed(towards, most)
 
 
 @check("DEX1-CMD-01", "DEX3-CMD-01")
@@ -520,8 +535,10 @@ def unchanged(ctx: Context) -> Outcome:
         f"{step.name}{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {before:.2f} s in the "
         "same step before any bad command"
     )
+    longest = ctx.tolerance("max_ratio") * (before + slack)
     if ratio <= ctx.tolerance("max_ratio"):
-        return ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
+        met = ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
+        return met.timed(seconds, longest, span=(step.begin, step.end))
     return (
         ctx.failed(
             f"x {ratio:.1f}",
@@ -530,7 +547,8 @@ def unchanged(ctx: Context) -> Outcome:
             ratio=ratio,
         )
         .about(step.joint)
-        .if_late(seconds - ctx.tolerance("max_ratio") * (before + slack))
+        .timed(seconds, longest)
+        .if_late(seconds - longest)
     )
 
 

@@ -14,6 +14,7 @@ from dexkit.conformance.plots import Plot
 from dexkit.conformance.robot import RobotRecording
 from dexkit.conformance.stimuli.robot import STEP
 from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.sums import mean, total
 from dexkit.hand import Floats
 from dexkit.messages import Columns
 
@@ -106,9 +107,9 @@ def client_rate(ctx: RobotContext) -> Outcome:
     """The mean rate of commands."""
     steps = np.diff(ctx.commands.t)
     steady = steps[steps <= 0.1]
-    if float(steady.sum()) < ctx.tolerance("min_observed_s"):
+    if total(steady) < ctx.tolerance("min_observed_s"):
         return ctx.skipped("hardly any steady commands in the recording")
-    rate = len(steady) / float(steady.sum())
+    rate = len(steady) / total(steady)
     text = f"{len(ctx.commands)} commands, {rate:.0f} Hz while they are sent"
     if rate >= ctx.tolerance("min_rate_hz"):
         return ctx.passed(f"{rate:.0f} Hz", text)
@@ -193,7 +194,7 @@ def speed_of_q(ctx: RobotContext) -> Outcome:
         change = (q[later] - q[first]) / np.maximum(t[later] - t[first], 1e-6)
         sums = np.concatenate(([0.0], np.cumsum(dq)))
         reported = (sums[later] - sums[first]) / (later - first)
-        off = float(np.abs(change - reported).mean())
+        off = mean(np.abs(change - reported))
         if not off <= worst:
             worst, which = off, joint
     name = ctx.joints[which].name if which >= 0 else ""
@@ -264,7 +265,7 @@ def unit_quaternion(ctx: RobotContext) -> Outcome:
     length = np.linalg.norm(ctx.low["imu_state.quaternion"], axis=1)
     bad = ~(np.abs(length - 1.0) <= ctx.tolerance("tolerance"))
     if not bad.any():
-        return ctx.passed(f"{length.mean():.3f}")
+        return ctx.passed(f"{mean(length):.3f}")
     first = float(length[np.argmax(bad)])
     return _wrong_rows(ctx, bad, f"{first:.3f}", f"its length is {first:.3f}")
 
@@ -297,7 +298,7 @@ def measured_gravity(ctx: RobotContext) -> Outcome:
     turning = np.linalg.norm(low["imu_state.gyroscope"][rows], axis=1)
     if not len(force):
         return ctx.skipped("no state before the first command")
-    g, rate = float(force.mean()), float(turning.mean())
+    g, rate = mean(force), mean(turning)
     text = f"{g:.2f} m/s^2 and {rate:.3f} rad/s on average"
     good = ctx.tolerance("low") <= g <= ctx.tolerance("high")
     if good and rate <= ctx.tolerance("max_rad_s"):
@@ -430,7 +431,7 @@ def follows(ctx: RobotContext) -> Outcome:
         if not len(q):
             return _silent(ctx, phase)
         ((joint, goal),) = phase.targets[ctx.side].items()
-        error = abs(float(q[:, joint].mean()) - goal)
+        error = abs(mean(q[:, joint]) - goal)
         error = error if math.isfinite(error) else math.inf
         if error > worst:
             worst, where, which = error, (begin, end), joint

@@ -7,9 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
+from dexkit.conformance.checks import (
+    STROKE_S,
+    Context,
+    Outcome,
+    causes,
+    check,
+    rate_measure,
+)
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps_of
-from dexkit.conformance.checks.timing import gaps, slow, too_slow
+from dexkit.conformance.checks.timing import (
+    gap_measures,
+    gaps,
+    least_rate,
+    longest_gap,
+    slow,
+    too_slow,
+)
+from dexkit.conformance.measure import Measure, Quantity
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 
@@ -29,16 +44,20 @@ def unharmed(ctx: Context, what: str) -> Outcome:
     judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
     if not judged:
         return ctx.skipped(f"the hand had stopped obeying before {what}")
+    measures: list[Measure] = []
     for phase in judged:
         begin, end = ctx.span(phase)
-        found = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end + 0.2)
+        limit = ctx.tolerance("max_gap_s")
+        found = gaps(ctx, limit, begin - 0.05, end + 0.2)
         if found:
             a, b = found[0]
-            return ctx.failed(
+            outcome = ctx.failed(
                 "state stops",
                 f"state stopped at {a:.3f} s, during {what}",
                 ctx.at(topic, a, b),
-            ).if_late(b - a - ctx.tolerance("max_gap_s"))
+            )
+            return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
+        measures.append(longest_gap(ctx, limit, begin - 0.05, end + 0.2))
         step = _recovery(ctx, phase)
         if step is None:
             return ctx.failed(
@@ -55,9 +74,10 @@ def unharmed(ctx: Context, what: str) -> Outcome:
                     error_rad=step.error,
                 )
                 .about(step.joint)
+                .placed(step.error, ctx.tolerance("max_error_stroke", step.joint))
                 .if_late(STROKE_S * step.error / step.stroke)
             )
-    return Outcome(None)
+    return Outcome(None).resting_on(*measures)
 
 
 def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
@@ -95,6 +115,7 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
                         motion_rad=most,
                     )
                     .about(joint)
+                    .placed(most, ctx.tolerance("max_motion_stroke", joint))
                     .if_late(STROKE_S * most / ctx.joints[joint].stroke)
                 )
             far = max(far, (most / ctx.joints[joint].stroke, most, joint))
@@ -103,7 +124,7 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
         f"{most:.3f} rad",
         ctx.named(f"moved by {most:.3f} rad during {what}", joint),
         motion_rad=most,
-    )
+    ).placed(most, ctx.tolerance("max_motion_stroke", joint))
 
 
 def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
@@ -114,7 +135,8 @@ def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
     after = unharmed(ctx, what)
     if after.met is False or after.reason:
         return after
-    return replace(still, observed=f"{still.observed}, then obeyed")
+    met = replace(still, observed=f"{still.observed}, then obeyed")
+    return met.resting_on(*still.measures, *after.measures)
 
 
 @check("DEX1-SAFE-01", "DEX3-SAFE-01")
@@ -162,7 +184,7 @@ def out_of_range(ctx: Context) -> Outcome:
         figure,
         "q stayed within the stroke, then obeyed",
         **(values if len(ctx.joints) == 1 else {}),
-    )
+    ).resting_on(*outcome.measures)
 
 
 @check("DEX1-SAFE-03", "DEX3-SAFE-03")
@@ -198,6 +220,7 @@ def brakes(ctx: Context) -> Outcome:
     states = ctx.states
     proofs: list[str] = []
     values: dict[str, float] = {}
+    measures: list[Measure] = []
     for last, end in _silences(ctx):
         free = states.between(last, last + timeout)
         late = states.between(last + timeout + ctx.tolerance("grace_s"), end)
@@ -206,27 +229,36 @@ def brakes(ctx: Context) -> Outcome:
         if len(q_late) < 5 or not len(q_free) or not len(before):
             continue
         moved = float(np.ptp(q_late))
+        stop = stopped(
+            *(states.t[states.between(last, end)], states.q[states.between(last, end), 0]),
+            last,
+            ctx.tolerance("max_motion_stroke"),
+            timeout + ctx.tolerance("grace_s"),
+        )
         if moved > ctx.tolerance("max_motion_stroke"):
-            return ctx.failed(
+            outcome = ctx.failed(
                 f"{moved:.2f} rad",
                 f"moved by {moved:.2f} rad more than {timeout:g} s after the last command",
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=moved,
             )
+            return outcome.resting_on(stop)
         jump, allowed = _jump(ctx, last + timeout, q_late)
         if jump > allowed:
-            return ctx.failed(
+            outcome = ctx.failed(
                 f"{jump:.2f} rad",
                 f"moved by {jump:.2f} rad while it braked",
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=jump,
-            ).if_late(STROKE_S * (jump - allowed) / ctx.joints[0].stroke)
+            ).placed(jump, allowed)
+            return outcome.if_late(STROKE_S * (jump - allowed) / ctx.joints[0].stroke)
         # at its stop it stands still without a brake as well
         stroke = ctx.joints[0].stroke
         at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
         if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
             proofs.append(f"was moving, then moved only {moved:.3f} rad")
             values["motion_rad"] = moved
+            measures.append(stop)
         pressed = float(np.median(np.abs(before)))
         if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_at is not None:
             still = float(np.median(np.abs(states.tau[late, 0])))
@@ -237,7 +269,10 @@ def brakes(ctx: Context) -> Outcome:
                     f"{still:.2f} N m after the time-out",
                     ctx.at(states.topic, last + timeout, end),
                     tau_nm=still,
-                )
+                ).pressed(still, ctx.tolerance("max_tau_part") * pressed)
+            measures.append(
+                Measure(still, ctx.tolerance("max_tau_part") * pressed, "N m", Quantity.TORQUE)
+            )
             proofs.append(f"pressed with {pressed:.2f} N m, then with {still:.2f} N m")
             values["tau_nm"] = still
         driven = states.mode[states.between(last - 0.2, last), 0]
@@ -250,7 +285,24 @@ def brakes(ctx: Context) -> Outcome:
             "distinguished from holding"
         )
     figure = "stops" if "motion_rad" in values else "lets go" if values else "says so"
-    return ctx.passed(figure, "; ".join(proofs), **values)
+    return ctx.passed(figure, "; ".join(proofs), **values).resting_on(*measures)
+
+
+def stopped(t: Floats, q: Floats, last: float, still: float, limit: float) -> Measure:
+    """When a joint stopped after the last command, s, against the latest time that is allowed.
+
+    :param t: of the states since then, s.
+    :param q: of the joint, rad.
+    :param last: when the last command came, s.
+    :param still: rad; a joint that does not move further than that any more has stopped.
+    :param limit: s after the last command.
+    """
+    t, q = t[np.isfinite(q)], q[np.isfinite(q)]
+    later = q[::-1]
+    range_left = np.maximum.accumulate(later) - np.minimum.accumulate(later)
+    moving = np.flatnonzero(~(range_left[::-1] <= still))
+    at = float(t[moving[-1]]) if len(moving) else last
+    return Measure(max(0.0, at - last), limit, span=(last, max(at, last + limit)))
 
 
 def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
@@ -284,18 +336,19 @@ def state_in_silence(ctx: Context) -> Outcome:
         found = gaps(ctx, limit, begin, end)
         if found:
             a, b = found[0]
-            return ctx.failed(
+            outcome = ctx.failed(
                 f"{b - a:.2f} s",
                 f"no state from {a:.3f} s to {b:.3f} s, in the pause that began at {begin:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 max_gap_s=b - a,
-            ).if_late(b - a - limit)
+            )
+            return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
         clock = ctx.states.clock
         inside = clock[(clock >= begin) & (clock <= end)]
         longest = max(longest, float(np.diff(inside).max()) if len(inside) > 1 else 0.0)
     return ctx.passed(
         f"{longest * 1e3:.1f} ms", f"longest gap {longest * 1e3:.1f} ms", max_gap_s=longest
-    )
+    ).timed(longest, limit, span=(spans[0][0], spans[-1][1]))
 
 
 @check("DEX1-WDOG-03", "DEX3-WDOG-03")
@@ -320,9 +373,14 @@ def resumes(ctx: Context) -> Outcome:
                 reaction_s=after,
             )
             .about(step.joint)
+            .timed(after, limit)
             .if_late(after - limit)
         )
-    return arrival(ctx, "after a pause of commands")
+    outcome = arrival(ctx, "after a pause of commands")
+    if outcome.met and slowest is not None:
+        span = slowest[1].begin, slowest[1].end
+        return outcome.timed(slowest[0], limit, span=span)
+    return outcome
 
 
 def arrival(ctx: Context, when: str) -> Outcome:
@@ -335,7 +393,8 @@ def arrival(ctx: Context, when: str) -> Outcome:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
     worst = max(found, key=lambda s: s.error / s.stroke)
     if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
-        return ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
+        met = ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
+        return met.placed(worst.error, ctx.tolerance("max_error_stroke", worst.joint))
     return disobeyed(ctx, when, worst)
 
 
@@ -378,6 +437,7 @@ def burst(ctx: Context) -> Outcome:
         if silent:
             a, b = silent[0]
             outcome = ctx.failed("state stops", f"no state from {a:.3f} s on", ctx.at(topic, a, b))
+            outcome = outcome.resting_on(*gap_measures(silent, ctx.tolerance("max_gap_s")))
             return outcome.if_late(b - a - ctx.tolerance("max_gap_s"))
         before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
         sent = begin + (phase.observed.get("sent_s") or 0.0)
@@ -400,13 +460,14 @@ def burst(ctx: Context) -> Outcome:
                         motion_rad=float(away[joint]),
                     )
                     .about(joint)
+                    .placed(float(away[joint]), ctx.tolerance("max_motion_stroke", joint))
                     .if_late(STROKE_S * float(away[joint]) / spec.stroke)
                 )
     return ctx.passed(
         f"{far[1]:.3f} rad",
         ctx.named(f"within {far[1]:.3f} rad {wait:g} s after the burst", far[2]),
         motion_rad=far[1],
-    )
+    ).placed(far[1], ctx.tolerance("max_motion_stroke", far[2]))
 
 
 @check("DEX1-SAFE-08", "DEX3-SAFE-09")
@@ -440,7 +501,7 @@ def two_writers(ctx: Context) -> Outcome:
         return outcome
     return ctx.passed(
         "between", "stayed between the two positions, and obeyed the remaining client"
-    )
+    ).resting_on(*outcome.measures)
 
 
 @check("DEX1-ORDER-02", "DEX3-ORDER-02")
@@ -462,15 +523,19 @@ def load(ctx: Context) -> Outcome:
         text = f"{rate:.1f} Hz under load"
         if found:
             a, b = found[0]
-            return ctx.failed(
+            outcome = ctx.failed(
                 f"{b - a:.2f} s",
                 f"{text}; no state from {a:.3f} to {b:.3f} s",
                 ctx.at(ctx.states.topic, a, b),
                 rate_hz=rate,
-            ).if_late(b - a - limit)
+            )
+            return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
         if slow(ctx, rate):
             outcome = ctx.failed(
                 f"{rate:.1f} Hz", text, ctx.at(ctx.states.topic, begin, end), rate_hz=rate
             )
+            outcome = outcome.rated(rate, least_rate(ctx), end - begin)
             return too_slow(ctx, outcome, rate, np.diff(inside))
-    return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
+    span = begin, end
+    met = ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
+    return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))

@@ -9,13 +9,15 @@ are judged by the times of reception as well: there the kit's own lateness is kn
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, check, rate_measure
+from dexkit.conformance.measure import Measure
 from dexkit.conformance.median import median
+from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 
 # stimuli with separate requirements for the state's rate
@@ -54,10 +56,25 @@ def gaps(ctx: Context, longer_than: float, begin: float, end: float) -> list[tup
     return sorted(found)
 
 
+def longest_gap(ctx: Context, limit: float, begin: float, end: float) -> Measure:
+    """The longest interval without state within [begin, end] against a limit, s."""
+    longest = 0.0
+    for clock in _times(ctx):
+        inside = clock[(clock >= begin) & (clock <= end)]
+        edges = np.concatenate(([begin], inside, [end]))
+        longest = max(longest, float(np.diff(edges).max()))
+    return Measure(longest, limit, span=(begin, end))
+
+
+def gap_measures(found: Iterable[tuple[float, float]], limit: float) -> list[Measure]:
+    """The gaps (begin, end) as measures against the longest one that is allowed, s."""
+    return [Measure(b - a, limit, span=(a, b)) for a, b in found]
+
+
 def _observed(ctx: Context) -> tuple[Floats, float]:
     """Intervals between states, and the seconds that they add up to."""
     intervals = np.diff(ctx.states.clock)
-    return intervals, float(intervals.sum())
+    return intervals, total(intervals)
 
 
 def _spans(ctx: Context, names: tuple[str, ...]) -> list[tuple[float, float]]:
@@ -78,11 +95,11 @@ def _slow_stretches(ctx: Context) -> list[tuple[float, float, Floats]]:
         keep &= (clock[1:] <= begin) | (starts >= end)
     lengths, starts = lengths[keep], starts[keep]
     window = ctx.tolerance("window_s")
-    total = np.concatenate(([0.0], np.cumsum(lengths)))
+    passed = np.concatenate(([0.0], np.cumsum(lengths)))
     found: list[tuple[int, int]] = []
-    for at in np.arange(0.0, float(total[-1]) - window, _STRIDE):
-        i, j = (int(k) for k in np.searchsorted(total, (at, at + window)))
-        seconds = float(total[j] - total[i]) - float(lengths[i:j].max(initial=0.0))
+    for at in np.arange(0.0, float(passed[-1]) - window, _STRIDE):
+        i, j = (int(k) for k in np.searchsorted(passed, (at, at + window)))
+        seconds = float(passed[j] - passed[i]) - float(lengths[i:j].max(initial=0.0))
         if j - i < 2 or not slow(ctx, (j - i - 1) / seconds):
             continue
         if found and i <= found[-1][1]:
@@ -97,7 +114,8 @@ def _exactly(
 ) -> tuple[float, float, Floats]:
     """The stretch between the first and the last slow intervals of [first, last)."""
     several = round(_STRIDE * ctx.tolerance("min_rate_hz"))
-    mean = np.convolve(lengths[first:last], np.full(several, 1 / several), "valid")
+    passed = np.concatenate(([0.0], np.cumsum(lengths[first:last])))
+    mean = (passed[several:] - passed[:-several]) / several
     late = np.flatnonzero(mean * ctx.tolerance("min_rate_hz") > 1.0)
     if len(late):
         # the mean over [k, k + several) rises when slow intervals enter at its end
@@ -113,7 +131,7 @@ def _rate(ctx: Context) -> tuple[float, float] | None:
     """(mean rate outside of gaps, seconds observed), or None if that is too short."""
     intervals, _ = _observed(ctx)
     steady = intervals[intervals <= _GAP]
-    seconds = float(steady.sum())
+    seconds = total(steady)
     if seconds < ctx.tolerance("min_observed_s"):
         return None
     return len(steady) / seconds, seconds
@@ -124,7 +142,12 @@ def slow(ctx: Context, rate: float) -> bool:
 
     The limit has a margin: clocks differ, and a window may cut an interval.
     """
-    return rate < (1 - ctx.tolerance("slack_part")) * ctx.tolerance("min_rate_hz")
+    return rate < least_rate(ctx)
+
+
+def least_rate(ctx: Context) -> float:
+    """The least rate that is measured of a hand that meets the limit, Hz."""
+    return (1 - ctx.tolerance("slack_part")) * ctx.tolerance("min_rate_hz")
 
 
 def too_slow(ctx: Context, outcome: Outcome, rate: float, intervals: Floats) -> Outcome:
@@ -163,23 +186,30 @@ def rate(ctx: Context) -> Outcome:
             f"{len(ctx.states)} states, {mean:.1f} Hz over {seconds:.1f} s",
             ctx.at(ctx.states.topic, float(ctx.states.t[0]), float(ctx.states.t[-1])),
             rate_hz=mean,
-        )
+        ).rated(mean, least_rate(ctx), seconds)
         return too_slow(ctx, outcome, mean, np.diff(clock))
     slowed = _slow_stretches(ctx)
     if not slowed:
-        return ctx.passed(f"{mean:.1f} Hz", f"{mean:.1f} Hz over {seconds:.1f} s", rate_hz=mean)
-    rates = [len(intervals) / float(intervals.sum()) for _, _, intervals in slowed]
+        text = f"{mean:.1f} Hz over {seconds:.1f} s"
+        met = ctx.passed(f"{mean:.1f} Hz", text, rate_hz=mean)
+        return met.rated(mean, least_rate(ctx), seconds)
+    rates = [len(intervals) / total(intervals) for _, _, intervals in slowed]
     begin, end, _ = slowed[0]
     many = "" if len(slowed) == 1 else f", the first of {len(slowed)} such stretches"
     period = 1 / ctx.tolerance("min_rate_hz")
     best = min(float(np.percentile(intervals, 25)) for _, _, intervals in slowed) - period
-    return ctx.failed(
+    measures = [
+        rate_measure(r, least_rate(ctx), b - a, span=(a, b))
+        for r, (a, b, _) in zip(rates, slowed, strict=True)
+    ]
+    outcome = ctx.failed(
         f"{min(rates):.1f} Hz",
         f"{mean:.1f} Hz over {seconds:.1f} s, but {rates[0]:.1f} Hz from {begin:.2f} s to "
         f"{end:.2f} s{many}",
         *(ctx.at(ctx.states.topic, a, b) for a, b, _ in slowed),
         rate_hz=min(rates),
-    ).if_late(*(1 / r - period for r in rates), how="mean", best=best)
+    ).resting_on(*measures)
+    return outcome.if_late(*(1 / r - period for r in rates), how="mean", best=best)
 
 
 @check("DEX1-RATE-02", "DEX3-RATE-02", "H1-RATE-02")
@@ -190,13 +220,14 @@ def vendor_rate(ctx: Context) -> Outcome:
         return _too_short(ctx)
     rate, seconds = measured
     text = f"{rate:.1f} Hz over {seconds:.1f} s"
-    if ctx.tolerance("min_rate_hz") <= rate <= ctx.tolerance("max_rate_hz"):
-        return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
+    least, most = ctx.tolerance("min_rate_hz"), ctx.tolerance("max_rate_hz")
+    if least <= rate <= most:
+        return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate).rated(rate, least, seconds)
     # load of the machine cannot cause too high a rate
     outcome = ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
-    if rate > ctx.tolerance("max_rate_hz"):
-        return outcome.if_late(math.inf)
-    return too_slow(ctx, outcome, rate, _observed(ctx)[0])
+    if rate > most:
+        return outcome.rated(rate, most, seconds, at_most=True).if_late(math.inf)
+    return too_slow(ctx, outcome.rated(rate, least, seconds), rate, _observed(ctx)[0])
 
 
 @check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03")
@@ -215,20 +246,21 @@ def no_gap(ctx: Context) -> Outcome:
         longest = max(b - a for a, b in found)
         first = found[0]
         many = "a gap" if len(found) == 1 else f"{len(found)} gaps; the first"
-        return ctx.failed(
+        outcome = ctx.failed(
             f"{longest:.3f} s",
             f"{many} from {first[0]:.3f} s to {first[1]:.3f} s",
             *(ctx.at(ctx.states.topic, a, b) for a, b in found),
             max_gap_s=longest,
             gaps=len(found),
-        ).if_late(*(b - a - limit for a, b in found))
+        ).resting_on(*gap_measures(found, limit))
+        return outcome.if_late(*(b - a - limit for a, b in found))
     free = np.ones(len(clock) - 1, dtype=np.bool_)
     for x, y in excluded:
         free &= (clock[1:] <= x) | (clock[:-1] >= y)
     longest = float(np.diff(clock)[free].max(initial=0.0))
     return ctx.passed(
         f"{longest * 1e3:.1f} ms", f"longest gap {longest * 1e3:.1f} ms", max_gap_s=longest
-    )
+    ).timed(longest, limit)
 
 
 @check("DEX1-RATE-04", "DEX3-RATE-04")
@@ -240,19 +272,23 @@ def regular(ctx: Context) -> Outcome:
     p50, p99 = np.percentile(intervals, [50, 99])
     text = f"p50 {p50 * 1e3:.2f} ms, p99 {p99 * 1e3:.2f} ms, longest {intervals.max() * 1e3:.1f} ms"
     worst = max((_worst_p99(ctx, clock) for clock in _times(ctx)), default=(p99, 0.0, seconds))
-    if max(p99, worst[0]) <= ctx.tolerance("max_p99_s"):
-        return ctx.passed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
-    if p99 > ctx.tolerance("max_p99_s"):
+    limit = ctx.tolerance("max_p99_s")
+    if max(p99, worst[0]) <= limit:
+        met = ctx.passed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
+        return met.timed(max(p99, worst[0]), limit)
+    if p99 > limit:
         outcome = ctx.failed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
-        return outcome.if_late(p99 - ctx.tolerance("max_p99_s"), how="p99")
+        outcome = outcome.timed(p99, limit)
+        return outcome.if_late(p99 - limit, how="p99")
     late, begin, end = worst
-    return ctx.failed(
+    outcome = ctx.failed(
         f"p99 {late * 1e3:.2f} ms",
         f"{text} in all; p99 {late * 1e3:.2f} ms from {begin:.1f} s to {end:.1f} s",
         ctx.at(ctx.states.topic, begin, end),
         p50_s=p50,
         p99_s=late,
-    ).if_late(late - ctx.tolerance("max_p99_s"), how="p99")
+    )
+    return outcome.timed(late, limit).if_late(late - limit, how="p99")
 
 
 def _worst_p99(ctx: Context, clock: Floats) -> tuple[float, float, float]:
@@ -335,6 +371,7 @@ def not_frozen(ctx: Context) -> Outcome:
                     frozen_s=float(held[i]),
                 )
                 .about(joint)
+                .timed(float(held[i]), limit)
                 .if_late(float(held[i]) - limit)
             )
     if not any(len(np.unique(c)) > 3 for c in ctx.states.q.T):
@@ -343,7 +380,7 @@ def not_frozen(ctx: Context) -> Outcome:
         f"{worst * 1e3:.0f} ms",
         f"no position was held for more than {worst:.3f} s and then jumped",
         frozen_s=worst,
-    )
+    ).timed(worst, limit)
 
 
 def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float) -> float:
@@ -405,7 +442,7 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
         fastest = median(np.diff(t[changes]))
         return ctx.passed(
             f"{fastest * 1e3:.1f} ms", "changes from sample to sample", hold_s=fastest
-        )
+        ).timed(fastest, ctx.tolerance("max_hold_s"))
     # the median of a few in a row, so that a hand whose values become old later is found
     count = min(_IN_A_ROW, len(holds))
     starts = t[changes][:-1][moving]
@@ -416,7 +453,8 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     hold = median(holds)
     text = f"a new value every {hold * 1e3:.1f} ms while moving (median of {len(holds)})"
     if medians[worst] <= ctx.tolerance("max_hold_s"):
-        return ctx.passed(f"{hold * 1e3:.1f} ms", ctx.named(text, joint), hold_s=hold)
+        met = ctx.passed(f"{hold * 1e3:.1f} ms", ctx.named(text, joint), hold_s=hold)
+        return met.timed(float(medians[worst]), ctx.tolerance("max_hold_s"))
     begin, end = float(starts[worst]), float(starts[worst + count - 1] + holds[worst + count - 1])
     hold = float(medians[worst])
     return (
@@ -427,6 +465,7 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
             hold_s=hold,
         )
         .about(joint)
+        .timed(hold, ctx.tolerance("max_hold_s"))
         .if_late(
             hold - ctx.tolerance("max_hold_s"),
             how="mean",

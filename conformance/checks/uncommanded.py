@@ -84,7 +84,8 @@ def still(ctx: Context) -> Outcome:
         return ctx.skipped("no joint came to rest while its command stayed the same")
     text = ctx.named(f"moved by at most {rad:.3f} rad at rest", joint)
     if rad <= ctx.tolerance("max_motion_stroke", joint):
-        return ctx.passed(f"{rad:.3f} rad", text, motion_rad=rad)
+        met = ctx.passed(f"{rad:.3f} rad", text, motion_rad=rad)
+        return met.placed(rad, ctx.tolerance("max_motion_stroke", joint))
     return (
         ctx.failed(
             f"{rad:.2f} rad",
@@ -93,6 +94,7 @@ def still(ctx: Context) -> Outcome:
             motion_rad=rad,
         )
         .about(joint)
+        .placed(rad, ctx.tolerance("max_motion_stroke", joint))
         .if_late(STROKE_S * rad / ctx.joints[joint].stroke)
     )
 
@@ -174,7 +176,7 @@ def path(ctx: Context) -> Outcome:
             f"{rad:.3f} rad",
             ctx.named(f"at most {rad:.3f} rad beyond its start and its goal", joint),
             beyond_rad=rad,
-        )
+        ).placed(rad, ctx.tolerance("max_beyond_stroke", joint))
     return (
         ctx.failed(
             f"{rad:.2f} rad",
@@ -187,6 +189,7 @@ def path(ctx: Context) -> Outcome:
             beyond_rad=rad,
         )
         .about(joint)
+        .placed(rad, ctx.tolerance("max_beyond_stroke", joint))
         .if_late(STROKE_S * rad / ctx.joints[joint].stroke)
     )
 

@@ -21,6 +21,8 @@ from dexkit.conformance.recording import Recording, TraceLike
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result
 from dexkit.conformance.robot import robot_in
+from dexkit.conformance.run_record import RECORD as RUN
+from dexkit.conformance.run_record import recorded_dialect, recorded_subjects
 from dexkit.conformance.verdicts import Judgement
 from dexkit.robots import ROBOTS
 from dexkit.topics import HAND_TOPICS
@@ -98,16 +100,21 @@ def layer(name: str) -> Layer[Any, Any, Any]:
 def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
     """Decode the DDS part of a recording: hands or a robot.
 
-    :param dialect_name: None to take what the topics show: hands, if there are any.
+    :param dialect_name: None to take what the run record says, else what the topics show: hands,
+        if there are any.
+    :param sides: none to take those of the run record, else those that have a topic.
     :raises ConformanceError: it has none of their topics.
     :raises UsageError: sides of a robot.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
-    name = dialect_name
+    run = trace.metadata.get(RUN, {})
+    name = dialect_name or recorded_dialect(run)
     if name is None:
         topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
         found = None if topics & HAND_TOPICS else robot_in(trace)
         name = found.name if found else None
+    if not sides and name == recorded_dialect(run):
+        sides = recorded_subjects(run)
     recording = layer("robot" if name in ROBOTS else "dds").decode(trace, name, sides)
     assert isinstance(recording, Recording), "only USB may be missing from a recording"
     return recording

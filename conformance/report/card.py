@@ -15,7 +15,7 @@ from dexkit.conformance.requirements import Kind, Requirement
 from dexkit.conformance.results import Evidence, Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
-__all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards"]
+__all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards", "near_limits"]
 
 
 class Item(str, Enum):
@@ -25,6 +25,7 @@ class Item(str, Enum):
     EXPECTED = "expected"
     ORIGINAL = "original"
     OBSERVED = "observed"
+    MEASURED = "measured"
     REASON = "reason"
     WHERE = "where"
     CAUSE = "cause"
@@ -122,6 +123,8 @@ class Card:
             side = result.side if len(self.results) > 1 else ""
             if result.observed:
                 yield Fact(Item.OBSERVED, result.observed, side)
+            if result.measure is not None and result.measure.told() not in result.reason:
+                yield Fact(Item.MEASURED, result.measure.told(), side)
             if result.reason:
                 yield Fact(Item.REASON, result.reason, side)
             for place in result.evidence:
@@ -169,6 +172,15 @@ def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
     return sorted(
         found, key=lambda card: (verdicts.index(card.verdict), -blocks[card.requirement.id])
     )
+
+
+def near_limits(result: RunResult) -> list[str]:
+    """A sentence for each pass that the kit's measurement error leaves in doubt."""
+    return [
+        f"{r.requirement.id} {r.side}: {r.measure.told()}"
+        for r in [*result.results, *result.client]
+        if r.verdict is Verdict.PASS and r.measure is not None and r.measure.uncertain
+    ]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,14 @@ from pathlib import Path
 from urllib.parse import quote
 
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.report.card import Blocked, Card, Fact, blocked_groups, cards
+from dexkit.conformance.report.card import (
+    Blocked,
+    Card,
+    Fact,
+    blocked_groups,
+    cards,
+    near_limits,
+)
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -54,6 +61,7 @@ _PLOT_BUDGET = 1_000_000
 """Bytes of plots on a page; the failures after that have none."""
 _BUSY = 0.2
 """Part of a run with programs waiting for a processor from which on the page reports it."""
+_RECORDED_WITH = ("dexkit", "python", "numpy", "cyclonedds", "processor", "kernel", "seed")
 _TROUBLE = (Verdict.FAIL, Verdict.ERROR, Verdict.WARN, Verdict.BLOCKED)
 _REALITY = {
     "emulated": "No real hand was involved: the device was an emulator at the far end of a wire. "
@@ -138,6 +146,9 @@ def _verdict(result: RunResult) -> str:
             f"<p><b>The testing machine was busy</b>: {escape(about_harness(result))}. What "
             "this can have caused is blocked, not failed; run again on an idle machine.</p>"
         )
+    if near := near_limits(result):
+        items = "".join(f"<li>{escape(text)}</li>" for text in near)
+        caution += f"<p><b>Nearer to a limit than the kit can measure</b>:</p><ul>{items}</ul>"
     if of := part(result):
         caution = f"<p><b>{of}</b>: this does not prove a drop-in.</p>{caution}"
     question = f"Is this a drop-in for Unitree's {escape(model_title(result))}?"
@@ -477,7 +488,9 @@ def _cell(result: Result) -> str:
 
 
 def _seen(result: Result, link: str) -> str:
-    text = ". ".join(t for t in (result.observed, result.reason) if t) or result.figure
+    told = result.measure.told() if result.measure is not None else ""
+    told = "" if told in result.reason else told
+    text = ". ".join(t for t in (result.observed, told, result.reason) if t) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
@@ -550,8 +563,10 @@ def _glossary(result: RunResult) -> str:
 
 def _environment(result: RunResult) -> str:
     notes = "".join(f"<li>{escape(n)}</li>" for n in result.notes)
+    rows = list(result.environment.items())
+    rows += [(f"recorded with {k}", result.run[k]) for k in _RECORDED_WITH if k in result.run]
     return (
-        f"<h2>Made with</h2>{_definitions(list(result.environment.items()))}"
+        f"<h2>Made with</h2>{_definitions(rows)}"
         + (f"<p>Notes on the recording:</p><ul>{notes}</ul>" if notes else "")
         + '<p class="dim">Times are seconds of the recording; log times are nanoseconds since '
         "1970, as the recording has them. It opens in Foxglove and PlotJuggler, and "

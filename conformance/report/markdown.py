@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards
+from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards, near_limits
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -115,6 +115,8 @@ def _troubles(result: RunResult) -> list[str]:
     for blocked in blocked_groups(result.results):
         names = ", ".join(code(card.requirement.id) for card in blocked.cards)
         lines += [f"{mark} {plain(blocked.reason)}: {names}", ""]
+    for text in near_limits(result):
+        lines += [f"- {plain(text)}", ""]
     return lines
 
 

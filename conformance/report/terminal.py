@@ -9,7 +9,7 @@ import rich.markup
 from rich.table import Table
 from rich.text import Text
 
-from dexkit.conformance.report.card import Card, blocked_groups, cards
+from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits
 from dexkit.conformance.report.labels import about_harness
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, grouped, worst
@@ -55,6 +55,8 @@ def print_result(
         console.print()
         _print_card(card, console)
     _print_blocked(result, console)
+    for text in near_limits(result):
+        console.print(f"[yellow]{_hung(console, '', text)}[/]", highlight=False, soft_wrap=True)
     if verbose:
         reasons: dict[tuple[str, str], list[str]] = {}
         for entry in [*result.results, *result.client]:

@@ -16,6 +16,7 @@ import numpy as np
 from dexkit.conformance.checks import BaseContext, Outcome, check
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.stimuli.usb import BUSES, DRIVEN, FREE
+from dexkit.conformance.sums import total
 from dexkit.conformance.usb.frames import NO_VALUE, STATE_SIZE, Scale, read_command
 from dexkit.conformance.usb.record import UsbPhase, topic
 from dexkit.conformance.usb.recording import Answer, Exchange, Floats, UsbRecording, UsbSide
@@ -499,12 +500,12 @@ def _speed_unit(c: UsbContext) -> Outcome:
         # an integral over samples that are far apart is meaningless, whatever caused the gap
         close = len(points) > 2 and np.diff(t).max() <= _COARSEST
         if close and abs(q[-1] - q[0]) > 0.05:
-            way = float(np.sum((dq[1:] + dq[:-1]) / 2 * np.diff(t)))
+            way = total((dq[1:] + dq[:-1]) / 2 * np.diff(t))
             ratio = ratios[joint] = way / float(q[-1] - q[0])
             # answers that arrive late by some time shift the integral by at most that time
             # multiplied by all changes of the speed
             beyond = max(c.tolerance("min_ratio") - ratio, ratio - c.tolerance("max_ratio"))
-            changes = float(np.abs(np.diff(dq)).sum())
+            changes = total(np.abs(np.diff(dq)))
             late[joint] = beyond * abs(float(q[-1] - q[0])) / changes if changes else math.inf
     outcome = _ratio(c, ratios, "the integrated speed is {:.2f} of the way of {}")
     if outcome.met is False:
@@ -537,7 +538,7 @@ def _torque_unit(c: UsbContext) -> Outcome:
             reported.append(motor.torque / scale.tau)
         both = np.array([law, reported])
         if both.size and np.abs(both[0]).max() > c.tolerance("min_tau"):
-            ratios[joint] = float(both[0] @ both[1] / (both[0] @ both[0]))
+            ratios[joint] = total(both[0] * both[1]) / total(both[0] ** 2)
     return _ratio(c, ratios, "the reported torque is {:.2f} of what the gains demand of {}")
 
 

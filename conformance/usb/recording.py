@@ -294,6 +294,11 @@ class UsbRecording:
         """
         return self.beats.lateness(self.log_time(begin), self.log_time(end))
 
+    def time_error(self, begin: float, end: float) -> float | None:
+        """The kit's error of a time in [begin, end], seconds; None if it is not known."""
+        late = self.lateness(begin, end)
+        return None if late is None else late[1]
+
     def lost(self, begin: float, end: float) -> Lost | None:
         """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
         return self.beats.lost(self.log_time(begin), self.log_time(end))

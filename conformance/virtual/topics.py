@@ -161,6 +161,7 @@ def run_virtual(plan: Plan[Subject], service_class: type[TopicDevice]) -> Memory
     script = script_for(plan)
     play(script, player.carry_out)
     objects = {s: plan.objects.get(s) for s in plan.sides}
-    player.trace.metadata[RECORD] = Stimulus(phases=script.phases, objects=objects).to_metadata()
+    stimulus = Stimulus(phases=script.phases, objects=objects, virtual=True)
+    player.trace.metadata[RECORD] = stimulus.to_metadata()
     service_class.recorded(player.trace)
     return player.trace

@@ -32,7 +32,7 @@ from dexkit.robots import ROBOTS
 @click.option(
     "--side",
     type=click.Choice(["left", "right", "both"]),
-    help="Hands to judge. Default: those that are in the recording.",
+    help="Hands to judge. Default: those of the run, else all that are in the recording.",
 )
 @click.option(
     "--dialect",
@@ -54,7 +54,8 @@ from dexkit.robots import ROBOTS
     "--capabilities",
     type=click.Path(path_type=Path),
     metavar="FILE.toml",
-    help="What the vendor claims; the rest is reported as not claimed.",
+    help="What the vendor claims; the rest is reported as not claimed. Default: what the "
+    "recording of a run says",
 )
 @click.option(
     "--list", "list_only", is_flag=True, help="Print the requirements that are selected, and end."
@@ -95,6 +96,7 @@ def command(
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import Kind, catalogue, select
     from dexkit.conformance.robot import robot_in
+    from dexkit.conformance.run_record import recorded_claims
     from dexkit.digests import sha256_of_file
     from dexkit.traces import open_trace
 
@@ -111,7 +113,10 @@ def command(
         robot = robot_in(trace) if dialect == "auto" and view.layer != "robot" else None
         also = f"there is a robot, too: judge it with --dialect {robot.name}" if robot else ""
         model_name = view.model.name
-    claims = Claims.load(capabilities, model_name)
+    if capabilities is None and view is not None:
+        claims = recorded_claims(view.run)
+    else:
+        claims = Claims.load(capabilities, model_name)
     model_name = model_name or claims.hand.get("model")
     if view is None:
         every = catalogue(model_name, None)

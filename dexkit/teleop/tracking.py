@@ -213,7 +213,9 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
         return math.nan, math.nan  # it does not follow at all
     best = (math.nan, math.inf)
     for shift in range(back + 1):
-        rms = math.sqrt(float(np.mean((position[use] - goal[use - shift]) ** 2)))
+        # exact, so that it is the same with every NumPy
+        squares = (position[use] - goal[use - shift]) ** 2
+        rms = math.sqrt(math.fsum(squares.tolist()) / len(use))
         if rms < best[1]:
             best = (shift * GRID, rms)
     return best

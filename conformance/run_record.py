@@ -1,0 +1,144 @@
+"""The run record: with what, on which machine and for which requirements a live run was made.
+
+It is mcap metadata, :data:`RECORD`, beside the stimulus record. With it the recording alone says
+how to judge it as the run was judged (dialect, sides, claims), and how to do the run again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+from dexkit import __version__
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.requirements import LAYERS, Requirement, catalogue
+from dexkit.errors import DexkitError
+from dexkit.hand import ROBOT, Side, Subject
+from dexkit.models import DIALECTS
+from dexkit.robots import ROBOTS
+
+__all__ = [
+    "RECORD",
+    "catalogue_digest",
+    "recorded_claims",
+    "recorded_dialect",
+    "recorded_subjects",
+    "run_record",
+]
+
+RECORD = "dexkit.run"
+VERSION = "1"
+NO_SEED = "none: the stimulus has no random numbers"
+_CPUS = Path("/proc/cpuinfo")
+
+
+def run_record(
+    *,
+    backend: str,
+    dialect: str,
+    sides: Iterable[Subject],
+    phases: Iterable[str],
+    rounds: int,
+    requirements: Iterable[Requirement],
+    claims: Claims,
+) -> dict[str, str]:
+    """The content of the record of a live run that begins now.
+
+    :param phases: of the stimulus.
+    :param rounds: of the stimulus.
+    """
+    return {
+        "version": VERSION,
+        "kind": "live",
+        "dexkit": __version__,
+        "python": platform.python_version(),
+        "numpy": _version("numpy"),
+        "cyclonedds": _version("cyclonedds"),
+        "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": str(os.cpu_count() or 0),
+        "seed": NO_SEED,
+        "catalogue": catalogue_digest(),
+        "backend": backend,
+        "dialect": dialect,
+        "sides": json.dumps([str(side) for side in sides]),
+        "phases": json.dumps(sorted(phases)),
+        "rounds": str(rounds),
+        "requirements": json.dumps([r.id for r in requirements]),
+        "claims": json.dumps(
+            None
+            if claims.units is None
+            else {"claims": dict(claims.units), "hand": dict(claims.hand)}
+        ),
+    }
+
+
+@cache
+def catalogue_digest() -> str:
+    """What identifies the requirements that this dexkit judges: SHA-256 of all of them, hex."""
+    every = [
+        {k: str(v) if k in ("level", "kind", "plots") else v for k, v in asdict(r).items()}
+        for layer in sorted(LAYERS)
+        for r in catalogue(None, layer)
+    ]
+    text = json.dumps(every, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def recorded_dialect(run: Mapping[str, str]) -> str | None:
+    """The dialect that the run was judged with; None if the record does not say."""
+    name = run.get("dialect")
+    return name if name in DIALECTS or name in ROBOTS else None
+
+
+def recorded_subjects(run: Mapping[str, str]) -> tuple[Subject, ...]:
+    """The subjects that the run was about; none if the record does not say."""
+    known: dict[str, Subject] = {str(s): s for s in (*Side, ROBOT)}
+    names = _parsed(run, "sides")
+    names = names if isinstance(names, list) else []
+    return tuple(known[n] for n in names if isinstance(n, str) and n in known)
+
+
+def recorded_claims(run: Mapping[str, str]) -> Claims:
+    """The claims that the run was judged with; none if the record does not say."""
+    found = _parsed(run, "claims")
+    if not isinstance(found, dict):
+        return Claims()
+    try:
+        return Claims.of_document(found, "the run record")
+    except DexkitError:  # of another dexkit, whose units are not known here
+        return Claims()
+
+
+def _parsed(run: Mapping[str, str], name: str) -> object:
+    try:
+        found: object = json.loads(run.get(name, "null"))
+    except ValueError:
+        return None
+    return found
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "none"
+
+
+def _processor() -> str:
+    """The processor's name, where the system tells."""
+    try:
+        for line in _CPUS.read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -1,0 +1,74 @@
+"""Recordings of runs in files, and what ``dexkit check`` of another process says of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.requirements import CAPABILITIES, catalogue
+from dexkit.conformance.run_record import RECORD, run_record
+from dexkit.conformance.virtual import MemoryTrace
+from dexkit.hand import Side
+from dexkit.traces.recorder import Recorder
+from tests.conformance_helpers import copy_of, short_run, with_beats
+
+CLAIMS = Claims(dict.fromkeys(CAPABILITIES, True), {"name": "Fist", "model": "dex1-1"})
+
+
+def write_run(path: Path) -> Path:
+    """Write a run of the left hand, on a machine whose timer was always 1.234 ms late."""
+    trace = copy_of(short_run())
+    with_beats(trace, usual_us=1_234)
+    _write(trace, path)
+    return path
+
+
+def _write(trace: MemoryTrace, path: Path) -> None:
+    """Put a recording in memory into a file, with a run record."""
+    endpoints = {
+        f"{e.topic} {e.kind}": f"{e.reliability}, Durability.{e.durability}, type={e.type_name}"
+        for e in trace.endpoints
+    }
+    about = run_record(
+        backend="virtual",
+        dialect="unitree_go",
+        sides=[Side.LEFT],
+        phases=["step", "silence"],
+        rounds=1,
+        requirements=catalogue("dex1-1", "dds"),
+        claims=CLAIMS,
+    )
+    with Recorder(path) as recorder:
+        for name, values in {**trace.metadata, "dds_endpoints": endpoints, RECORD: about}.items():
+            recorder.add_metadata(name, values)
+        for (topic, kind), rows in trace.rows.items():
+            for log_ns, sent_ns, data in rows:
+                assert recorder.put(topic, kind, data, log_ns, sent_ns)
+
+
+def checked(
+    path: Path, out: Path, python: str | Path = sys.executable, *, hash_seed: str = "0"
+) -> dict[str, Any]:
+    """The result file of ``dexkit check``, in a process of its own."""
+    subprocess.run(
+        [python, "-m", "dexkit", "check", path, "--json", out],
+        env=os.environ | {"PYTHONHASHSEED": hash_seed},
+        capture_output=True,
+        check=False,
+        cwd=out.parent,
+        timeout=300,
+    )
+    found: dict[str, Any] = json.loads(out.read_text())
+    return found
+
+
+def without_surroundings(data: dict[str, Any]) -> dict[str, Any]:
+    """A result without the versions of the program that judged, and the name of the file."""
+    left = {k: v for k, v in data.items() if k != "environment"}
+    left["subject"] = {k: v for k, v in data["subject"].items() if k != "recording"}
+    return left

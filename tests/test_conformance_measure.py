@@ -1,0 +1,203 @@
+"""Test what a verdict says of its measured figure, its limit and the kit's own error."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dexkit.conformance.checks import Outcome, rate_measure
+from dexkit.conformance.claims import Claims
+from dexkit.conformance.judge import judge
+from dexkit.conformance.measure import Measure, Quantity, weigh
+from dexkit.conformance.recording import Recording
+from dexkit.conformance.report.card import Card, near_limits
+from dexkit.conformance.report.html import render
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.result_file import read_json
+from dexkit.conformance.results import Evidence, Result, RunResult, Verdict
+from dexkit.conformance.stimulus_record import RECORD, Calibration, Stimulus
+from dexkit.conformance.verdicts import Excuse, Judgement
+from dexkit.conformance.virtual import MemoryTrace
+from dexkit.errors import TraceUnsupported
+from dexkit.hand import Side
+from tests.conformance_helpers import copy_of, of, short_run, with_beats
+from tests.each import each
+
+BY_ID = {r.id: r for r in catalogue(None, None)}
+GAP = BY_ID["DEX1-RATE-03"]  # a MUST
+JITTER = BY_ID["DEX1-RATE-04"]  # a SHOULD
+STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
+
+
+class Clock:
+    """A recording whose times have one error, or another one from a second on."""
+
+    def __init__(self, error: float | None, later: float | None = None) -> None:
+        self.error, self.later = error, later
+
+    def time_error(self, begin: float, end: float) -> float | None:
+        return self.error if self.later is None or begin < 1 else self.later
+
+
+def judged(seconds: float, error: float | None, requirement: str = GAP.id) -> Result:
+    met = seconds <= 0.1
+    outcome = Outcome(met, evidence=(Evidence("t", 1.0, 0, 1.0 + seconds),)).timed(seconds, 0.1)
+    return Judgement(BY_ID[requirement], Side.LEFT, Claims(), {}).run_check(
+        lambda: outcome,
+        lambda _: Excuse(),
+        lambda o: weigh(Clock(error), o.measures, [(1.0, 1.0 + seconds)], (0.0, 9.0)),
+    )
+
+
+@each(
+    ("seconds", "error", "verdict", "uncertain"),
+    [
+        (0.09, 0.002, Verdict.PASS, False),
+        (0.099, 0.002, Verdict.PASS, True),
+        (0.101, 0.002, Verdict.BLOCKED, True),
+        (0.103, 0.002, Verdict.FAIL, False),
+        # exact, and not known: as without a measure
+        (0.1001, 0.0, Verdict.FAIL, False),
+        (0.1001, None, Verdict.FAIL, False),
+        (0.0999, None, Verdict.PASS, False),
+    ],
+)
+def test_failure_within_the_kits_error_is_inconclusive(
+    seconds: float, error: float | None, verdict: Verdict, uncertain: bool
+) -> None:
+    found = judged(seconds, error)
+    assert found.measure is not None
+    assert (found.verdict, found.measure.uncertain) == (verdict, uncertain)
+    assert found.retry is (verdict is Verdict.BLOCKED)
+    if verdict is Verdict.BLOCKED:
+        assert "fails by less than the kit's measurement error of 0.002 s" in found.reason
+        assert "a quieter machine or another run may tell" in found.reason
+        assert RunResult({}, [found]).exit_code() == 2
+        assert RunResult({}, [found]).disturbed
+
+
+def test_should_within_the_kits_error_warns_all_the_same() -> None:
+    found = judged(0.101, 0.002, JITTER.id)
+    assert found.verdict is Verdict.WARN
+    assert "fails by less than the kit's measurement error" in Card.of([found]).as_text()
+
+
+def test_pass_within_the_kits_error_is_told_on_card_and_page() -> None:
+    found = judged(0.099, 0.002)
+    told = "passes by less than the kit's measurement error of 0.002 s"
+    assert told in Card.of([found]).as_text()
+    about = {"model": "dex1-1", "dialect": "unitree_go", "sides": "left"}
+    result = RunResult(about, [found, judged(0.05, 0.002)])
+    assert [told in text for text in near_limits(result)] == [True]
+    assert "Nearer to a limit than the kit can measure" in render(result)
+
+
+@given(
+    value=st.floats(-1e3, 1e3),
+    limit=st.floats(-1e3, 1e3),
+    error=st.floats(1e-9, 1e3),
+    worse=st.booleans(),
+)
+def test_margin_is_positive_on_the_side_that_passes(
+    value: float, limit: float, error: float, worse: bool
+) -> None:
+    measure = Measure(value, limit, larger_is_worse=worse, error=error)
+    assert (measure.margin >= 0) is (value <= limit if worse else value >= limit)
+    assert measure.in_errors is not None
+    assert measure.in_errors * error == pytest.approx(measure.margin)
+    assert measure.uncertain is (abs(measure.margin) < error)
+    assert Measure.of_dict(json.loads(json.dumps(measure.as_dict()))) == measure
+
+
+def test_of_several_places_the_least_explained_one_decides() -> None:
+    early, late = (Measure(0.15, 0.1, span=(a, a + 0.15)) for a in (0.2, 2.0))
+    found = weigh(Clock(0.2, 0.001), [early, late], [], (0.0, 9.0))
+    assert found is not None
+    assert (found.span, found.uncertain) == (late.span, False)
+    assert weigh(Clock(0.0), [Measure(math.inf, 1.0)], [], (0.0, 9.0)) is None
+
+
+def test_error_of_a_rate_is_that_of_its_time() -> None:
+    found = weigh(Clock(0.01), [rate_measure(195.0, 196.0, 2.0)], [], (0.0, 9.0))
+    assert found is not None
+    assert found.error == pytest.approx(2 * 0.01 * 195 / 2)
+    assert (found.margin, found.unit, found.uncertain) == (-1.0, "Hz", True)
+
+
+def test_position_is_as_exact_as_the_message() -> None:
+    found = weigh(Clock(None), Outcome(True).placed(0.1, 0.2).measures, [], (0.0, 9.0))
+    assert found is not None
+    assert found.quantity is Quantity.POSITION
+    assert found.error == 2.0**-26  # a step of a float32 between 1/8 and 1/4
+
+
+def with_gap(seconds: float) -> Recording:
+    """A short run with one gap, on a machine whose timer was always 1 ms late."""
+    trace = copy_of(short_run())
+    begin = trace.rows[STATE][0][0] + round(2.5e9)
+    end = begin + round(seconds * 1e9)
+    trace.rows[STATE] = [r for r in trace.rows[STATE] if not begin <= r[0] < end]
+    return with_beats(trace, usual_us=1_000)
+
+
+def test_error_is_that_of_the_beats_at_the_place() -> None:
+    found = of(judge(with_gap(0.2)), GAP.id)
+    assert found.verdict is Verdict.FAIL
+    assert found.measure is not None
+    assert found.measure.error == pytest.approx(0.001)
+    assert found.measure.margin == pytest.approx(-0.1, abs=0.004)
+
+
+def test_virtual_run_measures_without_error_and_others_do_not_know() -> None:
+    trace = copy_of(short_run())
+    exact = of(judge(Recording.decode(trace)), GAP.id).measure
+    assert exact is not None
+    assert (exact.error, exact.in_errors) == (0.0, None)
+    trace.metadata.clear()
+    unknown = of(judge(Recording.decode(trace)), GAP.id).measure
+    assert unknown is not None
+    assert unknown.error is None
+    assert unknown.told().endswith("the kit's measurement error is not known here")
+
+
+def test_calibration_is_the_least_error_of_times() -> None:
+    trace = copy_of(short_run())
+    stimulus = Stimulus.from_metadata(with_beats_record(trace))
+    assert stimulus.time_error(stimulus.beats.begin_ns, 2**62) == pytest.approx(0.001)
+    stimulus.calibration = Calibration(4, [100, 200, 300, 9_000], [0, 0, 0, 0], 2)
+    again = Stimulus.from_metadata(stimulus.to_metadata())
+    assert again == stimulus
+    error = again.time_error(stimulus.beats.begin_ns, 2**62)
+    assert error == pytest.approx(0.009, rel=0.05)
+    assert Calibration(4, [100], [0] * 4).time_error is None  # most messages were lost
+    assert Calibration(2, [100, 100], [0, 0], clock_us=500).time_error == pytest.approx(0.0005)
+
+
+def with_beats_record(trace: MemoryTrace) -> dict[str, str]:
+    with_beats(trace, usual_us=1_000)
+    return trace.metadata[RECORD]
+
+
+@each(
+    "text",
+    ["[]", "3", '{"sent": 1.5}', '{"delay_us": ["x"]}', '{"delay_us": 3}', '{"strange": 1}'],
+)
+def test_damaged_calibration_is_refused(text: str) -> None:
+    record = {**short_run().metadata[RECORD], "calibration": text}
+    with pytest.raises(TraceUnsupported):
+        Stimulus.from_metadata(record)
+
+
+def test_result_file_keeps_measures(tmp_path: Path) -> None:
+    result = judge(with_gap(0.2))
+    result.write_json(tmp_path / "r.json")
+    again = read_json(tmp_path / "r.json")
+    assert [r.measure and r.measure.as_dict() for r in again.results] == [
+        r.measure and r.measure.as_dict() for r in result.results
+    ]
+    assert any(r.measure for r in again.results)
