@@ -37,7 +37,7 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Planned, Stimulus
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject
@@ -151,6 +151,7 @@ def record_run(
             objects={s: plan.objects.get(s) for s in plan.sides},
             stalls=heart.stalls,
             beats=heart.beats,
+            planned=Planned(plan.phases, plan.rounds),
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished

@@ -29,6 +29,7 @@ from typing import Any
 from dexkit import __version__, documents
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
+from dexkit.conformance.scores import NO_SCORE, Score
 
 __all__ = [
     "FORMAT",
@@ -314,6 +315,7 @@ class RunResult:
     :param client: results of the requirements about the client that commands the hands, each for
         the hand of that side. They do not count in the verdict on the hands. Empty in a run of
         the kit, which is its own client.
+    :param score: how many wrong hands a run like this catches.
     """
 
     subject: dict[str, str]
@@ -327,6 +329,7 @@ class RunResult:
     claims: dict[str, bool] | None = None
     catalogue: int = 0
     client: list[Result] = field(default_factory=list)
+    score: Score = NO_SCORE
 
     @property
     def partial(self) -> bool:
@@ -457,6 +460,7 @@ class RunResult:
             }
             if self.client
             else None,
+            "score": self.score.as_dict(),
         }
 
     def write_json(self, path: Path) -> None:

@@ -23,6 +23,7 @@ __all__ = [
     "Beats",
     "Lost",
     "Phase",
+    "Planned",
     "Stall",
     "Stimulus",
     "parse_stalls",
@@ -58,6 +59,36 @@ class Phase:
     targets: dict[Subject, dict[int, float]] = field(default_factory=dict)
     params: dict[str, str] = field(default_factory=dict)
     observed: dict[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Which stimuli a run was to apply.
+
+    :param phases: names of the phases that its requirements need.
+    :param rounds: how often it was to go through those between the first motion and the operator.
+    """
+
+    phases: frozenset[str]
+    rounds: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Planned:
+        """Parse the record's content.
+
+        :raises TypeError, ValueError, KeyError, TraceUnsupported: it is damaged.
+        """
+        found = _json(text)
+        phases, rounds = found["phases"], found["rounds"]
+        if not isinstance(phases, list) or not all(isinstance(p, str) for p in phases):
+            raise TypeError("the names of the planned phases are no texts")
+        if type(rounds) is not int:
+            raise TypeError(f"{rounds!r} is no number of rounds")
+        return cls(frozenset(phases), rounds)
+
+    def as_text(self) -> str:
+        """The record's content."""
+        return json.dumps({"phases": sorted(self.phases), "rounds": self.rounds})
 
 
 @dataclass(frozen=True)
@@ -141,12 +172,14 @@ class Stimulus:
         hand of one joint, percent of closing for others.
     :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
+    :param planned: which stimuli the run was to apply; None in recordings of earlier versions.
     """
 
     phases: list[Phase] = field(default_factory=list)
     objects: dict[Subject, float | None] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
+    planned: Planned | None = None
 
     def to_metadata(self) -> dict[str, str]:
         """The record's content."""
@@ -172,6 +205,7 @@ class Stimulus:
             "objects": json.dumps({str(s): q for s, q in self.objects.items()}),
             "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
             "beats": json.dumps(asdict(self.beats)),
+            **({"planned": self.planned.as_text()} if self.planned is not None else {}),
         }
 
     @classmethod
@@ -206,6 +240,7 @@ class Stimulus:
                 },
                 stalls=parse_stalls(record["stalls"]),
                 beats=Beats.parse(record.get("beats", "{}")),
+                planned=Planned.parse(record["planned"]) if "planned" in record else None,
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
