@@ -19,7 +19,7 @@ from dexkit.conformance import scores
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.generated.campaign import wilson
+from dexkit.conformance.mutants.generated.campaign import Trial, wilson
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.html import render
@@ -48,7 +48,7 @@ from dexkit.hand import Side
 from dexkit.models import BUILT_IN, model
 from dexkit.traces import open_trace, sample_path
 from tests.report_helpers import result_of_every_kind
-from tools.scores import HANDS, SEED, _try, as_text, tasks
+from tools.scores import HANDS, SEED, _entry, _keep, _kept, _try, as_text, tasks
 
 ROOT = Path(__file__).parent.parent
 KNOWN = Score(
@@ -380,7 +380,7 @@ def test_a_missing_or_wrong_file_of_scores(tmp_path: Path) -> None:
 
 
 def test_the_tool_judges_a_hand_in_every_kind_of_run() -> None:
-    chosen = tasks("dex1-1", {RunKind.QUICK: 1})
+    chosen = tasks("dex1-1", {(RunKind.QUICK, s): 1 for s in Setting})
     assert [t.setting for t in chosen] == list(Setting)
     trials = _try("dex1-1/unitree_go:q-offset@both,joint0,always", chosen)
     assert len(trials) == 2
@@ -391,6 +391,38 @@ def test_the_tool_judges_a_hand_in_every_kind_of_run() -> None:
     assert set(trials[0].failed) <= quick
 
 
+def test_the_tool_does_nothing_twice(tmp_path: Path) -> None:
+    file = tmp_path / "done.jsonl"
+    chosen = tasks("dex1-1", {(RunKind.QUICK, s): 2 for s in Setting})
+    assert _kept(None, chosen) == _kept(file, chosen) == {}
+    done = {(t, name): Trial(name, "x", "", "lesser") for t in chosen for name in ("a", "b")}
+    _keep(file, done)
+    with file.open("a") as cut:
+        cut.write('{"about": ')  # stopped while it wrote
+    assert _kept(file, chosen) == done
+    assert _kept(file, tasks("dex1-1", {(RunKind.DEFAULT, Setting.WHOLE): 2})) == {}
+    assert _kept(file, tasks("dex3-1", {(RunKind.QUICK, Setting.WHOLE): 2})) == {}
+    file.write_text("1\n")
+    with pytest.raises(UsageError, match="no trial of a hand"):
+        _kept(file, chosen)
+
+
+def test_an_entry_counts_hands_by_grade() -> None:
+    (task,) = tasks("dex1-1", {(RunKind.QUICK, Setting.WHOLE): 5})
+    grave = Trial("a", "x", "", "must-breaking", areas=("MOVE",))
+    trials = [
+        replace(grave, failed=("DEX1-MOVE-02",)),
+        replace(grave, failed=("DEX1-RATE-01",)),  # for a wrong reason
+        replace(grave, severity="lesser", warned=("DEX1-MOVE-02",)),
+        replace(grave, severity="equivalent"),
+    ]
+    made = _entry(task, trials, {"unitree_go": {}})
+    assert (made.hands, made.equivalent) == (4, 1)
+    assert (made.must_breaking.count, made.must_breaking.caught) == (2, 1)
+    assert (made.lesser.count, made.lesser.caught) == (1, 1)
+    assert Entry.from_dict(json.loads(json.dumps(made.as_dict()))) == made
+
+
 def test_thorough_runs_repeat_the_stimuli() -> None:
     assert plan_for(run=RunKind.THOROUGH).rounds == THOROUGH_ROUNDS
     assert plan_for().rounds == plan_for(run=RunKind.QUICK).rounds == 1
@@ -398,7 +430,7 @@ def test_thorough_runs_repeat_the_stimuli() -> None:
 
 
 def test_an_external_service_is_neither_restarted_nor_given_an_object() -> None:
-    (whole, external) = tasks("dex1-1", {RunKind.DEFAULT: 1})
+    (whole, external) = tasks("dex1-1", {(RunKind.DEFAULT, s): 1 for s in Setting})
     assert whole.plan("unitree_go", tuple(Side)).objects
     plan = external.plan("unitree_go", tuple(Side))
     assert not plan.objects

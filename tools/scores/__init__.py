@@ -11,9 +11,11 @@ from __future__ import annotations
 import json
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.generated import dialects, parse, sample
@@ -23,19 +25,32 @@ from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.scores import FORMAT, Caught, Entry, Setting, catalogue_digest
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
+from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
 from dexkit.models import model
 
-__all__ = ["HANDS", "SEED", "Task", "as_text", "entries_of", "tasks"]
+__all__ = ["HANDS", "SEED", "Counts", "Task", "as_text", "entries_of", "tasks"]
 
 SEED = 1
-HANDS: Mapping[str, Mapping[RunKind, int]] = {
-    "dex1-1": {RunKind.QUICK: 40, RunKind.DEFAULT: 40, RunKind.THOROUGH: 16},
-    "dex3-1": {RunKind.QUICK: 40, RunKind.DEFAULT: 40, RunKind.THOROUGH: 10},
-    "dex5-1": {RunKind.QUICK: 20, RunKind.DEFAULT: 20},
+Counts = Mapping[tuple[RunKind, Setting], int]
+"""How many hands are tried, by kind and setting of their runs."""
+HANDS: Mapping[str, Counts] = {
+    "dex1-1": {
+        (RunKind.QUICK, Setting.WHOLE): 40,
+        (RunKind.QUICK, Setting.EXTERNAL): 40,
+        (RunKind.DEFAULT, Setting.WHOLE): 40,
+        (RunKind.DEFAULT, Setting.EXTERNAL): 40,
+        (RunKind.THOROUGH, Setting.WHOLE): 20,
+    },
+    "dex3-1": {
+        (RunKind.QUICK, Setting.WHOLE): 40,
+        (RunKind.DEFAULT, Setting.WHOLE): 40,
+        (RunKind.THOROUGH, Setting.WHOLE): 10,
+    },
+    "dex5-1": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
 }
-"""By model, so many hands are generated and tried in runs of each kind. A run of a kind that is not
-there has no score."""
+"""By model, so many hands are generated and tried. A run of a kind that is not there has no
+score."""
 _NOT_OURS = frozenset({"shutdown", "service-restart"})
 """Phases that there are only where the kit has started the service."""
 
@@ -57,17 +72,13 @@ class Task:
         return plan
 
 
-def tasks(model_name: str, hands: Mapping[RunKind, int] | None = None) -> list[Task]:
-    """What is tried of a model. Thorough runs are tried whole only: they take long.
+def tasks(model_name: str, hands: Counts | None = None) -> list[Task]:
+    """What is tried of a model.
 
-    :param hands: how many, by kind; None for those of :data:`HANDS`.
+    :param hands: how many; None for those of :data:`HANDS`.
     """
-    return [
-        Task(model_name, run, setting, count)
-        for run, count in (HANDS[model_name] if hands is None else hands).items()
-        for setting in Setting
-        if setting is Setting.WHOLE or run is not RunKind.THOROUGH
-    ]
+    counts = HANDS[model_name] if hands is None else hands
+    return [Task(model_name, run, setting, n) for (run, setting), n in counts.items()]
 
 
 def _try(name: str, chosen: Sequence[Task]) -> list[Trial]:
@@ -119,38 +130,79 @@ def _entry(task: Task, trials: Sequence[Trial], fewer: Mapping[str, Mapping[str,
 def entries_of(
     model_name: str,
     *,
-    hands: Mapping[RunKind, int] | None = None,
+    hands: Counts | None = None,
+    keep: Path | None = None,
     jobs: int | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[Entry]:
     """Try the hands of a model.
 
-    :param hands: how many, by kind; None for those of :data:`HANDS`.
+    :param hands: how many; None for those of :data:`HANDS`.
+    :param keep: each trial is added to this file when it is done, and those that are there are
+        not done again. None for none.
     :param jobs: processes; one per processor by default.
     :param report: called with the name of each hand that is done.
     """
     every = tasks(model_name, hands)
     spoken = dialects(model_name)
     names = [h.name for h in sample(max(t.hands for t in every), SEED, spoken)]
-    todo = [(name, [t for t in every if i < t.hands]) for i, name in enumerate(names)]
-    found: dict[Task, list[Trial]] = {task: [] for task in every}
-
-    def trials(pool: ProcessPoolExecutor) -> Iterator[list[Trial]]:
-        return pool.map(_try, [n for n, _ in todo], [chosen for _, chosen in todo])
-
+    wanted = {(task, name) for task in every for name in names[: task.hands]}
+    found = {key: trial for key, trial in _kept(keep, every).items() if key in wanted}
+    left = {n: [t for t in every if (t, n) in wanted and (t, n) not in found] for n in names}
+    todo = [(name, chosen) for name, chosen in left.items() if chosen]
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        for (name, chosen), done in zip(todo, trials(pool), strict=True):
+        tried = pool.map(_try, [name for name, _ in todo], [chosen for _, chosen in todo])
+        for (name, chosen), done in zip(todo, tried, strict=True):
             report(name)
-            for task, trial in zip(chosen, done, strict=True):
-                found[task].append(trial)
+            new = {(task, name): trial for task, trial in zip(chosen, done, strict=True)}
+            _keep(keep, new)
+            found |= new
         dialect_names = [d.name for d in spoken]
         pairs = [(task, name) for task in every for name in dialect_names]
         counts = pool.map(_fewer, [t for t, _ in pairs], [name for _, name in pairs])
         fewer = dict(zip(pairs, counts, strict=True))
     return [
-        _entry(task, found[task], {name: fewer[task, name] for name in dialect_names})
+        _entry(
+            task,
+            [found[task, name] for name in names[: task.hands]],
+            {name: fewer[task, name] for name in dialect_names},
+        )
         for task in every
     ]
+
+
+def _about(task: Task) -> dict[str, Any]:
+    """What a trial of the task depends on, as plain data."""
+    digest = catalogue_digest(task.model)
+    return {"run": str(task.run), "setting": str(task.setting), "catalogue": digest, "seed": SEED}
+
+
+def _keep(file: Path | None, trials: Mapping[tuple[Task, str], Trial]) -> None:
+    """Add trials to a file, a line of JSON each."""
+    if file is None:
+        return
+    with file.open("a", encoding="utf-8") as out:
+        for (task, _), trial in trials.items():
+            out.write(json.dumps({"about": _about(task), "trial": asdict(trial)}) + "\n")
+
+
+def _kept(file: Path | None, every: Sequence[Task]) -> dict[tuple[Task, str], Trial]:
+    """The trials of the tasks that a file has; a line that was cut off is none.
+
+    :raises UsageError: it is no such file.
+    """
+    if file is None or not file.exists():
+        return {}
+    found = {}
+    lines = file.read_text(encoding="utf-8").split("\n")[:-1]
+    for line in lines:
+        try:
+            values = json.loads(line)
+            about, trial = values["about"], Trial.from_dict(values["trial"])
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UsageError(f"{file} has a line that is no trial of a hand") from error
+        found |= {(t, trial.name): trial for t in every if _about(t) == about}
+    return found
 
 
 def as_text(entries: Sequence[Entry]) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from pathlib import Path
 
 from dexkit.conformance.scores import FILE, catalogue_digest, entries
 from dexkit.documents import write_file
@@ -19,6 +20,9 @@ def main() -> int:
     parser.add_argument("--model", action="append", choices=list(HANDS), help="only this model")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument(
+        "--resume", type=Path, help="keep what is done in this file, and do not do it again"
+    )
+    parser.add_argument(
         "--check", action="store_true", help="try nothing; exit code 1 if requirements have changed"
     )
     options = parser.parse_args()
@@ -30,7 +34,7 @@ def main() -> int:
             print(f"the requirements of {name} have changed: run python -m tools.scores")
         return 1 if old else 0
     for name in options.model or HANDS:
-        found = entries_of(name, jobs=options.jobs, report=print)
+        found = entries_of(name, keep=options.resume, jobs=options.jobs, report=print)
         kept = [e for e in kept if e.model != name] + found
         kept.sort(key=lambda e: list(HANDS).index(e.model))
         write_file(FILE, as_text(kept))
