@@ -50,7 +50,7 @@ HANDS: Mapping[str, Counts] = {
     "dex5-1": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
 }
 """By model, so many hands are generated and tried. A run of a kind that is not there has no
-score."""
+score. ``--hands`` tries fewer; the file says how many each entry has."""
 _NOT_OURS = frozenset({"shutdown", "service-restart"})
 """Phases that there are only where the kit has started the service."""
 
@@ -72,13 +72,17 @@ class Task:
         return plan
 
 
-def tasks(model_name: str, hands: Counts | None = None) -> list[Task]:
+def tasks(model_name: str, hands: Counts | None = None, *, most: int | None = None) -> list[Task]:
     """What is tried of a model.
 
     :param hands: how many; None for those of :data:`HANDS`.
+    :param most: not more hands than that in any kind of run.
     """
     counts = HANDS[model_name] if hands is None else hands
-    return [Task(model_name, run, setting, n) for (run, setting), n in counts.items()]
+    return [
+        Task(model_name, run, setting, n if most is None else min(n, most))
+        for (run, setting), n in counts.items()
+    ]
 
 
 def _try(name: str, chosen: Sequence[Task]) -> list[Trial]:
@@ -131,19 +135,20 @@ def entries_of(
     model_name: str,
     *,
     hands: Counts | None = None,
+    most: int | None = None,
     keep: Path | None = None,
     jobs: int | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[Entry]:
     """Try the hands of a model.
 
-    :param hands: how many; None for those of :data:`HANDS`.
+    :param hands: how many, and ``most``: see :func:`tasks`.
     :param keep: each trial is added to this file when it is done, and those that are there are
         not done again. None for none.
     :param jobs: processes; one per processor by default.
     :param report: called with the name of each hand that is done.
     """
-    every = tasks(model_name, hands)
+    every = tasks(model_name, hands, most=most)
     spoken = dialects(model_name)
     names = [h.name for h in sample(max(t.hands for t in every), SEED, spoken)]
     wanted = {(task, name) for task in every for name in names[: task.hands]}
