@@ -198,7 +198,7 @@ def _kept(file: Path | None, every: Sequence[Task]) -> dict[tuple[Task, str], Tr
     """
     if file is None or not file.exists():
         return {}
-    found = {}
+    found: dict[tuple[Task, str], Trial] = {}
     lines = file.read_text(encoding="utf-8").split("\n")[:-1]
     for line in lines:
         try:
