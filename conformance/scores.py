@@ -266,7 +266,7 @@ def score_of(
         about = MODELS.get(model) or ROBOTS.get(model)
         return Score(
             f"no wrong {'robots' if model in ROBOTS else 'hands'} of the model "
-            f"{about.title if about else model} are generated and tried"
+            f"{about.title if about else model} have been tried"
         )
     if stimulus.planned is None:
         return Score("the recording does not say which stimuli were to be applied")
@@ -276,7 +276,7 @@ def score_of(
         if (e.phases, e.rounds) == (stimulus.planned.phases, stimulus.planned.rounds)
     ]
     if not of_kind:
-        return Score("a part of the stimuli was selected, which is no kind of run that was tried")
+        return Score("its stimuli are those of no kind of run that was tried")
     if any(e.catalogue != catalogue_digest(model) for e in of_kind):
         return Score("the requirements have changed since wrong hands were tried on them")
     if len(sides) < len(Side):

@@ -218,7 +218,7 @@ def test_a_complete_run_has_the_score_of_its_kind() -> None:
         ({"model": "twofinger"}, "no wrong hands of the model twofinger"),
         ({"stimulus": Stimulus()}, "does not say which stimuli"),
         ({"stimulus": Stimulus(planned=Planned(PHASES, 3))}, "no kind of run that was tried"),
-        ({"stimulus": Stimulus(planned=Planned(frozenset("a")))}, "a part of the stimuli"),
+        ({"stimulus": Stimulus(planned=Planned(frozenset("a")))}, "stimuli are those of no kind"),
         ({"sides": ["left"]}, "only the left hand was judged"),
         ({"selected": set(IDS[1:])}, "requirements were left out: DEX1-A-01"),
         ({"judged": {**BOTH, "DEX1-B-01": 1}}, "not be judged on each side: DEX1-B-01"),
