@@ -6,6 +6,7 @@ layer to layer is data, in :mod:`dexkit.conformance.layers`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from typing import Any
@@ -20,6 +21,7 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
+from dexkit.conformance.scores import Score, score_of
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
@@ -76,6 +78,7 @@ def judge(
         catalogue=len({r.requirement.id for r in results}),
         recorded_at=when.isoformat(timespec="seconds"),
         run=dict(recording.run),
+        score=_score(recording, chosen),
     )
 
 
@@ -140,6 +143,18 @@ def _harness(recording: Recording) -> dict[str, float]:
     if late is not None:
         figures |= {"jitter_p50_ms": late[0] * 1e3, "jitter_p99_ms": late[1] * 1e3}
     return figures
+
+
+def _score(recording: Recording, results: Sequence[Result]) -> Score:
+    """How many wrong hands a run with these results catches."""
+    return score_of(
+        recording.model.name,
+        recording.dialect.name,
+        [str(side) for side in recording.judged],
+        recording.stimulus,
+        {r.requirement.id for r in results},
+        Counter(r.requirement.id for r in results if r.verdict.judged),
+    )
 
 
 def _stage(recording: Recording, side: Subject) -> Stage:

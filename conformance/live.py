@@ -43,7 +43,7 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Planned, Stimulus
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject
@@ -176,6 +176,7 @@ def record_run(
             stalls=heart.stalls,
             beats=heart.beats,
             calibration=calibration,
+            planned=Planned(plan.phases, plan.rounds),
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished

@@ -24,6 +24,7 @@ from dexkit.conformance.results import (
     Stage,
     Verdict,
 )
+from dexkit.conformance.scores import Score
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 
@@ -55,6 +56,8 @@ def parse_result(data: Any, path: object) -> RunResult:
     elif about.get("version") != VERSION:
         raise UsageError(f"{path} is version {one_line(about.get('version'), 40)} of {FORMAT}")
     _validate(data, path)
+    # files of the first programs that wrote version 3 have no score, and none of a client
+    score = {"score": Score.from_dict(data["score"])} if "score" in data else {}
     return RunResult(
         subject=data["subject"],
         stage={side: Stage(stage) for side, stage in data["stage"].items()},
@@ -67,8 +70,8 @@ def parse_result(data: Any, path: object) -> RunResult:
         catalogue=data["catalogue"],
         recorded_at=data["recorded_at"],
         results=[_result_of(entry) for entry in data["results"]],
-        # files of the first programs that wrote version 3 have none
         client=[_result_of(entry) for entry in (data.get("client") or {"results": []})["results"]],
+        **score,
     )
 
 

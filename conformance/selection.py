@@ -1,8 +1,9 @@
-"""Select the requirements of a quick run, and print a selection."""
+"""The kinds of a run: which requirements each judges; and print a selection."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from functools import cache
 
 from dexkit.conformance.requirements import Level, Requirement
@@ -12,7 +13,30 @@ from dexkit.hand import ROBOT, Side
 from dexkit.models import model
 from dexkit.robots import ROBOTS
 
-__all__ = ["length", "print_selection", "quick"]
+__all__ = ["THOROUGH_ROUNDS", "RunKind", "length", "print_selection", "quick"]
+
+THOROUGH_ROUNDS = 10
+"""Rounds of a thorough run: about ten minutes of stimulus for a pair of grippers."""
+
+
+class RunKind(str, Enum):
+    """How much a run of the suite does."""
+
+    QUICK = "quick"
+    DEFAULT = "default"
+    THOROUGH = "thorough"
+
+    def __str__(self) -> str:
+        return self.value
+
+    @property
+    def rounds(self) -> int:
+        """How often a hand goes through the stimuli."""
+        return THOROUGH_ROUNDS if self is RunKind.THOROUGH else 1
+
+    def requirements(self, every: Sequence[Requirement]) -> tuple[Requirement, ...]:
+        """Those of ``every`` that such a run judges."""
+        return quick(every) if self is RunKind.QUICK else tuple(every)
 
 
 @cache

@@ -25,7 +25,7 @@ from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.robot import robot_dialect
-from dexkit.conformance.selection import quick as quick_ones
+from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.digests import sha256_of_file
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 __all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "selection"]
 
 T = TypeVar("T")
-THOROUGH_ROUNDS = 10
-"""Rounds of a thorough run: about ten minutes of stimulus for a pair of grippers."""
 _FILES = 48  # descriptors of a run: DDS, recording, the pipes of its processes
 
 
@@ -55,7 +53,7 @@ class SuiteOptions:
     """The options of a run of the suite.
 
     :param domain: None for a free one.
-    :param thorough: :data:`THOROUGH_ROUNDS` rounds of the stimulus.
+    :param thorough: every stimulus again and again, as :class:`RunKind` says.
     """
 
     backend: str
@@ -194,7 +192,7 @@ class SuiteOptions:
         claims = Claims.load(capabilities, chosen.model)
         requirements = select(claims.apply(every), prefixes=require, level=level)
         if quick:
-            requirements = quick_ones(requirements)
+            requirements = RunKind.QUICK.requirements(requirements)
         if not requirements:
             raise UsageError("no requirement is left by --require, --level and --quick together")
         options = cls(
@@ -263,7 +261,7 @@ def selection(config: pytest.Config) -> tuple[Requirement, ...]:
         prefixes=config.getoption("dexkit_require"),
         level=config.getoption("dexkit_level"),
     )
-    return quick_ones(found) if config.getoption("dexkit_quick") else found
+    return RunKind.QUICK.requirements(found) if config.getoption("dexkit_quick") else found
 
 
 def _robot_of(backend: str, dialect_name: str | None) -> str:
@@ -353,13 +351,13 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
             Session.load(options.trace) if options.trace else Session.default(options.dialect.model)
         ).for_hand(options.dialect)
     usb = any(r.layer == "usb" for r in options.requirements)
-    rounds = THOROUGH_ROUNDS if options.thorough else 1
+    run = RunKind.THOROUGH if options.thorough else RunKind.DEFAULT
     return LiveOptions(
         options.rig(domain),
         phases,
         session,
         usb=usb,
-        rounds=rounds,
+        rounds=run.rounds,
         requirements=options.requirements,
         claims=options.claims,
     )

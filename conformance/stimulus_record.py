@@ -26,6 +26,7 @@ __all__ = [
     "Calibration",
     "Lost",
     "Phase",
+    "Planned",
     "Stall",
     "Stimulus",
     "parse_stalls",
@@ -64,6 +65,36 @@ class Phase:
     targets: dict[Subject, dict[int, float]] = field(default_factory=dict)
     params: dict[str, str] = field(default_factory=dict)
     observed: dict[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Which stimuli a run was to apply.
+
+    :param phases: names of the phases that its requirements need.
+    :param rounds: how often it was to go through those between the first motion and the operator.
+    """
+
+    phases: frozenset[str]
+    rounds: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Planned:
+        """Parse the record's content.
+
+        :raises TypeError, ValueError, KeyError, TraceUnsupported: it is damaged.
+        """
+        found = _json(text)
+        phases, rounds = found["phases"], found["rounds"]
+        if not isinstance(phases, list) or not all(isinstance(p, str) for p in phases):
+            raise TypeError("the names of the planned phases are no texts")
+        if type(rounds) is not int:
+            raise TypeError(f"{rounds!r} is no number of rounds")
+        return cls(frozenset(phases), rounds)
+
+    def as_text(self) -> str:
+        """The record's content."""
+        return json.dumps({"phases": sorted(self.phases), "rounds": self.rounds})
 
 
 @dataclass(frozen=True)
@@ -188,6 +219,7 @@ class Stimulus:
     :param beats: how late the kit's own timer was.
     :param calibration: the kit measured against itself; None in a run without.
     :param virtual: whether the run was on a virtual clock, which is never late.
+    :param planned: which stimuli the run was to apply; None in recordings of earlier versions.
     """
 
     phases: list[Phase] = field(default_factory=list)
@@ -196,6 +228,7 @@ class Stimulus:
     beats: Beats = field(default_factory=Beats)
     calibration: Calibration | None = None
     virtual: bool = False
+    planned: Planned | None = None
 
     def time_error(self, begin_ns: int, end_ns: int) -> float | None:
         """The kit's error of a time in [begin, end], seconds; None if it is not known.
@@ -235,6 +268,7 @@ class Stimulus:
             "beats": json.dumps(asdict(self.beats)),
             **({"calibration": json.dumps(asdict(self.calibration))} if self.calibration else {}),
             **({"clock": _VIRTUAL} if self.virtual else {}),
+            **({"planned": self.planned.as_text()} if self.planned is not None else {}),
         }
 
     @classmethod
@@ -271,6 +305,7 @@ class Stimulus:
                 beats=Beats.parse(record.get("beats", "{}")),
                 calibration=Calibration.parse(record.get("calibration", "")),
                 virtual=record.get("clock") == _VIRTUAL,
+                planned=Planned.parse(record["planned"]) if "planned" in record else None,
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error

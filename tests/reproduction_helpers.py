@@ -68,7 +68,9 @@ def checked(
 
 
 def without_surroundings(data: dict[str, Any]) -> dict[str, Any]:
-    """A result without the versions of the program that judged, and the name of the file."""
+    """A result without the versions of the program that judged, and what names the file."""
     left = {k: v for k, v in data.items() if k != "environment"}
-    left["subject"] = {k: v for k, v in data["subject"].items() if k != "recording"}
+    left["subject"] = {
+        k: v for k, v in data["subject"].items() if k not in ("recording", "recording_sha256")
+    }
     return left

@@ -131,7 +131,9 @@ def test_the_badge_is_an_image_with_its_text() -> None:
     assert root.attrib["role"] == "img"
     title = root.find("{http://www.w3.org/2000/svg}title")
     assert title is not None
-    assert title.text == "Dex1-1 drop-in: fail, 1 of 6 not met; Dex1-1 safety: not judged"
+    verdicts, score = title.text.rsplit("; ", 1)
+    assert verdicts == "Dex1-1 drop-in: fail, 1 of 6 not met; Dex1-1 safety: not judged"
+    assert score == result_of_every_kind().score.sentence()
     assert "http" not in svg.replace("http://www.w3.org/2000/svg", "")
     width = float(root.attrib["width"])
     ends = [

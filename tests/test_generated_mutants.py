@@ -18,6 +18,8 @@ from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
 from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.mutants.generated.rig import Part, What, compose
 from dexkit.conformance.mutants.generated.times import WHENS
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.hand import Side
@@ -269,6 +271,11 @@ def test_a_campaign_is_resumed_and_not_done_again(tmp_path: Path) -> None:
     assert json.loads(score.read_text())["score"]["good"]["count"] == 2
     with pytest.raises(UsageError, match="is of seed 1"):
         Campaign(2, done)._done()
+    with pytest.raises(UsageError, match="is of default runs, not quick ones"):
+        Campaign(1, done, kind=RunKind.QUICK)._done()
+    # as earlier versions have written it
+    done.write_text(done.read_text().replace('"run": "default", ', ""))
+    assert set(again._done()) == {h.name for h in hands[:2]}
     done.write_text("no\nmore\n")
     with pytest.raises(UsageError, match="no trial of generated hands"):
         Campaign(1, done)._done()
@@ -279,15 +286,27 @@ def test_command_tries_a_generated_hand(tmp_path: Path) -> None:
     run = CliRunner().invoke(command, ["--hand", HAND, "--jobs", "1", "--json", str(path)])
     assert run.exit_code == 0, run.output
     assert "1 good hands: 0 fail a MUST, 0 are warned" in run.output
+    assert json.loads(path.read_text())["run"] == "default"
     (found,) = json.loads(path.read_text())["hands"]
     assert found["name"] == HAND
     assert found["caught"] is True
+
+
+def test_a_quick_run_judges_only_its_requirements() -> None:
+    found = try_generated(parse("dex1-1/unitree_go:q-offset@left,joint0,always"), 1, RunKind.QUICK)
+    quick = {r.id for r in RunKind.QUICK.requirements(catalogue("dex1-1"))}
+    assert found.severity == "must-breaking"
+    assert found.failed
+    assert {*found.failed, *found.warned} <= quick
 
 
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
         (["--good"], "go with --generated"),
+        (["--quick"], "go with --generated"),
+        (["--thorough", "--from", "a.py"], "go with --generated"),
+        (["--generated", "1", "--quick", "--thorough"], "two runs"),
         (["--generated", "1", "--require", "DEX1"], "do not go together"),
         (["--generated", "1", "--model", "h1"], "is a robot"),
         (["--generated", "1", "--dialect", "x"], "speak x"),

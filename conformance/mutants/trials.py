@@ -20,6 +20,7 @@ from dexkit.conformance.mutants.registry import Mutant
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.conformance.robot import robot_dialect
+from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
@@ -56,14 +57,20 @@ def _session(model_name: str) -> Session | None:
     return Session.default(model_name).first_seconds(SESSION_SECONDS)
 
 
-def plan_for(name: str = "unitree_go", *, sides: Sequence[Subject] | None = None) -> Plan[Subject]:
-    """Every phase; for hands with a session to replay and an object in the right hand.
+def plan_for(
+    name: str = "unitree_go",
+    *,
+    sides: Sequence[Subject] | None = None,
+    run: RunKind = RunKind.DEFAULT,
+) -> Plan[Subject]:
+    """Every phase that such a run has; for hands with a session to replay and an object in the
+    right hand.
 
     :param name: of a dialect or a robot.
     :param sides: by default both hands, or the robot.
     """
     if name in ROBOTS:
-        every = catalogue(name, "robot")
+        every = run.requirements(catalogue(name, "robot"))
         return Plan(robot_dialect(name), (ROBOT,), phases=phases_for(every))
     chosen, sides = dialect(name), tuple(sides or Side)
     return Plan(
@@ -71,16 +78,25 @@ def plan_for(name: str = "unitree_go", *, sides: Sequence[Subject] | None = None
         sides=sides,
         objects=default_objects(chosen, sides),
         session=_session(chosen.model),
-        phases=phases_for(catalogue(chosen.model)),
+        phases=phases_for(run.requirements(catalogue(chosen.model))),
+        rounds=run.rounds,
     )
 
 
-def run_mutant(service: type[TopicDevice], plan: Plan[Subject] | None = None) -> RunResult:
-    """Judge a service of hands, or a robot, on the virtual clock."""
+def run_mutant(
+    service: type[TopicDevice],
+    plan: Plan[Subject] | None = None,
+    requirements: Sequence[Requirement] | None = None,
+) -> RunResult:
+    """Judge a service of hands, or a robot, on the virtual clock.
+
+    :param requirements: those to be reported; None for all.
+    """
     chosen = plan or plan_for()
     trace = run_virtual(chosen, service)
     recording = recording_of(trace, chosen.dialect.name, chosen.sides)
-    return judge(recording, subject={"backend": f"virtual {service.__name__}"})
+    subject = {"backend": f"virtual {service.__name__}"}
+    return judge(recording, requirements=requirements, subject=subject)
 
 
 def run_usb_mutant(

@@ -64,7 +64,7 @@ def _width(text: str) -> int:
 
 
 def render_badge(result: RunResult, kind: Kind | None = None) -> str:
-    """Return the badges as one SVG, side by side.
+    """Return the badges as one SVG, side by side; its title also has the score of the run.
 
     :param kind: as for :func:`badges`.
     """
@@ -75,7 +75,7 @@ def render_badge(result: RunResult, kind: Kind | None = None) -> str:
         width, content = _badge(left, right, _colour(result, grade), x, number)
         drawn.append(content)
         x += width + _GAP
-    title = escape("; ".join(titles))
+    title = escape("; ".join([*titles, result.score.sentence()]))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{x - _GAP}" height="20" role="img" '
         f'aria-label="{title}"><title>{title}</title>{"".join(drawn)}</svg>\n'

@@ -168,6 +168,7 @@ def _verdict(result: RunResult) -> str:
         f"<p>{escape(sentence)}</p>{caution}</header>"
         f"{'' if result.client_only else _safety(result)}"
         f'<div class="chips">{chips}</div><div class="stages">{stages}</div>'
+        f'<p class="dim score">{escape(result.score.sentence())}</p>'
     )
 
 

@@ -50,6 +50,7 @@ def write_junit(result: RunResult, path: Path) -> None:
         **{f"harness.{name}": f"{value:g}" for name, value in result.harness.items()},
         "overall": str(result.overall),
         **{f"grade.{kind}": result.grade(kind).sentence() for kind in Kind},
+        "score": result.score.sentence(),
     }.items():
         ElementTree.SubElement(properties, "property", name=name, value=value)
     for entry, verdict in zip(entries, verdicts, strict=True):

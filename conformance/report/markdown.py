@@ -79,6 +79,7 @@ def render_markdown(result: RunResult) -> str:
     ]
     if harness := about_harness(result):
         lines.append(f"- test machine: {harness}")
+    lines += ["", plain(result.score.sentence())]
     lines += ["", *_areas(result), ""]
     lines += _troubles(result)
     lines += _folded("Every requirement", _every(result.results)) if result.results else []

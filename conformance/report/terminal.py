@@ -79,6 +79,7 @@ def print_result(
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
     # one line each at any width, so that logs can be searched for them
+    console.print(f"[dim]{escape(result.score.sentence())}[/dim]", highlight=False, soft_wrap=True)
     if result.client and not result.client_only:
         console.print(escape(result.client_sentence()), highlight=False, soft_wrap=True)
     for grade in () if result.client_only else map(result.grade, Kind):

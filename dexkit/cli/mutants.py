@@ -81,6 +81,12 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None) -> Non
     default=1,
     help="With --generated: which of them.  [default: 1]",
 )
+@click.option("--quick", is_flag=True, help="With --generated: judge them in quick runs.")
+@click.option(
+    "--thorough",
+    is_flag=True,
+    help="With --generated: in thorough runs, which take ten times as long.",
+)
 @click.option("--dialect", help="With --generated: only hands that speak it.")
 @click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
 @click.option(
@@ -103,6 +109,8 @@ def command(
     generated: int | None,
     good: bool,
     seed: int,
+    quick: bool,
+    thorough: bool,
     dialect: str | None,
     names: tuple[str, ...],
     resume: Path | None,
@@ -118,7 +126,8 @@ def command(
     virtual clock: no device, no DDS.
 
     With --generated the hands are put together from faults, places and conditions that the checks'
-    authors have not seen together; with --from they are yours (docs/mutants.md).
+    authors have not seen together, and judged in default, quick or thorough runs, as the
+    conformance suite does them; with --from they are yours (docs/mutants.md).
 
     Exit code: 0 every requirement is proven by a wrong hand, 1 one is missed, wrongly blamed or
     has no wrong hand, 2 there is nothing to try. With --generated and --from: 0 every wrong hand is
@@ -126,8 +135,10 @@ def command(
     """
     if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:
         raise UsageError("--generated, --hand, --from and --require do not go together")
-    if generated is None and not names and (good or dialect or resume):
-        raise UsageError("--good, --dialect and --resume go with --generated")
+    if generated is None and not names and (good or dialect or resume or quick or thorough):
+        raise UsageError("--good, --quick, --thorough, --dialect and --resume go with --generated")
+    if quick and thorough:
+        raise UsageError("--quick and --thorough are two runs: choose one")
     if source is not None and model is not None:
         raise UsageError("--from says which models its hands are of", hint="leave out --model")
     if json_path:
@@ -144,6 +155,7 @@ def command(
     if generated is not None or names:
         from dexkit.conformance.mutants.generated import dialects, parse, sample, sample_good
         from dexkit.conformance.mutants.generated.campaign import Campaign
+        from dexkit.conformance.selection import RunKind
 
         if model in ROBOTS:
             raise UsageError(f"{model} is a robot; only hands are generated")
@@ -151,7 +163,8 @@ def command(
         if generated is not None:
             spoken = dialects(model, dialect)
             hands += (sample_good if good else sample)(generated, seed, spoken)
-        campaign = Campaign(seed, resume)
+        kind = RunKind.QUICK if quick else RunKind.THOROUGH if thorough else RunKind.DEFAULT
+        campaign = Campaign(seed, resume, kind=kind)
         with stop_on_signals() as stop:
             _follow(len(hands), campaign.run(hands, stop, jobs))
             if stop:

@@ -22,17 +22,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from dexkit.conformance.mutants.generated import Generated, parse
-from dexkit.conformance.mutants.generated.oracle import Severity, examine, shortest
+from dexkit.conformance.mutants.generated.oracle import Opinion, Severity, examine, shortest
 from dexkit.conformance.mutants.generated.rig import Faulty
 from dexkit.conformance.mutants.outsiders import blame
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.console import Console
 from dexkit.documents import parse_json, write_file
 from dexkit.errors import UsageError
 from dexkit.hand import Subject
 
-__all__ = ["Campaign", "Trial", "try_generated", "wilson"]
+__all__ = ["Campaign", "Trial", "graded", "judged", "try_generated", "wilson"]
 
 GOOD = "good"
 
@@ -101,28 +103,43 @@ def area_of(requirement: str) -> str:
     return requirement.split("-")[-2]
 
 
-def try_generated(hand: Generated, seed: int = 1) -> Trial:
-    """Examine a hand, and judge it by a whole conformance run on the virtual clock.
+def try_generated(hand: Generated, seed: int = 1, run: RunKind = RunKind.DEFAULT) -> Trial:
+    """Examine a hand, and judge it by a conformance run on the virtual clock.
 
     :param seed: of the oracle's random stimulus.
+    :param run: which requirements are judged, and how much the hand is provoked.
     """
     service = hand.service()
-    plan = plan_for(hand.dialect.name, sides=hand.sides)
+    trial, opinion = graded(hand, service, seed)
+    if not trial.counts:
+        return trial
+    trial = judged(trial, service, plan_for(hand.dialect.name, sides=hand.sides, run=run), run)
+    if trial.caught or opinion is None:
+        return trial
+    return replace(trial, shown_by=shortest(hand, opinion, seed))
+
+
+def graded(hand: Generated, service: type[Faulty], seed: int) -> tuple[Trial, Opinion | None]:
+    """A hand's grade, not judged yet, and the oracle's opinion; None of a good hand.
+
+    :param service: the hand's service.
+    """
     trial = Trial(hand.name, hand.kind, hand.summary, GOOD, areas=tuple(sorted(hand.areas)))
     if hand.good:
-        return _judged(trial, service, plan)
+        return trial, None
     opinion = examine(service, hand.dialect, hand.sides, seed)
     trial = replace(trial, severity=opinion.severity.value, in_kit=opinion.in_kit.value)
-    if opinion.severity is Severity.EQUIVALENT:
-        return trial
-    worst = opinion.effects[0]
-    effect = f"{worst.text} ({worst.stimulus}: {worst.stretch}, {worst.at:.2f} s)"
-    trial = _judged(replace(trial, effect=effect), service, plan)
-    return trial if trial.caught else replace(trial, shown_by=shortest(hand, opinion, seed))
+    if trial.counts:
+        worst = opinion.effects[0]
+        where = f"{worst.stimulus}: {worst.stretch}, {worst.at:.2f} s"
+        trial = replace(trial, effect=f"{worst.text} ({where})")
+    return trial, opinion
 
 
-def _judged(trial: Trial, service: type[Faulty], plan: Plan[Subject]) -> Trial:
-    failed, warned, errors = blame(run_mutant(service, plan))
+def judged(trial: Trial, service: type[Faulty], plan: Plan[Subject], run: RunKind) -> Trial:
+    """The trial with what a run of that plan and kind finds."""
+    wanted = run.requirements(catalogue(plan.dialect.model))
+    failed, warned, errors = blame(run_mutant(service, plan, wanted))
     return replace(trial, failed=failed, warned=warned, errors=errors)
 
 
@@ -140,8 +157,8 @@ def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def _work(name: str, seed: int) -> dict[str, Any]:
-    return asdict(try_generated(parse(name), seed))
+def _work(name: str, seed: int, run: RunKind) -> dict[str, Any]:
+    return asdict(try_generated(parse(name), seed, run))
 
 
 def _ignore_interrupts() -> None:
@@ -155,11 +172,13 @@ class Campaign:
 
     :param file: where each is added as a line of JSON when it is done; those that are there
         already are not tried again. None for none.
+    :param kind: of the conformance runs.
     """
 
     seed: int
     file: Path | None = None
     trials: list[Trial] = field(default_factory=list)
+    kind: RunKind = RunKind.DEFAULT
 
     def run(
         self, hands: Sequence[Generated], stop: object = None, jobs: int | None = None
@@ -168,7 +187,7 @@ class Campaign:
 
         :param stop: ends it early when it becomes true.
         :param jobs: processes; one per processor by default.
-        :raises UsageError: the file holds something else than trials of this seed.
+        :raises UsageError: the file holds something else than trials of this seed and kind.
         """
         done = self._done()
         for hand in hands:
@@ -178,7 +197,7 @@ class Campaign:
         todo = [h for h in hands if h.name not in done]
         pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _ignore_interrupts)
         try:
-            waiting = {pool.submit(_work, h.name, self.seed) for h in todo}
+            waiting = {pool.submit(_work, h.name, self.seed, self.kind) for h in todo}
             while waiting and not stop:
                 ready = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done
                 waiting -= ready
@@ -191,13 +210,14 @@ class Campaign:
     def run_here(self, hands: Iterable[Generated]) -> None:
         """Try the hands in this process."""
         for hand in hands:
-            self._add(try_generated(hand, self.seed))
+            self._add(try_generated(hand, self.seed, self.kind))
 
     def _add(self, trial: Trial) -> Trial:
         self.trials.append(trial)
         if self.file is not None:
             with self.file.open("a", encoding="utf-8") as out:
-                out.write(json.dumps({"seed": self.seed, **asdict(trial)}) + "\n")
+                about = {"seed": self.seed, "run": str(self.kind)}
+                out.write(json.dumps({**about, **asdict(trial)}) + "\n")
         return trial
 
     def _done(self) -> dict[str, Trial]:
@@ -209,6 +229,8 @@ class Campaign:
             try:
                 values = parse_json(line, f"{self.file}:{number}")
                 seed = values.pop("seed")
+                # files of earlier versions hold default runs only
+                run = values.pop("run", str(RunKind.DEFAULT))
                 trial = Trial.from_dict(values)
             except (UsageError, TypeError, KeyError, AttributeError) as error:
                 if number == len(lines):
@@ -220,6 +242,10 @@ class Campaign:
             if seed != self.seed:
                 raise UsageError(
                     f"{self.file} is of seed {seed}, not {self.seed}", hint="give its seed"
+                )
+            if run != str(self.kind):
+                raise UsageError(
+                    f"{self.file} is of {run} runs, not {self.kind} ones", hint="give another file"
                 )
             found[trial.name] = trial
         return found
@@ -265,6 +291,7 @@ class Campaign:
         grades = [Severity.BREAKING.value, Severity.LESSER.value]
         return {
             "seed": self.seed,
+            "run": str(self.kind),
             "perfect": self.perfect,
             "score": {
                 **{g: self.score(g) for g in grades},

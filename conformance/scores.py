@@ -1,0 +1,301 @@
+"""How many wrong hands a run like this one catches, as a sentence for every report.
+
+``scores.json`` beside this module holds what ``python -m tools.scores`` has found out: it tries
+generated wrong hands (docs/mutants.md) in runs of each kind, on the virtual clock. A figure of the
+file is about one model, one :class:`~dexkit.conformance.selection.RunKind` and one
+:class:`Setting`. :func:`score_of` gives it to a run only if that was applied the same stimuli, was
+judged by the same requirements, and left out none that the trial could judge. Every other run has
+no score, and says why.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import asdict, dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from dexkit import documents
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.stimulus_record import Stimulus
+from dexkit.errors import UsageError
+from dexkit.hand import Side
+from dexkit.models import MODELS
+from dexkit.robots import ROBOTS
+
+__all__ = [
+    "FILE",
+    "FORMAT",
+    "NO_SCORE",
+    "Caught",
+    "Entry",
+    "Score",
+    "Setting",
+    "catalogue_digest",
+    "entries",
+    "score_of",
+]
+
+FILE = Path(__file__).with_name("scores.json")
+FORMAT = "dexkit-scores"
+_NAMED = 3
+"""Requirements that a sentence names; it counts the others."""
+_DIGESTED = (
+    "id",
+    "level",
+    "kind",
+    "needs",
+    "after",
+    "dialects",
+    "tolerances",
+    "realtime",
+    "capability",
+    "repeat",
+    "like",
+    "spoils",
+)
+"""Members of a requirement that change what it catches; the others are texts and plots."""
+
+
+class Setting(str, Enum):
+    """What else a run needs beside its kind, in which trials differ."""
+
+    WHOLE = "whole"
+    """The kit starts and ends the service, and there is an object in one hand."""
+    EXTERNAL = "external"
+    """The service runs already and is not restarted; nothing is in the hands."""
+
+    def __str__(self) -> str:
+        return self.value
+
+    @property
+    def remark(self) -> str:
+        """What a sentence says of it; empty for a whole run."""
+        whole = self is Setting.WHOLE
+        return "" if whole else "; the service not restarted, nothing in the hands"
+
+
+@dataclass(frozen=True)
+class Caught:
+    """How many of the hands of one grade were caught.
+
+    :param interval: 95 % confidence interval of their part, 0 to 1 (Wilson's score).
+    """
+
+    count: int
+    caught: int
+    interval: tuple[float, float]
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Caught:
+        """Read it back from JSON."""
+        low, high = values["interval"]
+        return cls(values["count"], values["caught"], (low, high))
+
+    def text(self) -> str:
+        """``55 % (95 % interval 45 to 65 %)``."""
+        low, high = self.interval
+        part = self.caught / self.count
+        return f"{100 * part:.0f} % (95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score of a run, or why none is known.
+
+    :param why: why none is known; empty where one is. The other members are then without meaning.
+    :param run: the kind of the run.
+    :param must_breaking: wrong hands that break a MUST, caught by a MUST that failed for a right
+        reason; ``lesser`` those with lesser faults, noticed by a failure or a warning.
+    :param seed: of the trial.
+    :param catalogue: :func:`catalogue_digest` of the requirements that it was computed with.
+    """
+
+    why: str = ""
+    run: str = ""
+    setting: str = ""
+    must_breaking: Caught | None = None
+    lesser: Caught | None = None
+    seed: int = 0
+    catalogue: str = ""
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Score:
+        """Read it back from a result file."""
+        found = {name: value for name, value in values.items() if name != "sentence"}
+        for name in ("must_breaking", "lesser"):
+            if found[name] is not None:
+                found[name] = Caught.from_dict(found[name])
+        return cls(**found)
+
+    def sentence(self) -> str:
+        """The score in one sentence, for people."""
+        found = self.must_breaking
+        if self.why or found is None or not found.count:
+            return f"No score is known for this run: {self.why or 'no wrong hand was tried'}."
+        remark = next((s.remark for s in Setting if str(s) == self.setting), "")
+        return (
+            f"In a trial of {found.count} generated wrong hands that break a MUST, a run like this "
+            f"({self.run}{remark}) caught {found.text()}."
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The score as plain data."""
+        return {"sentence": self.sentence(), **asdict(self)}
+
+
+NO_SCORE = Score("the result holds none")
+"""Of a result that was written before there were scores."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of the file: hands of one model, tried in runs of one kind and setting.
+
+    :param hands: how many were generated; those that cannot be told from a good one count nowhere.
+    :param phases: the phases of the stimulus that such a run asks for, and ``rounds`` how often.
+    :param requirements: ids of those that such a run judges.
+    :param fewer: by dialect, on how many sides of a good hand a requirement is judged in such a
+        run: those that are not judged on both.
+    """
+
+    model: str
+    run: str
+    setting: str
+    seed: int
+    hands: int
+    equivalent: int
+    must_breaking: Caught
+    lesser: Caught
+    catalogue: str
+    rounds: int
+    phases: frozenset[str]
+    requirements: tuple[str, ...]
+    fewer: Mapping[str, Mapping[str, int]]
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Entry:
+        """Read it back from JSON."""
+        return cls(
+            **{
+                **values,
+                "must_breaking": Caught.from_dict(values["must_breaking"]),
+                "lesser": Caught.from_dict(values["lesser"]),
+                "phases": frozenset(values["phases"]),
+                "requirements": tuple(values["requirements"]),
+            }
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry as plain data."""
+        return {**asdict(self), "phases": sorted(self.phases)}
+
+    @property
+    def score(self) -> Score:
+        """The score of a run that the entry is about."""
+        return Score(
+            run=self.run,
+            setting=self.setting,
+            must_breaking=self.must_breaking,
+            lesser=self.lesser,
+            seed=self.seed,
+            catalogue=self.catalogue,
+        )
+
+    def missing(self, dialect: str, judged: Mapping[str, int]) -> list[str]:
+        """Ids that are judged on fewer sides than in the trial."""
+        fewer = self.fewer.get(dialect, {})
+        return [r for r in self.requirements if judged.get(r, 0) < fewer.get(r, len(Side))]
+
+
+@cache
+def catalogue_digest(model: str) -> str:
+    """Digest of a hand model's requirements on DDS: of what they ask for, not of how it is said.
+
+    It changes when a requirement comes or goes, or when its level, its limits, its stimulus or
+    what it depends on changes.
+    """
+    found = [
+        {name: value for name, value in asdict(r).items() if name in _DIGESTED}
+        for r in sorted(catalogue(model), key=lambda r: r.id)
+    ]
+    text = json.dumps(found, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@cache
+def entries(file: Path = FILE) -> tuple[Entry, ...]:
+    """The entries of the file; none where there is no file: it is to be written first.
+
+    :raises UsageError: it is another file.
+    """
+    if not file.exists():
+        return ()
+    data = documents.read_json(file)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise UsageError(f"{file} is no file of scores", hint="python -m tools.scores writes it")
+    return tuple(Entry.from_dict(e) for e in data["scores"])
+
+
+def score_of(
+    model: str,
+    dialect: str,
+    sides: Sequence[str],
+    stimulus: Stimulus | None,
+    selected: AbstractSet[str],
+    judged: Mapping[str, int],
+    known: Sequence[Entry] | None = None,
+) -> Score:
+    """The score of a run.
+
+    :param sides: of the hands that were judged.
+    :param stimulus: the recording's stimulus record; None in a recording of a session.
+    :param selected: ids of the requirements that were to be judged.
+    :param judged: on how many sides each of them came to a finding.
+    :param known: what there is to choose from; None for what the file has.
+    """
+    if stimulus is None:
+        return Score("a recorded session was judged, and not a run of the conformance suite")
+    of_model = [e for e in (entries() if known is None else known) if e.model == model]
+    if not of_model:
+        about = MODELS.get(model) or ROBOTS.get(model)
+        return Score(
+            f"no wrong {'robots' if model in ROBOTS else 'hands'} of the model "
+            f"{about.title if about else model} have been tried"
+        )
+    if stimulus.planned is None:
+        return Score("the recording does not say which stimuli were to be applied")
+    of_kind = [
+        e
+        for e in of_model
+        if (e.phases, e.rounds) == (stimulus.planned.phases, stimulus.planned.rounds)
+    ]
+    if not of_kind:
+        return Score("its stimuli are those of no kind of run that was tried")
+    if any(e.catalogue != catalogue_digest(model) for e in of_kind):
+        return Score("the requirements have changed since wrong hands were tried on them")
+    if len(sides) < len(Side):
+        return Score(f"only the {' and '.join(sides)} hand was judged")
+    lacking = [[r for r in e.requirements if r not in selected] for e in of_kind]
+    if all(lacking):
+        return Score(f"requirements were left out: {_few(min(lacking, key=len))}")
+    of_kind = [e for e, ids in zip(of_kind, lacking, strict=True) if not ids]
+    empty = not any(place is not None for place in stimulus.objects.values())
+    for entry in of_kind:
+        held = entry.setting == Setting.WHOLE
+        if held is not empty and not entry.missing(dialect, judged):
+            return entry.score
+    missing = of_kind[0].missing(dialect, judged)
+    if not missing:
+        return Score("nothing was held, and the trial of such a run was with an object")
+    return Score(f"requirements could not be judged on each side: {_few(missing)}")
+
+
+def _few(ids: Sequence[str]) -> str:
+    more = len(ids) - _NAMED
+    return ", ".join(ids[:_NAMED]) + (f" and {more} more" if more > 0 else "")
