@@ -20,8 +20,8 @@ from dexkit.conformance.measure import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
-from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.scores import Score, score_of
+from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
