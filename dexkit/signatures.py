@@ -13,10 +13,8 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dexkit import documents
 from dexkit.errors import SigningError, UsageError
@@ -148,7 +146,7 @@ def sign(tool: str, data: bytes, key: Path) -> tuple[bytes, str]:
             command = ["-S", "-s", path, "-m", str(message), "-x", str(signature)]
             command += ["-t", NAMESPACE, "-c", "signature of a dexkit result"]
         # minisign asks on standard input, ssh-keygen on the terminal
-        done = _run(tool, *command, stdin=sys.__stdin__ if tool == MINISIGN else None)
+        done = _run(tool, *command, stdin=_STANDARD_INPUT if tool == MINISIGN else subprocess.DEVNULL)
         if done.returncode or not signature.is_file():
             raise SigningError(
                 f"{tool} does not sign with {key}: {_last_line(done)}",
@@ -247,11 +245,16 @@ def _minisign_id(text: str) -> str:
     return raw[2:10][::-1].hex().upper()
 
 
-def _run(tool: str, *arguments: str, stdin: Any = None) -> subprocess.CompletedProcess[str]:
+_STANDARD_INPUT = 0
+
+
+def _run(
+    tool: str, *arguments: str, stdin: int = subprocess.DEVNULL
+) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(
             [require(tool), *arguments],
-            stdin=subprocess.DEVNULL if stdin is None else stdin,
+            stdin=stdin,
             capture_output=True,
             encoding="utf-8",
             errors="replace",

@@ -27,8 +27,9 @@ def main() -> None:
         q = float("nan")
         while time.monotonic() < end:
             commands.write(command)
-            if states.wait(0.02):
-                q = states.take()[-1].message.states[0].q
+            states.wait(0.02)
+            for sample in states.take():
+                q = sample.message.states[0].q
             if abs(q - options.q) < 0.05:
                 print(f"there: {q:.2f}", flush=True)
                 return
