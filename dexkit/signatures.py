@@ -146,7 +146,8 @@ def sign(tool: str, data: bytes, key: Path) -> tuple[bytes, str]:
             command = ["-S", "-s", path, "-m", str(message), "-x", str(signature)]
             command += ["-t", NAMESPACE, "-c", "signature of a dexkit result"]
         # minisign asks on standard input, ssh-keygen on the terminal
-        done = _run(tool, *command, stdin=_STANDARD_INPUT if tool == MINISIGN else subprocess.DEVNULL)
+        stdin = _STANDARD_INPUT if tool == MINISIGN else subprocess.DEVNULL
+        done = _run(tool, *command, stdin=stdin)
         if done.returncode or not signature.is_file():
             raise SigningError(
                 f"{tool} does not sign with {key}: {_last_line(done)}",
