@@ -15,6 +15,7 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from dexkit import documents
 from dexkit.errors import SigningError, UsageError
@@ -250,7 +251,7 @@ _STANDARD_INPUT = 0
 
 
 def _run(
-    tool: str, *arguments: str, stdin: int = subprocess.DEVNULL
+    tool: str, *arguments: str, stdin: int | IO[bytes] = subprocess.DEVNULL
 ) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(
