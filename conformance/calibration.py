@@ -4,7 +4,7 @@ A writer of the kit's own sends messages at known instants, and a reader in anot
 the kit takes them as the recorder takes states: woken by DDS, in a thread of its own. How much
 later than written they are stamped is what the kit adds to any time of reception.
 
-The topic :data:`TOPIC` belongs to no hand and no robot, so nothing reacts to the messages.
+The topic belongs to no hand and no robot, so nothing reacts to the messages.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from dexkit.errors import DdsError
 from dexkit.messages import message_type
 from dexkit.threads import Worker
 
-__all__ = ["COUNT", "TOPIC", "Loopback"]
+__all__ = ["COUNT", "Loopback"]
 
-TOPIC = CALIBRATION_TOPIC
 TYPE = "unitree_go::msg::dds_::MotorStates_"
 COUNT = 200
 PERIOD = 0.003
@@ -74,10 +73,14 @@ class Loopback:
         try:
             with DdsNode(domain=self._domain, interface=self._interface) as node:
                 reader = self._receiver.reader(
-                    TOPIC, kind, qos=Qos.reader_default(), most=self._count, on_data=self._woken.set
+                    CALIBRATION_TOPIC,
+                    kind,
+                    qos=Qos.reader_default(),
+                    most=self._count,
+                    on_data=self._woken.set,
                 )
                 try:
-                    writer = node.writer(TOPIC, kind, qos=Qos.writer_default())
+                    writer = node.writer(CALIBRATION_TOPIC, kind, qos=Qos.writer_default())
                     if not writer.wait_matched(_MATCH_S):
                         return
                     receiver = Worker("calibration reader", self._receive, reader.take)

@@ -5,7 +5,7 @@ for that kind of figure, at that place of that recording:
 
 =========== =======================================================================================
 time        the 99th percentile by which the kit's own timer was late there, or the receive delay
-            that it measured against itself at the begin of the run, whichever is larger; 0 on the
+            that it measured against itself at the start of the run, whichever is larger; 0 on the
             virtual clock; unknown in a recording of somebody else
 position,   the resolution of the message: the step of a 32-bit float of that size
 torque
@@ -83,6 +83,11 @@ class Measure:
         return self.margin / self.error if self.error else None
 
     @property
+    def explains_failure(self) -> bool:
+        """Whether the kit's error alone may have put the figure on the side that fails."""
+        return self.uncertain and self.margin <= 0
+
+    @property
     def uncertain(self) -> bool:
         """Whether the figure is nearer to its limit than the kit can measure."""
         return self.error is not None and abs(self.margin) < self.error
@@ -106,7 +111,7 @@ class Measure:
         names = ("value", "limit", "unit", "larger_is_worse", "error")
         return cls(quantity=Quantity(data["quantity"]), **{name: data[name] for name in names})
 
-    def told(self) -> str:
+    def sentence(self) -> str:
         """The figure, its limit and the kit's error in one sentence."""
         text = (
             f"{self.value:.6g} {self.unit} with a limit of {self.limit:.6g} {self.unit}: "
@@ -136,16 +141,14 @@ def weigh(
     places: Sequence[tuple[float, float | None]],
     whole: tuple[float, float],
 ) -> Measure | None:
-    """The measure that decides, with the kit's error; None if none is finite.
+    """The measure that decides, with the kit's error; None if one has no end or there is none.
 
     :param places: begin and end of the outcome's places, seconds.
     :param whole: begin and end of the recording, for measures without a place.
     """
-    found = [
-        replace(m, error=_error(recording, m, places, whole))
-        for m in measures
-        if math.isfinite(m.value) and math.isfinite(m.limit)
-    ]
+    if not all(math.isfinite(m.value) and math.isfinite(m.limit) for m in measures):
+        return None  # what never came is no matter of precision
+    found = [replace(m, error=_error(recording, m, places, whole)) for m in measures]
     return min(found, key=_hardest, default=None)
 
 

@@ -304,8 +304,8 @@ class Judgement:
         failed = Verdict.FAIL if must else Verdict.WARN
         verdict = Verdict.BLOCKED if busy.excused else failed
         measure = weigh(outcome)
-        if verdict is Verdict.FAIL and measure is not None and measure.uncertain:
+        if verdict is Verdict.FAIL and measure is not None and measure.explains_failure:
             verdict = Verdict.BLOCKED
-            told = f"{measure.told()}; a quieter machine or another run may tell"
-            outcome = replace(outcome, reason=told, retry=True)
+            reason = f"{measure.sentence()}; a quieter machine or another run may decide it"
+            outcome = replace(outcome, reason=reason, retry=True)
         return self.result(verdict, outcome, disturbance=busy.disturbance, measure=measure)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dexkit.conformance.calibration import TOPIC, Loopback
+from dexkit.conformance.calibration import Loopback
+from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.dds import DdsNode
 from dexkit.topics import HAND_TOPICS
 from tests.dds_helpers import free_domain
@@ -31,4 +32,4 @@ def test_loopback_can_be_left_early() -> None:
 
 
 def test_topic_is_no_hands() -> None:
-    assert TOPIC not in HAND_TOPICS
+    assert CALIBRATION_TOPIC not in HAND_TOPICS

@@ -76,9 +76,28 @@ def test_failure_within_the_kits_error_is_inconclusive(
     assert found.retry is (verdict is Verdict.BLOCKED)
     if verdict is Verdict.BLOCKED:
         assert "fails by less than the kit's measurement error of 0.002 s" in found.reason
-        assert "a quieter machine or another run may tell" in found.reason
+        assert "a quieter machine or another run may decide it" in found.reason
         assert RunResult({}, [found]).exit_code() == 2
         assert RunResult({}, [found]).disturbed
+
+
+def weighed_failure(*values: float) -> Result:
+    """A failure with these figures, each with a limit of 0.1 s and an error of 2 ms."""
+    outcome = Outcome(False, measures=tuple(Measure(value, 0.1) for value in values))
+    return Judgement(GAP, Side.LEFT, Claims(), {}).run_check(
+        lambda: outcome,
+        lambda _: Excuse(),
+        lambda o: weigh(Clock(0.002), o.measures, [(1.0, 1.1)], (0.0, 9.0)),
+    )
+
+
+def test_failure_for_another_reason_is_not_excused_by_a_figure_that_passes() -> None:
+    assert weighed_failure(0.0999).verdict is Verdict.FAIL
+
+
+def test_figure_without_end_is_not_hidden_by_one_near_the_limit() -> None:
+    assert weighed_failure(0.1001).verdict is Verdict.BLOCKED
+    assert weighed_failure(0.1001, math.inf).verdict is Verdict.FAIL
 
 
 def test_should_within_the_kits_error_warns_all_the_same() -> None:
@@ -87,7 +106,7 @@ def test_should_within_the_kits_error_warns_all_the_same() -> None:
     assert "fails by less than the kit's measurement error" in Card.of([found]).as_text()
 
 
-def test_pass_within_the_kits_error_is_told_on_card_and_page() -> None:
+def test_pass_within_the_kits_error_is_shown_on_card_and_page() -> None:
     found = judged(0.099, 0.002)
     told = "passes by less than the kit's measurement error of 0.002 s"
     assert told in Card.of([found]).as_text()
@@ -162,7 +181,7 @@ def test_virtual_run_measures_without_error_and_others_do_not_know() -> None:
     unknown = of(judge(Recording.decode(trace)), GAP.id).measure
     assert unknown is not None
     assert unknown.error is None
-    assert unknown.told().endswith("the kit's measurement error is not known here")
+    assert unknown.sentence().endswith("the kit's measurement error is not known here")
 
 
 def test_calibration_is_the_least_error_of_times() -> None:

@@ -123,8 +123,8 @@ class Card:
             side = result.side if len(self.results) > 1 else ""
             if result.observed:
                 yield Fact(Item.OBSERVED, result.observed, side)
-            if result.measure is not None and result.measure.told() not in result.reason:
-                yield Fact(Item.MEASURED, result.measure.told(), side)
+            if result.measure is not None and result.measure.sentence() not in result.reason:
+                yield Fact(Item.MEASURED, result.measure.sentence(), side)
             if result.reason:
                 yield Fact(Item.REASON, result.reason, side)
             for place in result.evidence:
@@ -177,7 +177,7 @@ def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
 def near_limits(result: RunResult) -> list[str]:
     """A sentence for each pass that the kit's measurement error leaves in doubt."""
     return [
-        f"{r.requirement.id} {r.side}: {r.measure.told()}"
+        f"{r.requirement.id} {r.side}: {r.measure.sentence()}"
         for r in [*result.results, *result.client]
         if r.verdict is Verdict.PASS and r.measure is not None and r.measure.uncertain
     ]

@@ -489,9 +489,9 @@ def _cell(result: Result) -> str:
 
 
 def _seen(result: Result, link: str) -> str:
-    told = result.measure.told() if result.measure is not None else ""
-    told = "" if told in result.reason else told
-    text = ". ".join(t for t in (result.observed, told, result.reason) if t) or result.figure
+    measured = result.measure.sentence() if result.measure is not None else ""
+    measured = "" if measured in result.reason else measured
+    text = ". ".join(t for t in (result.observed, measured, result.reason) if t) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
