@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 from rich.markup import escape
@@ -17,24 +17,36 @@ from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
-from dexkit.stop_signals import stop_on_signals
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from dexkit.conformance.mutants.generated.campaign import Trial
-    from dexkit.conformance.mutants.matrix import Outcome
+    from dexkit.conformance.mutants.generated.campaign import Campaign, Trial
+    from dexkit.conformance.mutants.matrix import Outcome, Score
     from dexkit.conformance.mutants.outsiders import Verdicts
 
 
-def _follow(total: int, found: Iterator[Outcome | Trial | Verdicts]) -> None:
-    """Show the progress of trials."""
+def _follow(total: int, found: Iterator[Outcome | Trial | Verdicts], stop: StopRequest) -> None:
+    """Show the progress of trials. Raises `click.Abort` when a signal stopped them."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"{total} hands", total=total)
         for done, outcome in enumerate(found, 1):
             text = f"{done} of {total}: {escape(outcome.name)}"
             progress.update(task, advance=1, description=text)
+    if stop:
+        raise click.Abort
+
+
+def _end_with(
+    result: Campaign | Score, console: Console, json_path: Path | None, *, verbose: bool
+) -> NoReturn:
+    """Print and write a result, and end with its exit code."""
+    result.print(console, verbose=verbose)
+    if json_path:
+        result.write_json(json_path)
+    sys.exit(0 if result.perfect else 1)
 
 
 def _try_outsiders(source: str, console: Console, json_path: Path | None) -> None:
@@ -50,9 +62,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None) -> Non
             yield verdicts
 
     with stop_on_signals() as stop:
-        _follow(len(hands), each())
-        if stop:
-            raise click.Abort
+        _follow(len(hands), each(), stop)
     outsiders.print_verdicts(console, found)
     if json_path:
         outsiders.write_verdicts(json_path, found)
@@ -166,22 +176,12 @@ def command(
         kind = RunKind.QUICK if quick else RunKind.THOROUGH if thorough else RunKind.DEFAULT
         campaign = Campaign(seed, resume, kind=kind)
         with stop_on_signals() as stop:
-            _follow(len(hands), campaign.run(hands, stop, jobs))
-            if stop:
-                raise click.Abort
-        campaign.print(console, verbose=verbose)
-        if json_path:
-            campaign.write_json(json_path)
-        sys.exit(0 if campaign.perfect else 1)
+            _follow(len(hands), campaign.run(hands, stop, jobs), stop)
+        _end_with(campaign, console, json_path, verbose=verbose)
     from dexkit.conformance.mutants.matrix import Score, chosen
 
     requirements, trials = chosen(model, require)
     score = Score(requirements)
     with stop_on_signals() as stop:
-        _follow(len(trials), score.run(trials, stop, jobs))
-        if stop:
-            raise click.Abort
-    score.print(console, verbose=verbose)
-    if json_path:
-        score.write_json(json_path)
-    sys.exit(0 if score.perfect else 1)
+        _follow(len(trials), score.run(trials, stop, jobs), stop)
+    _end_with(score, console, json_path, verbose=verbose)

@@ -106,6 +106,14 @@ class _History(_Reported):
         return past[0][1]
 
 
+class _Remembering(_Reported):
+    """Keeps a time and a q of each joint from one report to the next."""
+
+    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
+        super().__init__(rig, side, joints)
+        self.kept: dict[int, tuple[float, float]] = {}
+
+
 @_fault("position", "q-echo", "reports the commanded q")
 class _Echo(_Reported):
     def report(self, joint: int, values: Report) -> None:
@@ -113,19 +121,15 @@ class _Echo(_Reported):
 
 
 @_fault("position", "q-echo-slewed", "reports the commanded q at the speed of a good hand")
-class _EchoSlewed(_Reported):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.at: dict[int, tuple[float, float]] = {}
-
+class _EchoSlewed(_Remembering):
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
-        then, q = self.at.get(joint, (now, values.q))
+        then, q = self.kept.get(joint, (now, values.q))
         if now - then > 0.1:
             then, q = now, values.q
         step = 1.3 * self.span(joint) * (now - then)
         values.q = q + min(max(self.rig.goal(self.side, joint) - q, -step), step)
-        self.at[joint] = now, values.q
+        self.kept[joint] = now, values.q
 
 
 @_fault("position", "q-echo-near", "reports the commanded q when it is within a tenth of it")
@@ -157,20 +161,16 @@ class _Scale(_Reported):
 
 
 @_fault("position", "q-filter", "reports q through a low-pass filter of 0.15 s")
-class _Filter(_Reported):
+class _Filter(_Remembering):
     seconds = 0.15
-
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.at: dict[int, tuple[float, float]] = {}
 
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
-        then, q = self.at.get(joint, (now, values.q))
+        then, q = self.kept.get(joint, (now, values.q))
         if now - then > 0.5:
             q = values.q
         q += (values.q - q) * min(1.0, (now - then) / self.seconds)
-        self.at[joint] = now, q
+        self.kept[joint] = now, q
         values.q = q
 
 
@@ -222,12 +222,8 @@ class _Swap(_Reported):
 
 
 @_fault("position", "q-slow", "measures q ten times a second")
-class _Slow(_Reported):
+class _Slow(_Remembering):
     period = 0.1
-
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.kept: dict[int, tuple[float, float]] = {}
 
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
