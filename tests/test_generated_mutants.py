@@ -103,7 +103,7 @@ def test_a_reference_without_known_mechanics_is_refused() -> None:
 
 def test_without_faults_the_reference_behaves_as_before() -> None:
     service = compose("x", "", model("dex1-1").reference.load(), ())
-    assert oracle.examine(service, GO, BOTH).effects == ()
+    assert oracle.examine(service, GO, (Side.LEFT,)).effects == ()
 
 
 # ------------------------------------------------------------------------------ properties

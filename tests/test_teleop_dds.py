@@ -36,7 +36,7 @@ TELEOP = command_line("teleop")
 def served(backend: str, side: str) -> Iterator[int]:
     """A domain on which ``dexkit serve`` serves a simulated hand."""
     domain = free_domain()
-    arguments = command_line("serve", backend, "--side", side, "--state-rate", "250", "--quiet")
+    arguments = command_line("serve", backend, "--side", side, "--state-rate", "100", "--quiet")
     with subprocess.Popen(
         [*arguments, "--domain", str(domain)],
         stdout=subprocess.PIPE,

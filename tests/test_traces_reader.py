@@ -246,7 +246,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Sh
     data = mcap_bytes(expected, shape, metadata={"m": {"k": "v"}})
     last = 0
     # every byte around the ends of records, and a comb over the rest
-    offsets = sorted({*range(0, len(data), 11), *range(min(120, len(data))), len(data) - 1})
+    offsets = sorted({*range(0, len(data), 29), *range(min(120, len(data))), len(data) - 1})
     for cut in offsets:
         got = check_cut(tmp_path, data, cut, expected)
         assert got >= last, "a longer file never gives less"
@@ -257,7 +257,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(tmp_path: Path, shape: Sh
 def test_truncation_loses_only_the_cut_record(tmp_path: Path) -> None:
     expected = rows(8)
     data = mcap_bytes(expected, Shape(chunked=False))
-    for cut in range(header_end(data), len(data), 3):
+    for cut in range(header_end(data), len(data), 7):
         got = check_cut(tmp_path, data, cut, expected)
         whole = 0
         at = header_end(data)
