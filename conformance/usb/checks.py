@@ -27,6 +27,8 @@ __all__ = ["UsbContext"]
 
 _ORDINARY = ("exchange", "burst", "move", "lock", "pause", "drive", "tripped", "clear")
 """Phases in which every command is valid and is followed by a wait for its answer."""
+_MOVE_S = 0.2
+"""Seconds that each motor has to move (``conformance/stimuli/usb.py``, phase "move")."""
 _COARSEST = 0.03
 """s between two answers over which a speed is integrated; most of a move takes 0.1 s."""
 _DAMAGED = ("malformed", "broadcast", "short")
@@ -437,17 +439,21 @@ def _moves(c: UsbContext) -> Iterator[tuple[UsbPhase, int, float, float]]:
 def _follows(c: UsbContext) -> Outcome:
     parts: dict[int, float] = {}
     wrong = []
+    late = []
+    least = c.tolerance("min_part")
     for phase, joint, begin, target in _moves(c):
-        parts[joint] = _part(c.hand, phase, joint, begin, target)
+        part = parts[joint] = _part(c.hand, phase, joint, begin, target)
         # overshooting by the same distance is not following either
-        if not c.tolerance("min_part") <= parts[joint] <= 2 - c.tolerance("min_part"):
+        if not least <= part <= 2 - least:
             wrong.append((joint, phase))
+            # no delay sends a joint the wrong way or too far
+            late.append((least - part) * _MOVE_S if -0.1 < part < least else math.inf)
     figure = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
     if not wrong:
         return c.passed(figure, f"of the way in 0.2 s: {figure}")
     text = ", ".join(f"{_named(c, [joint])} {parts[joint]:.0%}" for joint, _ in wrong)
     outcome = c.failed(figure, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
-    return outcome.about(*(joint for joint, _ in wrong))
+    return outcome.about(*(joint for joint, _ in wrong)).if_late(*late)
 
 
 @check("DEX3USB-MOVE-02")
