@@ -61,6 +61,7 @@ from dexkit.errors import (
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
+from tests.dds_helpers import wait_until
 from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
@@ -979,6 +980,24 @@ def test_interrupted_calibration_switches_torque_off(tmp_path: Path) -> None:
         calls = iter([False] * 50)
         with pytest.raises(CalibrationFailed, match="interrupted"):
             calibration.find_zero(servo, cancelled=lambda: next(calls, True))
+        assert gripper.servo.get(mx64.GOAL_CURRENT) == 0
+        hand.close()
+
+
+def test_calibration_is_not_misled_by_a_pause_of_the_machine(tmp_path: Path) -> None:
+    """A servo that its bus watchdog has stopped stands still, but not at an end of the stroke."""
+    with emulated(start=90.0) as gripper:
+        hand = EZGripper(gripper.path, configuration=configured(tmp_path))
+        servo = hand.connect()
+        calls = iter(range(10**6))
+
+        def paused() -> bool:
+            if next(calls) == 20:
+                wait_until(lambda: gripper.servo.get(mx64.BUS_WATCHDOG) == mx64.WATCHDOG_TRIPPED)
+            return False
+
+        with pytest.raises(CalibrationFailed, match="bus watchdog stopped it"):
+            calibration.find_zero(servo, cancelled=paused)
         assert gripper.servo.get(mx64.GOAL_CURRENT) == 0
         hand.close()
 

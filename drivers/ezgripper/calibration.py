@@ -80,6 +80,10 @@ class Drive(Protocol):
         """Switch the motor on with ``goal`` in its registers."""
         ...
 
+    def rearm_watchdog(self) -> None:
+        """Clear a tripped bus watchdog, so that the servo accepts goals; it holds its position."""
+        ...
+
 
 @dataclass(frozen=True)
 class Track:
@@ -119,6 +123,12 @@ def _check(sample: Sample) -> None:
         )
     if not sample.torque:
         raise CalibrationFailed("the servo's torque went off during calibration")
+    if sample.watchdog == mx64.WATCHDOG_TRIPPED:
+        # it stands where it was stopped, which must not be taken for an end of the stroke
+        raise CalibrationFailed(
+            "no instruction reached the servo for too long, and its bus watchdog stopped it",
+            hint="this machine or the adapter paused; try again when it is less busy",
+        )
 
 
 def move(
@@ -149,8 +159,8 @@ def move(
             drive.exchange(without_profile(first.position, goal.current))
         while True:
             sample = drive.exchange(goal)
-            _check(sample)
             samples.append(sample)
+            _check(sample)
             if cancelled():
                 raise CalibrationFailed("interrupted")
             if detector.update(sample.time, sample.position, position, received=sample.received):
@@ -168,6 +178,8 @@ def move(
     except BaseException:
         # limp after any failure; if this write fails, too, the bus watchdog stops the motor
         try:
+            if samples and samples[-1].watchdog == mx64.WATCHDOG_TRIPPED:
+                drive.rearm_watchdog()  # until then it refuses goals
             drive.exchange(limp)
         except HandError:
             pass
