@@ -93,7 +93,7 @@ class Dex1Mechanics:
         """Set the speed to 0."""
         self.joint.dq = 0.0
 
-    def use(self, command: HandCommand) -> None:
+    def apply(self, command: HandCommand) -> None:
         """Apply a command for the one joint."""
         if not command.mode[0]:
             self.brake()

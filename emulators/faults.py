@@ -1,4 +1,4 @@
-"""Faults that an emulated device can be told to have, at a time or at once.
+"""Faults that can be injected into an emulated device, at a time or at once.
 
 A fault is written ``KIND[@TIME][:KEY=VALUE[,KEY=VALUE...]]``::
 
@@ -288,19 +288,19 @@ class FaultSchedule:
             self.add(fault, start)
 
     def add(self, fault: Fault, start: float) -> None:
-        """Plan another fault, its time counted from ``start``."""
+        """Schedule another fault, its time counted from ``start``."""
         self._begins.append((start + fault.at, fault))
         self._begins.sort(key=lambda entry: entry[0])
 
     @property
     def next_time(self) -> float | None:
-        """When something begins or ends next, or None."""
+        """Time at which a fault begins or ends next, or None."""
         if not self._begins and not self._ends:
             return None
         return min(time for time, _ in (self._begins[:1] + self._ends[:1]))
 
     def poll(self, now: float) -> list[tuple[Fault, bool]]:
-        """What began (True) or ended (False) up to ``now``, in order of time."""
+        """The faults that began (True) or ended (False) up to ``now``, in order of time."""
         events: list[tuple[Fault, bool]] = []
         while True:
             following = self.next_time

@@ -271,7 +271,7 @@ class FingerMechanics:
         ):
             motor.follow(q, feedforward, kp, kd)
 
-    def use(self, command: HandCommand) -> None:
+    def apply(self, command: HandCommand) -> None:
         """Apply ``command`` to every motor."""
         for i, row in enumerate(
             zip(

@@ -29,11 +29,11 @@ class Mechanics(Protocol):
     def step(self, n: int = 1) -> None:
         """Live ``n`` steps."""
 
-    def use(self, command: HandCommand) -> None:
-        """Obey ``command`` from here on."""
+    def apply(self, command: HandCommand) -> None:
+        """Apply ``command`` until the next one."""
 
     def state(self, stamp: float) -> HandState:
-        """What can be seen, measured at ``stamp``."""
+        """The state, measured at ``stamp``."""
 
 
 class SimulatedHand:
@@ -84,7 +84,7 @@ class SimulatedHand:
             self._mechanics.brake()
         self._last = now
         self._mechanics.step(self._steps.due(now))
-        self._mechanics.use(command)
+        self._mechanics.apply(command)
         return self._mechanics.state(now)
 
 

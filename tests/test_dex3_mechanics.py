@@ -434,7 +434,7 @@ def test_jammed_joint_makes_torque_without_motion() -> None:
 
 def test_state_holds_every_quantity_of_the_mechanics() -> None:
     mechanics = Dex3Mechanics(Side.LEFT, object_at=40)
-    mechanics.use(HandCommand.position(DEX3_1.rest_q[Side.LEFT], kp=KP, kd=KD))
+    mechanics.apply(HandCommand.position(DEX3_1.rest_q[Side.LEFT], kp=KP, kd=KD))
     state = live(mechanics, 0.1).state(3.5)
     assert state.stamp == 3.5
     for name in ("q", "dq", "ddq", "tau", "temperature", "winding_temperature"):

@@ -1,4 +1,4 @@
-"""What a recording's summary says, and where it contradicts the recording."""
+"""Read the summary of a recording, and find contradictions to its data."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Summary:
 
 
 def contradictions(summary: Summary, found: Found, *, complete: bool) -> Iterator[str]:
-    """Where the summary and the data section say different things, in sentences.
+    """Contradictions between the summary and the data section, as sentences.
 
     :param complete: whether all schemas and channels are known.
     """

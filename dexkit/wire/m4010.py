@@ -139,7 +139,7 @@ _CALIBRATED = 2  # speed field of the answer
 
 
 class Status(IntEnum):
-    """What a motor is told to do; bits 4 to 6 of the mode byte (docs/sources/unitree-dex.md#g,
+    """Commanded status, bits 4 to 6 of the mode byte (docs/sources/unitree-dex.md#g,
     docs/sources/unitree-dex.md#d28).
     """
 
@@ -167,7 +167,7 @@ class CalibrationProblem(IntFlag):
 
 
 class Setpoint(NamedTuple):
-    """What a command asks of the joint: rad, rad/s, N·m, N·m/rad, N·m·s/rad."""
+    """Setpoint of the joint: rad, rad/s, N·m, N·m/rad, N·m·s/rad."""
 
     q: float
     dq: float

@@ -20,7 +20,7 @@ __all__ = ["Bus", "Counters"]
 
 @dataclass
 class Counters(LineCounters):
-    """What the line has seen and done."""
+    """Counters of the line."""
 
     commands: int = 0
     answers: int = 0
@@ -70,7 +70,7 @@ class Bus(SerialLine):
     # --- time and faults
 
     def advance_to(self, now: float) -> None:
-        """Let faults strike and motors live up to ``now``."""
+        """Advance faults and motors to ``now``."""
         events = self.schedule.poll(now)
         for motor in self.motors:
             motor.advance_to(now)
@@ -84,7 +84,7 @@ class Bus(SerialLine):
 
     @property
     def busy(self) -> bool:
-        """Whether a motor drives or moves, so that time should be let pass often."""
+        """Whether a motor drives or moves, so that :meth:`advance_to` should be called often."""
         return any(not motor.resting for motor in self.motors)
 
     # --- from the host

@@ -96,7 +96,7 @@ class Dex1Motors:
 
     @property
     def path(self) -> str:
-        """What a client opens, of the first line."""
+        """Path of the first line, for a client to open."""
         return self._lines[0].path
 
     @property
@@ -106,7 +106,7 @@ class Dex1Motors:
 
     @property
     def error(self) -> BaseException | None:
-        """What ended the service of a line, if anything."""
+        """The error that ended the service of a line, or None."""
         return next((port.error for port in self._lines if port.error is not None), None)
 
     @property
@@ -116,7 +116,7 @@ class Dex1Motors:
 
     @property
     def ready_lines(self) -> list[str]:
-        """One a line: where it is and who answers there."""
+        """For each line: its path and the motors on it."""
         lines = []
         for port in self._lines:
             here = [side for side in self.ports if self.ports[side] is port]
@@ -139,7 +139,7 @@ class Dex1Motors:
             port.inject(fault)
 
     def summaries(self) -> list[str]:
-        """One a line: what passed on it."""
+        """For each line: its counters."""
         found = []
         for port in self._lines:
             bus = port.line

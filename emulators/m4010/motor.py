@@ -82,7 +82,7 @@ class Motor:
 
     @property
     def error(self) -> MotorError:
-        """What it reports, the trip of its protection included."""
+        """MError as reported, with the trip of the time-out protection."""
         tripped = MotorError.MOTOR_SAW_HOST_TIMEOUT if self.tripped else MotorError.NONE
         return self._own_errors | self._faults | tripped
 
@@ -176,7 +176,7 @@ class Motor:
     # --- the line
 
     def handle(self, command: MotorCmd) -> MotorData | None:
-        """Obey a command; the answer, or None when it is silent or not meant.
+        """Execute a command; return the data frame, or None if the motor is silent or not meant.
 
         Call it after :meth:`advance_to`.
         """
@@ -232,7 +232,7 @@ class Motor:
         return calibration.answer(problem)
 
     def data(self) -> MotorData:
-        """What it measures now."""
+        """The data frame of the present state."""
         status = Status.FOC if self.mechanics.mode is JointMode.FOC else Status.BRAKE
         return MotorData.measured(
             self.number,

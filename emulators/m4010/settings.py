@@ -1,4 +1,4 @@
-"""What can be set about an emulated M4010: what no source says of the real one, and its heat.
+"""Settings of an emulated M4010: points that no source documents, and its thermal model.
 
 Only the vendor's library was measured (docs/sources/unitree-dex.md#g), no motor. The default of
 each point is the reading that is best supported; docs/emulators.md lists them.

@@ -32,7 +32,7 @@ _FAST = (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
 
 @dataclass
 class Counters(LineCounters):
-    """What the bus has seen and done."""
+    """Counters of the bus."""
 
     instructions: int = 0
     statuses: int = 0
@@ -90,7 +90,7 @@ class Bus(SerialLine):
     # --- time and faults
 
     def advance_to(self, now: float) -> None:
-        """Let faults strike and servos live up to ``now``."""
+        """Advance faults and servos to ``now``."""
         for fault, begins in self.schedule.poll(now):
             self._apply_fault(fault, begins)
         for servo in self.servos:
@@ -98,7 +98,7 @@ class Bus(SerialLine):
 
     @property
     def busy(self) -> bool:
-        """Whether a servo moves or holds, so that time should be let pass often."""
+        """Whether a servo moves or holds, so that :meth:`advance_to` should be called often."""
         return any(not servo.drive.resting for servo in self.servos)
 
     def _apply_fault(self, fault: Fault, begins: bool) -> None:

@@ -139,7 +139,7 @@ class Servo:
 
     @property
     def silent(self) -> bool:
-        """It hears nothing: it boots, or its supply has gone."""
+        """Whether it receives nothing: it is booting, or has no supply."""
         return not self._powered or self.now < self._boot_until
 
     @property
@@ -179,7 +179,7 @@ class Servo:
     # --- time
 
     def advance_to(self, now: float) -> None:
-        """Let time pass up to ``now``, in whole control periods; never goes back."""
+        """Advance to ``now`` in whole control periods; never goes back."""
         periods = int((now - self._origin) / PERIOD + 1e-6) - self._periods
         drive = self.drive
         while periods > 0:
@@ -311,7 +311,7 @@ class Servo:
         return sign * self.drive.position + self._homing
 
     def _update_demand(self) -> None:
-        """Carry the registers over to the drive, in the motor's own direction."""
+        """Set the drive's demand from the registers, in the motor's direction."""
         sign = -1 if self._reverse else 1
         demand = self.drive.demand
         demand.torque = self.torque
@@ -392,7 +392,7 @@ class Servo:
         )
 
     def _target(self, address: int) -> int:
-        """Where the byte at ``address`` really is: follows indirect data, one level."""
+        """Address that ``address`` stands for: follows one level of indirect data."""
         for block in mx64.INDIRECT_BLOCKS:
             k = address - block.data
             if 0 <= k < block.count:
@@ -517,7 +517,7 @@ class Servo:
         return low, high
 
     def _apply(self, item: Item, value: int) -> None:
-        """Set an item and do what setting it does."""
+        """Set an item, and carry out its effect."""
         if item is mx64.TORQUE_ENABLE:
             self._set_torque(bool(value))
             return

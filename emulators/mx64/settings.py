@@ -1,4 +1,4 @@
-"""What can be set about an emulated MX-64: the uncertain points, and the mechanics it drives.
+"""Settings of an emulated MX-64: undocumented points of its firmware, and its mechanics.
 
 Each field of :class:`Firmware` is a point on which the manual is silent or sources disagree
 (docs/sources/mx64-ezgripper.md#f); the default is the reading that is best supported, and
@@ -83,7 +83,7 @@ class Firmware:
 
 @dataclass(frozen=True)
 class GripperMechanics:
-    """The EZGripper as the servo's shaft feels it; 0 % is closed, 100 % open.
+    """Mechanics of the EZGripper at the servo's shaft; 0 % is closed, 100 % open.
 
     Stroke and closing direction are facts (docs/sources/mx64-ezgripper.md#d1,
     docs/sources/mx64-ezgripper.md#d2). Nobody publishes stiffness or friction of the whole gripper:
