@@ -308,6 +308,10 @@ def test_late_answer_is_not_taken_for_the_next_one() -> None:
         with pytest.raises(HandTimeout, match="motor 1 on"):
             hand.exchange(BRAKE)
         hand.configuration = patient
+        assert hand._line is not None
+        assert hand._line._port is not None
+        port = hand._line._port
+        wait_for(lambda: port.in_waiting)  # the driver itself waits for LATE only
         assert hand.exchange(LIMP).mode[0] == JointMode.FOC  # and not that of the brake
 
 
