@@ -120,9 +120,7 @@ def _say_plan(machine: Machine, plan: Plan) -> None:
 
 
 def _say_result(found: Installed, plan: Plan) -> None:
-    click.echo(
-        one_line(f"DDS works: cyclonedds {found.version} with {', '.join(found.libraries)}")
-    )
+    click.echo(one_line(f"DDS works: cyclonedds {found.version} with {', '.join(found.libraries)}"))
     for note in plan.notes:
         click.echo(f"note: {one_line(note)}")
 

@@ -83,9 +83,7 @@ class _Task:
 
     folder = Path()
 
-    def __init__(
-        self, machine: Machine, runner: Runner, progress: Callable[[str], object]
-    ) -> None:
+    def __init__(self, machine: Machine, runner: Runner, progress: Callable[[str], object]) -> None:
         self._machine = machine
         self._interpreter = machine.interpreter
         self._runner = runner
@@ -135,9 +133,7 @@ class _Task:
                 ).read_bytes()
         return library, files
 
-    def _build(
-        self, library: Library, module: str, files: Mapping[str, bytes], rpath: str
-    ) -> Path:
+    def _build(self, library: Library, module: str, files: Mapping[str, bytes], rpath: str) -> Path:
         self._progress("trying the compiler")
         prefix = _prefix_of_links(self.folder / "prefix", library)
         try_compiler(self._machine, self._runner, self.folder, prefix)

@@ -195,24 +195,22 @@ def libraries(
             yield library
 
 
-def _places(
-    environment: Mapping[str, str], prefix: str, root: Path
-) -> Iterator[tuple[str, Path]]:
+def _places(environment: Mapping[str, str], prefix: str, root: Path) -> Iterator[tuple[str, Path]]:
     if home := environment.get("CYCLONEDDS_HOME"):
         yield "CYCLONEDDS_HOME", Path(home)
     for variable in ("CMAKE_PREFIX_PATH", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"):
         for place in filter(None, environment.get(variable, "").split(os.pathsep)):
             yield variable, Path(place)
             yield variable, Path(place) / "cyclonedds"
-    ros = sorted((root / "opt/ros").glob("*"), reverse=True)
     sourced = environment.get("ROS_DISTRO", "")
-    for place in sorted(ros, key=lambda p: p.name != sourced):
-        yield f"ROS 2 {place.name}", place
+    ros = sorted((root / "opt/ros").glob("*"), reverse=True)
+    for folder in sorted(ros, key=lambda p: p.name != sourced):
+        yield f"ROS 2 {folder.name}", folder
     yield "this environment", Path(prefix)
     user = environment.get("HOME", "")
     for pattern in _WORKSPACES if user else ():
-        for place in sorted(Path(p) for p in glob.glob(os.path.join(glob.escape(user), pattern))):
-            yield "your home", place
+        for found in sorted(glob.glob(os.path.join(glob.escape(user), pattern))):
+            yield "your home", Path(found)
     yield "/usr/local", root / "usr/local"
     yield "the distribution", root / "usr"
 
@@ -244,9 +242,7 @@ def _runtime_name(folder: Path, real: Path) -> str:
     the next update changes. ``libddsc.so`` is the developers'.
     """
     names = sorted(
-        path.name
-        for path in folder.glob("libddsc.so.*")
-        if os.path.realpath(path) == str(real)
+        path.name for path in folder.glob("libddsc.so.*") if os.path.realpath(path) == str(real)
     )
     return min(names, key=lambda name: (bool(_number(name)), len(name)), default="libddsc.so")
 
