@@ -36,7 +36,13 @@ from tests import optional
 from tests.each import each
 
 DEBIAN_12 = Distribution("debian", "12", "Debian GNU/Linux 12 (bookworm)")
-LIBRARY = Library("the distribution", "/usr/include", "/usr/lib/x86_64-linux-gnu", "libddsc.so.0")
+LIBRARY = Library(
+    "the distribution",
+    "/usr/include",
+    "/usr/lib/x86_64-linux-gnu",
+    "libddsc.so.0",
+    "/usr/lib/x86_64-linux-gnu/libddsc.so.0.10.5",
+)
 PYTHON = Interpreter()
 MACHINE = Machine(
     libraries=(LIBRARY,), distribution=DEBIAN_12, installed=Installed(), cmake="/usr/bin/cmake"
@@ -68,6 +74,18 @@ def refusal(
 def test_a_cyclonedds_that_works_stays() -> None:
     machine = dataclasses.replace(MACHINE, installed=Installed("0.10.2", "", ("/x/libddsc.so.0",)))
     assert isinstance(plan.make_plan(machine).action, plan.Keep)
+
+
+def test_one_that_works_is_replaced_on_request_only() -> None:
+    installed = Installed("0.10.5", "", ("/x/libddsc.so.0",))
+    machine = dataclasses.replace(
+        MACHINE, installed=installed, needs_variables=("LD_LIBRARY_PATH",)
+    )
+    (note,) = plan.make_plan(machine).notes
+    assert "LD_LIBRARY_PATH" in note
+    replaced = plan.make_plan(machine, plan.Options(replace=True))
+    assert replaced.action == plan.Build(LIBRARY)
+    assert not replaced.notes
 
 
 def test_it_stays_on_an_interpreter_into_which_nothing_may_be_installed() -> None:
@@ -167,7 +185,7 @@ def test_another_library_that_every_program_is_offered_is_pointed_out() -> None:
     (note,) = plan.make_plan(machine).notes
     assert "/opt/ros/humble/lib/libddsc.so.0" in note
     assert "crashes" in note
-    mine = dataclasses.replace(MACHINE, elsewhere=("/usr/lib/x86_64-linux-gnu/libddsc.so.0",))
+    mine = dataclasses.replace(MACHINE, elsewhere=(LIBRARY.real,))
     assert not plan.make_plan(mine).notes
 
 
@@ -346,8 +364,8 @@ def test_libraries_that_the_loader_is_offered_are_found(tmp_path: Path) -> None:
     offered = look.offered_elsewhere(
         {"LD_LIBRARY_PATH": f":/none:{tmp_path}/ros/lib", "LD_PRELOAD": "/a/libx.so /b/libddsc.so"}
     )
-    assert list(offered) == [f"{tmp_path}/ros/lib/libddsc.so", "/b/libddsc.so"]
-    assert list(look.offered_elsewhere({})) == []
+    assert offered == sorted(["/b/libddsc.so", f"{tmp_path}/ros/lib/libddsc.so.0.10.5"])
+    assert look.offered_elsewhere({}) == []
 
 
 def test_the_version_of_a_source_is_read(tmp_path: Path) -> None:

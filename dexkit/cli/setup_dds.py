@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +14,12 @@ from typing import IO, TYPE_CHECKING
 import click
 
 from dexkit.errors import DdsInstallError, OutputError
-from dexkit.escaping import one_line
+from dexkit.escaping import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.setup_dds.facts import Installed, Machine
     from dexkit.setup_dds.plan import Plan
+    from dexkit.setup_dds.running import Runner
 
 __all__ = ["command"]
 
@@ -36,7 +40,7 @@ __all__ = ["command"]
     help="Keep the wheel here, for other environments and machines.",
 )
 @click.option(
-    "--replace", is_flag=True, help="Replace an installed cyclonedds that is not 0.10.x, too."
+    "--replace", is_flag=True, help="Replace an installed cyclonedds that works, or is not 0.10.x."
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be done, and do nothing.")
 @click.option(
@@ -79,6 +83,7 @@ def command(
             plan = make_plan(machine, options)
             _say_plan(machine, plan)
             if dry_run:
+                _say_notes(plan)
                 click.echo("dry run: nothing was changed")
                 return
             progress = _Progress(file)
@@ -94,15 +99,18 @@ def command(
         _say_result(found, plan)
 
 
-def _look(runner: object, source: Path | None) -> tuple[Machine, str]:
+def _look(runner: Runner, source: Path | None) -> tuple[Machine, str]:
+    """The facts, and the version of the source."""
     from dexkit.setup_dds import look, probe
-    from dexkit.setup_dds.running import ProcessRunner
 
-    assert isinstance(runner, ProcessRunner)
-    import sys
+    def find(environment: dict[str, str] | None = None) -> Installed:
+        done = runner.run(probe.command(sys.executable, send=False), environment)
+        return probe.result_of(done.code, done.output)
 
-    done = runner.run(probe.command(sys.executable, send=False))
-    machine = look.look(probe.result_of(done.code, done.output))
+    installed = find()
+    bare = {k: v for k, v in os.environ.items() if k not in look.VARIABLES}
+    needed = installed.version and len(bare) < len(os.environ)
+    machine = look.look(installed, find(bare) if needed else None)
     return machine, look.source_version(source) if source else ""
 
 
@@ -115,14 +123,18 @@ def _say_plan(machine: Machine, plan: Plan) -> None:
         )
     )
     for line in plan.looked_at:
-        click.echo(f"  {one_line(line)}")
-    click.echo(f"to do: {one_line(plan.action)}")
+        click.echo(f"  {one_line(line, REMARK)}")
+    click.echo(f"to do: {one_line(plan.action, REMARK)}")
 
 
 def _say_result(found: Installed, plan: Plan) -> None:
     click.echo(one_line(f"DDS works: cyclonedds {found.version} with {', '.join(found.libraries)}"))
+    _say_notes(plan)
+
+
+def _say_notes(plan: Plan) -> None:
     for note in plan.notes:
-        click.echo(f"note: {one_line(note)}")
+        click.echo(f"note: {one_line(note, REMARK)}")
 
 
 class _Progress:
@@ -142,8 +154,6 @@ class _Progress:
 @contextlib.contextmanager
 def _log_file(path: Path | None) -> Iterator[tuple[IO[str], Path]]:
     """The log, emptied; where the default place cannot be written, there is none."""
-    import io
-
     import platformdirs
 
     place = path or Path(platformdirs.user_log_dir("dexkit")) / "setup-dds.log"

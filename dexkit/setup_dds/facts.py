@@ -83,6 +83,7 @@ class Library:
     :ivar include: folder that has ``dds/``; empty if it has no headers.
     :ivar folder: folder of ``libddsc.so``.
     :ivar file: the name by which programs load it, in that folder.
+    :ivar real: path of the file that it is in the end.
     :ivar header_version: as its headers say; empty without headers.
     :ivar version: as the name of its file says; empty if that says nothing.
     :ivar processor: what it is compiled for.
@@ -92,6 +93,7 @@ class Library:
     include: str
     folder: str
     file: str
+    real: str = ""
     header_version: str = "0.10.5"
     version: str = "0.10.5"
     processor: str = "x86_64"
@@ -116,7 +118,9 @@ class Machine:
     """Everything that a plan rests on.
 
     :ivar free: bytes that can be written to the temporary folder and the folder of packages.
-    :ivar elsewhere: files of libddsc that LD_LIBRARY_PATH or LD_PRELOAD offers to every program.
+    :ivar elsewhere: files of libddsc that LD_LIBRARY_PATH or LD_PRELOAD offers to every program,
+        without links.
+    :ivar needs_variables: the installed package works only with these variables of the shell.
     :ivar cmake: path of cmake; empty if there is none.
     """
 
@@ -127,6 +131,7 @@ class Machine:
     temporary: str = "/tmp"
     free: tuple[int, int] = (1 << 40, 1 << 40)
     elsewhere: tuple[str, ...] = ()
+    needs_variables: tuple[str, ...] = ()
     cmake: str = ""
 
 

@@ -15,12 +15,13 @@ import struct
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from dexkit.setup_dds.facts import Distribution, Installed, Interpreter, Library, Machine
 
 __all__ = [
+    "VARIABLES",
     "distribution",
     "interpreter",
     "libraries",
@@ -43,10 +44,15 @@ _WORKSPACES = (
 )
 
 
-def look(installed: Installed) -> Machine:
+VARIABLES = ("CYCLONEDDS_HOME", "LD_LIBRARY_PATH", "LD_PRELOAD")
+"""Variables that decide which library a program loads."""
+
+
+def look(installed: Installed, without_variables: Installed | None = None) -> Machine:
     """Everything about this machine.
 
     :param installed: what a child process found of the installed package.
+    :param without_variables: what one without :data:`VARIABLES` found; None if none is set.
     """
     found = interpreter()
     temporary = tempfile.gettempdir()
@@ -58,6 +64,9 @@ def look(installed: Installed) -> Machine:
         temporary=temporary,
         free=(_free(temporary), _free(found.packages)),
         elsewhere=tuple(offered_elsewhere(os.environ)),
+        needs_variables=tuple(v for v in VARIABLES if os.environ.get(v))
+        if without_variables and without_variables.error and not installed.error
+        else (),
         cmake=shutil.which("cmake") or _beside(found.executable, "cmake"),
     )
 
@@ -189,9 +198,8 @@ def libraries(
         library = library_at(place, origin, processor)
         if library is None:
             continue
-        real = os.path.realpath(os.path.join(library.folder, library.file))
-        if real not in seen:
-            seen.add(real)
+        if library.real not in seen:
+            seen.add(library.real)
             yield library
 
 
@@ -230,6 +238,7 @@ def library_at(prefix: Path, origin: str, processor: str) -> Library | None:
             include=str(include) if headers else "",
             folder=str(folder),
             file=_runtime_name(folder, real),
+            real=str(real),
             header_version=_header_version(include) if headers else "",
             version=_number(real.name),
             processor=processor_of(real),
@@ -261,17 +270,14 @@ def _header_version(include: Path) -> str:
     return match[1] if match else ""
 
 
-def offered_elsewhere(environment: Mapping[str, str]) -> Iterator[str]:
-    """Files of libddsc that every program of this shell is offered."""
+def offered_elsewhere(environment: Mapping[str, str]) -> list[str]:
+    """Files of libddsc that every program of this shell is offered, without links."""
+    found = []
     for folder in filter(None, environment.get("LD_LIBRARY_PATH", "").split(":")):
-        yield from _runtime_files(sorted(Path(folder).glob("libddsc.so*")))
+        found += list(Path(folder).glob("libddsc.so*"))
     preloaded = re.split(r"[: ]", environment.get("LD_PRELOAD", ""))
-    yield from _runtime_files(Path(p) for p in preloaded if "libddsc" in p)
-
-
-def _runtime_files(paths: Iterable[Path]) -> Iterator[str]:
-    first = {os.path.realpath(p): str(p) for p in sorted(paths, reverse=True)}
-    yield from (p for _, p in sorted(first.items()))
+    found += [Path(p) for p in preloaded if os.path.basename(p).startswith("libddsc")]
+    return sorted({os.path.realpath(p) for p in found})
 
 
 def source_version(folder: Path) -> str:

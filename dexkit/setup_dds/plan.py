@@ -29,7 +29,7 @@ class Options:
 
     :ivar source: checkout of the C library that is to be built.
     :ivar source_version: its version; empty if the folder is no such checkout.
-    :ivar replace: whether another cyclonedds than 0.10.x may be replaced.
+    :ivar replace: whether a cyclonedds is replaced that works, or is not 0.10.x.
     :ivar keep_wheel: a wheel is wanted, also where a working cyclonedds is installed.
     """
 
@@ -109,7 +109,8 @@ def make_plan(machine: Machine, options: Options | None = None) -> Plan:
     if installed.version:
         problem = _installed_problem(machine, options)
         if not problem and not options.source and not options.keep_wheel:
-            return Plan(Keep(), (f"installed: cyclonedds {installed.version}",), _notes(machine))
+            looked_at.append(f"installed: cyclonedds {installed.version}")
+            return Plan(Keep(), tuple(looked_at), _notes(machine))
         looked_at.append(f"installed: cyclonedds {installed.version}: {problem or 'it works'}")
     _check_environment(machine)
     if options.source:
@@ -192,6 +193,8 @@ def _installed_problem(machine: Machine, options: Options) -> str:
             f"its process has two CycloneDDS libraries ({' and '.join(installed.libraries)}), "
             "which crash it sooner or later"
         )
+    if options.replace:
+        return "it is to be replaced"
     for file in installed.libraries:
         version = file_version(file)
         if version and not version.startswith("0."):
@@ -303,7 +306,12 @@ def _endurance(library: Library, machine: Machine) -> tuple[str, ...]:
 
 def _notes(machine: Machine, library: Library | None = None) -> tuple[str, ...]:
     notes = []
-    mine = {f"{library.folder}/{library.file}"} if library else set(machine.installed.libraries)
+    if library is None and machine.needs_variables:
+        notes.append(
+            f"it works only with {' and '.join(machine.needs_variables)} set as now; "
+            "'dexkit setup-dds --replace' builds one that needs no variables"
+        )
+    mine = {library.real} if library else set(machine.installed.libraries)
     for file in machine.elsewhere:
         if file not in mine:
             notes.append(
