@@ -72,7 +72,7 @@ def carry_out(
         task.check(str(trial), installed=False)
         if wheel_folder is not None:
             _keep(wheel, wheel_folder)
-            progress(f"kept: {wheel_folder / wheel.name}")
+            progress(f"kept: {wheel_folder / wheel.name}{_needs(plan)}")
         progress(f"installing into {machine.interpreter.packages}")
         task.install(wheel)
     return task.check("", installed=True)
@@ -350,6 +350,13 @@ def _pip_version(machine: Machine) -> tuple[int, int]:
     except ImportError:
         match = None
     return (int(match[1]), int(match[2])) if match else (99, 0)
+
+
+def _needs(plan: Plan) -> str:
+    if not isinstance(plan.action, Build):
+        return ""
+    library = plan.action.library
+    return f"; a machine that installs it needs {library.folder}/{library.file}, too"
 
 
 def _keep(wheel: Path, folder: Path) -> None:
