@@ -24,7 +24,6 @@ from dexkit.errors import (
     DdsBuildFailed,
     DdsInstallError,
     DdsLibraryMissing,
-    DdsUnavailable,
     DexkitError,
     InterpreterRefused,
 )
@@ -656,18 +655,6 @@ def test_a_broken_log_or_source_is_one_error(
     for arguments in (("--log", tmp_path / "none" / "log"), ("--from-source", tmp_path)):
         assert run_command("--dry-run", *arguments) == 2
         assert capsys.readouterr().err.startswith("error: ")
-
-
-def test_an_import_without_dds_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    from dexkit import dds
-
-    def missing(name: str) -> str:
-        raise dds.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(dds.metadata, "version", missing)
-    with pytest.raises(DdsUnavailable) as caught:
-        dds._Cyclone()
-    assert "dexkit setup-dds" in caught.value.hint
 
 
 @each("version", ["3.12", "3.13"])

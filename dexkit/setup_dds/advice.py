@@ -103,7 +103,8 @@ def cause_of(output: str, interpreter: Interpreter, distribution: Distribution) 
         return Cause(
             "the package index cannot be reached, or has no such package",
             "connect, or name a mirror (PIP_INDEX_URL); or on another machine with the same "
-            "system and Python: 'dexkit setup-dds --wheel DIR', and here: pip install --no-deps DIR/*.whl",
+            "system and Python: 'dexkit setup-dds --wheel DIR', and here: "
+            "pip install --no-deps DIR/*.whl",
         )
     if has(r"unable to execute '", r"command '\S+' failed: No such file",
            r"No CMAKE_C_COMPILER could be found", r"CMAKE_MAKE_PROGRAM is not set"):  # fmt: skip
