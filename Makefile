@@ -1,14 +1,23 @@
 # Everything a fresh machine needs is created inside the checkout: uv in .tools/, the
-# environment in .venv/ with the Python named in .python-version. Needs python3 with venv
-# and pip, git and make.
+# environment in .venv/ with the Python named in .python-version, or another one:
+# make setup PYTHON_VERSION=3.12 (kept until another is named). Needs python3 with venv and pip,
+# git and make; docs/install.md.
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
 UV_VERSION := 0.13.8
 TOOLS := .tools
 UV := $(TOOLS)/bin/uv
-RUN := $(UV) run --frozen
 STAMP := .venv/.synced
+CHOSEN := .venv/.python-version
+
+LAST_VERSION := $(shell cat $(CHOSEN) 2>/dev/null)
+PYTHON_VERSION ?= $(or $(LAST_VERSION),$(shell cat .python-version))
+# uv does not look into pyenv's folder, and pyenv's shims run only what is switched on
+FOUND_BY_PYENV := $(lastword $(sort $(wildcard \
+	$(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions/$(PYTHON_VERSION).*/bin/python)))
+FOR_PYTHON := --python $(or $(FOUND_BY_PYENV),$(PYTHON_VERSION))
+RUN := $(UV) run --frozen $(FOR_PYTHON)
 
 # An environment activated by the caller must not leak in.
 # Nor may bytecode go unwritten: hundreds of processes would each compile NumPy.
@@ -21,15 +30,24 @@ $(UV):
 	@$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check "uv==$(UV_VERSION)"
 
 $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
-	@$(UV) sync --frozen --quiet
+	@$(UV) sync --frozen --quiet $(FOR_PYTHON)
+ifneq ($(DDS),no)
+	@.venv/bin/python -c 'import cyclonedds.core' 2>/dev/null || .venv/bin/dexkit setup-dds || { \
+		echo "  or without DDS: make setup DDS=no" >&2; exit 2; }
+endif
+	@echo '$(PYTHON_VERSION)' > $(CHOSEN)
 	@touch $@
 
-.PHONY: help setup demo test soak campaign campaign-sample lint format docs bench lock clean
+ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
+.PHONY: $(STAMP)
+endif
+
+.PHONY: help setup demo test soak platforms campaign campaign-sample lint format docs bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
 
-setup: $(STAMP) ## create the environment
+setup: $(STAMP) ## create the environment (PYTHON_VERSION=3.12 for another Python, DDS=no without DDS)
 
 demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
 	@$(RUN) dexkit demo --out demo-out
@@ -46,6 +64,9 @@ campaign: $(STAMP) ## tries to break it: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill
 
 campaign-sample: $(STAMP) ## two minutes of it, all cases in miniature
 	$(RUN) python -m tools.campaign --sample $(if $(JOBS),--jobs $(JOBS)) $(ARGS)
+
+platforms: $(STAMP) ## each Python from 3.10 to 3.13: DDS, conformance, both directions with the 0.10.2 wheel
+	$(RUN) python -m tools.platforms $(ARGS)
 
 lint: $(STAMP) ## ruff and mypy strict
 	$(RUN) ruff check .
@@ -66,5 +87,5 @@ lock: | $(UV) ## resolve the dependencies again
 	$(UV) lock --upgrade
 
 clean: ## remove everything that make created
-	rm -rf $(TOOLS) .venv build dist demo-out campaign-out benchmarks/results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(TOOLS) .venv build dist demo-out platforms-out campaign-out benchmarks/results .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

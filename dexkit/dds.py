@@ -274,15 +274,14 @@ class _Cyclone:
                 "CycloneDDS is not installed"
                 if missing
                 else f"CycloneDDS cannot be loaded: {error}",
-                hint="DDS needs CPython 3.10 on x86-64 Linux (the only one with cyclonedds 0.10 "
-                "wheels): 'uv python install 3.10', or 'pip install \"cyclonedds<0.11\"' there. "
+                hint="type: dexkit setup-dds (it finds or builds CycloneDDS 0.10 for this Python). "
                 "Recordings, emulated devices and offline checks work without it.",
             ) from error
         if not version.startswith("0.10."):
             raise DdsUnavailable(
                 f"CycloneDDS {version} is installed, dexkit needs 0.10.x",
                 hint="an 11.x participant with Unitree's types crashes every 0.10.x peer, the "
-                "robot included: pip install 'cyclonedds>=0.10.2,<0.11'",
+                "robot included: dexkit setup-dds --replace",
             )
         self.version = version
         self.layer: Any = _clayer

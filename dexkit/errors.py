@@ -18,6 +18,10 @@
     │   └── EncodeError                     a value that the format cannot hold
     ├── DdsError
     │   ├── DdsUnavailable (ImportError)    CycloneDDS is not installed for this interpreter
+    │   ├── DdsInstallError                 'dexkit setup-dds' cannot install it
+    │   │   ├── InterpreterRefused              not for, or not into, this Python
+    │   │   ├── DdsLibraryMissing               no library, compiler or source to build from
+    │   │   └── DdsBuildFailed                  a step failed, or what was built does not work
     │   ├── DdsSetupError                   no such interface, no free participant index, ...
     │   └── TopicConflict                   another type or a foreign publisher on the topic
     ├── TraceError
@@ -51,7 +55,10 @@ __all__ = [
     "ChecksumError",
     "CommandRejected",
     "ConformanceError",
+    "DdsBuildFailed",
     "DdsError",
+    "DdsInstallError",
+    "DdsLibraryMissing",
     "DdsSetupError",
     "DdsUnavailable",
     "DexkitError",
@@ -63,6 +70,7 @@ __all__ = [
     "HandNotFound",
     "HandRefused",
     "HandTimeout",
+    "InterpreterRefused",
     "ModelBroken",
     "OutputError",
     "OversizeError",
@@ -159,6 +167,26 @@ class DdsUnavailable(DdsError, ImportError):
     """CycloneDDS 0.10.x is not installed for this interpreter."""
 
     exit_code = 2
+
+
+class DdsInstallError(DdsError):
+    """CycloneDDS 0.10.x cannot be installed for this interpreter."""
+
+    exit_code = 2
+
+
+class InterpreterRefused(DdsInstallError):
+    """It cannot or must not be installed into this Python's environment."""
+
+
+class DdsLibraryMissing(DdsInstallError):
+    """Something that the build needs is not on this machine."""
+
+
+class DdsBuildFailed(DdsInstallError):
+    """A step of the installation failed, or what was built does not work."""
+
+    exit_code = 1
 
 
 class DdsSetupError(DdsError):

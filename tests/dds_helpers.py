@@ -17,7 +17,7 @@ import pytest
 
 from tests.patience import PATIENCE
 
-pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10: dexkit setup-dds")
 
 from dexkit.dds import DdsNode, Reader, Sample
 from dexkit.domains import AUTOMATIC_DOMAINS, ReservedDomain

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import NamedTuple
 
-from uv import find_uv_bin
+from tools.platforms.interpreters import UV, find_python
 
 __all__ = [
     "OPTIONAL",
     "UNSHARE",
+    "UV",
     "Optional",
     "chromium",
     "header",
@@ -26,7 +25,6 @@ __all__ = [
 ]
 
 UNSHARE = ["unshare", "--user", "--map-root-user", "--net"]
-UV = find_uv_bin()  # of the dev group, wherever the tests were started from
 
 
 class Optional(NamedTuple):
@@ -70,22 +68,8 @@ def namespaces() -> bool:
 
 @functools.cache
 def python(version: str) -> str | None:
-    """A Python of this machine; pyenv's shims do not run what pyenv has not switched on."""
-    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    places = os.get_exec_path() + [str(p / "bin") for p in pyenv.glob(f"{version}.*")]
-    for place in places:
-        found = Path(place) / f"python{version}"
-        if found.exists() and not subprocess.run([found, "-c", ""], capture_output=True).returncode:
-            return str(found)
-    env = {k: v for k, v in os.environ.items() if k not in {"VIRTUAL_ENV", "PYTHONPATH"}}
-    asked = subprocess.run(
-        [UV, "python", "find", "--no-project", version],
-        env=env | {"UV_PYTHON_DOWNLOADS": "never", "UV_NO_PROGRESS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return None if asked.returncode else asked.stdout.strip()
+    """A Python of this machine."""
+    return find_python(version)
 
 
 def _package(name: str) -> Callable[[], object]:
@@ -95,8 +79,8 @@ def _package(name: str) -> Callable[[], object]:
 OPTIONAL = (
     Optional("Chromium", chromium, ("conformance_report_browser",)),
     Optional("user and network namespaces", namespaces, ("dds_multicast", "lan")),
-    Optional("Python 3.11", lambda: python("3.11"), ("package",)),
-    Optional("Python 3.13", lambda: python("3.13"), ("package",)),
+    Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
+    Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
     Optional("CycloneDDS 0.10", _package("cyclonedds"), ("campaign", "demo", "everything on DDS")),
     Optional(
         "the package unitree-sdk2",

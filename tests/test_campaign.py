@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10 (CPython 3.10)")
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10: dexkit setup-dds")
 
 from dexkit.errors import UsageError
 from tools.campaign.case import ROOT, Finding

@@ -366,7 +366,7 @@ from dexkit.errors import DdsUnavailable
 try:
     dexkit.dds.DdsNode(1)
 except DdsUnavailable as error:
-    print(isinstance(error, ImportError), "3.10" in error.hint)
+    print(isinstance(error, ImportError), "dexkit setup-dds" in error.hint)
 """
     assert _run(script) == "True True\n"
     assert _run("import sys, dexkit.dds; print('cyclonedds' in sys.modules)") == "False\n"

@@ -175,4 +175,4 @@ def test_without_dds_everything_else_works(version: str, wheel: Path, tmp_path: 
         assert refused.returncode == 2, command
         assert "Traceback" not in refused.stderr
         assert "CycloneDDS" in refused.stderr  # what is missing
-        assert "uv python install 3.10" in refused.stderr  # what to do
+        assert "dexkit setup-dds" in refused.stderr  # what to do

@@ -39,6 +39,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording."),
     "report": ("dexkit.cli.report", "Write the reports of a result."),
     "serve": ("dexkit.cli.serve", "Publish and subscribe Unitree's topics for a hand."),
+    "setup-dds": ("dexkit.cli.setup_dds", "Find or build CycloneDDS 0.10 for this Python."),
     "sign": ("dexkit.cli.sign", "Sign a result with its recording as one archive."),
     "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
     "verify": ("dexkit.cli.verify", "Verify a signed result, and judge it again."),
