@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from types import SimpleNamespace
 
 from rich.console import Console
 
@@ -22,7 +23,10 @@ from dexkit.doctor.observations import (
     UsbDevice,
 )
 from dexkit.doctor.report import print_report
-from dexkit.doctor.topics import nearly
+from dexkit.doctor.rtps import Data, parse_message, parse_participant
+from dexkit.doctor.topics import is_driven, nearly
+from dexkit.models import DIALECTS
+from tests.doctor_packets import FAST_PARTICIPANT
 from tests.each import each
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
@@ -133,7 +137,7 @@ def _two_publishers() -> DomainView:
 def _frozen() -> DomainView:
     commands = [e for e in GOOD.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
     states = tuple(dataclasses.replace(s, identical=True) for s in GOOD.streams)
-    flows = tuple(_flow(e, q_span=1.0) for e in commands)
+    flows = tuple(_flow(e, q_span=1.0, driven_span=1.0) for e in commands)
     return dataclasses.replace(GOOD, streams=states + flows)
 
 
@@ -260,6 +264,39 @@ def test_silent_process_is_reported_on_another_interface() -> None:
     assert "--interface eth0" in found.fix
     known = dataclasses.replace(seen, sockets=(DdsSocket(1, 7650, _who("client").pid),))
     assert "NET-INTERFACE" not in _ids(known)
+
+
+def test_fast_dds_client_on_loopback_is_known_by_its_port() -> None:
+    """It announces no process id in CycloneDDS's way; its announcement is a genuine one."""
+    _, ((_, item),) = parse_message(FAST_PARTICIPANT)
+    assert isinstance(item, Data)
+    places = tuple((p.address, p.port) for p in parse_participant(item.payload).discovery)
+    assert places == (("127.0.0.1", 7662),)
+    client = Participant("client", "Fast DDS", addresses=("127.0.0.1",), places=places)
+    seen = Observations(
+        domains=(_pair(client=client),),
+        interfaces=(LO,),
+        sockets=(DdsSocket(1, 7650, 4242, "fastclient", (7650, 7662)),),
+    )
+    assert "NET-INTERFACE" not in _ids(seen)
+    elsewhere = dataclasses.replace(client, places=(("192.168.123.5", 7662),))
+    seen = dataclasses.replace(seen, domains=(_pair(client=elsewhere),))
+    assert "NET-INTERFACE" in _ids(seen)
+
+
+@each(
+    ("name", "mode", "kp", "expected"),
+    [
+        ("unitree_go", 0, 5.0, True),
+        ("unitree_go", 1, 0.0, False),
+        ("unitree_hg", 0, 0.0, True),  # its commands have no gains
+        ("dex3", 0x10, 1.5, True),
+        ("dex3", 0x01, 1.5, False),  # locked
+        ("dex3", 0x11, 0.0, False),
+    ],
+)
+def test_a_command_drives_a_motor(name: str, mode: int, kp: float, expected: bool) -> None:
+    assert is_driven(SimpleNamespace(mode=mode, kp=kp), DIALECTS[name]) is expected
 
 
 def test_restarted_hand_is_not_reported_as_late_joiner() -> None:

@@ -20,9 +20,10 @@ from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
 from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
-from dexkit.doctor.topics import is_hand_topic
+from dexkit.doctor.topics import is_driven, is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
+from dexkit.topics import roles
 
 __all__ = ["DISCOVERY_SECONDS", "observe_domains"]
 
@@ -36,6 +37,7 @@ _TICK = 0.05
 _BUFFER = 4 << 20
 _DECODE_EVERY = 0.02  # seconds between samples of a stream whose positions are read
 _LOOPBACK = "127.0.0.1"
+_FAST = "fastdds.physical_data."  # prefix of the properties of a Fast DDS participant
 
 
 @dataclass
@@ -53,10 +55,15 @@ class _Watch:
     low: list[float] = field(default_factory=list)
     high: list[float] = field(default_factory=list)
     q: tuple[float, ...] = ()
+    driven: dict[int, tuple[float, float]] = field(default_factory=dict)
     nonzero: bool = False
     undecodable: int = 0
     decoded_at: float = float("-inf")
     newest: bytes = b""
+
+    def __post_init__(self) -> None:
+        found = roles(self.endpoint.topic, self.endpoint.type_name)
+        self.dialects = [role.dialect for role in found if role.kind == "cmd"]
 
     def take(self, sequence: int, data: bytes, now: float) -> None:
         if self.samples and sequence <= self.last_sequence:
@@ -81,6 +88,10 @@ class _Watch:
         q = [float(motor.q) for motor in motors]
         self.nonzero = self.nonzero or any(q)
         self.q = tuple(q)
+        for i, motor in enumerate(motors if self.dialects else ()):
+            if any(is_driven(motor, dialect) for dialect in self.dialects):
+                low, high = self.driven.get(i, (q[i], q[i]))
+                self.driven[i] = min(low, q[i]), max(high, q[i])
         if len(q) != len(self.low):
             self.low, self.high = list(q), list(q)
         self.low = [min(pair) for pair in zip(self.low, q, strict=True)]
@@ -103,6 +114,7 @@ class _Watch:
             identical=self.identical and self.samples > 1,
             q=self.q,
             q_span=max((h - low for low, h in zip(self.low, self.high, strict=True)), default=0.0),
+            driven_span=max((high - low for low, high in self.driven.values()), default=0.0),
             nonzero=self.nonzero,
             undecodable=self.undecodable,
         )
@@ -307,17 +319,20 @@ def _view(number: int, windows: Sequence[_Window], began: float, until: float) -
 
 
 def _participant(data: rtps.ParticipantData, interface: str) -> Participant:
-    host = data.properties.get("__Hostname", "")
-    pid = process_id(data.properties.get("__Pid", ""))
+    # as CycloneDDS announces them, or as Fast DDS does ("name:hash")
+    said = data.properties
+    host = said.get("__Hostname", "") or said.get(_FAST + "host", "").rpartition(":")[0]
+    pid = process_id(said.get("__Pid", "") or said.get(_FAST + "process", ""))
     here = bool(pid) and host == socket.gethostname()
     return Participant(
         key=data.prefix.hex(),
         vendor=rtps.vendor_name(data.vendor),
         version=data.version,
-        process=data.properties.get("__ProcessName", ""),
+        process=said.get("__ProcessName", ""),
         pid=pid,
         host=host,
         addresses=tuple(dict.fromkeys(p.address for p in (*data.data, *data.discovery))),
+        places=tuple(dict.fromkeys((p.address, p.port) for p in (*data.data, *data.discovery))),
         multicast=data.multicast,
         interface=interface,
         command=command_line(pid) if here else "",

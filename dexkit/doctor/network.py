@@ -107,9 +107,16 @@ def dds_sockets(domains: list[int], proc: Path = Path("/proc")) -> tuple[DdsSock
     if not ports:
         return ()
     owners = open_sockets()
-    found: dict[tuple[int, int], DdsSocket] = {}
+    found: dict[tuple[int, int], set[int]] = {}
     for domain, port, inode in ports:
-        pid = owners.get(inode, 0)
-        command = command_line(pid) if pid else ""
-        found.setdefault((domain, pid), DdsSocket(domain, port, pid, command))
-    return tuple(found[key] for key in sorted(found))
+        found.setdefault((domain, owners.get(inode, 0)), set()).add(port)
+    return tuple(
+        DdsSocket(
+            domain,
+            min(found[domain, pid]),
+            pid,
+            command_line(pid) if pid else "",
+            tuple(sorted(found[domain, pid])),
+        )
+        for domain, pid in sorted(found)
+    )

@@ -20,6 +20,7 @@ from dexkit.doctor.observations import (
     UsbDevice,
 )
 from dexkit.doctor.topics import nearly, short
+from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.topics import Role, roles
@@ -240,13 +241,23 @@ def _versions(view: DomainView) -> Iterator[Finding]:
         parts = re.match(r"(\d+)\.(\d+)", one.version)
         if one.vendor != "CycloneDDS" or parts is None:
             continue
-        if (int(parts[1]), int(parts[2])) <= (0, 10):
+        version = int(parts[1]), int(parts[2])
+        if version <= (0, 10):
             continue
-        typed = any(
-            e.participant == one.key and e.type_name.startswith(("unitree_", "std_msgs"))
-            for e in view.endpoints
-        )
-        peers = [p.name for p in view.participants if p.version.startswith("0.10.")]
+        ends = [e for e in view.endpoints if e.participant == one.key]
+        typed = any(e.type_name.startswith(("unitree_", "std_msgs")) for e in ends)
+        if version < (1, 0):
+            # 0.11.0 is announced by the wheel of 0.10.2 and by builds that crash it; only how
+            # they describe a type differs
+            typed = any(
+                e.type_hash and TYPE_HASHES.get(e.type_name, e.type_hash) != e.type_hash
+                for e in ends
+            )
+            if not typed:
+                continue
+        peers = [
+            p.name for p in view.participants if p is not one and re.match(r"0\.1[01]\.", p.version)
+        ]
         risk = ("has Unitree's types" if typed else "has no endpoint of Unitree's types yet") + (
             f"; in danger: {', '.join(peers)}" if peers else "; no 0.10 peer is (still) there"
         )
@@ -486,11 +497,11 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
                 topic=topic,
             )
         command = _command(view, part, scope)
-        if stream.identical and command is not None and command.q_span >= _FROZEN_COMMANDS:
+        if stream.identical and command is not None and command.driven_span >= _FROZEN_COMMANDS:
             yield _finding(
                 "DDS-FROZEN",
                 f"{what}: {stream.samples} identical states while the commands moved by "
-                f"{command.q_span:.2f} rad",
+                f"{command.driven_span:.2f} rad",
                 domain=view.number,
                 topic=topic,
             )
@@ -695,11 +706,20 @@ def _deaf_loopback(
 
 def _hidden(seen: Observations, focus: list[DomainView]) -> Iterator[Finding]:
     """Processes of this machine on a domain that did not answer on the observed interface."""
+    local = {address for i in seen.interfaces for address in i.addresses}
     for view in focus:
         known = {p.pid for p in view.participants}
+        # who announces no process id (Fast DDS) is known by its port
+        places = {p for one in view.participants for p in one.places if p[0] in local}
+        ports = {port for _, port in places}
         # one of another user has no pid here; it is probably one of those that answered
         hidden = [
-            s for s in seen.sockets if s.domain == view.number and s.pid and s.pid not in known
+            s
+            for s in seen.sockets
+            if s.domain == view.number
+            and s.pid
+            and s.pid not in known
+            and not ports.intersection((s.port, *s.ports))
         ]
         if not hidden:
             continue
