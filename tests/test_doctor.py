@@ -37,7 +37,7 @@ from tests.dds_helpers import free_domain
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
-
+HG_LOW = "unitree_hg::msg::dds_::LowState_"
 
 _FIRST_DOMAIN = 80
 """Below those that programs and free_domain() choose: these would meet somebody."""
@@ -157,6 +157,11 @@ def _build(world: _World) -> None:
     for q in (1.0, 4.0):
         _gripper(world, world.node("two publishers"), q=q)
 
+    node = world.node("body")
+    for topic in ("rt/lowstate", "rt/lf/lowstate"):
+        node.reader(topic, HG_LOW)
+    world.write(world.node("body"), "rt/lowstate", HG_LOW, hg.LowState_())
+
     world.write(world.node("unheard"), "rt/dex3/left/cmd", HAND_CMD, hg.HandCmd_())
 
 
@@ -227,6 +232,7 @@ def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> Non
         ("zero", "DDS-ALL-ZERO", "every q is 0.0"),
         ("frozen", "DDS-FROZEN", "identical states while the commands moved by 2.00 rad"),
         ("two publishers", "DDS-TWO-PUBLISHERS", " and by "),
+        ("body", "DDS-UNPUBLISHED", "waits for rt/lf/lowstate (unitree_hg LowState_)"),
         ("unheard", "DDS-UNHEARD", "rt/dex3/left/cmd"),
     ],
 )
@@ -237,7 +243,11 @@ def test_each_fault_gets_its_diagnosis(
     assert name in found, sorted(found)
     assert expected in found[name].seen
     assert found[name].fix
-    if situation not in ("two publishers", "frozen"):
+    if situation == "body":
+        (stream,) = [s for v in looked.seen.domains for s in v.streams if s.topic == "rt/lowstate"]
+        assert stream.samples > 0
+        assert len([f for f in found if f == name]) == 1
+    if situation not in ("two publishers", "frozen", "body"):
         assert all(looked.ready(situation).values())
 
 

@@ -115,9 +115,18 @@ _ALL = (
         "start the hand: the vendor's service, or 'dexkit serve BACKEND --side both'",
     ),
     Diagnosis(
+        "DDS-UNPUBLISHED",
+        _E,
+        "a client waits for a state that no process publishes",
+        _WAITS + ", for the robot or for hands of another make",
+        "xr_teleoperate, LeRobot and the SDK's examples wait for the first state of the robot and "
+        "of each hand",
+        "start what publishes it, on the same domain and network",
+    ),
+    Diagnosis(
         "DDS-OTHER-DOMAIN",
         _E,
-        "the hand is on another DDS domain than the client",
+        "the hand or robot is on another DDS domain than the client",
         _WAITS + ", though the hand runs",
         "DDS domains are separate; xr_teleoperate uses domain 0, and 1 with --sim",
         "put both on one domain: 'dexkit serve ... --domain N', xr_teleoperate with or without "

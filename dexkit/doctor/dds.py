@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
+from dexkit.doctor.awaited import AWAITED
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
@@ -38,6 +39,11 @@ _BUFFER = 4 << 20
 _DECODE_EVERY = 0.02  # seconds between samples of a stream whose positions are read
 _LOOPBACK = "127.0.0.1"
 _FAST = "fastdds.physical_data."  # prefix of the properties of a Fast DDS participant
+
+
+def _is_watched(topic: str, type_name: str) -> bool:
+    """Whether the samples of a topic are counted."""
+    return topic in AWAITED or is_hand_topic(topic, type_name)
 
 
 @dataclass
@@ -79,6 +85,8 @@ class _Watch:
             self.decode(data)
 
     def decode(self, data: bytes) -> None:
+        if self.endpoint.topic in AWAITED:
+            return  # that they come is enough
         try:
             kind = message_type(self.endpoint.type_name)
             motors = getattr(kind.decode(data), kind.motor_sequence)
@@ -154,7 +162,7 @@ class _Window:
                 "__Pid": str(os.getpid()),
                 "__Hostname": socket.gethostname(),
             },
-            wanted=is_hand_topic,
+            wanted=_is_watched,
             on_sample=self.sample,
         )
 
@@ -207,9 +215,9 @@ class _Window:
 
     @property
     def streaming(self) -> bool:
-        """A topic of a hand is written here, so that it pays to wait."""
+        """A topic of a hand or robot is written here, so that it pays to wait."""
         return any(
-            is_writer and is_hand_topic(e.topic, e.type_name)
+            is_writer and _is_watched(e.topic, e.type_name)
             for e, is_writer in self.observer.endpoints.values()
         )
 
@@ -304,7 +312,7 @@ def _view(number: int, windows: Sequence[_Window], began: float, until: float) -
                 qos=found.qos,
                 type_hash=found.type_hash,
             )
-            if is_writer and is_hand_topic(found.topic, found.type_name):
+            if is_writer and _is_watched(found.topic, found.type_name):
                 watch = window.watches.get(guid)
                 seen = (
                     watch.stream(until, began)

@@ -12,10 +12,7 @@ from dexkit.doctor.proc_files import command_line, open_sockets
 from dexkit.errors import DdsSetupError
 from dexkit.interface_filter import interface_address, interface_flags
 
-__all__ = ["ROBOT_NETWORK", "address_of", "dds_sockets", "interfaces"]
-
-ROBOT_NETWORK = "192.168.123."
-"""Where Unitree's robots are (docs/sources/unitree-dex.md#a6)."""
+__all__ = ["address_of", "dds_sockets", "interfaces"]
 
 _IFF_UP, _IFF_LOOPBACK, _IFF_MULTICAST = 0x1, 0x8, 0x1000
 _GROUP = "0100FFEF"  # 239.255.0.1 as /proc/net/igmp writes it on little-endian machines
