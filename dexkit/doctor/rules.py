@@ -703,13 +703,13 @@ def _absent(
         which = " and ".join(str(v.number) for v in focus) or numbers
         who = {0: "is no process", 1: "is one other process"}.get(people, f"are {people} others")
         # a client of the body or of other hands may need no Dex hand
-        others = any(_awaiting(v) and not _clients(v, scope) for v in focus)
+        other_clients = any(_awaiting(v) and not _clients(v, scope) for v in focus)
         yield _finding(
             "DDS-NOBODY",
             f"there {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
             f"on {', '.join(seen.looked_at)}",
             fix=_elsewhere(seen),
-            severity=Severity.NOTE if scope.devices_only or (others and not wanted) else None,
+            severity=Severity.NOTE if scope.devices_only or (other_clients and not wanted) else None,
         )
 
 
