@@ -227,6 +227,10 @@ class _RejectedStatus(ctypes.Structure):
     ]
 
 
+class _LostStatus(ctypes.Structure):
+    _fields_ = [("total_count", ctypes.c_uint32), ("total_count_change", ctypes.c_int32)]
+
+
 class _SampleInfo(ctypes.Structure):
     _fields_ = [
         ("sample_state", ctypes.c_int),
@@ -316,6 +320,7 @@ class _Cyclone:
             "dds_get_publication_matched_status": (entity, matched),
             "dds_get_subscription_matched_status": (entity, matched),
             "dds_get_sample_rejected_status": (entity, ctypes.POINTER(_RejectedStatus)),
+            "dds_get_sample_lost_status": (entity, ctypes.POINTER(_LostStatus)),
             "dds_lookup_participant": (ctypes.c_uint32, ctypes.c_void_p, ctypes.c_size_t),
             "dds_take": (
                 entity,
@@ -736,6 +741,7 @@ class Reader(_Handle):
     ) -> None:
         super().__init__(node, topic, kind, qos)
         self._refused = 0
+        self._lost = 0
         self._on_data = on_data
         self._arrived = threading.Event()
         self._take = _cyclone().layer.ddspy_take
@@ -752,6 +758,16 @@ class Reader(_Handle):
         ):
             self._refused = int(status.total_count)
         return self._refused
+
+    @property
+    def lost(self) -> int:
+        """Samples that DDS says were lost on their way: in 0.10 those too old for the reader."""
+        status = _LostStatus()
+        if self._entity is not None and (
+            _cyclone().dds_get_sample_lost_status(self._ref, ctypes.byref(status)) == _OK
+        ):
+            self._lost = int(status.total_count)
+        return self._lost
 
     def _on_status(self) -> None:
         cyclone = _cyclone()

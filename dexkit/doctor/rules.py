@@ -709,7 +709,9 @@ def _absent(
             f"there {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
             f"on {', '.join(seen.looked_at)}",
             fix=_elsewhere(seen),
-            severity=Severity.NOTE if scope.devices_only or (other_clients and not wanted) else None,
+            severity=Severity.NOTE
+            if scope.devices_only or (other_clients and not wanted)
+            else None,
         )
 
 
