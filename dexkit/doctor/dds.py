@@ -131,9 +131,10 @@ class _Watch:
 class _Window:
     """One domain, seen from one interface."""
 
-    def __init__(self, domain: int, interface: str) -> None:
+    def __init__(self, domain: int, interface: str, peers: Sequence[str] = ()) -> None:
         self.domain = domain
         self.interface = interface
+        self.peers = peers
         self.address = address_of(interface)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -186,11 +187,13 @@ class _Window:
     def everywhere(self, packet: bytes) -> list[Send]:
         """A packet to wherever a participant may listen."""
         places = [Locator(_GROUP, rtps.spdp_multicast_port(self.domain)), *self.observer.addresses]
-        if self.address == _LOOPBACK:
-            # where loopback has no multicast, its participants listen to these ports alone
-            places += [
-                Locator(_LOOPBACK, rtps.unicast_port(self.domain, i)) for i in range(_INDICES)
-            ]
+        # where there is no multicast, participants listen to these ports alone
+        called = (_LOOPBACK,) if self.address == _LOOPBACK else self.peers
+        places += [
+            Locator(peer, rtps.unicast_port(self.domain, i))
+            for peer in called
+            for i in range(_INDICES)
+        ]
         return [(packet, place) for place in dict.fromkeys(places) if place.port < 65536]
 
     def send(self, packets: Iterable[Send]) -> None:
@@ -227,12 +230,14 @@ def observe_domains(
     interfaces: Sequence[str] = ("lo",),
     *,
     seconds: float = 2.0,
+    peers: Sequence[str] = (),
     stop: threading.Event | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> tuple[DomainView, ...]:
     """Look at domains without disturbing anybody: no topic is written.
 
     :param seconds: how long the samples of hands are watched where there are any.
+    :param peers: addresses of other machines to call by unicast.
     :param stop: ends the look early.
     :raises DdsSetupError: an interface is not there or has no address.
     """
@@ -242,7 +247,7 @@ def observe_domains(
     try:
         for domain in domains:
             for interface in interfaces:
-                window = _Window(domain, interface)
+                window = _Window(domain, interface, peers)
                 windows.append(window)
                 selector.register(window.socket, selectors.EVENT_READ, window)
         began = time.monotonic()

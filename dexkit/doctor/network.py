@@ -9,8 +9,8 @@ from pathlib import Path
 
 from dexkit.doctor.observations import DdsSocket, Interface
 from dexkit.doctor.proc_files import command_line, open_sockets
-from dexkit.errors import DdsSetupError
 from dexkit.interface_filter import interface_address, interface_flags
+from dexkit.interface_names import find_interface
 
 __all__ = ["address_of", "dds_sockets", "interfaces"]
 
@@ -19,29 +19,11 @@ _GROUP = "0100FFEF"  # 239.255.0.1 as /proc/net/igmp writes it on little-endian 
 
 
 def address_of(interface: str) -> str:
-    """The IPv4 address of an interface.
+    """The IPv4 address of an interface (:func:`dexkit.interface_names.find_interface`).
 
     :raises DdsSetupError: it is not there, or has none.
     """
-    found = {one.name: one for one in interfaces()}
-    if interface not in found:
-        raise DdsSetupError(
-            f"there is no network interface {interface!r}", hint=f"this machine has: {_list(found)}"
-        )
-    if not found[interface].addresses:
-        raise DdsSetupError(
-            f"network interface {interface!r} has no IPv4 address"
-            + ("" if found[interface].up else " and is down"),
-            hint=f"is the cable plugged in? This machine has: {_list(found)}",
-        )
-    return found[interface].addresses[0]
-
-
-def _list(found: dict[str, Interface]) -> str:
-    return ", ".join(
-        f"{one.name} ({', '.join(one.addresses)})" if one.addresses else one.name
-        for one in found.values()
-    )
+    return interface_address(find_interface(interface))
 
 
 def interfaces(proc: Path = Path("/proc")) -> tuple[Interface, ...]:
