@@ -28,6 +28,9 @@ A node sees only what comes in by its interface or from this machine
 machine. Where the system has no filter for that, a node is refused, unless
 ``DEXKIT_ALL_INTERFACES=1`` allows it.
 
+``DEXKIT_PEERS=HOST,...`` (``--peer``) names other machines that are called by unicast, for networks
+without multicast. Samples then go by unicast only.
+
 ``DEXKIT_DDS_LOG=PATH`` appends CycloneDDS's own log to a file; otherwise its warnings only become
 part of a :class:`~dexkit.errors.DdsSetupError`.
 """
@@ -45,7 +48,7 @@ import threading
 import time
 import uuid
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
@@ -57,11 +60,13 @@ from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
+from dexkit.interface_names import find_interface, resolve_peers
 from dexkit.messages import MessageType, layout, message_type
 from dexkit.open_file_limit import require_open_files
 from dexkit.threads import Worker
 
 __all__ = [
+    "PEERS",
     "DdsNode",
     "Discovery",
     "DiscoveryEvent",
@@ -77,6 +82,9 @@ __all__ = [
 ]
 
 _log = logging.getLogger(__name__)
+
+PEERS = "DEXKIT_PEERS"
+"""Environment variable: other machines to call by unicast, separated by commas."""
 
 _INFINITY = 0x7FFFFFFFFFFFFFFF
 _OK = 0
@@ -227,6 +235,10 @@ class _RejectedStatus(ctypes.Structure):
     ]
 
 
+class _LostStatus(ctypes.Structure):
+    _fields_ = [("total_count", ctypes.c_uint32), ("total_count_change", ctypes.c_int32)]
+
+
 class _SampleInfo(ctypes.Structure):
     _fields_ = [
         ("sample_state", ctypes.c_int),
@@ -315,6 +327,7 @@ class _Cyclone:
             "dds_get_publication_matched_status": (entity, matched),
             "dds_get_subscription_matched_status": (entity, matched),
             "dds_get_sample_rejected_status": (entity, ctypes.POINTER(_RejectedStatus)),
+            "dds_get_sample_lost_status": (entity, ctypes.POINTER(_LostStatus)),
             "dds_lookup_participant": (ctypes.c_uint32, ctypes.c_void_p, ctypes.c_size_t),
             "dds_take": (
                 entity,
@@ -448,26 +461,40 @@ def _trace(verbosity: str, path: str) -> str:
 _DEAF = "<Internal><ControlTopic><Deaf>true</Deaf></ControlTopic></Internal>"
 
 
-def _config(interface: str, more: str = "") -> str:
+def _peers() -> tuple[str, ...]:
+    """Addresses of the other machines that are called by unicast.
+
+    :raises DdsSetupError: a name is not known.
+    """
+    return resolve_peers([p.strip() for p in os.environ.get(PEERS, "").split(",") if p.strip()])
+
+
+def _config(interface: str, more: str = "", peers: Sequence[str] = ()) -> str:
     """CycloneDDS configuration of a domain (docs/sources/unitree-dex.md#a6).
 
     On loopback peers are called on 127.0.0.1 by port, since multicast may be off there;
     ``multicast="default"`` keeps listening to it where it is on, because an SDK process then
-    listens to nothing else.
+    listens to nothing else. With named peers only discovery uses multicast: what does not carry
+    multicast would lose the samples of two readers.
+
+    On a network participants are announced twice a second instead of every 8 s: after a link was
+    down for more than the lease (10 s), both sides have forgotten each other, and the first
+    announcement ends that.
     """
-    peers = (
-        '<Peers><Peer address="127.0.0.1"/></Peers>'
-        if interface_filter.is_loopback(interface)
-        else ""
-    )
+    loopback = interface_filter.is_loopback(interface)
+    called = ("127.0.0.1",) if loopback else tuple(peers)
+    listed = "".join(f'<Peer address="{peer}"/>' for peer in called)
+    announce = "" if loopback else "<SPDPInterval>500ms</SPDPInterval>"
+    unicast = "<AllowMulticast>spdp</AllowMulticast>" if peers and not loopback else ""
     return (
         "<CycloneDDS><Domain>"
         "<General><Interfaces>"
         f'<NetworkInterface name={quoteattr(interface)} priority="default" multicast="default"/>'
-        "</Interfaces></General>"
+        f"</Interfaces>{unicast}</General>"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANT_INDEX}</MaxAutoParticipantIndex>"
-        f"{peers}</Discovery>{more}"
+        + (f"<Peers>{listed}</Peers>" if listed else "")
+        + f"{announce}</Discovery>{more}"
         "</Domain></CycloneDDS>"
     )
 
@@ -501,17 +528,13 @@ def _acquire_domain(number: int, interface: str) -> None:
             )
         known.nodes += 1
         return
-    if interface not in interfaces():
-        raise DdsSetupError(
-            f"there is no network interface {interface!r}",
-            hint=f"this machine has: {', '.join(interfaces())}",
-        )
+    peers = _peers()
     path = os.environ.get("DEXKIT_DDS_LOG")
     tracing = _trace("config", path) if path else ""
     before = open_sockets()
     sockets = None
     try:
-        entity = cyclone.domain.Domain(number, _config(interface, _DEAF + tracing))
+        entity = cyclone.domain.Domain(number, _config(interface, _DEAF + tracing, peers))
     except cyclone.error as error:
         if error.code != _PRECONDITION_NOT_MET:
             raise DdsSetupError(
@@ -735,6 +758,7 @@ class Reader(_Handle):
     ) -> None:
         super().__init__(node, topic, kind, qos)
         self._refused = 0
+        self._lost = 0
         self._on_data = on_data
         self._arrived = threading.Event()
         self._take = _cyclone().layer.ddspy_take
@@ -751,6 +775,16 @@ class Reader(_Handle):
         ):
             self._refused = int(status.total_count)
         return self._refused
+
+    @property
+    def lost(self) -> int:
+        """Samples that DDS says were lost on their way: in 0.10 those too old for the reader."""
+        status = _LostStatus()
+        if self._entity is not None and (
+            _cyclone().dds_get_sample_lost_status(self._ref, ctypes.byref(status)) == _OK
+        ):
+            self._lost = int(status.total_count)
+        return self._lost
 
     def _on_status(self) -> None:
         cyclone = _cyclone()
@@ -898,7 +932,8 @@ class DdsNode:
     """A participant on one domain and interface, with its readers, writers and discovery.
 
     :param domain: 0 is the robot, 1 what xr_teleoperate's simulation mode uses.
-    :param interface: network interface; loopback keeps traffic on this machine.
+    :param interface: network interface by name, address or prefix
+        (:mod:`dexkit.interface_names`); loopback keeps traffic on this machine.
     :raises DdsUnavailable: CycloneDDS 0.10.x is not installed for this interpreter.
     :raises DdsSetupError: no such interface, or the domain cannot be set up.
 
@@ -913,7 +948,7 @@ class DdsNode:
         require_open_files(_FILES, "DDS")
         cyclone = _cyclone()
         self.domain = domain
-        self.interface = interface
+        self.interface = interface = find_interface(interface)
         self.discovery = Discovery(self)
         self._closed = False
         # Held while callbacks run and while endpoints come and go, so that closing waits for

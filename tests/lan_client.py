@@ -18,12 +18,13 @@ def main() -> None:
     parser.add_argument("--domain", type=int, required=True)
     parser.add_argument("--interface", default="lo")
     parser.add_argument("--q", type=float, required=True)
+    parser.add_argument("--seconds", type=float, default=20.0, help="patience")
     options = parser.parse_args()
     command = MotorCmds_([MotorCmd_(mode=1, q=options.q, kp=5.0, kd=0.05)])
     with DdsNode(options.domain, options.interface) as node:
         states = node.reader("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
         commands = node.writer("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
-        end = time.monotonic() + 20
+        end = time.monotonic() + options.seconds
         q = float("nan")
         while time.monotonic() < end:
             commands.write(command)

@@ -50,8 +50,11 @@ class Host:
         options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
         return subprocess.Popen([*self.enter, *map(str, command)], text=True, cwd=ROOT, **options)
 
-    def run(self, *command: object, timeout: float = 120.0) -> str:
-        """Run a command on this host to its end, and return what it printed."""
+    def run(self, *command: object, timeout: float = 120.0, check: bool = True) -> str:
+        """Run a command on this host to its end, and return what it printed.
+
+        :param check: it must end with 0.
+        """
         done = subprocess.run(
             [*self.enter, *map(str, command)],
             capture_output=True,
@@ -60,7 +63,9 @@ class Host:
             timeout=timeout,
             check=False,
         )
-        assert done.returncode == 0, f"{self.name}: {command}: {done.stderr}{done.stdout}"
+        assert not check or done.returncode == 0, (
+            f"{self.name}: {command}: {done.stderr}{done.stdout}"
+        )
         return done.stdout
 
     def sh(self, script: str) -> str:

@@ -28,6 +28,7 @@ from dexkit.dds import DdsNode, Qos, Writer, type_hash
 from dexkit.doctor import Finding, Observations, Scope, diagnose, readiness
 from dexkit.doctor import dds as doctor_dds
 from dexkit.doctor.rtps import parse_message, unicast_port
+from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.models import DIALECTS
@@ -36,7 +37,7 @@ from tests.dds_helpers import free_domain
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
-
+HG_LOW = "unitree_hg::msg::dds_::LowState_"
 
 _FIRST_DOMAIN = 80
 """Below those that programs and free_domain() choose: these would meet somebody."""
@@ -146,8 +147,20 @@ def _build(world: _World) -> None:
         commands = [go.MotorCmds_([go.MotorCmd_(q=q, kp=5.0)]) for q in (1.0, 2.0, 3.0)]
         world.write(client, f"rt/dex1/{side}/cmd", CMDS, *commands)
 
+    node = world.node("limp")
+    _gripper(world, node)
+    client = world.node("limp")
+    for side in ("left", "right"):
+        commands = [go.MotorCmds_([go.MotorCmd_(q=q)]) for q in (1.0, 2.0, 3.0)]
+        world.write(client, f"rt/dex1/{side}/cmd", CMDS, *commands)
+
     for q in (1.0, 4.0):
         _gripper(world, world.node("two publishers"), q=q)
+
+    node = world.node("body")
+    for topic in ("rt/lowstate", "rt/lf/lowstate"):
+        node.reader(topic, HG_LOW)
+    world.write(world.node("body"), "rt/lowstate", HG_LOW, hg.LowState_())
 
     world.write(world.node("unheard"), "rt/dex3/left/cmd", HAND_CMD, hg.HandCmd_())
 
@@ -219,6 +232,7 @@ def test_observed_endpoints_equal_those_of_dds_discovery(looked: _Looked) -> Non
         ("zero", "DDS-ALL-ZERO", "every q is 0.0"),
         ("frozen", "DDS-FROZEN", "identical states while the commands moved by 2.00 rad"),
         ("two publishers", "DDS-TWO-PUBLISHERS", " and by "),
+        ("body", "DDS-UNPUBLISHED", "waits for rt/lf/lowstate (unitree_hg LowState_)"),
         ("unheard", "DDS-UNHEARD", "rt/dex3/left/cmd"),
     ],
 )
@@ -229,8 +243,25 @@ def test_each_fault_gets_its_diagnosis(
     assert name in found, sorted(found)
     assert expected in found[name].seen
     assert found[name].fix
-    if situation not in ("two publishers", "frozen"):
+    if situation == "body":
+        (stream,) = [s for v in looked.seen.domains for s in v.streams if s.topic == "rt/lowstate"]
+        assert stream.samples > 0
+        assert len([f for f in found if f == name]) == 1
+    if situation not in ("two publishers", "frozen", "body"):
         assert all(looked.ready(situation).values())
+
+
+def test_hand_that_is_commanded_without_gains_is_not_frozen(looked: _Looked) -> None:
+    assert looked.seen.domains
+    (command,) = {
+        (s.q_span, s.driven_span)
+        for view in looked.seen.domains
+        if view.number == looked.domains["limp"]
+        for s in view.streams
+        if s.topic.endswith("cmd")
+    }
+    assert command == (2.0, 0.0)
+    assert "DDS-FROZEN" not in looked.findings("limp")
 
 
 def test_root_cause_suppresses_its_consequences(looked: _Looked) -> None:
@@ -255,42 +286,75 @@ def test_only_the_requested_dialect_is_judged(looked: _Looked) -> None:
     assert "DDS-ONE-SIDE" in looked.findings("one side", "unitree_go")
 
 
-def _play_cyclone_11(domain: int, ready: threading.Event, stop: threading.Event) -> None:
-    """Answer announcements with what a real participant of 11.0.1 answered."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", unicast_port(domain, 3)))
-        sock.settimeout(0.05)
-        ready.set()
+@contextlib.contextmanager
+def _played(*answers: bytes) -> Iterator[int]:
+    """A domain on which announcements get what a real participant answered; yields its number."""
+    domain = free_domain()
+    stop = threading.Event()
+
+    def play(sock: socket.socket) -> None:
+        owner = answers[-1][8:20]
         while not stop.is_set():
             try:
                 data, source = sock.recvfrom(65536)
             except TimeoutError:
                 continue
             asker, _ = parse_message(data)
-            owner = packets.CYCLONE_11_PUBLICATION[8:20]
-            for packet in (packets.CYCLONE_11_PARTICIPANT, packets.CYCLONE_11_PUBLICATION):
-                # the two were captured from two participants; here they are one
+            for packet in answers:
+                # those of two captured participants; here they are one
                 prefix = packet[8:20]
                 sock.sendto(
                     packet[:24].replace(prefix, owner) + asker + packet[36:].replace(prefix, owner),
                     source,
                 )
 
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", unicast_port(domain, 3)))
+        sock.settimeout(0.05)
+        thread = threading.Thread(target=play, args=(sock,))
+        thread.start()
+        try:
+            yield domain
+        finally:
+            stop.set()
+            thread.join()
+
+
+def _cyclone_11(*answers: bytes) -> tuple[list[Finding], str]:
+    """The findings of DDS-CYCLONE-11, and the version that is announced."""
+    with _played(*answers) as domain:
+        views = doctor_dds.observe_domains([domain], seconds=0.2)
+    ((one,), ends) = views[0].participants, views[0].endpoints
+    assert ends
+    found = [f for f in diagnose(Observations(domains=views)) if f.id == "DDS-CYCLONE-11"]
+    return found, one.version
+
 
 def test_a_participant_of_cyclonedds_11() -> None:
-    domain = free_domain()
-    ready, stop = threading.Event(), threading.Event()
-    thread = threading.Thread(target=_play_cyclone_11, args=(domain, ready, stop))
-    thread.start()
-    try:
-        assert ready.wait(60)
-        views = doctor_dds.observe_domains([domain], seconds=0.2)
-    finally:
-        stop.set()
-        thread.join()
-    (found,) = [f for f in diagnose(Observations(domains=views)) if f.id == "DDS-CYCLONE-11"]
+    (found,), version = _cyclone_11(packets.CYCLONE_11_PARTICIPANT, packets.CYCLONE_11_PUBLICATION)
+    assert version == "11.0.1"
     assert "CycloneDDS 11.0.1" in found.seen
     assert str(found.severity) == "error"
+
+
+def test_the_wheel_of_cyclonedds_0_10_2_is_not_taken_for_11() -> None:
+    found, version = _cyclone_11(
+        packets.CYCLONE_0_10_2_PARTICIPANT, packets.CYCLONE_0_10_2_ENDPOINTS
+    )
+    assert version == "0.11.0"
+    assert not found
+
+
+def test_a_build_that_announces_the_same_version_and_crashes_peers_is_found() -> None:
+    (found,), version = _cyclone_11(
+        packets.CYCLONE_NIGHTLY_PARTICIPANT, packets.CYCLONE_NIGHTLY_PUBLICATION
+    )
+    assert version == "0.11.0"
+    assert str(found.severity) == "error"
+
+
+def test_known_hashes_are_those_of_cyclonedds_0_10() -> None:
+    assert {name: type_hash(name) for name in TYPE_HASHES} == TYPE_HASHES
 
 
 def test_observation_leaves_no_reader_behind() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from types import SimpleNamespace
 
 from rich.console import Console
 
@@ -22,7 +23,10 @@ from dexkit.doctor.observations import (
     UsbDevice,
 )
 from dexkit.doctor.report import print_report
-from dexkit.doctor.topics import nearly
+from dexkit.doctor.rtps import Data, parse_message, parse_participant
+from dexkit.doctor.topics import is_driven, nearly
+from dexkit.models import DIALECTS
+from tests.doctor_packets import FAST_PARTICIPANT
 from tests.each import each
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
@@ -133,7 +137,7 @@ def _two_publishers() -> DomainView:
 def _frozen() -> DomainView:
     commands = [e for e in GOOD.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
     states = tuple(dataclasses.replace(s, identical=True) for s in GOOD.streams)
-    flows = tuple(_flow(e, q_span=1.0) for e in commands)
+    flows = tuple(_flow(e, q_span=1.0, driven_span=1.0) for e in commands)
     return dataclasses.replace(GOOD, streams=states + flows)
 
 
@@ -147,6 +151,25 @@ def _legacy() -> DomainView:
     )
 
 
+def _waiting(
+    topic: str = "rt/lowstate",
+    kind: str = "LowState_",
+    *,
+    number: int = 0,
+    address: str = "10.0.0.7",
+    publisher: str = "",
+    samples: int = 1000,
+) -> DomainView:
+    """A client that waits for a state that is not a Dex hand's, and its publisher if any."""
+    reader = _end("client", "reader", topic, f"unitree_hg::msg::dds_::{kind}")
+    people, ends, streams = [_who("client", addresses=(address,))], [reader], []
+    if publisher:
+        ends.append(_end("robot", "writer", topic, f"{publisher}::msg::dds_::{kind}"))
+        people.append(_who("robot", addresses=(address,)))
+        streams.append(_flow(ends[-1], samples=samples))
+    return DomainView(number, tuple(people), tuple(ends), tuple(streams))
+
+
 ETH = Interface("eth0", up=True, loopback=False, multicast=False, addresses=("192.168.123.5",))
 CASES: dict[str, Observations] = {
     "DDS-CYCLONE-11": _seen(_pair(client=_who("client", version="11.0.1"))),
@@ -154,6 +177,7 @@ CASES: dict[str, Observations] = {
     "NET-INTERFACE": _seen(_pair(client=_who("client", addresses=("192.168.123.5",)))),
     "NET-MULTICAST": Observations(domains=(GOOD,), interfaces=(LO, ETH), looked_at=("lo", "eth0")),
     "DDS-NOBODY": _seen(_without(GOOD, "hand")),
+    "DDS-UNPUBLISHED": _seen(_waiting()),
     "DDS-OTHER-DOMAIN": _seen(_without(GOOD, "hand"), _without(_pair(number=7), "client")),
     "DDS-OTHER-STACK": _seen(_legacy()),
     "DDS-NAME": _seen(_renamed(GOOD, "hand", topic="x{0}")),
@@ -260,6 +284,98 @@ def test_silent_process_is_reported_on_another_interface() -> None:
     assert "--interface eth0" in found.fix
     known = dataclasses.replace(seen, sockets=(DdsSocket(1, 7650, _who("client").pid),))
     assert "NET-INTERFACE" not in _ids(known)
+
+
+def test_fast_dds_client_on_loopback_is_known_by_its_port() -> None:
+    """It announces no process id in CycloneDDS's way; its announcement is a genuine one."""
+    _, ((_, item),) = parse_message(FAST_PARTICIPANT)
+    assert isinstance(item, Data)
+    places = tuple((p.address, p.port) for p in parse_participant(item.payload).discovery)
+    assert places == (("127.0.0.1", 7662),)
+    client = Participant("client", "Fast DDS", addresses=("127.0.0.1",), places=places)
+    seen = Observations(
+        domains=(_pair(client=client),),
+        interfaces=(LO,),
+        sockets=(DdsSocket(1, 7650, 4242, "fastclient", (7650, 7662)),),
+    )
+    assert "NET-INTERFACE" not in _ids(seen)
+    elsewhere = dataclasses.replace(client, places=(("192.168.123.5", 7662),))
+    seen = dataclasses.replace(seen, domains=(_pair(client=elsewhere),))
+    assert "NET-INTERFACE" in _ids(seen)
+
+
+@each(
+    ("name", "mode", "kp", "expected"),
+    [
+        ("unitree_go", 0, 5.0, True),
+        ("unitree_go", 1, 0.0, False),
+        ("unitree_hg", 0, 0.0, True),  # its commands have no gains
+        ("dex3", 0x10, 1.5, True),
+        ("dex3", 0x01, 1.5, False),  # locked
+        ("dex3", 0x11, 0.0, False),
+    ],
+)
+def test_a_command_drives_a_motor(name: str, mode: int, kp: float, expected: bool) -> None:
+    assert is_driven(SimpleNamespace(mode=mode, kp=kp), DIALECTS[name]) is expected
+
+
+def test_state_of_a_robot_that_nobody_publishes_is_named_with_its_publisher() -> None:
+    (found,) = [f for f in diagnose(_seen(_waiting())) if f.severity is Severity.ERROR]
+    assert found.id == "DDS-UNPUBLISHED"
+    assert "client.py" in found.seen
+    assert "waits for rt/lowstate (unitree_hg LowState_) on domain 0" in found.seen
+    assert "the robot itself" in found.seen
+    assert "on domain 0, on the robot's network (192.168.123.x)" in found.seen
+    assert "the client is at 10.0.0.7" in found.fix
+    assert "--network-interface" in found.fix
+    assert "'dexkit emulate g1 --domain 0'" in found.fix
+    # in the robot's network it is not the interface; on domain 1 the domain may be wrong
+    right = diagnose(_seen(_waiting(address="192.168.123.5")))[0]
+    assert "the client is at" not in right.fix
+    simulated = diagnose(_seen(_waiting(number=1)))[0]
+    assert "the client is on domain 1, the robot on 0" in simulated.fix
+    assert "'dexkit emulate g1 --domain 1'" in simulated.fix
+
+
+def test_state_of_a_robot_that_comes_is_no_finding() -> None:
+    assert all(
+        f.severity is Severity.NOTE for f in diagnose(_seen(_waiting(publisher="unitree_hg")))
+    )
+
+
+def test_state_of_another_robot_silent_or_on_another_domain() -> None:
+    (found,) = [
+        f for f in diagnose(_seen(_waiting(publisher="unitree_go"))) if f.severity is Severity.ERROR
+    ]
+    assert found.id == "DDS-TYPE"
+    assert "--arm" in found.fix
+    assert "DDS-SILENT" in _ids(_seen(_waiting(publisher="unitree_hg", samples=0)))
+    robot = _waiting(number=1, publisher="unitree_hg")
+    seen = _seen(_waiting(number=0), _without(robot, "client"))
+    (found,) = [f for f in diagnose(seen) if f.severity is Severity.ERROR]
+    assert found.id == "DDS-OTHER-DOMAIN"
+    assert "robot.py (pid" in found.seen
+
+
+@each(
+    ("topic", "kind", "expected"),
+    [
+        ("rt/inspire/state", "MotorStates_", "RH56DFX"),
+        ("rt/inspire_hand/state/l", "inspire_hand_state", "RH56DFTP"),
+        ("rt/brainco/right/state", "MotorStates_", "brainco_hand_service"),
+        ("rt/sim_state", "String_", "no robot does"),
+        ("rt/secondary_imu", "IMUState_", "torso"),
+    ],
+)
+def test_other_hands_and_simulators_are_named(topic: str, kind: str, expected: str) -> None:
+    found = [f for f in diagnose(_seen(_waiting(topic, kind))) if f.id == "DDS-UNPUBLISHED"]
+    assert expected in found[0].seen
+    assert nearly(topic) is None
+
+
+def test_a_requested_hand_leaves_other_states_aside() -> None:
+    asked = Scope(dialects=(DIALECTS["dex3"],))
+    assert "DDS-UNPUBLISHED" not in _ids(_seen(_waiting()), asked)
 
 
 def test_restarted_hand_is_not_reported_as_late_joiner() -> None:

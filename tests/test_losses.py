@@ -8,20 +8,23 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from random import Random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode
+from dexkit.messages import message_type
 from dexkit.socket_losses import ReceiveBuffers
 from dexkit.traces import Recorder, open_trace
-from dexkit.traces.dds_recording import DdsRecording
+from dexkit.traces.dds_recording import DdsRecording, _tick_of
 from dexkit.traces.losses import PAUSE, Losses
 from tests.dds_helpers import free_domain, wait_until
+from tests.each import each
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
 
 MS = 1_000_000
@@ -85,6 +88,101 @@ def test_untimed_and_unordered_samples_are_accepted() -> None:
             losses.sample("rt/a", 1, source)
     losses.look(0.0, 1, {})
     assert sum(losses.about.values()) <= 2
+
+
+_HALF = frozenset(Random(2).sample(range(1000), 500))
+
+
+@each(
+    ("kept", "missing"),
+    [
+        (lambda n: True, 0),
+        (lambda n: not 200 <= n < 230, 30),
+        (lambda n: n % 10 != 5, 100),  # one in ten, alone
+        (lambda n: n not in _HALF, 500),  # half of them, from the start
+    ],
+)
+def test_samples_that_a_steady_state_topic_lacks(kept: Callable[[int], bool], missing: int) -> None:
+    losses = Losses()
+    late = 0
+    for n in range(1000):
+        if kept(n):
+            late = (n * 31) % 7 == 0  # written a quarter of a period late, the next one in time
+            losses.state("rt/a/state", 1, T0 + n * 2 * MS + late * MS // 2)
+    losses.state("rt/a/state", 1, T0 + 1000 * 2 * MS)
+    assert losses.look(0.0, 0, {}) == bool(missing)
+    found = sum(gaps.missing for gaps in losses.gaps.values())
+    assert abs(found - missing) <= 0.1 * missing
+    assert not losses  # whoever is to blame
+    assert (f"about {found} missing" in losses.brief()) == bool(missing)
+    assert any("missing" in text for text in losses.sentences()) == bool(missing)
+    assert losses.metadata()["missing about"] == str(found)
+
+
+def test_a_writer_that_catches_up_lacks_nothing_and_an_irregular_one_is_not_judged() -> None:
+    losses = Losses()
+    times = [T0 + n * 2 * MS for n in range(300)]
+    times[100:110] = [T0 + 109 * 2 * MS + n for n in range(10)]  # stood still, then all at once
+    for time_ns in times:
+        losses.state("rt/a/state", 1, time_ns)
+    random = Random(5)
+    at = T0
+    for _ in range(300):
+        at += int(2 * MS * 10 ** random.uniform(-2, 2))
+        losses.state("rt/b/state", 2, at)
+    assert losses.gaps == {}
+
+
+def test_what_the_kernel_dropped_is_not_said_twice() -> None:
+    losses = Losses()
+    for n in (*range(100), *range(150, 300)):
+        losses.sample("rt/a/state", 1, T0 + n * 2 * MS)
+        losses.state("rt/a/state", 1, T0 + n * 2 * MS)
+    losses.look(0.0, 50, {})
+    assert losses.about == {"rt/a/state": 50}
+    assert losses.gaps == {}
+
+
+def test_loss_that_dds_reports_is_a_loss() -> None:
+    losses = Losses()
+    assert losses.look(0.0, 0, {}, {"rt/a/state": 3})
+    assert losses
+    assert losses.brief() == "3 lost"
+    assert "3 samples of rt/a/state were lost (reported by DDS)" in losses.sentences()
+    assert losses.metadata()["lost rt/a/state"] == "3"
+    assert not losses.look(1.0, 0, {}, {"rt/a/state": 3})
+
+
+@each("name", ["unitree_go::msg::dds_::LowState_", "unitree_hg::msg::dds_::LowState_"])
+def test_clock_in_a_message_is_read_from_its_bytes(name: str) -> None:
+    kind = message_type(name)
+    message = kind.cls()
+    message.tick = 123_456
+    data = kind.encode(message)
+    assert _tick_of(name)(data) == 123_456 * MS
+    assert _tick_of(name)(data[:10]) == 0
+    assert _tick_of(STATE_TYPE)(state(1.0)) == 0
+
+
+def test_gaps_of_a_writer_are_in_the_file_and_in_the_status(tmp_path: Path) -> None:
+    """The time at which a sample is written is given, so that a busy machine changes nothing."""
+    domain = free_domain()
+    path = tmp_path / "a.mcap"
+    with (
+        DdsNode(domain) as hand,
+        DdsNode(domain) as node,
+        Recorder(path) as recorder,
+        DdsRecording(node, recorder, [STATE], types={STATE: STATE_TYPE}) as recording,
+    ):
+        writer = hand.writer(STATE, STATE_TYPE)
+        assert writer.wait_matched(10)
+        for n in (*range(100), *range(140, 200)):
+            writer.write_raw(state(float(n)), T0 + n * 2 * MS)
+        wait_until(lambda: recorder.offered.get(STATE) == 160)
+        wait_until(lambda: "about 40 missing" in recording.losses.brief())
+    about = open_trace(path).metadata["dexkit_recorder"]
+    assert about["missing about"] == "40"
+    assert about[f"gaps {STATE}"] == "1, about 40 samples, longest 0.082 s"
 
 
 def test_pauses_are_reported_with_their_time() -> None:

@@ -13,11 +13,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import cache, partial
+from typing import Literal
 
 from dexkit.dds import DdsNode, Endpoint, Qos, Reader
 from dexkit.errors import DdsError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
+from dexkit.messages.codec import HEADER
 from dexkit.models import DIALECTS
 from dexkit.socket_losses import ReceiveBuffers
 from dexkit.threads import Worker
@@ -195,7 +198,11 @@ class DdsRecording:
         for (topic, _), reader in self._readers.items():
             if count := reader.refused:
                 refused[topic] = refused.get(topic, 0) + count
-        return self.losses.look(now, self._sockets.count_new_drops(), refused)
+        lost: dict[str, int] = {}
+        for (topic, _), reader in self._readers.items():
+            if count := reader.lost:
+                lost[topic] = lost.get(topic, 0) + count
+        return self.losses.look(now, self._sockets.count_new_drops(), refused, lost)
 
     def _discover(self) -> bool:
         with self._fresh_lock:
@@ -248,10 +255,13 @@ class DdsRecording:
             if key not in self._known_channels:
                 self._known_channels.add(key)
                 self.recorder.add_channel(topic, type_name, self._channel_metadata(key))
+            tick = _tick_of(type_name) if topic.endswith("state") else None
             for sample in samples:
                 # a writer may send no timestamp, which DDS gives as a negative number
                 source = max(sample.source_timestamp_ns, 0)
                 self.losses.sample(topic, sample.writer, source)
+                if tick is not None:
+                    self.losses.state(topic, sample.writer, tick(sample.data) or source)
                 self.recorder.put(topic, type_name, sample.data, sample.reception_ns, source)
 
     def _channel_metadata(self, key: tuple[str, str]) -> dict[str, str]:
@@ -302,6 +312,30 @@ def record_topics(
             if on_tick is not None:
                 on_tick(recording)
     return recording
+
+
+@cache
+def _tick_of(type_name: str) -> Callable[[bytes], int]:
+    """Returns a function that reads the writer's clock, ns, from a sample's bytes.
+
+    It gives 0 where the message has none.
+    """
+    struct = message_type(type_name).layout
+    offset = 0
+    if struct.is_fixed:
+        for leaf in struct.leaves():
+            start = -(-offset // leaf.type.size) * leaf.type.size
+            if leaf.path == ("tick",):
+                return partial(_tick, start + len(HEADER))
+            offset = start + leaf.type.size * leaf.count
+    return lambda data: 0
+
+
+def _tick(at: int, data: bytes) -> int:
+    if len(data) < at + 4:
+        return 0
+    order: Literal["little", "big"] = "little" if data[1] & 1 else "big"
+    return int.from_bytes(data[at : at + 4], order) * 1_000_000  # ms
 
 
 def _model_types(topic: str) -> list[str]:

@@ -1,6 +1,6 @@
 """Count samples that are missing in a recording, as far as the recorder can detect; no I/O.
 
-Three things are counted:
+Five things are counted:
 
 * *datagrams* that the kernel dropped because the socket's receive buffer was full. An exact count,
   but not per topic. CycloneDDS 0.10 gives readers no sequence numbers, and its "sample lost" status
@@ -10,17 +10,20 @@ Three things are counted:
 * samples that are *probably missing* on each topic: when datagrams were dropped, gaps in a writer's
   source timestamps are divided by its period. An estimate.
 
-Losses before this machine are not detected: the readers are best-effort, so that the recorder never
-slows down the writers.
+* *gaps* of a state topic that comes at a steady rate: by the robot's own clock where the message
+  has one (``tick``), else by the writer's source timestamps. An estimate, whoever is to blame:
+  samples that were lost on the network, or a writer that stood still.
+
+The readers are best-effort, so that the recorder never slows down the writers.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
-__all__ = ["PAUSE", "Losses", "Pause"]
+__all__ = ["PAUSE", "Gaps", "Losses", "Pause"]
 
 #: Seconds between two iterations of the recorder's loop from which on it counts as a pause.
 PAUSE = 0.5
@@ -32,6 +35,12 @@ _SHARE = 1 / 16
 # Seconds after a drop in which its gap may be detected: the next sample must arrive first.
 _GAP_WINDOW = 5.0
 _MAX_PAUSES = 20  # pauses that are kept
+_MAX_WRITERS = 1024  # whose gaps are looked for
+# Intervals from which a writer's period is learnt, and how much those of one period differ.
+_LEARN = 32
+_ALIKE = 0.3
+# Periods from which on an interval is long, and up to which it makes up for a late sample.
+_LATE, _EARLY = 1.6, 0.6
 
 
 @dataclass(frozen=True)
@@ -63,17 +72,92 @@ class _Stream:
         self.holes = 0
 
 
+@dataclass(frozen=True)
+class Gaps:
+    """The gaps of one topic.
+
+    :param count: how many.
+    :param missing: samples that should have come in them, about.
+    :param longest: seconds.
+    """
+
+    count: int
+    missing: int
+    longest: float
+
+
+class _Pace:
+    """Finds gaps in the samples of a writer that keeps a schedule.
+
+    A sample that is written late is followed by one that seems early, and nothing is missing; after
+    a gap the next sample comes a whole period later. The period is that of the shortest common
+    intervals, so that it is right even when half of the samples are missing from the start.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.missing = 0
+        self.longest = 0  # ns
+        self._last = 0
+        self._first: list[int] = []
+        self._period = 0.0  # ns; 0 while it is not known, NaN for an irregular writer
+        self._length = 0  # ns of a long interval, with the short ones that follow it
+        self._parts = 0  # intervals in it
+
+    def sample(self, at_ns: int) -> None:
+        """Note a sample by the time at which it was written."""
+        passed, self._last = at_ns - self._last, at_ns
+        if passed <= 0 or passed == at_ns:  # a clock that was set; the first
+            self._length = 0
+        elif not self._period:
+            self._learn(passed)
+        elif self._period == self._period:  # not NaN
+            self._judge(passed)
+
+    def _learn(self, passed: int) -> None:
+        self._first.append(passed)
+        if len(self._first) < _LEARN:
+            return
+        low = sorted(self._first)[_LEARN // 4]
+        alike = [i for i in self._first if abs(i - low) <= _ALIKE * low]
+        regular = len(alike) >= _LEARN // 4
+        self._period = sum(alike) / len(alike) if regular else float("nan")
+        first, self._first = self._first, []
+        for interval in first if regular else ():
+            self._judge(interval)
+
+    def _judge(self, passed: int) -> None:
+        periods = passed / self._period
+        if periods < _EARLY and self._length:
+            self._length += passed
+            self._parts += 1
+            return
+        if self._length and (lacking := round(self._length / self._period) - self._parts) > 0:
+            self.count += 1
+            self.missing += lacking
+            self.longest = max(self.longest, self._length)
+        self._length = 0
+        if periods > _LATE:
+            self._length, self._parts = passed, 1
+        elif abs(periods - 1) < _ALIKE:
+            self._period += (passed - self._period) / 64
+
+
 class Losses:
     """Counts what was lost.
 
     :ivar datagrams: dropped by the kernel.
+    :ivar lost: samples by topic, by the status of DDS.
     :ivar refused: samples by topic.
     :ivar pauses: the first ones; ``paused`` counts all.
     """
 
     def __init__(self) -> None:
         self.datagrams = 0
+        self.lost: dict[str, int] = {}
         self.refused: dict[str, int] = {}
+        self._paces: dict[tuple[str, int], _Pace] = {}
+        self._gaps_said: dict[str, Gaps] = {}
         self.pauses: list[Pause] = []
         self.paused = 0
         self._about: Counter[str] = Counter()
@@ -117,14 +201,55 @@ class Losses:
             share = _SHARE if known else 1 / stream.intervals
             stream.period += (passed - stream.period) * share
 
-    def look(self, now: float, dropped: int, refused: dict[str, int]) -> bool:
+    def state(self, topic: str, writer: int, at_ns: int) -> None:
+        """Note a received sample of a state topic, which comes at a steady rate.
+
+        :param at_ns: when it was written, by a clock of the writer's.
+        """
+        pace = self._paces.get((topic, writer))
+        if pace is None:
+            if len(self._paces) >= _MAX_WRITERS:
+                return
+            pace = self._paces[topic, writer] = _Pace()
+        pace.sample(at_ns)
+
+    @property
+    def gaps(self) -> dict[str, Gaps]:
+        """Gaps by topic, without what the kernel dropped."""
+        found: dict[str, Gaps] = {}
+        for (topic, _), pace in sorted(self._paces.items()):
+            old = found.get(topic, Gaps(0, 0, 0.0))
+            found[topic] = Gaps(
+                old.count + pace.count,
+                old.missing + pace.missing,
+                max(old.longest, pace.longest * 1e-9),
+            )
+        dropped = self.about
+        left = {
+            topic: replace(gaps, missing=gaps.missing - dropped.get(topic, 0))
+            for topic, gaps in found.items()
+        }
+        return {topic: gaps for topic, gaps in left.items() if gaps.missing > 0}
+
+    def look(
+        self,
+        now: float,
+        dropped: int,
+        refused: dict[str, int],
+        lost: dict[str, int] | None = None,
+    ) -> bool:
         """Update the counters; call it periodically.
 
         :param dropped: datagrams dropped since the last call.
         :param refused: samples refused in total, by topic.
+        :param lost: samples lost in total by the status of DDS, by topic.
         :returns: whether anything was lost since the last call.
         """
         news = dropped > 0
+        if (lost or {}) != self.lost:
+            self.lost, news = dict(lost or {}), True
+        if (gaps := self.gaps) != self._gaps_said:
+            self._gaps_said, news = gaps, True
         self.datagrams += dropped
         if dropped:
             self._until = now + _GAP_WINDOW
@@ -150,7 +275,20 @@ class Losses:
         return {topic: round(n * scale) for topic, n in sorted(self._about.items())}
 
     def __bool__(self) -> bool:
-        return bool(self.datagrams or sum(self.refused.values()))
+        return bool(self.datagrams or sum(self.refused.values()) or sum(self.lost.values()))
+
+    def brief(self) -> str:
+        """The losses in a few words, for a status line; empty when there are none."""
+        parts = []
+        if self.datagrams:
+            parts.append(f"{self.datagrams} datagrams lost")
+        if lost := sum(self.lost.values()):
+            parts.append(f"{lost} lost")
+        if refused := sum(self.refused.values()):
+            parts.append(f"{refused} refused")
+        if missing := sum(gaps.missing for gaps in self.gaps.values()):
+            parts.append(f"about {missing} missing")
+        return ", ".join(parts)
 
     def sentences(self) -> list[str]:
         """Losses and pauses as sentences for the user."""
@@ -168,6 +306,16 @@ class Losses:
             for topic, n in sorted(self.refused.items())
             if n
         ]
+        said += [
+            f"{n} samples of {topic} were lost (reported by DDS)"
+            for topic, n in sorted(self.lost.items())
+            if n
+        ]
+        said += [
+            f"about {gaps.missing} samples of {topic} are missing ({gaps.count} gaps, the longest "
+            f"{gaps.longest:.3f} s): they were lost on the way, or their writer stood still"
+            for topic, gaps in self.gaps.items()
+        ]
         return said
 
     def metadata(self) -> dict[str, str]:
@@ -175,6 +323,13 @@ class Losses:
         values = {
             "lost_datagrams": str(self.datagrams),
             "refused": str(sum(self.refused.values())),
+            "lost": str(sum(self.lost.values())),
+            "missing about": str(sum(gaps.missing for gaps in self.gaps.values())),
+        }
+        values |= {f"lost {topic}": str(n) for topic, n in sorted(self.lost.items()) if n}
+        values |= {
+            f"gaps {topic}": f"{g.count}, about {g.missing} samples, longest {g.longest:.3f} s"
+            for topic, g in self.gaps.items()
         }
         values |= {f"lost about {topic}": str(n) for topic, n in self.about.items() if n}
         values |= {f"refused {topic}": str(n) for topic, n in sorted(self.refused.items()) if n}

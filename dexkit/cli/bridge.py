@@ -16,6 +16,7 @@ from dexkit.cli.options import (
     dds_options,
     duration_option,
     force_option,
+    found_interface,
     quiet_option,
     real_time_option,
     side_option,
@@ -89,7 +90,9 @@ def command(
     status = sys.stderr.isatty() and not quiet
     log_to_stderr(quiet, status, "dexkit.bridge.counters")
     far_domain = domain if to_domain is None else to_domain
-    far_interface = interface if to_interface is None else to_interface
+    far_interface = interface
+    if to_interface is not None:
+        far_interface = found_interface(click.get_current_context(), to_interface)
     with (
         # before any thread is started: they inherit it
         real_time_priority() if real_time else nullcontext(True),

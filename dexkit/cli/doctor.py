@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import DIALECT, DOMAIN, Number, json_option
+from dexkit.cli.options import (
+    DIALECT,
+    DOMAIN,
+    Number,
+    found_interface,
+    json_option,
+    network_options,
+    peer_addresses,
+)
 from dexkit.errors import UsageError
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.open_file_limit import require_open_files
@@ -65,8 +73,9 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     "interfaces",
     multiple=True,
     metavar="IF",
-    help="Examine this network interface as well as lo; may be repeated.",
+    help="Examine this network interface (name, address or prefix) as well as lo; may be repeated.",
 )
+@network_options()
 @click.option(
     "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand model.  [default: any]"
 )
@@ -114,6 +123,13 @@ def command(
     if domain is None and not scan:
         raise UsageError("no domain to examine", hint="give --domain or --scan")
     scope = Scope(domain, _dialects(model, dialect), bool(devices) and domain is None)
+    ctx = click.get_current_context()
+    peers = peer_addresses(ctx)
+    interfaces = tuple(dict.fromkeys(found_interface(ctx, text) for text in interfaces))
+    if peers and not interfaces:
+        from dexkit.interface_names import interface_towards
+
+        interfaces = tuple(dict.fromkeys(interface_towards(peer) for peer in peers))
     windows = len({*scan, *([] if domain is None else [domain])}) * len({"lo", *interfaces})
     require_open_files(windows + _FILES, f"examining {windows} domain(s)")
     with stop_on_signals() as stop, ThreadPoolExecutor(1) as beside:
@@ -124,6 +140,7 @@ def command(
             seen = _observe(
                 sorted({*scan, *([] if domain is None else [domain])}),
                 tuple(dict.fromkeys(("lo", *interfaces))),
+                peers,
                 devices,
                 seconds,
                 env.result,
@@ -166,6 +183,7 @@ def _dialects(model: str | None, dialect: str | None) -> tuple[Dialect, ...]:
 def _observe(
     domains: list[int],
     interfaces: tuple[str, ...],
+    peers: tuple[str, ...],
     devices: tuple[str, ...],
     seconds: float,
     env: Callable[[], Environment],
@@ -186,7 +204,7 @@ def _observe(
         else:
             ports.append(doctor_devices.inspect_port(device, progress=progress))
     views = dds.observe_domains(
-        domains, interfaces, seconds=seconds, stop=stop.event, progress=progress
+        domains, interfaces, seconds=seconds, peers=peers, stop=stop.event, progress=progress
     )
     progress("")
     return Observations(

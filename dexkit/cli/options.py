@@ -6,6 +6,7 @@ An option of which commands differ in one word or in the default is a function o
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +27,7 @@ __all__ = [
     "duration_option",
     "fault_options",
     "force_option",
+    "found_interface",
     "grade_option",
     "html_option",
     "json_option",
@@ -33,7 +35,9 @@ __all__ = [
     "latency_timer_option",
     "line_time_option",
     "markdown_option",
+    "network_options",
     "object_option",
+    "peer_addresses",
     "quiet_option",
     "real_time_option",
     "require_option",
@@ -95,7 +99,9 @@ FILE = click.Path(path_type=Path)
 def dds_options(
     *, default_domain: int | None = 1, domain_default_text: str = ""
 ) -> Callable[[F], F]:
-    """``--domain`` and ``--interface``; the interface defaults to loopback.
+    """``--domain``, ``--interface``, ``--peer`` and ``--wait-for-interface``.
+
+    The interface defaults to loopback, or to that by which the first peer is reached.
 
     :param domain_default_text: what ``--help`` prints where there is no fixed default.
     """
@@ -112,9 +118,92 @@ def dds_options(
         default="lo",
         show_default=True,
         metavar="IF",
-        help="Network interface. Traffic stays on this machine unless one is named.",
+        callback=_interface,
+        help="Network interface: name, address or prefix (192.168.123.0/24). Traffic stays on "
+        "this machine unless one is named.",
     )
-    return lambda function: domain(interface(function))
+    network = network_options()
+    return lambda function: domain(interface(network(function)))
+
+
+def network_options() -> Callable[[F], F]:
+    """``--peer`` and ``--wait-for-interface``; :func:`found_interface` uses them."""
+    peer = click.option(
+        "--peer",
+        "peers",
+        multiple=True,
+        metavar="HOST",
+        is_eager=True,  # before --interface
+        expose_value=False,
+        callback=_set_peers,
+        help="Call this machine by unicast, for networks without multicast; may be repeated.",
+    )
+    wait = click.option(
+        "--wait-for-interface",
+        type=Number(min=0),
+        default=0.0,
+        metavar="S",
+        is_eager=True,
+        expose_value=False,
+        callback=lambda ctx, param, value: ctx.meta.__setitem__(_WAIT, value),
+        help="Wait up to S seconds for a network interface that is not up yet.",
+    )
+    return lambda function: peer(wait(function))
+
+
+_PEERS, _WAIT = "dexkit.peers", "dexkit.wait_for_interface"
+
+
+def _set_peers(
+    ctx: click.Context, parameter: click.Parameter, peers: tuple[str, ...]
+) -> tuple[str, ...]:
+    ctx.meta[_PEERS] = peers
+    if peers:
+        # for this process and those that it starts
+        from dexkit.dds import PEERS
+
+        os.environ[PEERS] = ",".join(peers)
+    return peers
+
+
+def peer_addresses(ctx: click.Context) -> tuple[str, ...]:
+    """Addresses of the machines of ``--peer``.
+
+    :raises DdsSetupError: a name is not known.
+    """
+    from dexkit.interface_names import resolve_peers
+
+    return resolve_peers(list(ctx.meta.get(_PEERS, ())))
+
+
+def found_interface(ctx: click.Context, text: str) -> str:
+    """The name of the interface that an option means, waited for if that was asked for.
+
+    :raises DdsSetupError: it is not there.
+    """
+    from dexkit.interface_names import find_interface, wait_for_interface
+
+    seconds = ctx.meta.get(_WAIT, 0.0)
+    if ctx.resilient_parsing or not seconds:
+        return find_interface(text)
+    return wait_for_interface(
+        text,
+        seconds,
+        waiting=lambda why: click.echo(f"waiting for up to {seconds:g} s: {why}", err=True),
+    )
+
+
+def _interface(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
+    """Resolve ``--interface``; without it, that by which the peers are reached."""
+    from dexkit.interface_names import interface_towards
+
+    if ctx.resilient_parsing:
+        return text
+    peers = peer_addresses(ctx)
+    given = ctx.get_parameter_source(str(parameter.name))
+    if peers and given is click.core.ParameterSource.DEFAULT:
+        return interface_towards(peers[0])
+    return found_interface(ctx, text)
 
 
 def topic_option(verb: str, default: str) -> Callable[[F], F]:

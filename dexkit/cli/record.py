@@ -98,13 +98,8 @@ def command(
 
 
 def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:
-    losses = recording.losses
-    text = f"{recorder.dropped} dropped"
-    if losses.datagrams:
-        text += f", {losses.datagrams} datagrams lost"
-    if refused := sum(losses.refused.values()):
-        text += f", {refused} refused"
-    return text
+    brief = recording.losses.brief()
+    return f"{recorder.dropped} dropped" + (f", {brief}" if brief else "")
 
 
 def _refuse_empty(node: DdsNode, recording: DdsRecording, waited: float) -> None:

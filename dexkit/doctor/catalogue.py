@@ -74,8 +74,9 @@ _ALL = (
         _E,
         "a CycloneDDS 11 participant that crashes its 0.10 peers is on the domain",
         "clients, the hand's service or the robot's own programs die with a segmentation fault",
-        "Unitree's stack is CycloneDDS 0.10.x; a participant of 11.x with Unitree's types, even "
-        "one that only reads, crashes 0.10.x peers when they ask it for a type",
+        "Unitree's stack is CycloneDDS 0.10.x; a participant of 11.x (or a nightly build since "
+        "2023, which announces 0.11.0) with Unitree's types, even one that only reads, crashes "
+        "0.10.x peers when they ask it for a type",
         "stop that process now and install 'cyclonedds>=0.10.2,<0.11' for it; restart what died",
     ),
     Diagnosis(
@@ -114,9 +115,18 @@ _ALL = (
         "start the hand: the vendor's service, or 'dexkit serve BACKEND --side both'",
     ),
     Diagnosis(
+        "DDS-UNPUBLISHED",
+        _E,
+        "a client waits for a state that no process publishes",
+        _WAITS + ", for the robot or for hands of another make",
+        "xr_teleoperate, LeRobot and the SDK's examples wait for the first state of the robot and "
+        "of each hand",
+        "start what publishes it, on the same domain and network",
+    ),
+    Diagnosis(
         "DDS-OTHER-DOMAIN",
         _E,
-        "the hand is on another DDS domain than the client",
+        "the hand or robot is on another DDS domain than the client",
         _WAITS + ", though the hand runs",
         "DDS domains are separate; xr_teleoperate uses domain 0, and 1 with --sim",
         "put both on one domain: 'dexkit serve ... --domain N', xr_teleoperate with or without "
@@ -238,7 +248,8 @@ _ALL = (
         _E,
         "the state does not follow commands that change",
         "the displayed hand does not move",
-        "the state is published, but nothing new is measured",
+        "the state is published, but nothing new is measured; commands without a position gain, "
+        "and locked motors, do not count",
         "check whether the hand's service has lost its device; 'dexkit doctor --device PATH' "
         "checks a serial port",
     ),

@@ -15,14 +15,16 @@ from dataclasses import dataclass, field
 from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
+from dexkit.doctor.awaited import AWAITED
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
 from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
-from dexkit.doctor.topics import is_hand_topic
+from dexkit.doctor.topics import is_driven, is_hand_topic
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
+from dexkit.topics import roles
 
 __all__ = ["DISCOVERY_SECONDS", "observe_domains"]
 
@@ -36,6 +38,12 @@ _TICK = 0.05
 _BUFFER = 4 << 20
 _DECODE_EVERY = 0.02  # seconds between samples of a stream whose positions are read
 _LOOPBACK = "127.0.0.1"
+_FAST = "fastdds.physical_data."  # prefix of the properties of a Fast DDS participant
+
+
+def _is_watched(topic: str, type_name: str) -> bool:
+    """Whether the samples of a topic are counted."""
+    return topic in AWAITED or is_hand_topic(topic, type_name)
 
 
 @dataclass
@@ -53,10 +61,15 @@ class _Watch:
     low: list[float] = field(default_factory=list)
     high: list[float] = field(default_factory=list)
     q: tuple[float, ...] = ()
+    driven: dict[int, tuple[float, float]] = field(default_factory=dict)
     nonzero: bool = False
     undecodable: int = 0
     decoded_at: float = float("-inf")
     newest: bytes = b""
+
+    def __post_init__(self) -> None:
+        found = roles(self.endpoint.topic, self.endpoint.type_name)
+        self.dialects = [role.dialect for role in found if role.kind == "cmd"]
 
     def take(self, sequence: int, data: bytes, now: float) -> None:
         if self.samples and sequence <= self.last_sequence:
@@ -72,6 +85,8 @@ class _Watch:
             self.decode(data)
 
     def decode(self, data: bytes) -> None:
+        if self.endpoint.topic in AWAITED:
+            return  # that they come is enough
         try:
             kind = message_type(self.endpoint.type_name)
             motors = getattr(kind.decode(data), kind.motor_sequence)
@@ -81,6 +96,10 @@ class _Watch:
         q = [float(motor.q) for motor in motors]
         self.nonzero = self.nonzero or any(q)
         self.q = tuple(q)
+        for i, motor in enumerate(motors if self.dialects else ()):
+            if any(is_driven(motor, dialect) for dialect in self.dialects):
+                low, high = self.driven.get(i, (q[i], q[i]))
+                self.driven[i] = min(low, q[i]), max(high, q[i])
         if len(q) != len(self.low):
             self.low, self.high = list(q), list(q)
         self.low = [min(pair) for pair in zip(self.low, q, strict=True)]
@@ -103,6 +122,7 @@ class _Watch:
             identical=self.identical and self.samples > 1,
             q=self.q,
             q_span=max((h - low for low, h in zip(self.low, self.high, strict=True)), default=0.0),
+            driven_span=max((high - low for low, high in self.driven.values()), default=0.0),
             nonzero=self.nonzero,
             undecodable=self.undecodable,
         )
@@ -111,9 +131,10 @@ class _Watch:
 class _Window:
     """One domain, seen from one interface."""
 
-    def __init__(self, domain: int, interface: str) -> None:
+    def __init__(self, domain: int, interface: str, peers: Sequence[str] = ()) -> None:
         self.domain = domain
         self.interface = interface
+        self.peers = peers
         self.address = address_of(interface)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -142,7 +163,7 @@ class _Window:
                 "__Pid": str(os.getpid()),
                 "__Hostname": socket.gethostname(),
             },
-            wanted=is_hand_topic,
+            wanted=_is_watched,
             on_sample=self.sample,
         )
 
@@ -166,11 +187,13 @@ class _Window:
     def everywhere(self, packet: bytes) -> list[Send]:
         """A packet to wherever a participant may listen."""
         places = [Locator(_GROUP, rtps.spdp_multicast_port(self.domain)), *self.observer.addresses]
-        if self.address == _LOOPBACK:
-            # where loopback has no multicast, its participants listen to these ports alone
-            places += [
-                Locator(_LOOPBACK, rtps.unicast_port(self.domain, i)) for i in range(_INDICES)
-            ]
+        # where there is no multicast, participants listen to these ports alone
+        called = (_LOOPBACK,) if self.address == _LOOPBACK else self.peers
+        places += [
+            Locator(peer, rtps.unicast_port(self.domain, i))
+            for peer in called
+            for i in range(_INDICES)
+        ]
         return [(packet, place) for place in dict.fromkeys(places) if place.port < 65536]
 
     def send(self, packets: Iterable[Send]) -> None:
@@ -195,9 +218,9 @@ class _Window:
 
     @property
     def streaming(self) -> bool:
-        """A topic of a hand is written here, so that it pays to wait."""
+        """A topic of a hand or robot is written here, so that it pays to wait."""
         return any(
-            is_writer and is_hand_topic(e.topic, e.type_name)
+            is_writer and _is_watched(e.topic, e.type_name)
             for e, is_writer in self.observer.endpoints.values()
         )
 
@@ -207,12 +230,14 @@ def observe_domains(
     interfaces: Sequence[str] = ("lo",),
     *,
     seconds: float = 2.0,
+    peers: Sequence[str] = (),
     stop: threading.Event | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> tuple[DomainView, ...]:
     """Look at domains without disturbing anybody: no topic is written.
 
     :param seconds: how long the samples of hands are watched where there are any.
+    :param peers: addresses of other machines to call by unicast.
     :param stop: ends the look early.
     :raises DdsSetupError: an interface is not there or has no address.
     """
@@ -222,7 +247,7 @@ def observe_domains(
     try:
         for domain in domains:
             for interface in interfaces:
-                window = _Window(domain, interface)
+                window = _Window(domain, interface, peers)
                 windows.append(window)
                 selector.register(window.socket, selectors.EVENT_READ, window)
         began = time.monotonic()
@@ -292,7 +317,7 @@ def _view(number: int, windows: Sequence[_Window], began: float, until: float) -
                 qos=found.qos,
                 type_hash=found.type_hash,
             )
-            if is_writer and is_hand_topic(found.topic, found.type_name):
+            if is_writer and _is_watched(found.topic, found.type_name):
                 watch = window.watches.get(guid)
                 seen = (
                     watch.stream(until, began)
@@ -307,17 +332,20 @@ def _view(number: int, windows: Sequence[_Window], began: float, until: float) -
 
 
 def _participant(data: rtps.ParticipantData, interface: str) -> Participant:
-    host = data.properties.get("__Hostname", "")
-    pid = process_id(data.properties.get("__Pid", ""))
+    # as CycloneDDS announces them, or as Fast DDS does ("name:hash")
+    said = data.properties
+    host = said.get("__Hostname", "") or said.get(_FAST + "host", "").rpartition(":")[0]
+    pid = process_id(said.get("__Pid", "") or said.get(_FAST + "process", ""))
     here = bool(pid) and host == socket.gethostname()
     return Participant(
         key=data.prefix.hex(),
         vendor=rtps.vendor_name(data.vendor),
         version=data.version,
-        process=data.properties.get("__ProcessName", ""),
+        process=said.get("__ProcessName", ""),
         pid=pid,
         host=host,
         addresses=tuple(dict.fromkeys(p.address for p in (*data.data, *data.discovery))),
+        places=tuple(dict.fromkeys((p.address, p.port) for p in (*data.data, *data.discovery))),
         multicast=data.multicast,
         interface=interface,
         command=command_line(pid) if here else "",

@@ -9,42 +9,21 @@ from pathlib import Path
 
 from dexkit.doctor.observations import DdsSocket, Interface
 from dexkit.doctor.proc_files import command_line, open_sockets
-from dexkit.errors import DdsSetupError
 from dexkit.interface_filter import interface_address, interface_flags
+from dexkit.interface_names import find_interface
 
-__all__ = ["ROBOT_NETWORK", "address_of", "dds_sockets", "interfaces"]
-
-ROBOT_NETWORK = "192.168.123."
-"""Where Unitree's robots are (docs/sources/unitree-dex.md#a6)."""
+__all__ = ["address_of", "dds_sockets", "interfaces"]
 
 _IFF_UP, _IFF_LOOPBACK, _IFF_MULTICAST = 0x1, 0x8, 0x1000
 _GROUP = "0100FFEF"  # 239.255.0.1 as /proc/net/igmp writes it on little-endian machines
 
 
 def address_of(interface: str) -> str:
-    """The IPv4 address of an interface.
+    """The IPv4 address of an interface (:func:`dexkit.interface_names.find_interface`).
 
     :raises DdsSetupError: it is not there, or has none.
     """
-    found = {one.name: one for one in interfaces()}
-    if interface not in found:
-        raise DdsSetupError(
-            f"there is no network interface {interface!r}", hint=f"this machine has: {_list(found)}"
-        )
-    if not found[interface].addresses:
-        raise DdsSetupError(
-            f"network interface {interface!r} has no IPv4 address"
-            + ("" if found[interface].up else " and is down"),
-            hint=f"is the cable plugged in? This machine has: {_list(found)}",
-        )
-    return found[interface].addresses[0]
-
-
-def _list(found: dict[str, Interface]) -> str:
-    return ", ".join(
-        f"{one.name} ({', '.join(one.addresses)})" if one.addresses else one.name
-        for one in found.values()
-    )
+    return interface_address(find_interface(interface))
 
 
 def interfaces(proc: Path = Path("/proc")) -> tuple[Interface, ...]:
@@ -107,9 +86,16 @@ def dds_sockets(domains: list[int], proc: Path = Path("/proc")) -> tuple[DdsSock
     if not ports:
         return ()
     owners = open_sockets()
-    found: dict[tuple[int, int], DdsSocket] = {}
+    found: dict[tuple[int, int], set[int]] = {}
     for domain, port, inode in ports:
-        pid = owners.get(inode, 0)
-        command = command_line(pid) if pid else ""
-        found.setdefault((domain, pid), DdsSocket(domain, port, pid, command))
-    return tuple(found[key] for key in sorted(found))
+        found.setdefault((domain, owners.get(inode, 0)), set()).add(port)
+    return tuple(
+        DdsSocket(
+            domain,
+            min(found[domain, pid]),
+            pid,
+            command_line(pid) if pid else "",
+            tuple(sorted(found[domain, pid])),
+        )
+        for domain, pid in sorted(found)
+    )

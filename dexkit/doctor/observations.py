@@ -33,6 +33,7 @@ class Participant:
     :param pid: process id that it announces, or 0.
     :param host: machine that it announces, or empty.
     :param addresses: where it takes messages.
+    :param places: address and UDP port of each place where it takes messages.
     :param multicast: it listens to multicast.
     :param interface: the interface on which it was found.
     :param command: its command line, if it runs on this machine and may be read.
@@ -47,6 +48,7 @@ class Participant:
     pid: int = 0
     host: str = ""
     addresses: tuple[str, ...] = ()
+    places: tuple[tuple[str, int], ...] = ()
     multicast: bool = False
     interface: str = "lo"
     command: str = ""
@@ -93,6 +95,8 @@ class Stream:
     :param identical: all samples were the same bytes.
     :param q: positions of the last sample, rad; empty when none could be decoded.
     :param q_span: the furthest that any joint moved, rad.
+    :param driven_span: of commands: the furthest that the target of any joint moved, rad, over
+        the commands that drive it (with a position gain, and a mode that obeys).
     :param nonzero: some position of some sample was not exactly 0.
     :param undecodable: samples that do not decode as their type.
     """
@@ -105,6 +109,7 @@ class Stream:
     identical: bool = False
     q: tuple[float, ...] = ()
     q_span: float = 0.0
+    driven_span: float = 0.0
     nonzero: bool = False
     undecodable: int = 0
 
@@ -150,15 +155,18 @@ class Interface:
 
 @dataclass(frozen=True)
 class DdsSocket:
-    """A process of this machine listens on a port that belongs to a domain.
+    """A process of this machine listens on ports that belong to a domain.
 
+    :param port: the lowest of them.
     :param pid: 0 when the process belongs to another user.
+    :param ports: all of them.
     """
 
     domain: int
     port: int
     pid: int = 0
     command: str = ""
+    ports: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from rich.table import Column, Table
 
 from dexkit.console import Console
 from dexkit.console import markup as escape
+from dexkit.doctor.awaited import AWAITED
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Observations
 from dexkit.doctor.rules import Readiness, Verdict
@@ -114,8 +115,8 @@ def print_report(
 def _row(view: DomainView, endpoint: Endpoint) -> tuple[str, ...]:
     stream = view.stream(endpoint)
     rate = f"{stream.rate:.0f}" if stream and stream.samples else ("0" if stream else "")
-    known = roles(endpoint.topic) or endpoint.topic in _BODY_TOPICS
-    mark = "" if known else " (not a hand's)"
+    known = roles(endpoint.topic) or endpoint.topic in _BODY_TOPICS or endpoint.topic in AWAITED
+    mark = "" if known else " (not known)"
     kind = "publishes" if endpoint.kind == "writer" else "reads"
     return (
         str(view.number),

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
+from dexkit.doctor.awaited import AWAITED, Awaited, awaited
 from dexkit.doctor.catalogue import DIAGNOSES, Finding, Severity
 from dexkit.doctor.observations import (
     DomainView,
@@ -20,12 +21,16 @@ from dexkit.doctor.observations import (
     UsbDevice,
 )
 from dexkit.doctor.topics import nearly, short
+from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.topics import Role, roles
 from dexkit.wire import dex3_usb, mx64
 
-__all__ = ["Readiness", "Scope", "Verdict", "diagnose", "readiness", "verdict"]
+__all__ = ["ROBOT_NETWORK", "Readiness", "Scope", "Verdict", "diagnose", "readiness", "verdict"]
+
+ROBOT_NETWORK = "192.168.123."
+"""Where Unitree's robots are (docs/sources/unitree-dex.md#a6)."""
 
 _FROZEN_COMMANDS = 0.1  # rad that commands move while a measured state must change
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
@@ -157,9 +162,16 @@ def _focus(seen: Observations, scope: Scope) -> list[DomainView]:
     """The domains that are judged."""
     if scope.domain is not None:
         return [v for v in seen.domains if v.number == scope.domain]
-    return [v for v in seen.domains if _hands(v, scope) or _clients(v, scope)] or [
-        v for v in seen.domains if v.number in (0, 1)
-    ]
+    return [
+        v
+        for v in seen.domains
+        if _hands(v, scope) or _clients(v, scope) or (not scope.dialects and _awaiting(v))
+    ] or [v for v in seen.domains if v.number in (0, 1)]
+
+
+def _awaiting(view: DomainView) -> list[Endpoint]:
+    """Readers of states that are not a Dex hand's and that Unitree's clients wait for."""
+    return [e for e in view.endpoints if e.kind == "reader" and e.topic in AWAITED]
 
 
 def _wanted(views: Iterable[DomainView], scope: Scope) -> list[Dialect]:
@@ -232,6 +244,8 @@ def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
         yield from _matches(view)
         yield from _listeners(view, scope)
         yield from _streams(view, scope)
+        if not scope.dialects:
+            yield from _waiting(seen, view)
     yield from _absent(seen, focus, scope, explained=bool(found))
 
 
@@ -240,13 +254,23 @@ def _versions(view: DomainView) -> Iterator[Finding]:
         parts = re.match(r"(\d+)\.(\d+)", one.version)
         if one.vendor != "CycloneDDS" or parts is None:
             continue
-        if (int(parts[1]), int(parts[2])) <= (0, 10):
+        version = int(parts[1]), int(parts[2])
+        if version <= (0, 10):
             continue
-        typed = any(
-            e.participant == one.key and e.type_name.startswith(("unitree_", "std_msgs"))
-            for e in view.endpoints
-        )
-        peers = [p.name for p in view.participants if p.version.startswith("0.10.")]
+        ends = [e for e in view.endpoints if e.participant == one.key]
+        typed = any(e.type_name.startswith(("unitree_", "std_msgs")) for e in ends)
+        if version < (1, 0):
+            # 0.11.0 is announced by the wheel of 0.10.2 and by builds that crash it; only how
+            # they describe a type differs
+            typed = any(
+                e.type_hash and TYPE_HASHES.get(e.type_name, e.type_hash) != e.type_hash
+                for e in ends
+            )
+            if not typed:
+                continue
+        peers = [
+            p.name for p in view.participants if p is not one and re.match(r"0\.1[01]\.", p.version)
+        ]
         risk = ("has Unitree's types" if typed else "has no endpoint of Unitree's types yet") + (
             f"; in danger: {', '.join(peers)}" if peers else "; no 0.10 peer is (still) there"
         )
@@ -486,14 +510,104 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
                 topic=topic,
             )
         command = _command(view, part, scope)
-        if stream.identical and command is not None and command.q_span >= _FROZEN_COMMANDS:
+        if stream.identical and command is not None and command.driven_span >= _FROZEN_COMMANDS:
             yield _finding(
                 "DDS-FROZEN",
                 f"{what}: {stream.samples} identical states while the commands moved by "
-                f"{command.q_span:.2f} rad",
+                f"{command.driven_span:.2f} rad",
                 domain=view.number,
                 topic=topic,
             )
+
+
+def _waiting(seen: Observations, view: DomainView) -> Iterator[Finding]:
+    """Clients of the body and of other hands whose state does not come."""
+    readers = _awaiting(view)
+    for one in awaited(e.topic for e in readers):
+        topic = one.topic
+        here = [e for e in readers if e.topic == topic]
+        writers = [e for e in view.endpoints if e.kind == "writer" and e.topic == topic]
+        who = " and ".join(sorted({view.owner(e) for e in here}))
+        kinds = " or ".join(sorted({short(e.type_name) for e in here}))
+        elsewhere = [
+            (other.number, other.owner(e))
+            for other in seen.domains
+            for e in other.endpoints
+            if other is not view and e.kind == "writer" and e.topic == topic
+        ]
+        if not writers and elsewhere:
+            number, publisher = elsewhere[0]
+            yield _finding(
+                "DDS-OTHER-DOMAIN",
+                f"{publisher} publishes {topic} on domain {number}; {who} waits for it on domain "
+                f"{view.number}",
+                fix=f"start the client on domain {number}, or its publisher on {view.number}: "
+                "xr_teleoperate uses domain 0, and 1 with --sim",
+                domain=view.number,
+                topic=topic,
+            )
+        elif not writers:
+            yield _finding(
+                "DDS-UNPUBLISHED",
+                f"{who} waits for {topic} ({kinds}) on domain {view.number}: no process publishes "
+                f"it; {one.publisher} does, {_place(one)}",
+                fix=_remedy(one, view, here),
+                domain=view.number,
+                topic=topic,
+            )
+        for writer in writers:
+            stream = view.stream(writer)
+            others = [e for e in here if e.type_name != writer.type_name]
+            if len(others) == len(here):
+                yield _finding(
+                    "DDS-TYPE",
+                    f"{topic} on domain {view.number}: {view.owner(writer)} publishes "
+                    f"{short(writer.type_name)}; {who} reads {kinds}",
+                    fix="select the robot that is there in the client (xr_teleoperate: --arm): G1, "
+                    "H1-2, H2 and R1 use unitree_hg, H1, Go2 and B2 unitree_go",
+                    domain=view.number,
+                    topic=topic,
+                )
+            elif stream is not None and stream.seconds > 0 and not stream.samples:
+                yield _finding(
+                    "DDS-SILENT",
+                    f"{topic} of {view.owner(writer)} on domain {view.number}: no sample in "
+                    f"{stream.seconds:.1f} s",
+                    fix=f"check {view.owner(writer)}: {one.publisher} publishes {topic}",
+                    domain=view.number,
+                    topic=topic,
+                )
+
+
+def _place(one: Awaited) -> str:
+    if one.simulation:
+        return "on domain 1; no robot does"
+    return f"on domain 0, on the robot's network ({ROBOT_NETWORK}x)"
+
+
+def _remedy(one: Awaited, view: DomainView, readers: Iterable[Endpoint]) -> str:
+    """What to do when no process publishes what clients wait for."""
+    if one.simulation:
+        return "start the simulator on this domain, or the client without --sim"
+    parts = []
+    if view.number == 0:
+        ends = [view.participant(e.participant) for e in readers]
+        places = sorted({a for p in ends if p for a in p.addresses})
+        if places and not _robot(places):
+            parts.append(
+                f"the client is at {', '.join(places)}: name its interface in the robot's network "
+                "(xr_teleoperate 1.5: --network-interface)"
+            )
+        parts.append(f"check {one.publisher}")
+    else:
+        parts.append(
+            f"the client is on domain {view.number}, the robot on 0: start it without --sim, or "
+            "the simulator on this domain"
+        )
+    if one.emulators:
+        to = " or ".join(f"'{command} --domain {view.number}'" for command in one.emulators)
+        parts.append(f"without a robot: {to}")
+    return "; ".join(parts)
 
 
 def _command(view: DomainView, hand: _Part, scope: Scope) -> Stream | None:
@@ -588,12 +702,16 @@ def _absent(
         numbers = ", ".join(str(v.number) for v in seen.domains)
         which = " and ".join(str(v.number) for v in focus) or numbers
         who = {0: "is no process", 1: "is one other process"}.get(people, f"are {people} others")
+        # a client of the body or of other hands may need no Dex hand
+        other_clients = any(_awaiting(v) and not _clients(v, scope) for v in focus)
         yield _finding(
             "DDS-NOBODY",
             f"there {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
             f"on {', '.join(seen.looked_at)}",
             fix=_elsewhere(seen),
-            severity=Severity.NOTE if scope.devices_only else None,
+            severity=Severity.NOTE
+            if scope.devices_only or (other_clients and not wanted)
+            else None,
         )
 
 
@@ -623,7 +741,7 @@ def _elsewhere(seen: Observations) -> str:
 
 
 def _robot(addresses: Iterable[str]) -> bool:
-    return any(a.startswith("192.168.123.") for a in addresses)  # docs/sources/unitree-dex.md#a6
+    return any(a.startswith(ROBOT_NETWORK) for a in addresses)
 
 
 # --- network
@@ -695,11 +813,20 @@ def _deaf_loopback(
 
 def _hidden(seen: Observations, focus: list[DomainView]) -> Iterator[Finding]:
     """Processes of this machine on a domain that did not answer on the observed interface."""
+    local = {address for i in seen.interfaces for address in i.addresses}
     for view in focus:
         known = {p.pid for p in view.participants}
+        # who announces no process id (Fast DDS) is known by its port
+        places = {p for one in view.participants for p in one.places if p[0] in local}
+        ports = {port for _, port in places}
         # one of another user has no pid here; it is probably one of those that answered
         hidden = [
-            s for s in seen.sockets if s.domain == view.number and s.pid and s.pid not in known
+            s
+            for s in seen.sockets
+            if s.domain == view.number
+            and s.pid
+            and s.pid not in known
+            and not ports.intersection((s.port, *s.ports))
         ]
         if not hidden:
             continue

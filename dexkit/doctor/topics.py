@@ -5,14 +5,17 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
+from typing import Any
 
 from dexkit.messages import message_types
+from dexkit.models import Dialect, ModeByte
 from dexkit.topics import HAND_TOPICS, roles
 
-__all__ = ["is_hand_topic", "nearly", "short"]
+__all__ = ["is_driven", "is_hand_topic", "nearly", "short"]
 
 _KNOWN_TYPES = frozenset(kind.name for kind in message_types())
 _ALIKE = 0.86  # ratio of difflib above which a name is a slip of the pen
+_FOC = 1  # status in RIS_Mode_t (dexkit.wire.ris.RIS_MODE)
 # other hands of the vendor's stack; not slips of the pen
 _OTHERS = re.compile(r"(rt)?/?(lf/)?(dex\d+|inspire\w*|brainco\w*)/")
 
@@ -20,6 +23,15 @@ _OTHERS = re.compile(r"(rt)?/?(lf/)?(dex\d+|inspire\w*|brainco\w*)/")
 def is_hand_topic(topic: str, type_name: str) -> bool:
     """Whether a topic is a hand's and its samples can be read, with the right type or another."""
     return bool(roles(topic, type_name))
+
+
+def is_driven(motor: Any, dialect: Dialect) -> bool:
+    """Whether a motor's command makes it follow ``q``: it has a position gain and is not locked."""
+    if dialect.mode_byte is ModeByte.STATUS and not motor.mode:
+        return False
+    if dialect.mode_byte is ModeByte.RIS and (motor.mode >> 4) & 7 != _FOC:
+        return False
+    return bool(motor.kp) or not dialect.gains_are_used
 
 
 def _plain(topic: str) -> str:
