@@ -677,10 +677,7 @@ class StopsInABurst(Service):
 
 @wrong_hand(
     ("DEX1-SAFE-08", "DEX3-SAFE-09"),
-    also=(
-        *("DEX1-SAFE-09", "DEX1-RATE-03", "DEX1-RATE-04"),
-        *("DEX3-SAFE-10", "DEX3-RATE-03", "DEX3-RATE-04"),
-    ),
+    also=("DEX1-SAFE-09", "DEX3-SAFE-10", "DEX1-RATE-03", "DEX3-RATE-03", "DEX1-RATE-04"),
 )
 class GivesUpOnTwo(Service):
     """Ends when a second client commands it, and is restarted 0.4 s later."""
@@ -731,7 +728,7 @@ class IgnoresTwo(Service):
             super().receive(topic, payload, client)
 
 
-@wrong_hand(("DEX1-MOVE-09", "DEX3-MOVE-08"))
+@wrong_hand(("DEX1-MOVE-09", "DEX3-MOVE-08"), whole=True)
 class DeafAfterFar(Service):
     """Ignores commands for 0.8 s after one that is far out of range."""
 
@@ -746,7 +743,7 @@ class DeafAfterFar(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-SAFE-02", "DEX3-SAFE-02"))
+@wrong_hand("DEX1-SAFE-02")
 class WrapsFarGoals(Service):
     """Takes a q that is far out of range modulo its range."""
 

@@ -71,6 +71,8 @@ class GripperScript(HandScript):
         self._stroke = plan.dialect.q_open
         # the interface specification: in unitree_hg the gains, dq and tau of a command are not used
         self._gains_used = plan.dialect.gains_are_used
+        self._gainless = False
+        """Whether commands have no gains: clients of a dialect that does not use them send none."""
 
     def _provoke(self) -> Steps:
         sides = self.plan.sides
@@ -91,6 +93,8 @@ class GripperScript(HandScript):
             yield from self._flood()
         if "limp" in self.plan.phases and self._gains_used:
             yield from self._limp()
+        if not self._gains_used:
+            self._gainless = True
         if "replay" in self.plan.phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
@@ -134,7 +138,7 @@ class GripperScript(HandScript):
         return self._goal[side][0] > self.plan.objects.get(side, -math.inf)
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
-        return (Motor(q=pose[0]),)
+        return (Motor(q=pose[0], kp=0.0, kd=0.0) if self._gainless else Motor(q=pose[0]),)
 
     # -- phases -----------------------------------------------------------------------------
 
