@@ -57,7 +57,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
 from dexkit.hand import JointMode, Side
 from dexkit.models import JointRoles
@@ -274,9 +274,11 @@ class FingerScript(HandScript):
         yield from self._bad_commands("nan", sides, kinds, 0.08)
         for name in ("empty", "short", "long", "negative"):
             if name in self.plan.phases:
+                yield from self._hold(BETWEEN)
                 bad = {s: self._malformed(name, s)[0] for s in sides}
                 yield from self._bad_commands(name, sides, [bad], 0.15)
         if "limp" in self.plan.phases:
+            yield from self._hold(BETWEEN)
             yield from self._limp(0.3)
         yield from self._far_away(1000.0, 0.2)
         yield from self._everyone("recover", self._other_place(), most=1.5, after=self._bad_again)

@@ -46,7 +46,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
 
@@ -222,15 +222,19 @@ class GripperScript(HandScript):
         yield from self._bad_commands("nan", sides, kinds, 0.1)
         good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
         if "empty" in phases:
+            yield from self._hold(BETWEEN)
             yield from self._bad_commands("empty", sides, [self._empty(sides)], 0.15)
         if "long" in phases:
+            yield from self._hold(BETWEEN)
             longer = self._codec.encode_longer(good, [Motor(q=self._far(sides[0]))])
             yield from self._bad_commands("long", sides, [longer], 0.15)
         if "negative" in phases and self._gains_used:
+            yield from self._hold(BETWEEN)
             kp, kd = self._model.client_gains
             wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
             yield from self._bad_commands("negative", sides, [wrong], 0.15)
         if "limp" in phases and self._gains_used:
+            yield from self._hold(BETWEEN)
             yield from self._unpulled(0.3)
         yield from self._far_away(1000.0, 0.2)
         yield from self._everyone("recover", self._other_place(), after=self._bad_again)

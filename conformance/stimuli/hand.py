@@ -46,6 +46,8 @@ ASIDE = 0.15
 """Part of a joint's range of a step that one side makes while the other gets bad commands."""
 ASIDE_SECONDS = 1.0
 """Least time, s, in which a side is asked to make such a step."""
+BETWEEN = 0.3
+"""Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 SINGLES, SINGLE_SECONDS = 10, 0.25
 """Commands that are sent once, and how long none follows, s: less than any time-out."""
 
