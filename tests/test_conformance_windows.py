@@ -84,3 +84,23 @@ def test_bursts_with_good_stamps_are_irregular_in_a_run_of_the_kit() -> None:
     result = _result(_recorded(sent.tolist(), received.tolist(), kit=True), "DEX1-RATE-04")
     assert result.verdict is Verdict.WARN
     assert result.values["p99_s"] == pytest.approx(0.03, abs=0.002)
+
+
+def test_long_bursts_fail_in_a_run_of_the_kit_although_their_stamps_are_good() -> None:
+    sent = np.array(_at(500, 0, 6))
+    received = np.where((sent > 2.0) & (sent < 4.0), np.ceil(sent / 0.08) * 0.08, sent)
+    result = _result(_recorded(sent.tolist(), received.tolist(), kit=True), "DEX1-RATE-05")
+    assert result.verdict is Verdict.FAIL
+    assert result.evidence[0].time_s == pytest.approx(2.0, abs=0.1)
+    assert result.values["intervals"] == pytest.approx(12, abs=1)
+    # another recorder may have been late itself
+    offline = _recorded(sent.tolist(), received.tolist())
+    assert _result(offline, "DEX1-RATE-05").verdict is Verdict.PASS
+
+
+def test_four_long_intervals_in_a_second_are_no_bursts() -> None:
+    times = np.array(_at(500, 0, 6))
+    for begin in (2.0, 2.2, 2.4, 2.6):
+        times = times[(times < begin) | (times > begin + 0.06)]
+    result = _result(_recorded(times.tolist()), "DEX1-RATE-05")
+    assert (result.verdict, result.values["intervals"]) == (Verdict.PASS, 4)

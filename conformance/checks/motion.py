@@ -98,7 +98,7 @@ def steps(ctx: Context) -> list[Step]:
     return [s for p in ctx.phases() for s in steps_of(ctx, p)]
 
 
-_PLAIN = ("step", "joint", "recover", "resume", "restart", "service-restart")
+_PLAIN = ("step", "joint", "recover", "resume", "company", "restart", "service-restart")
 """Steps with good commands alone, by which a hand shows that it obeys; each has a requirement."""
 _NEWEST = 3  # steps; in a single one it may have been at its target already
 _DISOBEYS = 0.1  # of the stroke
@@ -360,6 +360,63 @@ def settling(ctx: Context) -> Outcome:
     )
 
 
+@check("DEX1-MOVE-09", "DEX3-MOVE-08")
+def begins(ctx: Context) -> Outcome:
+    """Time from the command until the hand has made a tenth of its way, of every step of the run
+    that arrives.
+    """
+    slowest: tuple[float, float, Step] | None = None
+    first = [p for name in _AFTER_A_PAUSE for p in ctx.phases(name)[:1]]
+    for phase in (p for name in _PROMPT for p in ctx.phases(name)):
+        for step in steps_of(ctx, phase):
+            before = ctx.states.between(step.begin - 0.1, step.begin)
+            if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
+                continue  # it was still under way
+            way = (step.q - step.start) * np.sign(step.size) >= 0.1 * abs(step.size)
+            if (
+                abs(step.size) < ctx.tolerance("min_step_stroke", step.joint)
+                or step.error > _DISOBEYS * step.stroke
+                or not way.any()
+            ):
+                continue  # whether it arrives is judged by other requirements
+            after = float(step.t[np.argmax(way)]) - step.begin
+            limit = ctx.tolerance("max_first_s" if phase in first else "max_reaction_s")
+            if slowest is None or after / limit > slowest[0] / slowest[1]:
+                slowest = after, limit, step
+    if slowest is None:
+        return ctx.skipped("no step of that size was finished")
+    after, limit, step = slowest
+    text = f"{step.name}after {after:.2f} s in the step to {step.target:.2f} rad"
+    span = step.begin, step.begin + after
+    if after <= limit:
+        met = ctx.passed(f"{after:.2f} s", text, reaction_s=after)
+        return met.timed(after, limit, span=span)
+    return (
+        ctx.failed(
+            f"{after:.2f} s",
+            f"{step}, but it began to move only after {after:.2f} s",
+            ctx.at(ctx.states.topic, *span),
+            reaction_s=after,
+        )
+        .about(step.joint)
+        .timed(after, limit)
+        .if_late(after - limit)
+    )
+
+
+def _range(q: Floats) -> float:
+    return float(np.ptp(q)) if len(q) else 0.0
+
+
+_AFTER_A_PAUSE = ("restart", "service-restart")
+"""Steps of which the first comes when hand and client have just found each other."""
+_PROMPT = (
+    *("step", "joint", "ends", "center", "fingerprint", "recover", "beside", "old-stamps"),
+    *("company", *_AFTER_A_PAUSE),
+)
+"""Steps that must begin at once; after a pause, WDOG-03 judges them."""
+
+
 @check("DEX1-MOVE-08")
 def ends(ctx: Context) -> Outcome:
     """Distance from fully open and fully closed."""
@@ -511,7 +568,8 @@ def unchanged(ctx: Context) -> Outcome:
     """Duration of good steps after each abuse, compared with those before any, and the errors of
     the steps between the phases.
     """
-    for phase in (p for p in ctx.phases("center") if obeyed_before(ctx, p)):
+    between = [*ctx.phases("center"), *ctx.phases()]
+    for phase in (p for p in between if obeyed_before(ctx, p)):
         for step in steps_of(ctx, phase):
             if step.error > ctx.tolerance("max_error_stroke", step.joint):
                 return disobeyed(ctx, "between two phases", step)

@@ -32,7 +32,8 @@ from dexkit.hand import Floats
 def _recovery(ctx: Context, phase: Phase) -> Step | None:
     """The step after a bad command, of the joint with the largest error."""
     for after in ctx.phases("recover"):
-        if after.params.get("after") == phase.name and after.begin_ns >= phase.end_ns:
+        names = after.params.get("after", "").split()
+        if phase.name in names and after.begin_ns >= phase.end_ns:
             found = steps_of(ctx, after)
             return max(found, key=lambda s: s.error / s.stroke) if found else None
     return None
@@ -174,6 +175,9 @@ def out_of_range(ctx: Context) -> Outcome:
                     .about(joint)
                     .because(causes.of_range(float(np.nanmax(q))))
                 )
+            wrong = _other_way(ctx, phase, joint)
+            if wrong is not None:
+                return wrong
             reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} rad")
             values = {"q_min": float(q.min()), "q_max": float(q.max())}
     outcome = unharmed(ctx, "commands far out of range")
@@ -185,6 +189,46 @@ def out_of_range(ctx: Context) -> Outcome:
         "q stayed within the stroke, then obeyed",
         **(values if len(ctx.joints) == 1 else {}),
     ).resting_on(*outcome.measures)
+
+
+_TURNS_S = 0.06  # s that a moving hand is given to turn round
+
+
+def _other_way(ctx: Context, phase: Phase, joint: int) -> Outcome | None:
+    """The failure of a joint that moves away from the end beyond which it is commanded."""
+    begin, end = ctx.span(phase)
+    spec = ctx.joints[joint]
+    rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+    t, q = ctx.commands.t[rows], ctx.commands.q[rows, joint]
+    far = (q > spec.q_max + 0.1 * spec.stroke) * 1 - (q < spec.q_min - 0.1 * spec.stroke) * 1
+    t, far = t[far != 0], far[far != 0]
+    if not len(far):
+        return None
+    turns = np.flatnonzero(np.diff(far, prepend=0))
+    for a, b, way in zip(t[turns], [*t[turns[1:]], end], far[turns], strict=True):
+        turning = ctx.states.q[ctx.states.between(a, a + _TURNS_S), joint] * way
+        later = ctx.states.between(a + _TURNS_S, b)
+        if not len(turning) or not len(ctx.states.t[later]):
+            continue
+        back = float(turning.min()) - ctx.states.q[later, joint] * way
+        i = int(np.argmax(back))
+        if back[i] > ctx.tolerance("max_back_stroke", joint):
+            return (
+                ctx.failed(
+                    f"{back[i]:.2f} rad",
+                    ctx.named(
+                        f"commanded far {'above' if way > 0 else 'below'} its range it went the "
+                        f"other way by {back[i]:.2f} rad",
+                        joint,
+                    ),
+                    ctx.at(ctx.states.topic, float(ctx.states.t[later][i])),
+                    back_rad=float(back[i]),
+                )
+                .about(joint)
+                .placed(float(back[i]), ctx.tolerance("max_back_stroke", joint))
+                .if_late(STROKE_S * float(back[i]) / spec.stroke)
+            )
+    return None
 
 
 @check("DEX1-SAFE-03", "DEX3-SAFE-03")
@@ -502,6 +546,12 @@ def two_writers(ctx: Context) -> Outcome:
     return ctx.passed(
         "between", "stayed between the two positions, and obeyed the remaining client"
     ).resting_on(*outcome.measures)
+
+
+@check("DEX1-SAFE-09", "DEX3-SAFE-10")
+def company(ctx: Context) -> Outcome:
+    """The steps of this hand while a second client sends the same commands."""
+    return arrival(ctx, "while a second client commanded the same")
 
 
 @check("DEX1-ORDER-02", "DEX3-ORDER-02")

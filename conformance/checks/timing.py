@@ -24,7 +24,7 @@ from dexkit.hand import Floats
 OWN_GAP_RULE = (
     *("silence", "guard", "shutdown"),
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id"),
-    *("negative", "foreign", "burst", "two-writers", "load"),
+    *("foreign", "burst", "load"),
 )
 OWN_RATE_RULE = ("load", "burst", "shutdown")
 """Stimuli during which the state's rate is judged by another requirement, or there is no service.
@@ -289,6 +289,44 @@ def regular(ctx: Context) -> Outcome:
         p99_s=late,
     )
     return outcome.timed(late, limit).if_late(late - limit, how="p99")
+
+
+@check("DEX1-RATE-05", "DEX3-RATE-05")
+def spread(ctx: Context) -> Outcome:
+    """Long intervals between states that follow each other, as published and as received."""
+    limit, window = ctx.tolerance("max_interval_s"), ctx.tolerance("window_s")
+    allowed = int(ctx.tolerance("max_count"))
+    excluded = _spans(ctx, OWN_RATE_RULE)
+    most = 0
+    for clock in _times(ctx):
+        lengths = np.diff(clock)
+        late = np.flatnonzero(lengths > limit)
+        begins, ends = clock[:-1][late], clock[1:][late]
+        for begin, end in excluded:
+            keep = (ends <= begin) | (begins >= end)
+            begins, ends = begins[keep], ends[keep]
+        counts = np.searchsorted(begins, begins + window) - np.arange(len(begins))
+        most = max(most, int(counts.max(initial=0)))
+        if most <= allowed:
+            continue
+        first = int(np.argmax(counts > allowed))
+        found = [
+            (float(a), float(b))
+            for a, b in zip(begins[first:], ends[first : first + most], strict=False)
+        ]
+        begin, end = found[0][0], found[-1][1]
+        outcome = ctx.failed(
+            f"{most} in {window:g} s",
+            f"{len(found)} intervals of more than {limit:g} s from {begin:.2f} s to {end:.2f} s",
+            *(ctx.at(ctx.states.topic, a, b) for a, b in found),
+            intervals=most,
+        ).resting_on(*gap_measures(found, limit))
+        return outcome.if_late(*(b - a - limit for a, b in found))
+    return ctx.passed(
+        f"{most} in {window:g} s",
+        f"at most {most} intervals of more than {limit:g} s in {window:g} s",
+        intervals=most,
+    )
 
 
 def _worst_p99(ctx: Context, clock: Floats) -> tuple[float, float, float]:

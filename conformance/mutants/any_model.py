@@ -165,6 +165,15 @@ class Bursts(BurstsWithGoodStamps):
         return [replace(sample, sent=self.now + i * 1e-6) for i, sample in enumerate(burst)]
 
 
+@wrong_hand(("DEX1-RATE-05", "DEX3-RATE-05"), also=("DEX1-RATE-04", "DEX3-RATE-04"))
+class BurstsForTwoSeconds(BurstsWithGoodStamps):
+    """Delivers its states in bursts of twenty for two seconds, with the right timestamps."""
+
+    def publish(self) -> list[Sample]:
+        self.together = 20 if 2.0 < self.now < 4.0 else 1
+        return super().publish()
+
+
 @wrong_hand(("DEX1-ORDER-01", "DEX3-ORDER-01"))
 class RepeatsOldStates(Service):
     """Publishes every hundredth state again after the next one."""
@@ -666,7 +675,10 @@ class StopsInABurst(Service):
         return [] if self.busy_until > self.now + 0.02 else super().publish()
 
 
-@wrong_hand(("DEX1-SAFE-08", "DEX3-SAFE-09"))
+@wrong_hand(
+    ("DEX1-SAFE-08", "DEX3-SAFE-09"),
+    also=("DEX1-SAFE-09", "DEX3-SAFE-10", "DEX1-RATE-03", "DEX3-RATE-03", "DEX1-RATE-04"),
+)
 class GivesUpOnTwo(Service):
     """Ends when a second client commands it, and is restarted 0.4 s later."""
 
@@ -700,6 +712,49 @@ class StaysWithTheNewest(Service):
             self.master = client
         if client == self.master:
             super().receive(topic, payload, client)
+
+
+@wrong_hand(("DEX1-SAFE-09", "DEX3-SAFE-10"))
+class IgnoresTwo(Service):
+    """Obeys nobody while two clients command it."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.heard: dict[int, float] = {}
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.heard[client] = self.now
+        if all(other == client or self.now - at > 0.05 for other, at in self.heard.items()):
+            super().receive(topic, payload, client)
+
+
+@wrong_hand(("DEX1-MOVE-09", "DEX3-MOVE-08"), whole=True)
+class DeafAfterFar(Service):
+    """Ignores commands for 0.8 s after one that is far out of range."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.deaf_until: dict[Side, float] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if any(100.0 < abs(m.q) < math.inf for m in motors):
+            self.deaf_until[side] = self.now + 0.8
+        if self.now >= self.deaf_until.get(side, 0.0):
+            super().motors(side, motors)
+
+
+@wrong_hand("DEX1-SAFE-02")
+class WrapsFarGoals(Service):
+    """Takes a q that is far out of range modulo its range."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        wrapped = []
+        for motor, joint in zip(motors, joints_of(self.dialect, side), strict=True):
+            q = motor.q
+            if 100.0 < abs(q) < math.inf:
+                q = joint.q_min + (q - joint.q_min) % joint.stroke
+            wrapped.append(replace(motor, q=q))
+        super().motors(side, tuple(wrapped))
 
 
 @wrong_hand(("DEX1-ORDER-02", "DEX3-ORDER-02"))

@@ -38,11 +38,14 @@ silence        the commands stop for longer than the time-out; then on each side
                rejected commands arrive
 resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
-two-writers    a second client commands as well, and goes
-restart        the client goes away, another comes, and makes a step; bad commands again
+two-writers    a second client commands another place, and goes
+company        a second client commands the same: steps of each side alone, and of both in
+               opposite directions
+restart        the client goes away, another comes, and makes such steps; each kind of bad
+               commands again
 shutdown       the service is stopped and started again
 restarted      no commands
-service-       a step after that; silence again
+service-       such steps after that; silence again
 restart
 ============== =====================================================================================
 """
@@ -54,7 +57,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
 from dexkit.hand import JointMode, Side
 from dexkit.models import JointRoles
@@ -269,7 +272,25 @@ class FingerScript(HandScript):
         every = {s: self._not_finite(s) for s in sides}
         kinds = [{s: every[s][i] for s in sides} for i in range(0, len(NOT_FINITE), 2)]
         yield from self._bad_commands("nan", sides, kinds, 0.08)
-        yield from self._everyone("recover", self._other_place(), most=1.5, after="nan")
+        for name in ("empty", "short", "long", "negative"):
+            if name in self.plan.phases:
+                yield from self._hold(BETWEEN)
+                bad = {s: self._malformed(name, s)[0] for s in sides}
+                yield from self._bad_commands(name, sides, [bad], 0.15)
+        if "limp" in self.plan.phases:
+            yield from self._hold(BETWEEN)
+            yield from self._limp(0.3)
+        yield from self._far_away(1000.0, 0.2)
+        yield from self._everyone("recover", self._other_place(), most=1.5, after=self._bad_again)
+
+    def _limp(self, seconds: float) -> Steps:
+        """Zero gains with a q far away, as a phase."""
+        far = self._other_place()
+        targets = {s: dict(enumerate(pose)) for s, pose in far.items()}
+        phase = self._begin("limp", self.plan.sides, targets=targets)
+        limp = {s: [replace(m, kp=0.0, kd=0.0) for m in self._motors(s, far[s])] for s in far}
+        yield from self._hold(seconds, limp)
+        self._end(phase)
 
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)
@@ -398,6 +419,7 @@ class FingerScript(HandScript):
             self._report("... silence: nothing may be left driven by a velocity, a grip is kept")
             yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
+        yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})
         if len(sides) > 1 and "silence" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 home = self._motors(side, self._home(side))

@@ -27,11 +27,14 @@ silence        ... the commands stop for two command time-outs
 rejected       only commands that are not finite, to each side alone
 resume         a step after the silence
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
-two-writers    a second client commands as well, and goes
-restart        the client goes away, another comes, and makes a step; bad commands again
+two-writers    a second client commands another place, and goes
+company        a second client commands the same: steps of each side alone, and of both in
+               opposite directions
+restart        the client goes away, another comes, and makes such steps; each kind of bad
+               commands again
 shutdown       the service is stopped and started again
 restarted      no commands
-service-       a step after that; silence again
+service-       such steps after that; silence again
 restart
 ============== =====================================================================================
 """
@@ -43,7 +46,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
 
@@ -68,6 +71,8 @@ class GripperScript(HandScript):
         self._stroke = plan.dialect.q_open
         # the interface specification: in unitree_hg the gains, dq and tau of a command are not used
         self._gains_used = plan.dialect.gains_are_used
+        self._gainless = False
+        """Whether commands have no gains: clients of a dialect that does not use them send none."""
 
     def _provoke(self) -> Steps:
         sides = self.plan.sides
@@ -88,6 +93,8 @@ class GripperScript(HandScript):
             yield from self._flood()
         if "limp" in self.plan.phases and self._gains_used:
             yield from self._limp()
+        if not self._gains_used:
+            self._gainless = True
         if "replay" in self.plan.phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
@@ -131,7 +138,7 @@ class GripperScript(HandScript):
         return self._goal[side][0] > self.plan.objects.get(side, -math.inf)
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
-        return (Motor(q=pose[0]),)
+        return (Motor(q=pose[0], kp=0.0, kd=0.0) if self._gainless else Motor(q=pose[0]),)
 
     # -- phases -----------------------------------------------------------------------------
 
@@ -191,6 +198,9 @@ class GripperScript(HandScript):
             return self._codec.encode_empty(sides)
         return dict.fromkeys(sides, ())
 
+    def _at(self, side: Side, q: Sequence[float]) -> Motors:
+        return (Motor(q=q[0]),)
+
     def _far(self, side: Side) -> float:
         """A q far from the goal."""
         return self._low(side) if self._goal[side][0] > 0.6 * self._stroke else self._high()
@@ -206,11 +216,28 @@ class GripperScript(HandScript):
 
     def _again(self) -> Steps:
         self._report("bad commands of the new client: nothing may move")
-        sides = self.plan.sides
+        sides, phases = self.plan.sides, self.plan.phases
         every = {s: self._not_finite(s) for s in sides}
         kinds = [{s: (every[s][i],) for s in sides} for i in range(0, len(every[sides[0]]), 2)]
         yield from self._bad_commands("nan", sides, kinds, 0.1)
-        yield from self._everyone("recover", self._other_place(), after="nan")
+        good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
+        if "empty" in phases:
+            yield from self._hold(BETWEEN)
+            yield from self._bad_commands("empty", sides, [self._empty(sides)], 0.15)
+        if "long" in phases:
+            yield from self._hold(BETWEEN)
+            longer = self._codec.encode_longer(good, [Motor(q=self._far(sides[0]))])
+            yield from self._bad_commands("long", sides, [longer], 0.15)
+        if "negative" in phases and self._gains_used:
+            yield from self._hold(BETWEEN)
+            kp, kd = self._model.client_gains
+            wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
+            yield from self._bad_commands("negative", sides, [wrong], 0.15)
+        if "limp" in phases and self._gains_used:
+            yield from self._hold(BETWEEN)
+            yield from self._unpulled(0.3)
+        yield from self._far_away(1000.0, 0.2)
+        yield from self._everyone("recover", self._other_place(), after=self._bad_again)
 
     def _silent_again(self) -> Steps:
         if not self._gains_used:
@@ -221,14 +248,19 @@ class GripperScript(HandScript):
         yield from self._silence("silence", self._model.command_timeout + 0.6)
         yield from self._everyone("resume", self._other_place())
 
+    def _unpulled(self, seconds: float) -> Steps:
+        """Zero gains with a q far away, as a phase."""
+        far = {s: self._far(s) for s in self.plan.sides}
+        phase = self._begin("limp", self.plan.sides, targets={s: {0: q} for s, q in far.items()})
+        limp = {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in far.items()}
+        yield from self._hold(seconds, limp)
+        self._end(phase)
+
     def _limp(self) -> Steps:
         self._report("commands without force (zero gains): the hand must not be pulled")
         sides = self.plan.sides
         yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
-        low = {s: self._low(s) for s in sides}
-        phase = self._begin("limp", sides, targets={s: {0: q} for s, q in low.items()})
-        yield from self._hold(0.5, {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in low.items()})
-        self._end(phase)
+        yield from self._unpulled(0.5)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _squeeze_and_silence(self) -> Steps:
@@ -252,6 +284,7 @@ class GripperScript(HandScript):
         self._report("... silence: after a second the hand must brake")
         yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
         yield from self._everyone("resume", self._other_place())
+        yield from self._bad_at_once({s: (self._not_finite(s)[-1],) for s in sides})
         if len(sides) > 1 and not self._codec.shared and "rejected" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 yield from self._silent_alone(side, (Motor(q=bad),))

@@ -46,6 +46,8 @@ ASIDE = 0.15
 """Part of a joint's range of a step that one side makes while the other gets bad commands."""
 ASIDE_SECONDS = 1.0
 """Least time, s, in which a side is asked to make such a step."""
+BETWEEN = 0.3
+"""Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 SINGLES, SINGLE_SECONDS = 10, 0.25
 """Commands that are sent once, and how long none follows, s: less than any time-out."""
 
@@ -62,6 +64,8 @@ class HandScript(Script[Side]):
         self._model: HandModel = model(plan.dialect.model)
         self._joints = {s: joints_of(plan.dialect, s) for s in Side}
         self._held: tuple[dict[Side, Pose], Payloads] = ({}, [])
+        self._echoed = False
+        """Whether a second client sends each command as well."""
         self._period_ns = round(1e9 / self._model.command_rate)
 
     def run(self) -> Steps:
@@ -82,10 +86,12 @@ class HandScript(Script[Side]):
             yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
         if "two-writers" in self.plan.phases:
             yield from self._two_writers()
+        if "company" in self.plan.phases:
+            yield from self._company()
         if "restart" in self.plan.phases:
             self._report("the commanding program is restarted: the new one must be obeyed")
             yield Restart()
-            yield from self._everyone("restart", self._other_place())
+            yield from self._in_turn("restart")
             if "nan" in self.plan.phases:
                 yield from self._again()
         yield from self._hold(0.2)
@@ -98,7 +104,11 @@ class HandScript(Script[Side]):
 
     @abstractmethod
     def _again(self) -> Steps:
-        """Bad commands once more, of another client."""
+        """Bad commands of every kind once more, of another client."""
+
+    @abstractmethod
+    def _at(self, side: Side, q: Sequence[float]) -> Motors:
+        """The command to go to q of every joint, rad, which may be out of range."""
 
     @abstractmethod
     def _silent_again(self) -> Steps:
@@ -126,6 +136,9 @@ class HandScript(Script[Side]):
             hold = {s: self._motors(s, q) for s, q in self._goal.items()}
             self._held = (dict(self._goal), self._codec.encode(hold))
         yield from self._send(self._held[1])
+        if self._echoed:
+            self._next_ns += self._period_ns
+            yield from self._do(Send(self._held[1], self._next_ns, by=Role.RIVAL))
 
     def _hold(self, seconds: float, motors: Mapping[Side, Motors] | None = None) -> Steps:
         yield from self._repeat(seconds, lambda: self._command(motors))
@@ -193,6 +206,22 @@ class HandScript(Script[Side]):
         targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
         phase = self._begin(name, self.plan.sides, targets=targets, **params)
         yield from self._until_settled(phase, self.plan.sides, least=least, most=most)
+
+    def _in_turn(self, name: str) -> Steps:
+        """Steps of one side while the other rests, and of both in opposite directions, as phases
+        of that name.
+        """
+        home, away = dict(self._goal), self._other_place()
+        first, *others = self.plan.sides
+        turns = [{first: away[first]}, {first: home[first]}]
+        for side in others:
+            turns[-1][side] = away[side]
+            turns.append({side: home[side]})
+        for goals in turns:
+            self._goal.update(goals)
+            targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
+            phase = self._begin(name, tuple(goals), targets=targets)
+            yield from self._until_settled(phase, tuple(goals), least=0.5, most=1.5)
 
     def _approach(self) -> Steps:
         """Slowly to the middle: the first motion of an unknown hand."""
@@ -263,6 +292,33 @@ class HandScript(Script[Side]):
             for q, j in zip(self._goal[side], self._joints[side], strict=True)
         )
 
+    def _bad_at_once(self, broken: Mapping[Side, Motors]) -> Steps:
+        """Commands that are not finite, and such that are far out of range, soon after a pause."""
+        if "nan" in self.plan.phases:
+            yield from self._bad_commands("nan", self.plan.sides, [broken], 0.1)
+        yield from self._far_away(1000.0, 0.15)
+        if self.plan.phases & {"nan", "out-of-range"}:
+            yield from self._everyone("recover", self._other_place(), after=self._bad_again)
+
+    def _far_away(self, far: float, each: float) -> Steps:
+        """Commands far beyond both ends, to all sides at once.
+
+        :param far: q of every joint, rad.
+        :param each: seconds of each end.
+        """
+        sides = self.plan.sides
+        if "out-of-range" in self.plan.phases:
+            joints = len(self._joints[sides[0]])
+            kinds = [{s: self._at(s, [q] * joints) for s in sides} for q in (far, -far)]
+            yield from self._bad_commands("out-of-range", sides, kinds, each)
+
+    @property
+    def _bad_again(self) -> str:
+        """The names of the phases of bad commands before the newest good step."""
+        names = [p.name for p in self.phases]
+        last = max(i for i, name in enumerate(names) if name in ("restart", "resume", "recover"))
+        return " ".join(dict.fromkeys(names[last + 1 :]))
+
     def _each_alone(self) -> list[tuple[Side, ...]]:
         """Each side by itself; both where they share a message."""
         if self._codec.shared:
@@ -272,7 +328,8 @@ class HandScript(Script[Side]):
     def _single(self) -> Steps:
         """Commands that are not repeated: every one counts, and the newest most of all."""
         self._report("commands that are sent once: each must be obeyed")
-        yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
+        if self._goal != {s: self._home(s) for s in self.plan.sides}:
+            yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
         home = dict(self._goal)
         away = {s: self._aside(s, 0.4 * ASIDE) for s in home}
         decoy = {s: self._aside(s, -0.2 * ASIDE) for s in home}
@@ -426,6 +483,16 @@ class HandScript(Script[Side]):
         yield from self._do(Leave(Role.RIVAL))
         yield from self._everyone("recover", dict(self._goal), most=1.5, after="two-writers")
 
+    def _company(self) -> Steps:
+        """A second client sends each command as well."""
+        self._report("a second client commands the same: it must make no difference")
+        yield from self._do(Join(Role.RIVAL))
+        period = self._period_ns
+        self._period_ns, self._echoed = period // 2, True
+        yield from self._in_turn("company")
+        self._period_ns, self._echoed = period, False
+        yield from self._do(Leave(Role.RIVAL))
+
     def _beside(self, phase: Phase, payloads: Payloads, role: Role, seconds: float) -> Steps:
         """Another client sends between this one's commands, at the same rate."""
         period = self._period_ns
@@ -451,6 +518,7 @@ class HandScript(Script[Side]):
         self._next_ns = self._obs.now_ns
         yield from self._silence("restarted", 0.4)
         yield from self._everyone("service-restart", self._other_place(), most=4.0)
+        yield from self._in_turn("service-restart")
         if "silence" in self.plan.phases:
             yield from self._silent_again()
 

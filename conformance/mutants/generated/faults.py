@@ -29,18 +29,33 @@ KINDS: Mapping[str, frozenset[str]] = {
     ),
     "velocity and torque": frozenset(("FIELD", "FORCE", "SENS", "MODE")),
     "command": frozenset(
-        ("MOVE", "JOINT", "TRACK", "GAIN", "SAFE", "OPER", "WDOG", "LIFE", "ORDER", "MODE", "FORCE")
+        (
+            *("MOVE", "JOINT", "TRACK", "GAIN", "SAFE", "OPER", "WDOG", "LIFE", "ORDER", "MODE"),
+            # the path of a motion, commands that are sent once, and what changes within a run
+            *("FORCE", "PATH", "STILL", "CMD", "ABUSE"),
+        )
     ),
     "state flow": frozenset(
         ("RATE", "FRESH", "ORDER", "LOAD", "WDOG", "LIFE", "START", "TOPIC", "OPER")
     ),
-    "safety": frozenset(("WDOG", "GUARD", "SAFE", "HOLD", "MODE", "GAIN")),
+    # what a bad command has done may show in the next good ones
+    "safety": frozenset(
+        ("WDOG", "GUARD", "SAFE", "HOLD", "MODE", "GAIN", "MOVE", "PATH", "STILL", "SIDE", "ABUSE")
+    ),
     "motion": frozenset(
-        ("MOVE", "JOINT", "SAFE", "SIDE", "WDOG", "START", "HOLD", "GAIN", "TRACK", "LIFE")
+        (
+            *("MOVE", "JOINT", "SAFE", "SIDE", "WDOG", "START", "HOLD", "GAIN", "TRACK", "LIFE"),
+            *("PATH", "STILL", "ABUSE"),
+        )
     ),
     # a hand that does not let go disobeys after a silence in which it pressed
     "force": frozenset(("FORCE", "HOLD", "SENS", "TRACK", "MOVE", "WDOG", "OPER")),
-    "sides": frozenset(("SIDE", "MOVE", "JOINT", "START", "FIELD", "TRACK", "FRESH", "WDOG")),
+    "sides": frozenset(
+        (
+            *("SIDE", "MOVE", "JOINT", "START", "FIELD", "TRACK", "FRESH", "WDOG"),
+            *("PATH", "STILL", "ABUSE"),
+        )
+    ),
 }
 """The classes of faults, and the requirement areas that are a right reason for each."""
 
