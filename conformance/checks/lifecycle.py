@@ -71,7 +71,9 @@ def restarted_client(ctx: Context) -> Outcome:
 @check("DEX1-LIFE-03", "DEX3-LIFE-03")
 def restarted_service(ctx: Context) -> Outcome:
     """State and the step after a restart of the service, with a client that kept running."""
-    begin, end = ctx.span(ctx.phases()[0])
+    phase = ctx.phases()[0]
+    before = [p for p in ctx.phases("restarted") if p.end_ns <= phase.begin_ns]
+    begin, end = ctx.span(before[-1] if before else phase)
     later = ctx.states.t[ctx.states.t > begin]
     waited = float(later[0]) - begin if len(later) else np.inf
     if waited > ctx.tolerance("max_wait_s"):

@@ -112,7 +112,7 @@ def _judge(
     return ctx.failed(text(worst), observed, *places, **values).about(joint).if_late(size, how=how)
 
 
-@check("DEX1-OPER-01", "DEX3-OPER-01")
+@check("DEX1-OPER-01", "DEX1-OPER-06", "DEX3-OPER-01")
 def stroke(ctx: Context) -> Outcome:
     """Time of a full stroke."""
 

@@ -870,6 +870,20 @@ class DeafAfterRestart(Service):
 
 
 @wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
+class WaitsAfterRestart(Service):
+    """Publishes nothing after a restart until a command arrives, for which clients wait."""
+
+    heard = False
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.heard = True
+        super().receive(topic, payload, client)
+
+    def publish(self) -> list[Sample]:
+        return [] if self.restarted and not self.heard else super().publish()
+
+
+@wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
 class SilentAfterRestart(Service):
     """Publishes nothing for 2 s after a restart."""
 

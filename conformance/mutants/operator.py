@@ -57,11 +57,21 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-04",))
+@wrong_hand("DEX1-OPER-06", also=("DEX1-OPER-01", "DEX1-OPER-04"))
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a goal nearer than 0.14 rad: the client waits there and never moves on."""
 
     band = 0.14 / 5.4
+
+
+@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-02",))
+class SaturatingGain(ReferenceService):
+    """Takes no kp above 2: with the client's small lead it has 40 % of the force."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(
+            side, tuple(replace(m, kp=2.0) if 2.0 < m.kp < math.inf else m for m in motors)
+        )
 
 
 # what it leaves of each step shows in steps of every kind

@@ -516,7 +516,8 @@ class HandScript(Script[Side]):
         yield from self._do(StartService())
         self._end(phase)
         self._next_ns = self._obs.now_ns
-        yield from self._silence("restarted", 0.4)
+        # longer than a state may take, so that it must come without a command
+        yield from self._silence("restarted", 1.3)
         yield from self._everyone("service-restart", self._other_place(), most=4.0)
         yield from self._in_turn("service-restart")
         if "silence" in self.plan.phases:
