@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
@@ -21,6 +23,8 @@ from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 
 __all__: list[str] = []
+
+Rows: TypeAlias = NDArray[np.intp]
 
 _FEW = 10
 """Measurements that are needed to say anything."""
@@ -35,8 +39,7 @@ _OWN = 1.2
 class _Joint:
     """What a joint reported, without repetitions.
 
-    :param t: seconds; q and dq likewise, rad and rad/s.
-    :param gaps: how many of the gaps before each are too long to integrate over.
+    :param t: seconds; ``q``, rad, and ``dq``, rad/s, have the same length.
     """
 
     t: Floats
@@ -57,7 +60,7 @@ class _Joint:
             t, q, dq = t[new], q[new], dq[new]
         return cls(t, q, dq)
 
-    def windows(self, seconds: float, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    def windows(self, seconds: float, longest: float) -> tuple[Rows, Rows]:
         """First and last rows of all windows of that length without a gap above ``longest``."""
         ends = np.searchsorted(self.t, self.t + seconds)
         starts = np.flatnonzero(ends < len(self.t))
@@ -89,7 +92,8 @@ def _fastest(ctx: Context, joint: int) -> float:
     dq = dq[np.isfinite(dq)]
     if not len(dq) or not dq.any():
         return ctx.joints[joint].dq_max
-    return max(_OWN * float(np.sort(dq)[int(_FAST * (len(dq) - 1))]), ctx.tolerance("min_speed"))
+    fast = float(np.sort(dq)[int(_FAST * (len(dq) - 1))])
+    return max(_OWN * fast, ctx.tolerance("min_speed"))
 
 
 @check("DEX1-FIELD-15", "DEX3-FIELD-15")
@@ -171,7 +175,8 @@ def slope(ctx: Context) -> Outcome:
 
 def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float, float] | None:
     """Error, ratio and begin of a joint's worst window; None without one in which it moves."""
-    step, count = ctx.tolerance("slope_s"), round(ctx.tolerance("window_s") / ctx.tolerance("slope_s"))
+    step = ctx.tolerance("slope_s")
+    count = round(ctx.tolerance("window_s") / step)
     if len(x.t) < _FEW or x.t[-1] - x.t[0] < 2 * count * step:
         return None
     grid = np.asarray(np.arange(float(x.t[0]), float(x.t[-1]) - step, step))
@@ -214,7 +219,7 @@ def keeps_up(ctx: Context) -> Outcome:
                 worst = found
     if worst is None:
         return ctx.skipped("the states are too far apart to integrate dq")
-    part, excess, joint, begin, end, speed = worst
+    _, excess, joint, begin, end, speed = worst
     limit = ctx.tolerance("max_excess_stroke", joint)
     text = ctx.named(
         f"from {begin:.2f} to {end:.2f} s q moved {excess:.3f} rad beyond what dq allows", joint
@@ -283,7 +288,7 @@ class _Pressing:
     goal: float
 
 
-def _newest(ctx: Context) -> tuple[np.ndarray, Floats]:
+def _newest(ctx: Context) -> tuple[Rows, Floats]:
     """For each state, the row of the newest command (-1 without one) and its age in seconds."""
     t, asked = ctx.states.t, ctx.commands.t
     rows = np.searchsorted(asked, t, "right") - 1
@@ -291,14 +296,14 @@ def _newest(ctx: Context) -> tuple[np.ndarray, Floats]:
     return rows, ages
 
 
-def _goals(ctx: Context, rows: np.ndarray) -> Floats:
+def _goals(ctx: Context, rows: Rows) -> Floats:
     """The commanded q within the stroke, at each state."""
     spec = ctx.joints[0]
     return np.asarray(np.clip(ctx.commands.q[np.maximum(rows, 0), 0], spec.q_min, spec.q_max))
 
 
-def _stiffness(ctx: Context, rows: np.ndarray) -> Floats:
-    """kp in force, N m/rad, at each state: the client's usual one where it is not used."""
+def _stiffness(ctx: Context, rows: Rows) -> Floats:
+    """Stiffness kp in force, N m/rad, at each state: the client's usual one where it is not used."""
     usual = ctx.recording.model.gains[0][0]
     if not ctx.recording.dialect.gains_are_used:
         return np.full(len(rows), usual)
