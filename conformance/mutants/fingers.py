@@ -108,6 +108,52 @@ class TurnedVelocity(FingerService):
         motors["dq"] = -motors["dq"]
 
 
+class _Timed(FingerService):
+    """Has a fault at a certain time: its messages are made anew at rest, too."""
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.changed()
+
+
+@wrong_hand("DEX3-FIELD-15", also=("DEX3-PATH-01", "DEX3-STILL-01"))
+class JumpsOnce(_Timed):
+    """Has no dq, and publishes one pose that is half of each joint's range off."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["dq"] = motors["ddq"] = 0.0
+        if 0.5 <= self.now < 0.5 + self.period:
+            low, high = np.array(hand.low)[: len(motors)], np.array(hand.high)[: len(motors)]
+            up = motors["q"] < 0.5 * (low + high)
+            motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
+
+
+@wrong_hand("DEX3-FIELD-16")
+class ShakenVelocity(_Timed):
+    """For some seconds has an oscillation on dq that q does not make."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        if 3.5 <= self.now < 5.5:
+            stroke = (np.array(hand.high) - np.array(hand.low))[: len(motors)]
+            motors["dq"] += 3.0 * stroke * math.sin(2 * math.pi * 13.0 * self.now)
+
+
+@wrong_hand("DEX3-FIELD-17", also=("DEX3-FIELD-16", "DEX3-FRESH-02", "DEX3-STILL-01"))
+class ShiftsForAWhile(_Timed):
+    """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["ddq"] = 0.0
+        if 0.4 <= self.now < 0.8:
+            low, high = np.array(hand.low)[: len(motors)], np.array(hand.high)[: len(motors)]
+            up = motors["q"] < 0.5 * (low + high)
+            motors["q"] += np.where(up, 0.15, -0.15) * (high - low)
+
+
 @wrong_hand("DEX3-FIELD-05", brief=True)
 class TurnedAcceleration(FingerService):
     """Publishes ddq with the wrong sign."""

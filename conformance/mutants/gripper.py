@@ -164,6 +164,66 @@ class TurnedVelocity(_Fields):
         return {**fields, "dq": -fields["dq"]}
 
 
+# --------------------------------------------------------------------- consistency of the state
+
+
+@wrong_hand("DEX1-FIELD-15", also=("DEX1-PATH-01", "DEX1-STILL-01"))
+class JumpsOnce(_Fields):
+    """Has no dq, and publishes one q that is 30 % of the stroke off."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        off = 0.3 * self.dialect.q_open if 0.5 <= self.now < 0.5 + self.period else 0.0
+        return {**fields, "q": fields["q"] + off, "dq": 0.0, "ddq": 0.0}
+
+
+@wrong_hand("DEX1-FIELD-16")
+class ShakenVelocity(_Fields):
+    """For some seconds has an oscillation on dq that q does not make."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        if not 3.5 <= self.now < 5.5:
+            return fields
+        shaken = 3.0 * self.dialect.q_open * math.sin(2 * math.pi * 13.0 * self.now)
+        return {**fields, "dq": fields["dq"] + shaken}
+
+
+@wrong_hand("DEX1-FIELD-17", also=("DEX1-FRESH-02", "DEX1-STILL-01"))
+class ShiftsForAWhile(_Fields):
+    """Publishes q with an offset of 8 % of the stroke for 0.4 s; its dq stays true."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        off = 0.08 * self.dialect.q_open if 0.4 <= self.now < 0.8 else 0.0
+        return {**fields, "q": fields["q"] + off, "ddq": 0.0}
+
+
+@wrong_hand("DEX1-FIELD-18", also=("DEX1-TRACK-02",))
+class GoesThroughTheObject(_Fields):
+    """In contact lets the published q, and dq with it, go on to the command."""
+
+    speed = 0.4  # rad/s
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.off = dict.fromkeys(self.sides, 0.0)
+        self.rate = dict.fromkeys(self.sides, 0.0)
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for side, hand in self.hands.items():
+            inside = hand.touch is not None and hand.q < hand.touch
+            if hand.braking:
+                self.rate[side] = 0.0
+                continue
+            wanted = hand.goal.q - hand.q if inside and hand.goal is not None else 0.0
+            step = min(max(wanted - self.off[side], -self.speed * dt), self.speed * dt)
+            self.off[side] += step
+            self.rate[side] = step / dt
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        q, dq = fields["q"] + self.off[side], fields["dq"] + self.rate[side]
+        return {**fields, "q": q, "dq": dq, "ddq": 0.0}
+
+
 class _Filled(_Fields):
     """One member of the state has a fixed wrong value."""
 
@@ -460,6 +520,30 @@ class SignedForce(_Fields):
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         return {**fields, "tau_est": self.hands[side].tau}
+
+
+@wrong_hand("DEX1-FORCE-06")
+class FeelsLate(_Fields):
+    """Reports the force of a contact only when it has lasted for 0.9 s."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.since = dict.fromkeys(self.sides, 0.0)
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        hand = self.hands[side]
+        if hand.touch is None or hand.q > hand.touch:
+            self.since[side] = self.now
+        late = self.now - self.since[side] > 0.9
+        return fields if late else {**fields, "tau_est": 0.0}
+
+
+@wrong_hand("DEX1-FORCE-07")
+class ForceBeforeCommands(_Fields):
+    """Reports a force until it gets its first command."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return fields if self.hands[side].goal else {**fields, "tau_est": -0.6}
 
 
 # ----------------------------------------------------------------------------------- safety

@@ -1,0 +1,448 @@
+"""Do q, dq and tau_est of the state describe one body?
+
+A hand that reports anything else than what it measures (the command, a filtered value, another
+joint's) contradicts itself: its q moves while its dq stands, its torque says contact while its q
+goes on into the object. The checks compare the members of the state with each other, in windows,
+so that a fault that is there for half a second shows as well as one that is always there. What is
+legal leaves room: measurements that are up to 20 ms old, prediction between them, coarse encoders,
+a constant factor on dq (DEX1-FIELD-16 tells it), and torque only in contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.median import median
+from dexkit.conformance.sums import total
+from dexkit.hand import Floats
+
+__all__: list[str] = []
+
+Rows: TypeAlias = NDArray[np.intp]
+
+_FEW = 10
+"""Measurements that are needed to say anything."""
+_FAST = 0.999
+"""Part of the states at which the reported speed is no higher than the one that counts as the
+hand's fastest: a single wrong value does not make it fast."""
+_OWN = 1.2
+"""By how much a hand may exceed that speed."""
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """What a joint reported, without repetitions.
+
+    :param t: seconds; ``q``, rad, and ``dq``, rad/s, have the same length.
+    """
+
+    t: Floats
+    q: Floats
+    dq: Floats
+
+    @classmethod
+    def of(cls, ctx: Context, joint: int) -> _Joint:
+        """The measurements of a joint: states that repeat q and a dq that is not 0 are none."""
+        states = ctx.states
+        q, dq = states.q[:, joint], states.dq[:, joint]
+        good = np.isfinite(q) & np.isfinite(dq)
+        t, q, dq = states.clock[good], q[good], dq[good]
+        if len(t):
+            same = (np.diff(q) == 0) & (np.diff(dq) == 0) & (dq[1:] != 0)
+            rises = np.maximum.accumulate(t)[:-1] < t[1:]
+            new = np.concatenate(([True], ~same & rises))
+            t, q, dq = t[new], q[new], dq[new]
+        return cls(t, q, dq)
+
+    def windows(self, seconds: float, longest: float) -> tuple[Rows, Rows]:
+        """First and last rows of all windows of that length without a gap above ``longest``."""
+        ends = np.searchsorted(self.t, self.t + seconds)
+        starts = np.flatnonzero(ends < len(self.t))
+        ends = ends[starts]
+        gaps = np.concatenate(([0], np.cumsum(np.diff(self.t) > longest)))
+        whole = (gaps[ends] == gaps[starts]) & (self.t[ends] - self.t[starts] < 2 * seconds)
+        return starts[whole], ends[whole]
+
+    def integral(self, speeds: Floats) -> Floats:
+        """The integral of speeds up to each measurement, rad."""
+        steps = (speeds[1:] + speeds[:-1]) / 2 * np.diff(self.t)
+        return np.concatenate(([0.0], np.cumsum(steps)))
+
+    def reach(self, values: Floats, seconds: float) -> tuple[Floats, Floats]:
+        """The least and greatest of values within that time of each measurement."""
+        first = np.searchsorted(self.t, self.t - seconds)
+        last = np.searchsorted(self.t, self.t + seconds, "right")
+        ranges = np.column_stack((first, last)).ravel()
+        longer = np.append(values, values[-1])
+        return (
+            np.minimum.reduceat(longer, ranges)[::2],
+            np.maximum.reduceat(longer, ranges)[::2],
+        )
+
+
+def _fastest(ctx: Context, joint: int) -> float:
+    """The joint's fastest speed, rad/s: as reported, or its profile's where dq is not filled."""
+    dq = np.abs(ctx.states.dq[:, joint])
+    dq = dq[np.isfinite(dq)]
+    if not len(dq) or not dq.any():
+        return ctx.joints[joint].dq_max
+    fast = float(np.sort(dq)[int(_FAST * (len(dq) - 1))])
+    return max(_OWN * fast, ctx.tolerance("min_speed"))
+
+
+@check("DEX1-FIELD-15", "DEX3-FIELD-15")
+def jumps(ctx: Context) -> Outcome:
+    """The largest change of q between two states, as a part of what the speed allows."""
+    states = ctx.states
+    worst: tuple[float, float, float, int, float, float] | None = None
+    for joint in range(len(ctx.joints)):
+        good = np.isfinite(states.q[:, joint])
+        t, q = states.clock[good], states.q[good, joint]
+        if len(t) < _FEW:
+            continue
+        speed = _fastest(ctx, joint)
+        change, gaps = np.abs(np.diff(q)), np.maximum(np.diff(t), 0.0)
+        # a gap is judged by RATE-03, what a hand did in a long one nobody knows
+        near = gaps <= ctx.tolerance("max_gap_s")
+        allowed = speed * (gaps + ctx.tolerance("max_hold_s")) + ctx.tolerance("counts_rad")
+        part = np.where(near, change / allowed, 0.0)
+        i = int(np.argmax(part))
+        found = (float(part[i]), float(change[i]), float(allowed[i]), joint, float(t[i]), speed)
+        if worst is None or found > worst:
+            worst = found
+    if worst is None:
+        return ctx.skipped("too few states with a position")
+    _, change_rad, limit, joint, at, speed = worst
+    text = ctx.named(
+        f"q changes by at most {change_rad:.3f} rad from one state to the next; at the hand's "
+        f"fastest, {speed:.1f} rad/s, it may change by {limit:.2f} rad",
+        joint,
+    )
+    if change_rad <= limit:
+        return ctx.passed(f"{change_rad:.3f} rad", text, change_rad=change_rad).placed(
+            change_rad, limit
+        )
+    outcome = ctx.failed(
+        f"{change_rad:.2f} rad",
+        text,
+        ctx.at(states.topic, at - 0.05, at + 0.05),
+        change_rad=change_rad,
+    )
+    late = (change_rad - limit) / speed
+    return outcome.about(joint).placed(change_rad, limit).if_late(late)
+
+
+def _filled(ctx: Context) -> bool:
+    return bool(np.nan_to_num(ctx.states.dq).any())
+
+
+@check("DEX1-FIELD-16", "DEX3-FIELD-16")
+def slope(ctx: Context) -> Outcome:
+    """In the worst window, how far dq is from the slope of q, as a part of it (RMS)."""
+    if not _filled(ctx):
+        return ctx.absent("dq is not filled (0 throughout)")
+    worst: tuple[float, float, int, float] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        found = _window_error(ctx, _Joint.of(ctx, joint), spec.stroke)
+        if found is not None and (worst is None or found[0] > worst[0]):
+            worst = (*found[:2], joint, found[2])
+    if worst is None:
+        return ctx.skipped("the hand hardly moves in this recording")
+    error, ratio, joint, at = worst
+    window = ctx.tolerance("window_s")
+    text = ctx.named(
+        f"in the worst window of {window:g} s dq is {error:.0%} off the slope of q, which is "
+        f"{ratio:.2f} times dq",
+        joint,
+    )
+    limit = ctx.tolerance("max_relative_rms")
+    if error <= limit:
+        return ctx.passed(f"{error:.0%} off", text, relative_rms=error)
+    outcome = ctx.failed(
+        f"{error:.0%} off",
+        text + ("; its sign is turned" if ratio < 0 else ""),
+        ctx.at(ctx.states.topic, at, at + window),
+        relative_rms=error,
+    )
+    return outcome.about(joint).if_late((error - limit) * ctx.tolerance("slope_s"))
+
+
+def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float, float] | None:
+    """Error, ratio and begin of a joint's worst window; None without one in which it moves."""
+    step = ctx.tolerance("slope_s")
+    count = round(ctx.tolerance("window_s") / step)
+    if len(x.t) < _FEW or x.t[-1] - x.t[0] < 2 * count * step:
+        return None
+    grid = np.asarray(np.arange(float(x.t[0]), float(x.t[-1]) - step, step))
+    first = np.searchsorted(x.t, grid)
+    last = np.minimum(np.searchsorted(x.t, grid + step), len(x.t) - 1)
+    span = x.t[last] - x.t[first]
+    whole = (span > 0.5 * step) & (span < 2 * step)
+    c = x.integral(x.dq)
+    moved = np.where(whole, x.q[last] - x.q[first], 0.0)
+    said = np.where(whole, c[last] - c[first], 0.0)
+
+    def summed(values: Floats) -> Floats:
+        sums = np.concatenate(([0.0], np.cumsum(values)))
+        return np.asarray(sums[count:] - sums[:-count])
+
+    moves = summed(np.abs(moved)) > ctx.tolerance("min_motion_part") * stroke
+    if not moves.any():
+        return None
+    error = np.sqrt(np.maximum(summed((moved - said) ** 2), 0.0)[moves] / summed(moved**2)[moves])
+    i = int(np.argmax(error))
+    at = int(np.flatnonzero(moves)[i])
+    mine, theirs = moved[at : at + count], said[at : at + count]
+    ratio = total(mine * theirs) / max(total(theirs * theirs), 1e-12)
+    return float(error[i]), float(ratio), float(grid[at])
+
+
+@check("DEX1-FIELD-17", "DEX3-FIELD-17")
+def keeps_up(ctx: Context) -> Outcome:
+    """How far q moved beyond what dq, up to 40 ms earlier or later, allows, in the worst window."""
+    if not _filled(ctx):
+        return ctx.absent("dq is not filled (0 throughout)")
+    worst: tuple[float, float, int, float, float, float] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        x = _Joint.of(ctx, joint)
+        if len(x.t) < _FEW:
+            continue
+        for excess, begin, end, speed in _excesses(ctx, x):
+            found = (excess / spec.stroke, excess, joint, begin, end, speed)
+            if worst is None or found > worst:
+                worst = found
+    if worst is None:
+        return ctx.skipped("the states are too far apart to integrate dq")
+    _, excess, joint, begin, end, speed = worst
+    limit = ctx.tolerance("max_excess_stroke", joint)
+    text = ctx.named(
+        f"from {begin:.2f} to {end:.2f} s q moved {excess:.3f} rad beyond what dq allows", joint
+    )
+    if excess <= limit:
+        text = text if excess > 0 else ctx.named("q moves as dq says", joint)
+        return ctx.passed(f"{max(excess, 0.0):.3f} rad", text, excess_rad=excess).placed(
+            max(excess, 0.0), limit
+        )
+    outcome = ctx.failed(
+        f"{excess:.2f} rad", text, ctx.at(ctx.states.topic, begin, end), excess_rad=excess
+    )
+    late = (excess - limit) / max(speed, 1e-3)
+    return outcome.about(joint).placed(excess, limit).if_late(late)
+
+
+def _excesses(ctx: Context, x: _Joint) -> Iterator[tuple[float, float, float, float]]:
+    """For each length of window: the largest excess, begin, end, and fastest speed around."""
+    lag, part = ctx.tolerance("max_lag_s"), ctx.tolerance("max_part")
+    dq = _factor(x, lag) * x.dq
+    low, high = x.reach(x.integral(dq), lag)
+    path = x.integral(np.abs(dq))
+    for seconds in (1.25 * lag, 4 * lag, 10 * lag):
+        starts, ends = x.windows(seconds, 0.5 * lag)
+        if not len(starts):
+            continue
+        moved = x.q[ends] - x.q[starts]
+        most, least = high[ends] - low[starts], low[ends] - high[starts]
+        beyond = np.maximum(moved - most, least - moved) - part * (path[ends] - path[starts])
+        i = int(np.argmax(beyond))
+        inside = slice(starts[i], ends[i] + 1)
+        speed = float(np.abs(dq[inside]).max())
+        yield float(beyond[i]), float(x.t[starts[i]]), float(x.t[ends[i]]), speed
+
+
+def _factor(x: _Joint, lag: float) -> float:
+    """The constant factor between the slope of q and dq; 1 unless most windows agree on one."""
+    starts, ends = x.windows(4 * lag, 0.5 * lag)
+    c = x.integral(x.dq)
+    said, moved = c[ends] - c[starts], x.q[ends] - x.q[starts]
+    reach = float(np.ptp(x.q))
+    moving = np.abs(said) > 0.05 * reach
+    if int(moving.sum()) < _FEW or not reach:
+        return 1.0
+    ratios = np.sort(moved[moving] / said[moving])
+    low, middle, high = (float(ratios[int(p * (len(ratios) - 1))]) for p in (0.25, 0.5, 0.75))
+    return middle if middle and high - low <= 0.2 * abs(middle) else 1.0
+
+
+# --------------------------------------------------------------------------------------- torque
+
+
+@dataclass(frozen=True)
+class _Pressing:
+    """A stretch of states in which a gripper is commanded into its object.
+
+    :param begin: seconds, as ``end``.
+    :param tau: N m, the median of its size.
+    :param q: rad, the median, as ``goal``, which is within the stroke.
+    """
+
+    begin: float
+    end: float
+    tau: float
+    q: float
+    goal: float
+
+
+def _newest(ctx: Context) -> tuple[Rows, Floats]:
+    """For each state, the row of the newest command (-1 without one) and its age in seconds."""
+    t, asked = ctx.states.t, ctx.commands.t
+    rows = np.searchsorted(asked, t, "right") - 1
+    ages = np.where(rows >= 0, t - asked[np.maximum(rows, 0)], np.inf)
+    return rows, ages
+
+
+def _goals(ctx: Context, rows: Rows) -> Floats:
+    """The commanded q within the stroke, at each state."""
+    spec = ctx.joints[0]
+    return np.asarray(np.clip(ctx.commands.q[np.maximum(rows, 0), 0], spec.q_min, spec.q_max))
+
+
+def _stiffness(ctx: Context, rows: Rows) -> Floats:
+    """Stiffness kp in force, N m/rad, at each state: the client's usual one where it is not used."""
+    usual = ctx.recording.model.gains[0][0]
+    if not ctx.recording.dialect.gains_are_used:
+        return np.full(len(rows), usual)
+    return np.asarray(ctx.commands.kp[np.maximum(rows, 0), 0])
+
+
+def _contacts(ctx: Context, touch: float) -> list[_Pressing]:
+    """Consecutive pieces of all contacts in which a hand presses on an object that it touches."""
+    states, spec = ctx.states, ctx.joints[0]
+    rows, ages = _newest(ctx)
+    goals = _goals(ctx, rows)
+    depth, settle = ctx.tolerance("min_depth_stroke"), ctx.tolerance("settle_s")
+    usual = ctx.recording.model.gains[0][0]
+    with np.errstate(invalid="ignore"):
+        pressing = (
+            (ages < ctx.tolerance("max_age_s"))
+            & (goals < touch - depth)
+            & (states.q[:, 0] < touch + ctx.tolerance("near_stroke"))
+            & (states.q[:, 0] > spec.q_min + ctx.tolerance("near_stroke"))
+            & (_stiffness(ctx, rows) >= 0.5 * usual)
+            & np.isfinite(states.tau[:, 0])
+        )
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], pressing.view(np.int8), [0]))))
+    found = []
+    window = ctx.tolerance("window_s")
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        begin, end = float(states.t[first]) + settle, float(states.t[last - 1])
+        while begin + window <= end:
+            piece = slice(*np.searchsorted(states.t, (begin, begin + window)))
+            if piece.stop - piece.start >= 5:
+                found.append(
+                    _Pressing(
+                        begin,
+                        begin + window,
+                        median(np.abs(states.tau[piece, 0])),
+                        median(states.q[piece, 0]),
+                        median(goals[piece]),
+                    )
+                )
+            begin += window
+    return found
+
+
+@check("DEX1-FORCE-06")
+def force_in_every_contact(ctx: Context) -> Outcome:
+    """The least size of tau_est of all pieces of all contacts with the object."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = _contacts(ctx, ctx.object_at)
+    if not found:
+        return ctx.skipped("it never pressed on the object for long enough")
+    least = min(found, key=lambda p: p.tau)
+    limit = ctx.tolerance("min_tau_nm")
+    text = f"tau_est of {least.tau:.3f} N m or more in {len(found)} pieces of contacts"
+    if least.tau >= limit:
+        met = ctx.passed(f"{least.tau:.2f} N m", text, tau_nm=least.tau)
+        return met.pressed(least.tau, limit, at_least=True)
+    text = (
+        f"tau_est of {least.tau:.3f} N m while q was at {least.q:.2f} rad on the object and "
+        f"{least.goal:.2f} rad was commanded"
+    )
+    place = ctx.at(ctx.states.topic, least.begin, least.end)
+    outcome = ctx.failed(f"{least.tau:.3f} N m", text, place, tau_nm=least.tau)
+    return outcome.pressed(least.tau, limit, at_least=True)
+
+
+@check("DEX1-FIELD-18")
+def stops_at_object(ctx: Context) -> Outcome:
+    """How far q goes into the object while tau_est says contact, as a part of the command."""
+    touch = ctx.object_at
+    if touch is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    felt = [p for p in _contacts(ctx, touch) if p.tau >= ctx.tolerance("min_tau_nm")]
+    if not felt:
+        return ctx.skipped("tau_est shows no contact with the object")
+
+    def into(p: _Pressing) -> float:
+        return (touch - p.q) / (touch - p.goal)
+
+    deepest = max(felt, key=into)
+    part, limit = into(deepest), ctx.tolerance("max_depth_part")
+    text = (
+        f"pressing on an object at {touch:.2f} rad with {deepest.tau:.2f} N m, q was at "
+        f"{deepest.q:.2f} rad, and {deepest.goal:.2f} rad was commanded"
+    )
+    if part <= limit:
+        return ctx.passed(f"{max(part, 0.0):.0%} of the way in", text, part=part)
+    place = ctx.at(ctx.states.topic, deepest.begin, deepest.end)
+    outcome = ctx.failed(f"{part:.0%} of the way in", text, place, part=part)
+    return outcome.placed(touch - deepest.q, limit * (touch - deepest.goal))
+
+
+@check("DEX1-FORCE-07")
+def no_force_at_any_rest(ctx: Context) -> Outcome:
+    """The largest tau_est at a rest in the free, beyond what its distance to the goal explains."""
+    states, spec = ctx.states, ctx.joints[0]
+    if ctx.recording.stimulus is None:
+        return ctx.skipped("nobody knows what was between the fingers in this recording")
+    if not len(states) or not len(ctx.commands):
+        return ctx.skipped("no states, or no commands to this hand")
+    ends = ctx.tolerance("clear_stroke")
+    low = (spec.q_min if ctx.object_at is None else ctx.object_at) + ends
+    rows, ages = _newest(ctx)
+    goals, stiff = _goals(ctx, rows), _stiffness(ctx, rows)
+    offs = np.abs(goals - states.q[:, 0])
+    feed = np.maximum(rows, 0)
+    with np.errstate(invalid="ignore"):
+        plain = (ctx.commands.tau[feed, 0] == 0) & (ctx.commands.dq[feed, 0] == 0)
+        held = (ages < ctx.tolerance("max_age_s")) & plain & (stiff > 0)
+        held &= offs <= ctx.tolerance("max_error_stroke")
+    idle = ages > ctx.recording.model.command_timeout + 0.5  # before the first one, too
+    window = ctx.tolerance("min_rest_s")
+    worst: tuple[float, float, float, float] | None = None
+    count = 0
+    for begin in np.arange(float(states.t[0]), float(states.t[-1]) - window, 0.5 * window):
+        piece = slice(*np.searchsorted(states.t, (begin, begin + window)))
+        q, tau = states.q[piece, 0], states.tau[piece, 0]
+        if len(q) < 5 or not (np.isfinite(q).all() and np.isfinite(tau).all()):
+            continue
+        if q.min() < low or q.max() > spec.q_max - ends:
+            continue
+        if float(np.ptp(q)) > ctx.tolerance("max_ripple_stroke"):
+            continue
+        if held[piece].all() and float(np.ptp(goals[piece])) <= ctx.tolerance("max_ripple_stroke"):
+            pull = ctx.tolerance("max_stiffness") * median(stiff[piece] * offs[piece])
+        elif idle[piece].all():
+            pull = 0.0
+        else:
+            continue
+        count += 1
+        size = median(np.abs(tau))
+        limit = ctx.tolerance("max_tau_nm") + pull
+        if worst is None or size - limit > worst[0]:
+            worst = (size - limit, size, limit, float(begin))
+    if worst is None:
+        return ctx.skipped("the gripper never rests in the free in this recording")
+    beyond, size, limit, at = worst
+    text = f"tau_est of {size:.3f} N m at the worst of {count} rests in the free"
+    if beyond <= 0:
+        return ctx.passed(f"{size:.3f} N m", text, tau_nm=size).pressed(size, limit)
+    place = ctx.at(states.topic, at, at + window)
+    return ctx.failed(f"{size:.2f} N m", text, place, tau_nm=size).pressed(size, limit)
