@@ -61,7 +61,7 @@ def carry_out(
     task = _Task(machine, runner, progress)
     if isinstance(plan.action, Keep):
         progress("sending a message to another process and back")
-        return task.check("", installed=True)
+        return task.check("", "")
     with TemporaryFolder("setup-dds") as folder:
         task.folder = folder
         wheel = task.wheel(plan.action)
@@ -69,13 +69,13 @@ def carry_out(
         trial = folder / "trial"
         with zipfile.ZipFile(wheel) as packed:
             packed.extractall(trial)
-        task.check(str(trial), installed=False)
+        task.check(str(trial), "; nothing was installed")
         if wheel_folder is not None:
             _keep(wheel, wheel_folder)
             progress(f"kept: {wheel_folder / wheel.name}{_needs(plan)}")
         progress(f"installing into {machine.interpreter.packages}")
         task.install(wheel)
-    return task.check("", installed=True)
+    return task.check("", "; it is installed, and worked in a temporary folder")
 
 
 class _Task:
@@ -200,11 +200,11 @@ class _Task:
             to_the_end=True,
         )
 
-    def check(self, folder: str, *, installed: bool) -> Installed:
+    def check(self, folder: str, state: str) -> Installed:
         """Try what is installed, or unpacked in ``folder``."""
         command = probe.command(self._interpreter.executable, folder, send=True)
         done = self._runner.run(command)
-        return check(probe.result_of(done.code, done.output), installed=installed)
+        return check(probe.result_of(done.code, done.output), state)
 
     def _run(
         self,
@@ -232,13 +232,12 @@ def _failure(what: str, done: Done, machine: Machine) -> DdsBuildFailed:
     return DdsBuildFailed(f"{what}: {cause.message}", hint=cause.hint)
 
 
-def check(found: Installed, *, installed: bool) -> Installed:
+def check(found: Installed, state: str) -> Installed:
     """Judge what the child process found.
 
-    :param installed: whether it is installed, or still in the temporary folder.
+    :param state: what the error adds: whether something was installed.
     :raises DdsBuildFailed: it cannot be used.
     """
-    state = "" if installed else "; nothing was installed"
     if found.error or not found.version:
         missing = "it is not there" if not found.version else found.error
         raise DdsBuildFailed(
