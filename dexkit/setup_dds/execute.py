@@ -266,6 +266,9 @@ def _prefix_of_links(folder: Path, library: Library) -> Path:
     (folder / "lib").mkdir(parents=True)
     (folder / "bin").mkdir()
     (folder / "include").symlink_to(library.include)
+    # Debian has some headers in a folder of the processor, which only its own compiler looks into
+    own = Path(library.include, f"{library.processor}-linux-gnu")
+    (folder / "own-include").symlink_to(own if (own / "dds").is_dir() else library.include)
     source = Path(library.folder)
     (folder / "lib" / "libddsc.so").symlink_to(source / "libddsc.so")
     idl = source / "libcycloneddsidl.so"
@@ -282,7 +285,7 @@ def build_environment(
     :param rpath: where its compiled part looks for the library.
     """
     found = {k: v for k, v in environment.items() if k not in ("STANDALONE_WHEELS", "LDSHARED")}
-    flags = [found.get("CFLAGS", "")]
+    flags = [found.get("CFLAGS", ""), f"-I{prefix}/own-include"]
     if machine.interpreter.version >= (3, 13):
         # public under its new name; with the old one it compiles and does not import
         flags.append("-D_Py_IsFinalizing=Py_IsFinalizing")
@@ -326,8 +329,12 @@ def try_compiler(machine: Machine, runner: Runner, folder: Path, prefix: Path) -
         if number == 1:
             command.append(f"-I{interpreter.headers}")
         if number == 2:
-            command += [f"-I{prefix}/include", f"-L{prefix}/lib", "-lddsc",
-                        "-Wl,--allow-shlib-undefined"]  # fmt: skip
+            command += [
+                *(f"-I{prefix}/{name}" for name in ("include", "own-include")),
+                f"-L{prefix}/lib",
+                "-lddsc",
+                "-Wl,--allow-shlib-undefined",
+            ]
         done = runner.run(command, {**os.environ, "TMPDIR": str(folder)})
         if done.code:
             output = done.output
