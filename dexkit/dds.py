@@ -983,6 +983,7 @@ class DdsNode:
         cyclone.dds_waitset_attach(self._waitset, self._waitset, 0)
         self._thread = Worker("DDS dispatcher", self._dispatch, failed=lambda error: self._notify())
         self._thread.start()
+        _exit_thread()
         _nodes.add(self)
 
     def __repr__(self) -> str:
@@ -1373,19 +1374,37 @@ def _qos_of(qos: int, kind: str) -> Qos:
     return Qos("reliable" if reliable else "best_effort", _DURABILITIES[durability], kept)
 
 
-@atexit.register
-def _close_all() -> None:
-    # a dispatcher that is inside CycloneDDS while the interpreter goes away may crash it
-    def close() -> None:
+class _ExitThread(threading.Thread):
+    """Closes all nodes at the end of the process.
+
+    A thread, so that a callback that never returns cannot keep the process from ending; one that
+    waits from the first node on, because Python 3.12 and later start none at their end.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(name="dds-exit", daemon=True)
+        self.asked = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        self.asked.wait()
         for node in list(_nodes):
             with contextlib.suppress(Exception):
                 node.close()
 
+
+@cache
+def _exit_thread() -> _ExitThread:
+    return _ExitThread()
+
+
+@atexit.register
+def _close_all() -> None:
+    # a dispatcher that is inside CycloneDDS while the interpreter goes away may crash it
     if not _nodes:
         return
-    # in a thread, so that a callback that never returns cannot keep the process from ending
-    closer = threading.Thread(target=close, name="dds-exit", daemon=True)
-    closer.start()
+    closer = _exit_thread()
+    closer.asked.set()
     closer.join(_EXIT_PATIENCE)
     if closer.is_alive():
         _log.warning("DDS was not closed within %g s; leaving it behind", _EXIT_PATIENCE)

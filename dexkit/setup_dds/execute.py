@@ -61,7 +61,7 @@ def carry_out(
     task = _Task(machine, runner, progress)
     if isinstance(plan.action, Keep):
         progress("sending a message to another process and back")
-        return task.check("", installed=True)
+        return task.check("", "")
     with TemporaryFolder("setup-dds") as folder:
         task.folder = folder
         wheel = task.wheel(plan.action)
@@ -69,13 +69,13 @@ def carry_out(
         trial = folder / "trial"
         with zipfile.ZipFile(wheel) as packed:
             packed.extractall(trial)
-        task.check(str(trial), installed=False)
+        task.check(str(trial), "; nothing was installed")
         if wheel_folder is not None:
             _keep(wheel, wheel_folder)
             progress(f"kept: {wheel_folder / wheel.name}{_needs(plan)}")
         progress(f"installing into {machine.interpreter.packages}")
         task.install(wheel)
-    return task.check("", installed=True)
+    return task.check("", "; it is installed, and worked in a temporary folder")
 
 
 class _Task:
@@ -200,11 +200,11 @@ class _Task:
             to_the_end=True,
         )
 
-    def check(self, folder: str, *, installed: bool) -> Installed:
+    def check(self, folder: str, state: str) -> Installed:
         """Try what is installed, or unpacked in ``folder``."""
         command = probe.command(self._interpreter.executable, folder, send=True)
         done = self._runner.run(command)
-        return check(probe.result_of(done.code, done.output), installed=installed)
+        return check(probe.result_of(done.code, done.output), state)
 
     def _run(
         self,
@@ -232,13 +232,12 @@ def _failure(what: str, done: Done, machine: Machine) -> DdsBuildFailed:
     return DdsBuildFailed(f"{what}: {cause.message}", hint=cause.hint)
 
 
-def check(found: Installed, *, installed: bool) -> Installed:
+def check(found: Installed, state: str) -> Installed:
     """Judge what the child process found.
 
-    :param installed: whether it is installed, or still in the temporary folder.
+    :param state: what the error adds: whether something was installed.
     :raises DdsBuildFailed: it cannot be used.
     """
-    state = "" if installed else "; nothing was installed"
     if found.error or not found.version:
         missing = "it is not there" if not found.version else found.error
         raise DdsBuildFailed(
@@ -267,6 +266,9 @@ def _prefix_of_links(folder: Path, library: Library) -> Path:
     (folder / "lib").mkdir(parents=True)
     (folder / "bin").mkdir()
     (folder / "include").symlink_to(library.include)
+    # Debian has some headers in a folder of the processor, which only its own compiler looks into
+    own = Path(library.include, f"{library.processor}-linux-gnu")
+    (folder / "own-include").symlink_to(own if (own / "dds").is_dir() else library.include)
     source = Path(library.folder)
     (folder / "lib" / "libddsc.so").symlink_to(source / "libddsc.so")
     idl = source / "libcycloneddsidl.so"
@@ -283,7 +285,7 @@ def build_environment(
     :param rpath: where its compiled part looks for the library.
     """
     found = {k: v for k, v in environment.items() if k not in ("STANDALONE_WHEELS", "LDSHARED")}
-    flags = [found.get("CFLAGS", "")]
+    flags = [found.get("CFLAGS", ""), f"-I{prefix}/own-include"]
     if machine.interpreter.version >= (3, 13):
         # public under its new name; with the old one it compiles and does not import
         flags.append("-D_Py_IsFinalizing=Py_IsFinalizing")
@@ -327,8 +329,12 @@ def try_compiler(machine: Machine, runner: Runner, folder: Path, prefix: Path) -
         if number == 1:
             command.append(f"-I{interpreter.headers}")
         if number == 2:
-            command += [f"-I{prefix}/include", f"-L{prefix}/lib", "-lddsc",
-                        "-Wl,--allow-shlib-undefined"]  # fmt: skip
+            command += [
+                *(f"-I{prefix}/{name}" for name in ("include", "own-include")),
+                f"-L{prefix}/lib",
+                "-lddsc",
+                "-Wl,--allow-shlib-undefined",
+            ]
         done = runner.run(command, {**os.environ, "TMPDIR": str(folder)})
         if done.code:
             output = done.output

@@ -73,7 +73,7 @@ def look(installed: Installed, without_variables: Installed | None = None) -> Ma
 
 def interpreter() -> Interpreter:
     """The Python that runs this."""
-    packages = sysconfig.get_path("purelib")
+    packages = sysconfig.get_path("platlib")
     include = sysconfig.get_path("include")
     pyvenv = Path(sys.prefix, "pyvenv.cfg")
     return Interpreter(
@@ -82,7 +82,8 @@ def interpreter() -> Interpreter:
         implementation=sys.implementation.name,
         free_threaded=bool(sysconfig.get_config_var("Py_GIL_DISABLED")),
         system=sys.platform,
-        processor=processor_of(Path(sys.executable)),
+        # the name may be that of a script that starts it
+        processor=processor_of(Path(sys.executable)) or processor_of(Path("/proc/self/exe")),
         kind=_kind(),
         prefix=sys.prefix,
         packages=packages,
