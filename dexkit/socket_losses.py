@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["ReceiveBuffers"]
+__all__ = ["ReceiveBuffers", "receive_buffer_errors"]
 
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
@@ -35,7 +35,7 @@ class ReceiveBuffers:
         first = 7400 + 250 * domain
         self._ports = range(first + 1, min(first + 250, 65536), 2)
         self._seen = self._drops()
-        self._errors = _receive_buffer_errors()
+        self._errors = receive_buffer_errors()
         self.dropped = 0
         """Datagrams with samples that the kernel dropped since this was made, as last counted."""
 
@@ -75,7 +75,7 @@ class ReceiveBuffers:
         The socket's counter includes what a filter kept out, so it is believed only as far as
         the system counted errors of receive buffers meanwhile.
         """
-        drops, errors = self._drops(), _receive_buffer_errors()
+        drops, errors = self._drops(), receive_buffer_errors()
         more = sum(max(count - self._seen.get(inode, 0), 0) for inode, count in drops.items())
         new = min(more, max(errors - self._errors, 0))
         self._seen, self._errors = drops, errors
@@ -101,7 +101,7 @@ class ReceiveBuffers:
         return min(found, default=0)
 
 
-def _receive_buffer_errors() -> int:
+def receive_buffer_errors() -> int:
     """UDP datagrams that found a receive buffer full, ever, in this network namespace."""
     try:
         rows = [r.split() for r in _SNMP.read_text().splitlines() if r.startswith("Udp:")]

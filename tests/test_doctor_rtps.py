@@ -78,7 +78,7 @@ def test_observer_requests_missing_discovery_data() -> None:
         ME,
         PLACE,
         wanted=lambda *reader: wanted.append(reader) is None,
-        on_sample=lambda w, n, data, now: samples.append((w.topic, n, data)),
+        on_sample=lambda w, n, data, now, written: samples.append((w.topic, n, data)),
     )
     answers = observer.receive(_addressed(packets.CYCLONE_0_10_PARTICIPANT), 0.0)
     asked = [i for p, _ in answers for _, i in rtps.parse_message(p)[1] if isinstance(i, AckNack)]

@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
+import math
+import threading
 from types import SimpleNamespace
 
+import pytest
 from rich.console import Console
 
-from dexkit.doctor import DIAGNOSES, Observations, Scope, Severity, diagnose, readiness, verdict
+from dexkit.doctor import (
+    DIAGNOSES,
+    Observations,
+    Scope,
+    Severity,
+    diagnose,
+    link,
+    readiness,
+    verdict,
+)
+from dexkit.doctor.link import RoundTrips, link_to
 from dexkit.doctor.observations import (
     DdsSocket,
     DomainView,
     Endpoint,
     Environment,
     Interface,
+    Link,
     Participant,
     Policies,
     SerialPort,
@@ -22,7 +37,7 @@ from dexkit.doctor.observations import (
     Stream,
     UsbDevice,
 )
-from dexkit.doctor.report import print_report
+from dexkit.doctor.report import as_data, print_report
 from dexkit.doctor.rtps import Data, parse_message, parse_participant
 from dexkit.doctor.topics import is_driven, nearly
 from dexkit.models import DIALECTS
@@ -113,6 +128,25 @@ def _usb(**more: object) -> Observations:
     return Observations(usb=(dataclasses.replace(HAND, **more),))  # type: ignore[arg-type]
 
 
+GOOD_LINK = Link(
+    *("robot", "192.168.123.161", "eth0", "ICMP echo"),
+    sent=100,
+    received=100,
+    rtt_min=0.001,
+    rtt_median=0.002,
+    rtt_95=0.004,
+    participants=2,
+    multicast=True,
+    clock_offset=0.01,
+    samples=1000,
+    rmem_max=16 << 20,
+)
+
+
+def _linked(**more: object) -> Observations:
+    return Observations(link=dataclasses.replace(GOOD_LINK, **more))  # type: ignore[arg-type]
+
+
 def _without(view: DomainView, owner: str, kind: str = "") -> DomainView:
     keep = tuple(e for e in view.endpoints if e.participant != owner or kind not in ("", e.kind))
     return dataclasses.replace(view, endpoints=keep)
@@ -197,6 +231,14 @@ CASES: dict[str, Observations] = {
     "DDS-FROZEN": _seen(_frozen()),
     "DDS-RATE": _seen(_pair(rate=50.0)),
     "DDS-NO-CLIENT": _seen(_without(GOOD, "client")),
+    "LINK-NO-ANSWER": _linked(received=0, samples=0),
+    "LINK-LOSS": _linked(received=97),
+    "LINK-LATENCY": _linked(rtt_median=0.06, rtt_95=0.07),
+    "LINK-JITTER": _linked(rtt_95=0.04),
+    "LINK-AGE": _linked(command_age_95=0.3),
+    "LINK-MULTICAST": _linked(multicast=False),
+    "LINK-CLOCK": _linked(clock_offset=-2.5),
+    "LINK-BUFFER": _linked(rmem_max=212992),
     "ENV-CYCLONEDDS-11": Observations(environment=Environment(cyclonedds="11.0.1")),
     "ENV-CYCLONEDDS-MISSING": Observations(environment=Environment(python="3.12.1")),
     "ENV-CYCLONEDDS-BROKEN": Observations(
@@ -376,6 +418,53 @@ def test_other_hands_and_simulators_are_named(topic: str, kind: str, expected: s
 def test_a_requested_hand_leaves_other_states_aside() -> None:
     asked = Scope(dialects=(DIALECTS["dex3"],))
     assert "DDS-UNPUBLISHED" not in _ids(_seen(_waiting()), asked)
+
+
+def test_a_good_link_is_no_finding_and_cures_name_the_interface() -> None:
+    devices = Scope(devices_only=True)
+    assert not [f for f in diagnose(_linked(), devices) if f.id.startswith("LINK-")]
+    (found,) = [f for f in diagnose(_linked(rtt_95=0.04), devices) if f.id == "LINK-JITTER"]
+    assert "iw dev eth0 set power_save off" in found.fix
+    (found,) = [f for f in diagnose(_linked(multicast=False), devices) if f.id == "LINK-MULTICAST"]
+    assert "--peer robot" in found.fix
+    (found,) = [f for f in diagnose(_linked(received=80), devices) if f.id == "LINK-LOSS"]
+    assert found.severity is Severity.ERROR
+    # without commands from there their age follows from the round trips
+    (found,) = [f for f in diagnose(_linked(rtt_95=0.5), devices) if f.id == "LINK-AGE"]
+    assert "estimated" in found.seen
+
+
+def test_link_figures_follow_from_samples_and_round_trips() -> None:
+    trips = RoundTrips("ICMP echo")
+    trips.sent, trips.times = 5, [0.10, 0.11, 0.12, 0.30]
+    hand = _who("hand", addresses=("10.0.0.4",))
+    view = _pair(("left",), hand=hand, lost=50, delay_min=-2.0, delay_95=-1.9)
+    found = link_to("robot", "10.0.0.4", "eth0", trips, [], [view], rmem_max=7, dropped=3)
+    assert (found.sent, found.received, found.multicast, found.participants) == (5, 4, False, 1)
+    assert found.clock_offset == pytest.approx(2.05)  # half of the least round trip here
+    assert found.state_age_95 == pytest.approx(0.15)
+    assert math.isnan(found.command_age_95)
+    assert found.loss == pytest.approx(0.2)
+    assert (found.lost, found.samples, found.rmem_max, found.dropped) == (50, 1000, 7, 3)
+    with_multicast = link_to("robot", "10.0.0.4", "eth0", trips, [view], [view])
+    assert with_multicast.multicast is True
+    nothing = link_to("robot", "10.0.0.9", "eth0", RoundTrips("x"), [], [view])
+    assert (nothing.participants, nothing.multicast) == (0, None)
+    assert math.isnan(nothing.rtt_median)
+    text = io.StringIO()
+    seen = Observations(link=found)
+    print_report(Console(file=text, width=200), seen, [], verdict(seen, [], Scope()), [])
+    assert "round trip     120.0 ms median, 100.0 ms least" in text.getvalue()
+    assert "clock there    +2.050 s" in text.getvalue()
+    assert "multicast      does not work" in text.getvalue()
+    json.dumps(as_data(seen, [], verdict(seen, [], Scope()), []), allow_nan=False)
+
+
+def test_echoes_of_this_machine_come_back_by_either_method() -> None:
+    for measure in (link.measure_round_trips, link._by_tcp):
+        trips = measure("127.0.0.1", "127.0.0.1", 0.3, threading.Event())
+        assert 0 < len(trips.times) <= trips.sent
+        assert min(trips.times) > 0
 
 
 def test_restarted_hand_is_not_reported_as_late_joiner() -> None:

@@ -537,6 +537,7 @@ _KNOWN = {
     "dexkit/dds.py": {"Domain", "DomainParticipant"},
     "dexkit/domains.py": {"bind"},  # reserves a port of DDS and reads nothing from it
     "dexkit/doctor/dds.py": {"bind"},
+    "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address
     "emulators/dex3_mcu/server.py": {"bind", "listen"},
 }
 

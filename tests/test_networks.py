@@ -6,7 +6,8 @@ delays and loses frames (:mod:`tests.impaired_link`).
 
 from __future__ import annotations
 
-import re
+import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -135,12 +136,12 @@ import sys, time
 from dexkit.dds import DdsNode
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
 domain, interface, q = int(sys.argv[1]), sys.argv[2], float(sys.argv[3])
+began = time.monotonic()
 with DdsNode(domain, interface) as node:
     writer = node.writer("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
-    message = MotorCmds_([MotorCmd_(mode=1, q=q, kp=5.0, kd=0.05)])
-    print("ready", flush=True)
     while True:
-        writer.write(message)
+        target = min(q + 0.2 * (time.monotonic() - began), 5.0)  # a slow way
+        writer.write(MotorCmds_([MotorCmd_(mode=1, q=target, kp=5.0, kd=0.05)]))
         time.sleep(0.005)
 """
 
@@ -176,6 +177,49 @@ def test_peers_without_multicast_and_an_interface_that_comes_later() -> None:
 
 
 @pytest.mark.soak
+@pytest.mark.parametrize(
+    ("impairments", "expected"),
+    [
+        ((), set()),
+        (("--delay", 0.05, "--loss", 0.05), {"LINK-LOSS", "LINK-LATENCY"}),
+        (("--no-multicast",), {"LINK-MULTICAST"}),
+    ],
+    ids=["good", "slow and lossy", "no multicast"],
+)
+def test_a_link_is_measured(impairments: tuple[object, ...], expected: set[str]) -> None:
+    with _networked(*impairments) as hosts:
+        service = Program(
+            *(hosts["hand"], "serve", "sim-dex1", "--side", "left"),
+            *("--domain", 7, "--interface", HAND),
+        )
+        try:
+            service.wait_line("^ready")
+            said = hosts["client"].run(
+                *(sys.executable, "-m", "dexkit", "doctor", "--domain", 7, "--scan", "none"),
+                *("--link", HAND, "--seconds", 5, "--json"),
+                check=False,
+            )
+        finally:
+            assert service.end() == 0
+    report = json.loads(said)
+    link = report["observations"]["link"]
+    print("\n", impairments, link)
+    found = {f["id"] for f in report["findings"] if f["id"].startswith("LINK-")}
+    assert expected <= found
+    assert (link["multicast"] is False) == ("--no-multicast" in impairments)
+    assert link["participants"] == 1
+    assert link["samples"] > 0
+    if "--delay" in impairments:
+        assert link["rtt_min"] > 0.1
+    if not _busy():
+        assert found - {"LINK-BUFFER"} == expected
+        assert abs(link["clock_offset"]) < 0.05  # it is one clock
+        if "--delay" in impairments:
+            assert 0.1 < link["rtt_median"] < 0.15
+            assert 0.05 < link["state_age_95"] < 0.1
+
+
+@pytest.mark.soak
 def test_50_ms_and_2_percent_loss(tmp_path: Path) -> None:
     """A hand follows and its states are recorded, with what is missing."""
     with _networked("--delay", 0.05, "--loss", 0.02) as hosts:
@@ -203,11 +247,9 @@ def test_50_ms_and_2_percent_loss(tmp_path: Path) -> None:
     missing = int(about["missing about"])
     offered = int(about["messages"])
     assert f"about {missing} missing" in summary
-    assert 0.005 < missing / offered < 0.05, about
-
-
-def _lines(program: Program, pattern: str) -> list[str]:
-    return [line for line in program.lines if re.search(pattern, line)]
+    assert missing / offered > 0.005, about
+    if not _busy():  # a service that does not get the processor misses states, too
+        assert missing / offered < 0.05, about
 
 
 _WATCH = """
@@ -218,17 +260,24 @@ with DdsNode(int(sys.argv[1]), sys.argv[2]) as node:
     print("ready", flush=True)
     while True:
         states.wait(0.02)
-        for sample in states.take():
+        time.sleep(0.02)
+        for sample in states.take()[-1:]:
             print("q", time.monotonic(), sample.message.states[0].q, flush=True)
 """
 
 
+def _busy() -> bool:
+    """Whether others use the processors, so that times mean nothing."""
+    return os.getloadavg()[0] > (os.cpu_count() or 1) + 1
+
+
 def _newest(program: Program) -> tuple[float, float]:
-    _, at, q = _lines(program, "^q ")[-1].split()
+    line = next(line for line in reversed(program.lines) if line.startswith("q "))
+    _, at, q = line.split()
     return float(at), float(q)
 
 
-def _until(predicate: Callable[[], bool], seconds: float = 60.0) -> None:
+def _until(predicate: Callable[[], bool], seconds: float = 200.0) -> None:
     end = time.monotonic() + seconds
     while not predicate():
         assert time.monotonic() < end
@@ -251,9 +300,10 @@ def test_link_that_goes_down_in_mid_motion(seconds: float) -> None:
             # one beside the hand, which sees it all the time, and one across the link
             watch_hand = Program(hosts["hand"], _WATCH, 7, "net0", module=code)
             watch_client = Program(hosts["client"], _WATCH, 7, "net1", module=code)
-            _until(lambda: bool(_lines(watch_client, "^q ") and _lines(watch_hand, "^q ")))
+            for watch in (watch_hand, watch_client):
+                watch.wait_line("^q ", timeout=200.0)
             start = _newest(watch_hand)[1]
-            client = Program(hosts["client"], _COMMAND, 7, "net1", 0.5, module=code)
+            client = Program(hosts["client"], _COMMAND, 7, "net1", start, module=code)
             _until(lambda: abs(_newest(watch_hand)[1] - start) > 0.3)
             hosts["middle"].sh("ip link set port0 down")
             client.process.kill()  # its last command is still in a queue, and must not move it
@@ -262,14 +312,15 @@ def test_link_that_goes_down_in_mid_motion(seconds: float) -> None:
             stopped = _newest(watch_hand)[1]
             time.sleep(seconds / 2)
             assert abs(_newest(watch_hand)[1] - stopped) < 0.02
-            assert abs(stopped - 0.5) > 0.1, "it was stopped on its way"
+            assert start + 0.3 < stopped < 4.9, "it was stopped on its way"
             before = _newest(watch_client)[0]
             hosts["middle"].sh("ip link set port0 up")
             up = time.monotonic()
             _until(lambda: _newest(watch_client)[0] > max(before, up))
             back = _newest(watch_client)[0] - up
             print(f"\nlink down for {seconds:g} s: state back {back:.2f} s after the link")
-            assert back < 1.0
+            if not _busy():
+                assert back < 1.0
             time.sleep(1.5)
             assert abs(_newest(watch_hand)[1] - stopped) < 0.02
         finally:

@@ -33,6 +33,10 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
     "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
+    "install-service": (
+        "dexkit.cli.install_service",
+        "Write systemd units and udev rules that serve hands.",
+    ),
     "models": ("dexkit.cli.models", "Print hands and robots: joints, limits, topics, rates."),
     "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),

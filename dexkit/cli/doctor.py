@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +29,7 @@ from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.doctor import Finding, Observations, Readiness, Verdict
-    from dexkit.doctor.observations import Environment
+    from dexkit.doctor.observations import DomainView, Environment, Link
 
 __all__ = ["command"]
 
@@ -77,6 +78,11 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 )
 @network_options()
 @click.option(
+    "--link",
+    metavar="HOST",
+    help="Also measure the link to this machine: latency, loss, jitter, multicast, clock.",
+)
+@click.option(
     "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand model.  [default: any]"
 )
 @click.option("--dialect", type=DIALECT, help="Only this dialect.  [default: any]")
@@ -100,6 +106,7 @@ def command(
     domain: int | None,
     scan: list[int],
     interfaces: tuple[str, ...],
+    link: str | None,
     model: str | None,
     dialect: str | None,
     devices: tuple[str, ...],
@@ -125,6 +132,13 @@ def command(
     scope = Scope(domain, _dialects(model, dialect), bool(devices) and domain is None)
     ctx = click.get_current_context()
     peers = peer_addresses(ctx)
+    target = None
+    if link is not None:
+        from dexkit.interface_names import interface_towards, resolve_peers
+
+        (address,) = resolve_peers([link])
+        target = (link, address, interface_towards(address))
+        interfaces = tuple(dict.fromkeys((*interfaces, target[2])))
     interfaces = tuple(dict.fromkeys(found_interface(ctx, text) for text in interfaces))
     if peers and not interfaces:
         from dexkit.interface_names import interface_towards
@@ -145,6 +159,7 @@ def command(
                 seconds,
                 env.result,
                 stop,
+                target,
                 _progress(quiet=as_json or last is not None),
             )
             if stop:
@@ -188,6 +203,7 @@ def _observe(
     seconds: float,
     env: Callable[[], Environment],
     stop: StopRequest,
+    target: tuple[str, str, str] | None,
     progress: Callable[[str], object],
 ) -> Observations:
     from dexkit.cli import doctor_devices
@@ -203,9 +219,15 @@ def _observe(
             hands += doctor_devices.on_server(device)
         else:
             ports.append(doctor_devices.inspect_port(device, progress=progress))
-    views = dds.observe_domains(
-        domains, interfaces, seconds=seconds, peers=peers, stop=stop.event, progress=progress
-    )
+    link = None
+    if target is None:
+        views = dds.observe_domains(
+            domains, interfaces, seconds=seconds, peers=peers, stop=stop.event, progress=progress
+        )
+    else:
+        views, link = _measure_link(
+            target, domains, interfaces, peers, seconds, stop.event, progress
+        )
     progress("")
     return Observations(
         domains=views,
@@ -217,7 +239,37 @@ def _observe(
         serial=tuple(ports),
         usb=tuple(hands),
         usb_wanted="usb" in devices,
+        link=link,
     )
+
+
+def _measure_link(
+    target: tuple[str, str, str],
+    domains: list[int],
+    interfaces: tuple[str, ...],
+    peers: tuple[str, ...],
+    seconds: float,
+    stop: threading.Event,
+    progress: Callable[[str], object],
+) -> tuple[tuple[DomainView, ...], Link]:
+    """Observe the domains by multicast, then by unicast too while echoes are sent."""
+    from dexkit.doctor import dds
+    from dexkit.doctor.link import link_to, measure_round_trips
+    from dexkit.doctor.network import address_of
+    from dexkit.socket_losses import receive_buffer_errors
+
+    host, address, interface = target
+    progress(f"measuring the link to {host}")
+    before = receive_buffer_errors()
+    plain = dds.observe_domains(domains, (interface,), seconds=0.0, stop=stop)
+    with ThreadPoolExecutor(1) as beside:
+        echoes = beside.submit(measure_round_trips, address, address_of(interface), seconds, stop)
+        views = dds.observe_domains(
+            *(domains, interfaces), seconds=seconds, peers=(*peers, address), stop=stop
+        )
+        trips = echoes.result()
+    dropped = receive_buffer_errors() - before
+    return views, link_to(host, address, interface, trips, plain, views, dropped=dropped)
 
 
 def _progress(*, quiet: bool) -> Callable[[str], object]:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
+from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
@@ -24,6 +25,7 @@ __all__ = [
     "Number",
     "any_baudrate_option",
     "dds_options",
+    "devices_by_side",
     "duration_option",
     "fault_options",
     "force_option",
@@ -249,6 +251,30 @@ def side_option(
     # an explicit default of None would count as a value for required (click 8.3)
     given: dict[str, Any] = {} if default is None else {"default": default, "show_default": True}
     return click.option("--side", "sides", type=_Sides(), required=required, help=help, **given)
+
+
+def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:
+    """The paths of ``--device``, given as PATH or SIDE=PATH.
+
+    :raises UsageError: a path fits no side, or a side has two.
+    """
+    by_side: dict[Side, str] = {}
+    for text in devices:
+        prefix, equals, path = text.partition("=")
+        if equals and prefix in [str(s) for s in Side]:
+            side = Side(prefix)
+        elif len(sides) == 1:
+            side, path = sides[0], text
+        else:
+            raise UsageError(
+                f"which hand is {text}?", hint="--device left=PATH --device right=PATH"
+            )
+        if side not in sides:
+            raise UsageError(f"--device {text}, but only the {sides[0]} hand is served")
+        if side in by_side:
+            raise UsageError(f"two devices for the {side} hand: {by_side[side]} and {path}")
+        by_side[side] = path
+    return by_side
 
 
 def set_option(help: str) -> Callable[[F], F]:

@@ -17,6 +17,7 @@ from dexkit.cli.options import (
     DIALECT,
     Number,
     dds_options,
+    devices_by_side,
     force_option,
     quiet_option,
     real_time_option,
@@ -29,6 +30,7 @@ from dexkit.hand import Hand, Side
 from dexkit.models import MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
+from dexkit.sd_notify import notify, watchdog
 from dexkit.service import (
     Estimation,
     Fill,
@@ -140,7 +142,7 @@ def command(
     status = StatusLine(quiet)
     log_to_stderr(quiet, status.on_terminal, "dexkit.service.counters")
     kind = backend(backend_name)
-    by_side = _devices(devices, sides)
+    by_side = devices_by_side(devices, sides)
     values = _settings(settings, sides)
     hands = [kind.create(BackendOptions(side, by_side.get(side), values[side])) for side in sides]
     # a backend that needs something is a device, even where it finds it by itself
@@ -187,7 +189,13 @@ def command(
                     f"domain {chosen}, {interface}"
                 )
             sys.stdout.flush()
+            # from the state loop: a service that is alive and publishes nothing is restarted
+            if (alive := watchdog(time.monotonic)) is not None:
+                publisher.add(alive)
+                running.callback(publisher.remove, alive)
+            notify("READY=1", f"STATUS=serving {', '.join(s.state_topic for s in services)}")
             _watch(services, stop, status)
+            notify("STOPPING=1")
         for service in services:
             service.log_counters()
     for service in services:
@@ -196,26 +204,6 @@ def command(
         if service.failure is not None:
             raise DexkitError(f"the service died: {service.failure}")
     return 0
-
-
-def _devices(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:
-    by_side: dict[Side, str] = {}
-    for text in devices:
-        prefix, equals, path = text.partition("=")
-        if equals and prefix in [str(s) for s in Side]:
-            side = Side(prefix)
-        elif len(sides) == 1:
-            side, path = sides[0], text
-        else:
-            raise UsageError(
-                f"which hand is {text}?", hint="--device left=PATH --device right=PATH"
-            )
-        if side not in sides:
-            raise UsageError(f"--device {text}, but only the {sides[0]} hand is served")
-        if side in by_side:
-            raise UsageError(f"two devices for the {side} hand: {by_side[side]} and {path}")
-        by_side[side] = path
-    return by_side
 
 
 def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[str, str]]:

@@ -16,6 +16,7 @@ from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
 from dexkit.doctor.awaited import AWAITED
+from dexkit.doctor.link import percentile
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
@@ -37,6 +38,7 @@ _ANNOUNCE_AT = (0.0, 0.15, 0.5, 1.2, 2.5)
 _TICK = 0.05
 _BUFFER = 4 << 20
 _DECODE_EVERY = 0.02  # seconds between samples of a stream whose positions are read
+_MOST_DELAYS = 100_000  # of one writer
 _LOOPBACK = "127.0.0.1"
 _FAST = "fastdds.physical_data."  # prefix of the properties of a Fast DDS participant
 
@@ -66,15 +68,18 @@ class _Watch:
     undecodable: int = 0
     decoded_at: float = float("-inf")
     newest: bytes = b""
+    delays: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         found = roles(self.endpoint.topic, self.endpoint.type_name)
         self.dialects = [role.dialect for role in found if role.kind == "cmd"]
 
-    def take(self, sequence: int, data: bytes, now: float) -> None:
+    def take(self, sequence: int, data: bytes, now: float, written: float) -> None:
         if self.samples and sequence <= self.last_sequence:
             return
         self.samples += 1
+        if written and len(self.delays) < _MOST_DELAYS:
+            self.delays.append(now + _wall_clock_offset() - written)
         self.last_time, self.last_sequence, self.newest = now, sequence, data
         if not self.first:
             self.first = data
@@ -125,7 +130,15 @@ class _Watch:
             driven_span=max((high - low for low, high in self.driven.values()), default=0.0),
             nonzero=self.nonzero,
             undecodable=self.undecodable,
+            lost=gaps + 1 - self.samples if self.samples else 0,
+            delay_min=percentile(self.delays, 0.0),
+            delay_95=percentile(self.delays, 0.95),
         )
+
+
+def _wall_clock_offset() -> float:
+    """Seconds since the epoch at the zero of the monotonic clock."""
+    return time.time() - time.monotonic()
 
 
 class _Window:
@@ -178,11 +191,13 @@ class _Window:
                     hint=interface_filter.HINT,
                 ) from error
 
-    def sample(self, writer: EndpointData, sequence: int, data: bytes, now: float) -> None:
+    def sample(
+        self, writer: EndpointData, sequence: int, data: bytes, now: float, written: float
+    ) -> None:
         watch = self.watches.get(writer.guid)
         if watch is None:
             watch = self.watches[writer.guid] = _Watch(writer, now, sequence, now, sequence)
-        watch.take(sequence, data, now)
+        watch.take(sequence, data, now, written)
 
     def everywhere(self, packet: bytes) -> list[Send]:
         """A packet to wherever a participant may listen."""

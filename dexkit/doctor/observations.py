@@ -10,6 +10,7 @@ __all__ = [
     "Endpoint",
     "Environment",
     "Interface",
+    "Link",
     "Observations",
     "Participant",
     "Policies",
@@ -99,6 +100,10 @@ class Stream:
         the commands that drive it (with a position gain, and a mode that obeys).
     :param nonzero: some position of some sample was not exactly 0.
     :param undecodable: samples that do not decode as their type.
+    :param lost: sequence numbers that are missing between the first and the last sample.
+    :param delay_min: least reception time minus time of writing, seconds, each by its own
+        machine's clock; NaN when it is not known.
+    :param delay_95: the same, that 95 % of the samples are below.
     """
 
     topic: str
@@ -112,6 +117,9 @@ class Stream:
     driven_span: float = 0.0
     nonzero: bool = False
     undecodable: int = 0
+    lost: int = 0
+    delay_min: float = float("nan")
+    delay_95: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -254,12 +262,58 @@ class UsbDevice:
 
 
 @dataclass(frozen=True)
+class Link:
+    """The link to another machine. Times are in seconds; NaN where they are not known.
+
+    :param method: how round trips were measured.
+    :param sent: echoes.
+    :param received: answers.
+    :param participants: DDS participants that were found there.
+    :param multicast: they answer to multicast; None when there is none.
+    :param clock_offset: that machine's clock minus this one's.
+    :param samples: of its writers that came.
+    :param lost: of them that did not, by sequence number.
+    :param state_age_95: age on arrival that 95 % of its states are below.
+    :param command_age_95: the same of its commands.
+    :param rmem_max: bytes of receive buffer that a program may ask for; 0 when it is not known.
+    :param dropped: datagrams that found a receive buffer of this machine full meanwhile.
+    """
+
+    host: str
+    address: str = ""
+    interface: str = ""
+    method: str = ""
+    sent: int = 0
+    received: int = 0
+    rtt_min: float = float("nan")
+    rtt_median: float = float("nan")
+    rtt_95: float = float("nan")
+    participants: int = 0
+    multicast: bool | None = None
+    clock_offset: float = float("nan")
+    samples: int = 0
+    lost: int = 0
+    state_age_95: float = float("nan")
+    command_age_95: float = float("nan")
+    rmem_max: int = 0
+    dropped: int = 0
+
+    @property
+    def loss(self) -> float:
+        """Share of echoes or of samples that is lost, whichever is larger."""
+        echoes = 1 - self.received / self.sent if self.sent else 0.0
+        total = self.samples + self.lost
+        return max(echoes, self.lost / total if total else 0.0)
+
+
+@dataclass(frozen=True)
 class Observations:
     """All that was seen.
 
     :param looked_at: interfaces on which it was looked.
     :param seconds: how long the samples were watched.
     :param usb_wanted: the user has asked about a hand on USB.
+    :param link: the link to a machine that the user has asked about.
     """
 
     domains: tuple[DomainView, ...] = ()
@@ -271,3 +325,4 @@ class Observations:
     serial: tuple[SerialPort, ...] = ()
     usb: tuple[UsbDevice, ...] = ()
     usb_wanted: bool = False
+    link: Link | None = None

@@ -20,8 +20,9 @@ __all__ = ["Observer", "SampleHandler", "Send"]
 Send = tuple[bytes, Locator]
 """A packet and where to send it."""
 
-SampleHandler = Callable[[rtps.EndpointData, int, bytes, float], object]
-"""Takes a sample: its writer, sequence number, bytes, and when it came."""
+SampleHandler = Callable[[rtps.EndpointData, int, bytes, float, float], object]
+"""Takes a sample: its writer, sequence number, bytes, when it came, and when it was written by the
+writer's clock, seconds since the epoch (0 if that is not said)."""
 
 _SEDP = {rtps.SEDP_PUBLICATIONS: True, rtps.SEDP_SUBSCRIPTIONS: False}
 _REPEAT = 0.2  # seconds between requests for announcements, or announcements of our readers
@@ -86,7 +87,7 @@ class Observer:
         *,
         properties: dict[str, str] | None = None,
         wanted: Callable[[str, str], bool] = lambda topic, type_name: False,
-        on_sample: SampleHandler = lambda writer, sequence, data, now: None,
+        on_sample: SampleHandler = lambda writer, sequence, data, now, written: None,
     ) -> None:
         self.prefix = prefix
         self.participants: dict[bytes, rtps.ParticipantData] = {}
@@ -174,7 +175,8 @@ class Observer:
                 peer.histories[item.writer].seen.add(item.sequence)
                 self._take_endpoint(item, peer, out)
         else:
-            self._take_sample(item.source + item.writer, item.sequence, item.payload, now)
+            guid = item.source + item.writer
+            self._take_sample(guid, item.sequence, item.payload, now, item.written)
 
     def _take_participant(self, item: Data, now: float, address: str, out: list[Send]) -> None:
         if item.gone:
@@ -283,10 +285,12 @@ class Observer:
 
     # --- samples
 
-    def _take_sample(self, guid: bytes, sequence: int, data: bytes, now: float) -> None:
+    def _take_sample(
+        self, guid: bytes, sequence: int, data: bytes, now: float, written: float = 0.0
+    ) -> None:
         found = self.endpoints.get(guid)
         if found is not None and found[1] and data:
-            self._on_sample(found[0], sequence, data, now)
+            self._on_sample(found[0], sequence, data, now, written)
 
     def _take_fragment(self, item: DataFrag, now: float) -> None:
         guid = item.source + item.writer

@@ -12,7 +12,7 @@ from dexkit.console import Console
 from dexkit.console import markup as escape
 from dexkit.doctor.awaited import AWAITED
 from dexkit.doctor.catalogue import Finding, Severity
-from dexkit.doctor.observations import DomainView, Endpoint, Observations
+from dexkit.doctor.observations import DomainView, Endpoint, Link, Observations
 from dexkit.doctor.rules import Readiness, Verdict
 from dexkit.doctor.topics import short
 from dexkit.escaping import LONGEST
@@ -82,6 +82,8 @@ def print_report(
         console.print(f"  seen: {escape(finding.seen)}", highlight=False)
         console.print(f"  why:  {escape(finding.diagnosis.why)}", highlight=False)
         console.print(f"  do:   [bold]{escape(finding.fix)}[/]", highlight=False)
+    if seen.link is not None:
+        console.print(f"\n{escape(_link_text(seen.link))}", highlight=False)
     for state in states:
         text = "a client gets past its wait" if state.ready else f"a client waits: {state.missing}"
         console.print(f"\ndomain {state.domain}, {state.dialect}: {escape(text)}", highlight=False)
@@ -110,6 +112,33 @@ def print_report(
     looked = ", ".join(str(view.number) for view in seen.domains)
     if looked:
         console.print(f"\n[dim]looked at domains {looked} on {', '.join(seen.looked_at)}[/dim]")
+
+
+def _link_text(link: Link) -> str:
+    """The figures of a link in a few lines."""
+
+    def ms(seconds: float) -> str:
+        return f"{1000 * seconds:.1f} ms" if math.isfinite(seconds) else "unknown"
+
+    multicast = {True: "works", False: "does not work", None: "unknown (no participant there)"}
+    estimate = link.rtt_95 - link.rtt_min / 2
+    command = link.command_age_95
+    lines = [
+        f"link to {link.host} ({link.address}) by {link.interface}, {link.method}:",
+        f"  round trip     {ms(link.rtt_median)} median, {ms(link.rtt_min)} least, "
+        f"{ms(link.rtt_95)} 95 %",
+        f"  loss           {link.sent - link.received} of {link.sent} echoes, {link.lost} of "
+        f"{link.samples + link.lost} samples",
+        f"  age of states  {ms(link.state_age_95)} (95 %, on arrival here)",
+        f"  of commands    {ms(command)} (95 %, on arrival here)"
+        if math.isfinite(command)
+        else f"  of commands    {ms(estimate)} (95 %, estimated from the round trips)",
+        f"  multicast      {multicast[link.multicast]}",
+        "  clock there    "
+        + (f"{link.clock_offset:+.3f} s" if math.isfinite(link.clock_offset) else "unknown"),
+        f"  receive buffer {link.rmem_max} bytes at most, {link.dropped} datagrams dropped",
+    ]
+    return "\n".join(lines)
 
 
 def _row(view: DomainView, endpoint: Endpoint) -> tuple[str, ...]:

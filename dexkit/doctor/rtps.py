@@ -16,7 +16,7 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dexkit.errors import TruncatedError, WireError
 
@@ -137,6 +137,8 @@ class Data:
     :param writer: entity id, 4 bytes.
     :param payload: serialised, encapsulation header included; empty when there is none.
     :param gone: the instance was disposed of or unregistered.
+    :param written: when it was written by the writer's clock, seconds since the epoch; 0 if that
+        is not said.
     """
 
     source: bytes
@@ -144,6 +146,7 @@ class Data:
     sequence: int
     payload: bytes
     gone: bool
+    written: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +279,7 @@ def parse_message(data: bytes) -> tuple[bytes, list[tuple[bytes, Submessage]]]:
         raise WireError(f"RTPS version {data[4]}")
     sender = source = data[8:20]
     destination = bytes(12)
+    written = 0.0
     found: list[tuple[bytes, Submessage]] = []
     at = _HEADER
     while at + 4 <= len(data):
@@ -294,8 +298,14 @@ def parse_message(data: bytes) -> tuple[bytes, list[tuple[bytes, Submessage]]]:
                 destination = body[:12].ljust(12, b"\0")
             elif kind == 0x0C and len(body) >= 20:
                 source = body[8:20]
+            elif kind == 0x09:  # INFO_TS: the time of what follows, or none
+                whole, fraction = (0, 0) if flags & 2 else struct.unpack_from(order + "II", body)
+                written = whole + fraction / 2**32
             elif kind in _READERS:
-                found.append((destination, _READERS[kind](source, body, flags, order)))
+                item = _READERS[kind](source, body, flags, order)
+                if written and isinstance(item, Data):
+                    item = replace(item, written=written)
+                found.append((destination, item))
         except struct.error:
             raise TruncatedError(f"submessage 0x{kind:02x} is too short") from None
     return sender, found

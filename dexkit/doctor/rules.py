@@ -13,6 +13,7 @@ from dexkit.doctor.observations import (
     DomainView,
     Endpoint,
     Environment,
+    Link,
     Observations,
     Participant,
     Policies,
@@ -34,6 +35,13 @@ ROBOT_NETWORK = "192.168.123."
 
 _FROZEN_COMMANDS = 0.1  # rad that commands move while a measured state must change
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
+# what a link may have before it is reported; docs/doctor.md gives the reasons
+_MOST_LOSS = 0.01
+_MOST_ROUND_TRIP = 0.05  # s
+_MOST_JITTER = 0.02  # s
+_MOST_COMMAND_AGE = 0.2  # s; commands 0.25 s older than usual are stale (docs/service.md)
+_MOST_CLOCK_OFFSET = 0.1  # s
+_LEAST_BUFFER = 1 << 20  # bytes; what CycloneDDS asks for
 _DRIVER_BAUD = 1_000_000
 _DURABILITY = ("volatile", "transient_local", "transient", "persistent")
 
@@ -89,6 +97,8 @@ def diagnose(seen: Observations, scope: Scope | None = None) -> list[Finding]:
     found = [*_domains(seen, scope), *_network(seen, scope)]
     if seen.environment is not None:
         found += _environment(seen.environment)
+    if seen.link is not None:
+        found += _link(seen.link)
     for port in seen.serial:
         found += _serial(port)
     found += _usb(seen)
@@ -842,6 +852,66 @@ def _hidden(seen: Observations, focus: list[DomainView]) -> Iterator[Finding]:
             severity=Severity.WARNING,
             domain=view.number,
         )
+
+
+# --- the link to another machine
+
+
+def _link(link: Link) -> Iterator[Finding]:
+    def about(name: str, seen: str, severity: Severity | None = None) -> Finding:
+        fix = DIAGNOSES[name].fix.replace("INTERFACE", link.interface).replace("HOST", link.host)
+        return _finding(name, seen, fix=fix, severity=severity, host=link.host)
+
+    where = f"{link.host} by {link.interface}"
+    if not link.received and not link.samples:
+        yield about(
+            "LINK-NO-ANSWER", f"none of {link.sent} echoes ({link.method}) to {where} came back"
+        )
+        return
+    if link.loss > _MOST_LOSS:
+        parts = [f"{link.sent - link.received} of {link.sent} echoes"]
+        if link.samples:
+            parts.append(f"{link.lost} of {link.samples + link.lost} samples")
+        yield about(
+            "LINK-LOSS",
+            f"{where} lost {' and '.join(parts)} ({100 * link.loss:.1f} %)",
+            severity=Severity.ERROR if link.loss > 10 * _MOST_LOSS else None,
+        )
+    if link.rtt_median > _MOST_ROUND_TRIP:
+        yield about(
+            "LINK-LATENCY",
+            f"a round trip to {where} takes {1000 * link.rtt_median:.0f} ms (median)",
+        )
+    if link.rtt_95 - link.rtt_median > _MOST_JITTER:
+        yield about(
+            "LINK-JITTER",
+            f"one round trip in 20 to {where} takes {1000 * link.rtt_95:.0f} ms or more, the "
+            f"median is {1000 * link.rtt_median:.0f} ms",
+        )
+    measured = link.command_age_95 == link.command_age_95
+    age = link.command_age_95 if measured else link.rtt_95 - link.rtt_min / 2
+    if age > _MOST_COMMAND_AGE:
+        how = "measured by their time stamps" if measured else "estimated from the round trips"
+        yield about(
+            "LINK-AGE",
+            f"one command in 20 is {1000 * age:.0f} ms old or more when it arrives ({how})",
+        )
+    if link.multicast is False:
+        yield about(
+            "LINK-MULTICAST",
+            f"{link.participants} participants at {where} answer to unicast, none to multicast",
+        )
+    if abs(link.clock_offset) > _MOST_CLOCK_OFFSET:
+        ahead = "ahead of" if link.clock_offset > 0 else "behind"
+        yield about(
+            "LINK-CLOCK",
+            f"the clock of {link.host} is {abs(link.clock_offset):.3f} s {ahead} this machine's",
+        )
+    if link.dropped or 0 < link.rmem_max < _LEAST_BUFFER:
+        seen = f"net.core.rmem_max is {link.rmem_max} bytes"
+        if link.dropped:
+            seen += f"; {link.dropped} datagrams found a full buffer meanwhile"
+        yield about("LINK-BUFFER", seen)
 
 
 # --- environment

@@ -1,0 +1,276 @@
+"""systemd units and udev rules: their text, systemd's own check, and their command line at work."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from dexkit import sd_notify, systemd_units
+from dexkit.cli import cli
+from dexkit.errors import OutputError, UsageError
+from dexkit.hand import Side
+from dexkit.systemd_units import serial_rule, unit, usb_rules
+from tests.dds_helpers import free_domain
+from tests.each import each
+
+ROOT = Path(__file__).parent.parent
+_NOBODY = 65534
+
+
+def _install(*words: str) -> str:
+    done = CliRunner().invoke(cli, ["install-service", *words], standalone_mode=False)
+    if done.exception is not None:
+        raise done.exception
+    return done.output
+
+
+def _command(text: str) -> list[str]:
+    """The command line of a unit, as systemd reads a plain one."""
+    (line,) = [line for line in text.splitlines() if line.startswith("ExecStart=")]
+    return shlex.split(line.removeprefix("ExecStart="))
+
+
+def test_one_unit_a_hand_is_written_and_a_dry_run_writes_nothing(tmp_path: Path) -> None:
+    words = ("sim-dex1", "--side", "both", "--interface", "192.168.123.0/24", "--user", "root")
+    more = ("--set", "object=40", "--set", "left.start=10", "--directory", str(tmp_path))
+    said = _install(*words, *more, "--dry-run")
+    assert not list(tmp_path.iterdir())
+    assert "# " + str(tmp_path / "dexkit-left.service") in said
+    said = _install(*words, *more)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "dexkit-left.service",
+        "dexkit-right.service",
+    ]
+    assert "systemctl enable --now dexkit-left.service dexkit-right.service" in said
+    left, right = (_command((tmp_path / f"dexkit-{s}.service").read_text()) for s in Side)
+    assert left[:7] == [sys.executable, "-m", "dexkit", "serve", "sim-dex1", "--side", "left"]
+    assert "left.start=10" in left
+    assert "left.start=10" not in right
+    assert "object=40" in right
+    assert left[left.index("--interface") + 1] == "192.168.123.0/24"
+    assert "--wait-for-interface" in left
+
+
+def test_units_of_the_package_are_what_is_written() -> None:
+    for side in Side:
+        device = systemd_units.device_link(side)
+        command = (
+            *("/opt/dexkit/bin/python", "-m", "dexkit", "serve", "ezgripper", "--side", str(side)),
+            *("--device", device, "--domain", "0", "--interface", "192.168.123.0/24"),
+            *("--wait-for-interface", "600", "--wait-for-device", "--quiet"),
+        )
+        expected = unit(side, command, user="unitree", what="ezgripper")
+        path = ROOT / "packaging" / "systemd" / systemd_units.unit_name(side)
+        assert path.read_text(encoding="utf-8") == expected
+
+
+def test_systemd_accepts_the_units(tmp_path: Path) -> None:
+    analyze = shutil.which("systemd-analyze")
+    if analyze is None:
+        pytest.skip("systemd-analyze is not installed")
+    _install("sim-dex1", "--side", "both", "--user", "root", "--directory", str(tmp_path))
+    units = sorted(tmp_path.glob("*.service"))
+    done = subprocess.run([analyze, "verify", *units], capture_output=True, text=True, check=False)
+    complaints = [line for line in done.stderr.splitlines() if "dexkit-" in line]
+    assert not complaints, complaints
+
+
+def test_words_are_quoted_as_systemd_reads_them() -> None:
+    text = unit(Side.LEFT, ["a b", "50%", "$x", 'q"\\'], user="me", what="x")
+    assert 'ExecStart="a b" 50%% "$$x" "q\\"\\\\"' in text
+
+
+@each(
+    ("words", "said"),
+    [
+        (("no-such-hand", "--side", "left"), "no-such-hand"),
+        (("sim-dex1", "--side", "left", "--user", "no such user"), "there is no user"),
+        (("ezgripper", "--side", "both", "--device", "/dev/ttyUSB0"), "which hand is"),
+        (("ezgripper", "--side", "left", "--device", "/dev/null"), "no serial adapter"),
+        (("sim-dex1", "--side", "left", "--set", "a=\n", "--user", "root"), "cannot be in a unit"),
+    ],
+)
+def test_what_cannot_be_a_service_is_refused(words: tuple[str, ...], said: str) -> None:
+    with pytest.raises(Exception, match=said) as raised:
+        _install(*words, "--dry-run")
+    assert not isinstance(raised.value, OutputError)
+
+
+def test_a_folder_that_cannot_be_written_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dexkit.cli.install_service._UNITS", Path("/proc/1"))
+    with pytest.raises(OutputError) as raised:
+        _install("sim-dex1", "--side", "left", "--user", "root")
+    assert "sudo " in raised.value.hint
+    assert "--dry-run" in raised.value.hint
+
+
+# -- udev
+
+
+def _adapter(sys_folder: Path, serial: str) -> Path:
+    """An FTDI adapter as it looks in /sys; returns its device file."""
+    usb = sys_folder / "devices" / "usb1" / "1-4"
+    port = usb / "1-4:1.0" / "ttyUSB0"
+    port.mkdir(parents=True)
+    for name, text in {"idVendor": "0403", "idProduct": "6014", "serial": serial}.items():
+        if text:
+            (usb / name).write_text(text + "\n")
+    tty = sys_folder / "class" / "tty" / "ttyUSB0"
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to(port)
+    return Path("/dev/ttyUSB0")
+
+
+def test_an_adapter_gets_a_stable_name(tmp_path: Path) -> None:
+    rule = serial_rule(Side.LEFT, _adapter(tmp_path / "a", "FT9ABC"), tmp_path / "a")
+    assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT9ABC"' in rule
+    assert 'SYMLINK+="dexkit-left"' in rule
+    assert 'ATTR{latency_timer}="1"' in rule
+    for serial in ("", 'x", RUN+="/bin/sh'):  # none, or one that would be a rule of its own
+        folder = tmp_path / f"b{len(serial)}"
+        rule = serial_rule(Side.RIGHT, _adapter(folder, serial), folder)
+        assert 'KERNELS=="1-4"' in rule
+        assert "RUN" not in rule
+        assert 'SYMLINK+="dexkit-right"' in rule
+    assert 'ATTR{idProduct}=="1011"' in usb_rules()
+
+
+def test_a_port_that_is_not_on_usb_needs_no_rule(tmp_path: Path) -> None:
+    tty = tmp_path / "class" / "tty" / "ttyS0"
+    (tmp_path / "devices" / "serial8250").mkdir(parents=True)
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to(tmp_path / "devices" / "serial8250")
+    with pytest.raises(UsageError, match="is not on USB") as raised:
+        serial_rule(Side.LEFT, Path("/dev/ttyS0"), tmp_path)
+    assert "--no-udev" in raised.value.hint
+
+
+# -- notifications
+
+
+@contextmanager
+def _systemd(tmp_path: Path) -> Iterator[socket.socket]:
+    """A socket in the place of systemd's."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+        sock.bind(str(tmp_path / "notify"))
+        (tmp_path / "notify").chmod(0o777)
+        tmp_path.chmod(0o755)
+        sock.settimeout(120)
+        yield sock
+
+
+def test_watchdog_reports_three_times_in_its_interval(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    with _systemd(tmp_path) as sock:
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "3000000")
+        monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+        alive = sd_notify.watchdog(lambda: clock[0])
+        assert alive is not None
+        for _ in range(60):  # 6 s
+            alive(0)
+            clock[0] += 0.1
+        sock.setblocking(False)
+        assert [sock.recv(100) for _ in range(6)] == [b"WATCHDOG=1"] * 6
+        with pytest.raises(BlockingIOError):
+            sock.recv(100)
+
+
+@each(
+    ("variable", "value"),
+    [("WATCHDOG_USEC", "x"), ("WATCHDOG_USEC", "0"), ("WATCHDOG_PID", "1"), ("WATCHDOG_USEC", "")],
+)
+def test_nobody_is_told_where_systemd_does_not_watch(variable: str, value: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WATCHDOG_USEC", "1000000")
+        patch.setenv("WATCHDOG_PID", str(os.getpid()))
+        patch.setenv(variable, value)
+        assert sd_notify.watchdog(lambda: 0.0) is None
+        patch.setenv("NOTIFY_SOCKET", "relative")
+        assert not sd_notify.notify("READY=1")
+        patch.setenv("NOTIFY_SOCKET", "/nowhere/at/all")
+        assert not sd_notify.notify("READY=1")
+
+
+def _waiting(sock: socket.socket) -> bytes:
+    """What has come already, or nothing."""
+    try:
+        return sock.recv(1000)
+    except BlockingIOError:
+        return b""
+
+
+def _unprivileged() -> list[str]:
+    """How to run a command without privileges; it may read files, as where dexkit is installed."""
+    if os.geteuid() != 0:
+        return []
+    setpriv = shutil.which("setpriv")
+    if setpriv is None:
+        pytest.skip("setpriv is not installed, and the tests are run by root")
+    read = "+dac_read_search"
+    words = [setpriv, f"--reuid={_NOBODY}", f"--regid={_NOBODY}", "--clear-groups"]
+    words += [f"--inh-caps=-all,{read}", f"--ambient-caps=-all,{read}", "--no-new-privs"]
+    if subprocess.run([*words, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("this system lets nobody give privileges up (setpriv)")
+    return words
+
+
+def test_command_line_of_a_unit_runs_unprivileged_and_reports(tmp_path: Path) -> None:
+    _install(
+        *("sim-dex1", "--side", "left", "--user", "root", "--directory", str(tmp_path)),
+        *("--domain", str(free_domain())),
+    )
+    command = [*_unprivileged(), *_command((tmp_path / "dexkit-left.service").read_text())]
+    environment = {
+        **os.environ,
+        "NOTIFY_SOCKET": str(tmp_path / "notify"),
+        "WATCHDOG_USEC": "300000",
+        "HOME": "/",
+    }
+    with (
+        _systemd(tmp_path) as sock,
+        subprocess.Popen(
+            command, env=environment, stdout=-1, stderr=-1, text=True, cwd=ROOT
+        ) as process,
+    ):
+        try:
+            first = sock.recv(1000)
+            assert first.startswith(b"READY=1\nSTATUS=serving rt/dex1/left/state"), first
+            for _ in range(3):
+                assert sock.recv(1000) == b"WATCHDOG=1"
+            if os.geteuid() == 0:
+                status = Path(f"/proc/{process.pid}/status").read_text()
+                assert f"Uid:\t{_NOBODY}" in status
+            # a loop that stands still says nothing
+            process.send_signal(signal.SIGSTOP)
+            os.waitpid(process.pid, os.WUNTRACED)
+            sock.setblocking(False)
+            while _waiting(sock):
+                pass
+            sock.settimeout(0.3)
+            with pytest.raises(TimeoutError):
+                sock.recv(1000)
+            sock.settimeout(120)
+            process.send_signal(signal.SIGCONT)
+            assert sock.recv(1000) == b"WATCHDOG=1"
+            process.terminate()
+            while (last := sock.recv(1000)) == b"WATCHDOG=1":
+                pass
+            assert last == b"STOPPING=1"
+            assert process.wait(60) == 0
+        finally:
+            if process.poll() is None:
+                process.kill()
