@@ -303,7 +303,7 @@ def _goals(ctx: Context, rows: Rows) -> Floats:
 
 
 def _stiffness(ctx: Context, rows: Rows) -> Floats:
-    """Stiffness kp in force, N m/rad, at each state: the client's usual one where it is not used."""
+    """The kp in force, N m/rad, at each state: the usual one where it is not used."""
     usual = ctx.recording.model.gains[0][0]
     if not ctx.recording.dialect.gains_are_used:
         return np.full(len(rows), usual)
