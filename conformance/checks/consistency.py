@@ -21,6 +21,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
+from dexkit.models import model
 
 __all__: list[str] = []
 
@@ -302,9 +303,14 @@ def _goals(ctx: Context, rows: Rows) -> Floats:
     return np.asarray(np.clip(ctx.commands.q[np.maximum(rows, 0), 0], spec.q_min, spec.q_max))
 
 
+def _usual_kp(ctx: Context) -> float:
+    """The kp of the model's own client, N m/rad."""
+    return model(ctx.recording.dialect.model).gains[0][0]
+
+
 def _stiffness(ctx: Context, rows: Rows) -> Floats:
     """Kp of each state, N m/rad; the client's usual one where it is not used."""
-    usual = ctx.recording.model.gains[0][0]
+    usual = _usual_kp(ctx)
     if not ctx.recording.dialect.gains_are_used:
         return np.full(len(rows), usual)
     return np.asarray(ctx.commands.kp[np.maximum(rows, 0), 0])
@@ -316,7 +322,7 @@ def _contacts(ctx: Context, touch: float) -> list[_Pressing]:
     rows, ages = _newest(ctx)
     goals = _goals(ctx, rows)
     depth, settle = ctx.tolerance("min_depth_stroke"), ctx.tolerance("settle_s")
-    usual = ctx.recording.model.gains[0][0]
+    usual = _usual_kp(ctx)
     with np.errstate(invalid="ignore"):
         pressing = (
             (ages < ctx.tolerance("max_age_s"))
