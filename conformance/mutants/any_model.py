@@ -394,7 +394,7 @@ class HomesWhenRestarted(_Moves):
 
 @wrong_hand(
     ("DEX1-STILL-01", "DEX3-STILL-01"),
-    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX3-SAFE-06"),
+    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
     sides=BOTH,
     whole=True,
 )
