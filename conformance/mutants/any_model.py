@@ -477,7 +477,7 @@ class OneBehind(Service):
         super().motors(side, before)
 
 
-@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH)
+@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), also=("DEX1-MOVE-09", "DEX3-MOVE-08"), sides=BOTH)
 class BadCommandsStopBoth(Service):
     """Drops the commands to both hands for half a second after a bad one."""
 
