@@ -411,10 +411,11 @@ def _range(q: Floats) -> float:
 _AFTER_A_PAUSE = ("restart", "service-restart")
 """Steps of which the first comes when hand and client have just found each other."""
 _PROMPT = (
-    *("step", "joint", "ends", "center", "fingerprint", "recover", "beside", "old-stamps"),
+    *("step", "joint", "ends", "center", "fingerprint", "recover", "old-stamps"),
     *("company", *_AFTER_A_PAUSE),
 )
-"""Steps that must begin at once; after a pause, WDOG-03 judges them."""
+"""Steps that must begin at once; WDOG-03 judges those after a pause, SIDE-02 those beside bad
+commands."""
 
 
 @check("DEX1-MOVE-08")

@@ -191,7 +191,7 @@ def out_of_range(ctx: Context) -> Outcome:
     ).resting_on(*outcome.measures)
 
 
-_TURNS_S = 0.06  # s that a moving hand is given to turn round
+_TURNS_S = 0.25  # s that a moving hand is given to turn round, with a delay that it may have
 
 
 def _other_way(ctx: Context, phase: Phase, joint: int) -> Outcome | None:
@@ -206,8 +206,10 @@ def _other_way(ctx: Context, phase: Phase, joint: int) -> Outcome | None:
         return None
     turns = np.flatnonzero(np.diff(far, prepend=0))
     for a, b, way in zip(t[turns], [*t[turns[1:]], end], far[turns], strict=True):
-        turning = ctx.states.q[ctx.states.between(a, a + _TURNS_S), joint] * way
-        later = ctx.states.between(a + _TURNS_S, b)
+        # before the first of them it was at rest
+        since = a + _TURNS_S if a > t[0] else a
+        turning = ctx.states.q[ctx.states.between(a - 0.05, since), joint] * way
+        later = ctx.states.between(since, b)
         if not len(turning) or not len(ctx.states.t[later]):
             continue
         back = float(turning.min()) - ctx.states.q[later, joint] * way

@@ -394,7 +394,7 @@ class HomesWhenRestarted(_Moves):
 
 @wrong_hand(
     ("DEX1-STILL-01", "DEX3-STILL-01"),
-    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX3-SAFE-06"),
+    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
     sides=BOTH,
     whole=True,
 )
@@ -477,7 +477,7 @@ class OneBehind(Service):
         super().motors(side, before)
 
 
-@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH)
+@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), also=("DEX1-MOVE-09", "DEX3-MOVE-08"), sides=BOTH)
 class BadCommandsStopBoth(Service):
     """Drops the commands to both hands for half a second after a bad one."""
 

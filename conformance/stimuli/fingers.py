@@ -277,20 +277,8 @@ class FingerScript(HandScript):
                 yield from self._hold(BETWEEN)
                 bad = {s: self._malformed(name, s)[0] for s in sides}
                 yield from self._bad_commands(name, sides, [bad], 0.15)
-        if "limp" in self.plan.phases:
-            yield from self._hold(BETWEEN)
-            yield from self._limp(0.3)
         yield from self._far_away(1000.0, 0.2)
         yield from self._everyone("recover", self._other_place(), most=1.5, after=self._bad_again)
-
-    def _limp(self, seconds: float) -> Steps:
-        """Zero gains with a q far away, as a phase."""
-        far = self._other_place()
-        targets = {s: dict(enumerate(pose)) for s, pose in far.items()}
-        phase = self._begin("limp", self.plan.sides, targets=targets)
-        limp = {s: [replace(m, kp=0.0, kd=0.0) for m in self._motors(s, far[s])] for s in far}
-        yield from self._hold(seconds, limp)
-        self._end(phase)
 
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)

@@ -233,9 +233,6 @@ class GripperScript(HandScript):
             kp, kd = self._model.client_gains
             wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
             yield from self._bad_commands("negative", sides, [wrong], 0.15)
-        if "limp" in phases and self._gains_used:
-            yield from self._hold(BETWEEN)
-            yield from self._unpulled(0.3)
         yield from self._far_away(1000.0, 0.2)
         yield from self._everyone("recover", self._other_place(), after=self._bad_again)
 
@@ -248,19 +245,14 @@ class GripperScript(HandScript):
         yield from self._silence("silence", self._model.command_timeout + 0.6)
         yield from self._everyone("resume", self._other_place())
 
-    def _unpulled(self, seconds: float) -> Steps:
-        """Zero gains with a q far away, as a phase."""
-        far = {s: self._far(s) for s in self.plan.sides}
-        phase = self._begin("limp", self.plan.sides, targets={s: {0: q} for s, q in far.items()})
-        limp = {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in far.items()}
-        yield from self._hold(seconds, limp)
-        self._end(phase)
-
     def _limp(self) -> Steps:
         self._report("commands without force (zero gains): the hand must not be pulled")
         sides = self.plan.sides
         yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
-        yield from self._unpulled(0.5)
+        low = {s: self._low(s) for s in sides}
+        phase = self._begin("limp", sides, targets={s: {0: q} for s, q in low.items()})
+        yield from self._hold(0.5, {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in low.items()})
+        self._end(phase)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _squeeze_and_silence(self) -> Steps:
