@@ -138,7 +138,7 @@ class ShakenVelocity(_Timed):
         super().fill(motors, hand)
         if 3.5 <= self.now < 5.5:
             stroke = (np.array(hand.high) - np.array(hand.low))[: len(motors)]
-            motors["dq"] += 3.0 * stroke * math.sin(2 * math.pi * 13.0 * self.now)
+            motors["dq"] += 5.0 * stroke * math.sin(2 * math.pi * 13.0 * self.now)
 
 
 @wrong_hand("DEX3-FIELD-17", also=("DEX3-FIELD-16", "DEX3-FRESH-02", "DEX3-STILL-01"))

@@ -183,7 +183,7 @@ class ShakenVelocity(_Fields):
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         if not 3.5 <= self.now < 5.5:
             return fields
-        shaken = 3.0 * self.dialect.q_open * math.sin(2 * math.pi * 13.0 * self.now)
+        shaken = 5.0 * self.dialect.q_open * math.sin(2 * math.pi * 13.0 * self.now)
         return {**fields, "dq": fields["dq"] + shaken}
 
 
