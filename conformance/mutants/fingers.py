@@ -141,7 +141,7 @@ class ShakenVelocity(_Timed):
             motors["dq"] += 5.0 * stroke * math.sin(2 * math.pi * 13.0 * self.now)
 
 
-@wrong_hand("DEX3-FIELD-17", also=("DEX3-FIELD-16", "DEX3-FRESH-02", "DEX3-STILL-01"))
+@wrong_hand("DEX3-FIELD-17", also=("DEX3-FRESH-02", "DEX3-PATH-01", "DEX3-STILL-01"))
 class ShiftsForAWhile(_Timed):
     """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
 
