@@ -34,6 +34,7 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("emulate", "dex3-usb"): ["--port", "0"],
     ("emulate", "mx64"): ["--link", "<link>"],
     ("info",): [_SAMPLE],
+    ("install-service",): ["sim-dex1", "--side", "left", "--dry-run"],
     ("record",): ["<new>"],
     ("replay",): [_SAMPLE],
     ("report",): ["<result>"],

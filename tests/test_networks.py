@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
+from dexkit.dds import PEERS
 from dexkit.errors import DdsSetupError, UsageError
 from dexkit.interface_names import (
     find_interface,
@@ -110,6 +111,22 @@ def test_waiting_for_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert wait(5.0) == "lo2"
     assert said == ["there is no network interface 'lo2'"] * 2
     assert wait(0.0) == "lo2"
+
+
+def test_peers_last_as_long_as_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(PEERS, "10.0.0.1")
+    seen: list[str] = []
+    monkeypatch.setattr(
+        "dexkit.dds.DdsNode", lambda **options: seen.append(os.environ[PEERS]) or 1 / 0
+    )
+    words = ("record", str(tmp_path / "x.mcap"), "--peer", "127.0.0.1", "--peer", "localhost")
+    done = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert isinstance(done.exception, ZeroDivisionError)
+    assert seen == ["127.0.0.1"]
+    assert os.environ[PEERS] == "10.0.0.1"
+    done = CliRunner().invoke(cli, [*words[:2], "--peer", "no such host"], standalone_mode=False)
+    assert isinstance(done.exception, DdsSetupError)
+    assert os.environ[PEERS] == "10.0.0.1"
 
 
 @each(

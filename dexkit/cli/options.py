@@ -159,12 +159,23 @@ _PEERS, _WAIT = "dexkit.peers", "dexkit.wait_for_interface"
 def _set_peers(
     ctx: click.Context, parameter: click.Parameter, peers: tuple[str, ...]
 ) -> tuple[str, ...]:
-    ctx.meta[_PEERS] = peers
-    if peers:
-        # for this process and those that it starts
-        from dexkit.dds import PEERS
+    """Set the peers of this process, and of those that it starts, while the command runs."""
+    if ctx.resilient_parsing or not peers:
+        return peers
+    from dexkit.dds import PEERS
 
-        os.environ[PEERS] = ",".join(peers)
+    ctx.meta[_PEERS] = peers
+    found = ",".join(peer_addresses(ctx))  # refused before anything is changed
+    before = os.environ.get(PEERS)
+
+    def restore() -> None:
+        if before is None:
+            os.environ.pop(PEERS, None)
+        else:
+            os.environ[PEERS] = before
+
+    ctx.call_on_close(restore)
+    os.environ[PEERS] = found
     return peers
 
 
