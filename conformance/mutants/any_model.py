@@ -61,7 +61,7 @@ class BestEffortWriter(Service):
 # --------------------------------------------------------------------------------- start-up
 
 
-@wrong_hand(("DEX1-START-01", "DEX3-START-01"))
+@wrong_hand(("DEX1-START-01", "DEX3-START-01"), also=("DEX1-LIFE-03",))
 class SilentUntilCommanded(Service):
     """Publishes nothing before the first command."""
 
@@ -216,7 +216,7 @@ class StaleLater(StaleState):
         return super().payload(sides, length)
 
 
-@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), whole=True)
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), also=("DEX1-FIELD-15", "DEX3-FIELD-17"), whole=True)
 class FrozenAtFirst(Service):
     """Publishes its first measurement until 0.7 s after the first command."""
 
@@ -768,18 +768,19 @@ class DropsOldStamps(Service):
 
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), whole=True)
 class StuttersUnderLoad(Service):
-    """Publishes one state in three while four commands come within 11 ms."""
+    """Publishes one state in three while four commands of one client come within 11 ms."""
 
     tick = period = 0.002
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
-        self.came: dict[Side, list[float]] = {s: [] for s in self.sides}
+        self.came: dict[tuple[str, int], list[float]] = {}
         self.cycle = 0
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.came[side] = [*self.came[side][-3:], self.now]
-        super().motors(side, motors)
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        key = topic, client
+        self.came[key] = [*self.came.get(key, [])[-3:], self.now]
+        super().receive(topic, payload, client)
 
     def publish(self) -> list[Sample]:
         self.cycle += 1

@@ -99,7 +99,7 @@ class Unmirrored(FingerService):
         return tuple((self.signs(side) * super().positions(side)).tolist())
 
 
-@wrong_hand("DEX3-FIELD-04")
+@wrong_hand("DEX3-FIELD-04", also=("DEX3-FIELD-16",))
 class TurnedVelocity(FingerService):
     """Publishes dq with the wrong sign."""
 
@@ -374,7 +374,8 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", whole=True)
+@wrong_hand("DEX3-MOVE-03", also=("DEX3-SAFE-06",), whole=True)
+@wrong_hand("DEX5-MOVE-03", whole=True)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
@@ -607,7 +608,9 @@ class MilliNewtonMetres(FingerService):
 class _NegativeGains(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         super().take(rows, mode)
-        self.kp, self.kd = rows[3].copy(), np.abs(rows[4])
+        # weak enough to stay within the range
+        self.kp = np.where(rows[3] < 0.0, 0.3 * rows[3], rows[3])
+        self.kd = np.abs(rows[4])
 
 
 @wrong_hand("DEX3-SAFE-06")
@@ -632,7 +635,8 @@ class _NanPerJoint(FingerHand):
         )
 
 
-@wrong_hand("DEX3-SAFE-01")
+@wrong_hand("DEX3-SAFE-01", also=("DEX3-SAFE-03",))
+@wrong_hand("DEX5-SAFE-01")
 class RejectsOnlyTheBadJoint(FingerService):
     """Ignores only the joint whose command is NaN, and moves the others."""
 
@@ -754,7 +758,7 @@ class _SleepsWithoutGuard(FingerHand):
 
 
 # it sleeps through the step after the bad commands as well
-@wrong_hand("DEX3-WDOG-03", also=("DEX3-SAFE-01",))
+@wrong_hand("DEX3-WDOG-03")
 @wrong_hand("DEX5-WDOG-03")
 class SleepsWithoutGuard(FingerService):
     """Ignores commands for 2 s after a silence without protection."""

@@ -156,7 +156,7 @@ class Metres(_InUnit):
     full = 0.09
 
 
-@wrong_hand("DEX1-FIELD-04")
+@wrong_hand("DEX1-FIELD-04", also=("DEX1-FIELD-16",))
 class TurnedVelocity(_Fields):
     """Publishes dq with the wrong sign."""
 
