@@ -536,3 +536,10 @@ def test_pipe_without_a_reader_is_refused(tmp_path: Path) -> None:
         assert os.read(reader, 8) == b"\x89MCAP0\r\n"
     finally:
         os.close(reader)
+
+
+def test_the_root_folder_is_no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir("/")
+    for name in ("", "/", "."):
+        with pytest.raises(UsageError, match="it is a folder"):
+            RecordingFile(Path(name), overwrite=True)

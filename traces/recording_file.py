@@ -60,6 +60,8 @@ class RecordingFile:
         self.path = path
         self.displaced = ""
         self._target = Path(os.path.realpath(path))
+        if not self._target.name:  # "/", or no name in the folder "/"
+            raise UsageError(f"cannot record to {str(path)!r}: it is a folder")
         self._part = self._target.with_name(self._target.name + _PART)
         self._overwrite = overwrite
         self._fd = -1
