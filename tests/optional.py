@@ -78,7 +78,7 @@ def _package(name: str) -> Callable[[], object]:
 
 OPTIONAL = (
     Optional("Chromium", chromium, ("conformance_report_browser",)),
-    Optional("user and network namespaces", namespaces, ("dds_multicast", "lan")),
+    Optional("user and network namespaces", namespaces, ("dds_multicast", "lan", "networks")),
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
     Optional("CycloneDDS 0.10", _package("cyclonedds"), ("campaign", "demo", "everything on DDS")),
@@ -90,6 +90,7 @@ OPTIONAL = (
     Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
+    Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 

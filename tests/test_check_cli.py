@@ -82,7 +82,7 @@ def test_selection(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "DEX1-RATE-01" in out
     assert "DEX1-RATE-02" not in out
-    assert "(2 of 74 requirements: 2 pass)" in out
+    assert "(3 of 84 requirements: 3 pass)" in out
     assert check(sample_path("dex1_pick_place"), "--require", "DEX7") == 2
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-QOS-02", "--level", "must") == 2
 

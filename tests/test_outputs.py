@@ -33,12 +33,16 @@ _INPUTS = {
     "--recording",
     "--eeprom",
     "--config",
+    "--from-source",
     "--key",
     "--page",
     "--public-key",
 }
 _ELSEWHERE = {
     ("demo", "--out"),  # a folder, made before anything starts
+    ("install-service", "--directory"),  # tests/test_install_service.py
+    ("setup-dds", "--wheel"),  # tests/test_setup_dds.py
+    ("setup-dds", "--log"),
     ("sign", "-o"),  # tests/test_signing.py, which has a key
     ("teleop", "--record"),  # as 'record' writes
 }

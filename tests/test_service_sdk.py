@@ -93,7 +93,10 @@ def test_unitree_actuator(sdk: SdkClient, dds_domain: int) -> None:
         until(
             sdk,
             state,
-            lambda m: abs(m.states[0].q - 4.0) < 0.1 and abs(m.states[1].q - 2.0) < 0.1,
+            lambda m: all(
+                abs(s.q - q) < 0.1 and abs(s.dq) < 0.1
+                for s, q in zip(m.states, (4.0, 2.0), strict=True)
+            ),
         )
         assert hands[0].joint.q == pytest.approx(2.0, abs=0.1)
         assert hands[1].joint.q == pytest.approx(4.0, abs=0.1)

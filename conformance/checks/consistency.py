@@ -250,10 +250,19 @@ def _excesses(ctx: Context, x: _Joint) -> Iterator[tuple[float, float, float, fl
         moved = x.q[ends] - x.q[starts]
         most, least = high[ends] - low[starts], low[ends] - high[starts]
         beyond = np.maximum(moved - most, least - moved) - part * (path[ends] - path[starts])
+        for begin, end in _unstable(ctx):
+            beyond[(x.t[starts] < end) & (x.t[ends] > begin)] = -np.inf
         i = int(np.argmax(beyond))
         inside = slice(starts[i], ends[i] + 1)
         speed = float(np.abs(dq[inside]).max())
         yield float(beyond[i]), float(x.t[starts[i]]), float(x.t[ends[i]]), speed
+
+
+def _unstable(ctx: Context) -> list[tuple[float, float]]:
+    """Begin and end of commands with negative gains: where they are put in force, the joint may
+    oscillate faster than the states show.
+    """
+    return [ctx.span(p) for p in ctx.recording.phases("negative", ctx.side)]
 
 
 def _factor(x: _Joint, lag: float) -> float:

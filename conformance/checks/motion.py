@@ -362,9 +362,7 @@ def settling(ctx: Context) -> Outcome:
 
 @check("DEX1-MOVE-09", "DEX3-MOVE-08")
 def begins(ctx: Context) -> Outcome:
-    """Time from the command until the hand has made a tenth of its way, of every step of the run
-    that arrives.
-    """
+    """Time from the command until the hand moves, of every step of the run that arrives."""
     slowest: tuple[float, float, Step] | None = None
     first = [p for name in _AFTER_A_PAUSE for p in ctx.phases(name)[:1]]
     for phase in (p for name in _PROMPT for p in ctx.phases(name)):
@@ -372,7 +370,7 @@ def begins(ctx: Context) -> Outcome:
             before = ctx.states.between(step.begin - 0.1, step.begin)
             if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
                 continue  # it was still under way
-            way = (step.q - step.start) * np.sign(step.size) >= 0.1 * abs(step.size)
+            way = (step.q - step.start) * np.sign(step.size) >= _BEGUN * step.stroke
             if (
                 abs(step.size) < ctx.tolerance("min_step_stroke", step.joint)
                 or step.error > _DISOBEYS * step.stroke
@@ -408,6 +406,8 @@ def _range(q: Floats) -> float:
     return float(np.ptp(q)) if len(q) else 0.0
 
 
+_BEGUN = 0.02
+"""Part of the stroke after which a hand counts as moving: a slow one takes 0.1 s for it."""
 _AFTER_A_PAUSE = ("restart", "service-restart")
 """Steps of which the first comes when hand and client have just found each other."""
 _PROMPT = (
