@@ -344,17 +344,16 @@ _ALL = (
         "a CycloneDDS other than 0.10 is installed in dexkit's Python",
         "dexkit refuses to use it; other programs that use it would crash the robot's programs",
         "11.x participants with Unitree's types crash 0.10.x peers",
-        "pip install 'cyclonedds>=0.10.2,<0.11'",
+        "dexkit setup-dds --replace",
     ),
     Diagnosis(
         "ENV-CYCLONEDDS-MISSING",
         _W,
         "CycloneDDS is not installed in dexkit's Python",
         "dexkit serve, record and replay report that DDS is not available",
-        "they need CycloneDDS 0.10; its wheels are for CPython 3.8 to 3.10 on x86-64 Linux (the "
-        "doctor itself does without)",
-        "use Python 3.10 on x86-64: 'uv python install 3.10', or pip install "
-        "'cyclonedds>=0.10.2,<0.11' there",
+        "they need CycloneDDS 0.10; the package index has it for CPython up to 3.10 on x86-64 only "
+        "(the doctor itself does without)",
+        "dexkit setup-dds, which finds or builds it for this Python (docs/install.md)",
     ),
     Diagnosis(
         "ENV-CYCLONEDDS-BROKEN",
@@ -362,7 +361,7 @@ _ALL = (
         "CycloneDDS is installed but does not load",
         "dexkit serve, record and replay report that DDS is not available",
         "its library cannot be loaded",
-        "pip install --force-reinstall 'cyclonedds>=0.10.2,<0.11'; unset CYCLONEDDS_HOME",
+        "dexkit setup-dds --replace; unset CYCLONEDDS_HOME and LD_LIBRARY_PATH",
     ),
     Diagnosis(
         "ENV-URI",
