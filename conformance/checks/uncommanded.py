@@ -107,9 +107,9 @@ def _stretches(
     The goal of the stretches before the first command, and after a restart of the service, is None.
     """
     found: list[tuple[float, float, float | None]] = []
-    starts = [float(ctx.states.t[0])]
-    starts += [ctx.span(p)[0] for p in ctx.phases("restarted")]
-    for begin in starts:
+    shutdowns = [ctx.span(p) for p in ctx.phases("shutdown")]
+    restarts = [ctx.span(p) for p in ctx.phases("restarted")]
+    for begin in (float(ctx.states.t[0]), *(begin for begin, _ in restarts)):
         later = ctx.commands.t[ctx.commands.t >= begin]
         found.append((begin, float(later[0]) if len(later) else ctx.recording.duration, None))
     ends = np.append(goals.t[1:], ctx.recording.duration)
@@ -117,7 +117,8 @@ def _stretches(
         a, b = float(begin), float(end)
         if low != high or b - a < 2 * _AT_REST_S:
             continue
-        for x, y in sorted(excluded):
+        # the new service knows nothing of the goal, and need not be where the old one was
+        for x, y in sorted([*excluded, *shutdowns, *restarts]):
             if x <= a < y:
                 a = y
             elif a < x < b:
