@@ -41,12 +41,13 @@ class Heartbeat:
 
     def _beat(self) -> None:
         clock = RealClock()
-        waited = _waited()
+        waited, end, woken = _waited(), time.time_ns(), clock.now()
         while not self._stop.is_set():
-            begin, due = time.time_ns(), clock.now() + _BEAT
+            # from the last beat on, so that no pause between two is lost, wherever it comes
+            begin, due = end, woken + _BEAT
             clock.sleep_until(due)
-            late = clock.now() - due
-            end = time.time_ns()
+            end, woken = time.time_ns(), clock.now()
+            late = woken - due
             # a single append, so that another thread never reads half a beat
             self._beats.append(((end - self._begin_ns) // 1000, round(late * 1e6)))
             before, waited = waited, _waited()

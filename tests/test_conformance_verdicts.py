@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import threading
 import time
 from dataclasses import replace
 
@@ -25,6 +27,7 @@ from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, of, short_run, with_beats
+from tests.dds_helpers import wait_until
 from tests.each import each
 
 BY_ID = {r.id: r for r in catalogue(None, None)}
@@ -285,3 +288,20 @@ def test_missing_stimulus_has_a_hint() -> None:
         "the stimulus 'squeeze' was not applied in this run: put something between the fingers, "
         "and say where it is felt (--object left=PCT)"
     )
+
+
+def test_pause_of_the_kit_between_two_beats_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pause may come at any point of the thread, not only while it sleeps."""
+    calls = itertools.count()
+    resumed = threading.Event()
+
+    def waited() -> float:
+        if next(calls) == 3:
+            resumed.wait(0.06)
+        return 0.0
+
+    monkeypatch.setattr("dexkit.conformance.heartbeat._waited", waited)
+    with Heartbeat() as heart:
+        wait_until(lambda: len(heart.beats.t_us) > 5)
+    assert max(heart.beats.late_us) >= 45_000
+    assert heart.stalls

@@ -67,6 +67,10 @@ class HandScript(Script[Side]):
         self._echoed = False
         """Whether a second client sends each command as well."""
         self._period_ns = round(1e9 / self._model.command_rate)
+        session = plan.session if "replay" in plan.phases else None
+        sides = [s for s in plan.sides if session and s in session.sides]
+        # before the run: it takes long enough to hold up the kit's reception of states
+        self._timeline = session.timeline(sides, plan.dialect) if session and sides else []
 
     def run(self) -> Steps:
         """The whole script."""
@@ -369,7 +373,7 @@ class HandScript(Script[Side]):
         if not sides:
             return
         dialect = self.plan.dialect
-        timeline = session.timeline(sides, dialect)
+        timeline = self._timeline
         newest = {s: session.first(s, dialect) for s in sides}
         self._goal.update({s: tuple(m.q for m in motors) for s, motors in newest.items()})
         reachable = [s for s in sides if self._reachable(s)]
