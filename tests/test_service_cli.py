@@ -150,7 +150,8 @@ def test_client_of_another_dialect_is_reported(dds_domain: int, dds_node: DdsNod
 class TestEmulatedGripper:
     """The real driver on an emulated MX-64 behind the service. No real servo was involved."""
 
-    ZERO = ("--set", "zero=1510")
+    # an emulator on a busy machine answers late
+    ZERO = ("--set", "zero=1510", "--set", "timeout=0.3")
 
     def test_emulated_gripper_is_driven_and_recovers_after_unplugging(
         self, dds_domain: int, dds_node: DdsNode
