@@ -11,12 +11,12 @@ from pathlib import Path
 
 from dexkit.errors import UsageError
 from dexkit.hand import Side
+from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
 
 __all__ = ["device_link", "serial_rule", "unit", "unit_name", "usb_rules"]
 
 _PLAIN = re.compile(r"[A-Za-z0-9@%+=:,./_-]+")
 _WATCHDOG = 5  # seconds without a state after which systemd restarts the service
-_USB_SIDES = {Side.LEFT: "1010", Side.RIGHT: "1011"}  # product ids (docs/dex3-usb.md)
 
 
 def unit_name(side: Side) -> str:
@@ -139,7 +139,8 @@ def _attribute(path: Path) -> str:
 def usb_rules() -> str:
     """The udev rules of Dex3-1 hands on USB."""
     return "".join(
-        f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="34b7", ATTR{{idProduct}}=="{product}", '
+        f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{VENDOR_ID:04x}", '
+        f'ATTR{{idProduct}}=="{product:04x}", '
         f'MODE="0660", GROUP="plugdev", TAG+="uaccess", SYMLINK+="dexkit-dex3-{side}"\n'
-        for side, product in _USB_SIDES.items()
+        for side, product in PRODUCT_ID.items()
     )

@@ -41,10 +41,38 @@ LIBRARY = Library(
     "/usr/lib/x86_64-linux-gnu",
     "libddsc.so.0",
     "/usr/lib/x86_64-linux-gnu/libddsc.so.0.10.5",
+    header_version="0.10.5",
+    version="0.10.5",
+    processor="x86_64",
 )
-PYTHON = Interpreter()
+PYTHON = Interpreter(
+    executable="/env/bin/python",
+    version=(3, 12, 1),
+    implementation="cpython",
+    free_threaded=False,
+    system="linux",
+    processor="x86_64",
+    kind="venv",
+    prefix="/env",
+    packages="/env/lib/python3.12/site-packages",
+    not_writable="",
+    headers="/usr/include/python3.12",
+    compiler="/usr/bin/cc",
+    pip=True,
+    ensurepip=True,
+    uv="",
+    made_by_uv=False,
+)
 MACHINE = Machine(
-    libraries=(LIBRARY,), distribution=DEBIAN_12, installed=Installed(), cmake="/usr/bin/cmake"
+    interpreter=PYTHON,
+    installed=Installed(),
+    libraries=(LIBRARY,),
+    distribution=DEBIAN_12,
+    temporary="/tmp",
+    free=(1 << 40, 1 << 40),
+    elsewhere=(),
+    needs_variables=(),
+    cmake="/usr/bin/cmake",
 )
 
 

@@ -36,22 +36,22 @@ class Interpreter:
     :ivar made_by_uv: uv made the environment.
     """
 
-    executable: str = "/env/bin/python"
-    version: tuple[int, int, int] = (3, 12, 1)
-    implementation: str = "cpython"
-    free_threaded: bool = False
-    system: str = "linux"
-    processor: str = "x86_64"
-    kind: str = "venv"
-    prefix: str = "/env"
-    packages: str = "/env/lib/python3.12/site-packages"
-    not_writable: str = ""
-    headers: str = "/usr/include/python3.12"
-    compiler: str = "/usr/bin/cc"
-    pip: bool = True
-    ensurepip: bool = True
-    uv: str = ""
-    made_by_uv: bool = False
+    executable: str
+    version: tuple[int, int, int]
+    implementation: str
+    free_threaded: bool
+    system: str
+    processor: str
+    kind: str
+    prefix: str
+    packages: str
+    not_writable: str
+    headers: str
+    compiler: str
+    pip: bool
+    ensurepip: bool
+    uv: str
+    made_by_uv: bool
 
     @property
     def short(self) -> str:
@@ -93,10 +93,10 @@ class Library:
     include: str
     folder: str
     file: str
-    real: str = ""
-    header_version: str = "0.10.5"
-    version: str = "0.10.5"
-    processor: str = "x86_64"
+    real: str
+    header_version: str
+    version: str
+    processor: str
 
 
 @dataclass(frozen=True)
@@ -124,15 +124,15 @@ class Machine:
     :ivar cmake: path of cmake; empty if there is none.
     """
 
-    interpreter: Interpreter = Interpreter()
-    installed: Installed = Installed()
-    libraries: tuple[Library, ...] = ()
-    distribution: Distribution = Distribution()
-    temporary: str = "/tmp"
-    free: tuple[int, int] = (1 << 40, 1 << 40)
-    elsewhere: tuple[str, ...] = ()
-    needs_variables: tuple[str, ...] = ()
-    cmake: str = ""
+    interpreter: Interpreter
+    installed: Installed
+    libraries: tuple[Library, ...]
+    distribution: Distribution
+    temporary: str
+    free: tuple[int, int]
+    elsewhere: tuple[str, ...]
+    needs_variables: tuple[str, ...]
+    cmake: str
 
 
 def is_supported(version: str) -> bool:
