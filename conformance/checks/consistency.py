@@ -1,4 +1,4 @@
-"""Do q, dq and tau_est of the state describe one body?
+"""Check that q, dq and tau_est of the state agree with each other.
 
 A hand that reports anything else than what it measures (the command, a filtered value, another
 joint's) contradicts itself: its q moves while its dq stands, its torque says contact while its q
@@ -109,7 +109,7 @@ def jumps(ctx: Context) -> Outcome:
             continue
         speed = _fastest(ctx, joint)
         change, gaps = np.abs(np.diff(q)), np.maximum(np.diff(t), 0.0)
-        # a gap is judged by RATE-03, what a hand did in a long one nobody knows
+        # a gap is judged by RATE-03; what a hand did in a long one is unknown
         near = gaps <= ctx.tolerance("max_gap_s")
         allowed = speed * (gaps + ctx.tolerance("max_hold_s")) + ctx.tolerance("counts_rad")
         part = np.where(near, change / allowed, 0.0)
@@ -318,7 +318,7 @@ def _usual_kp(ctx: Context) -> float:
 
 
 def _stiffness(ctx: Context, rows: Rows) -> Floats:
-    """Kp of each state, N m/rad; the client's usual one where it is not used."""
+    """Kp of the command before each state, N m/rad; the usual one where gains are not used."""
     usual = _usual_kp(ctx)
     if not ctx.recording.dialect.gains_are_used:
         return np.full(len(rows), usual)
@@ -416,7 +416,7 @@ def no_force_at_any_rest(ctx: Context) -> Outcome:
     """The largest tau_est at a rest in the free, beyond what its distance to the goal explains."""
     states, spec = ctx.states, ctx.joints[0]
     if ctx.recording.stimulus is None:
-        return ctx.skipped("nobody knows what was between the fingers in this recording")
+        return ctx.skipped("the recording does not say what was between the fingers")
     if not len(states) or not len(ctx.commands):
         return ctx.skipped("no states, or no commands to this hand")
     ends = ctx.tolerance("clear_stroke")

@@ -278,7 +278,9 @@ class FingerScript(HandScript):
                 bad = {s: self._malformed(name, s)[0] for s in sides}
                 yield from self._bad_commands(name, sides, [bad], 0.15)
         yield from self._far_away(1000.0, 0.2)
-        yield from self._everyone("recover", self._other_place(), most=1.5, after=self._bad_again)
+        yield from self._everyone(
+            "recover", self._other_place(), most=1.5, after=self._bad_phases_since_recovery
+        )
 
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)

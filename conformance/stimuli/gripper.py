@@ -234,7 +234,9 @@ class GripperScript(HandScript):
             wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
             yield from self._bad_commands("negative", sides, [wrong], 0.15)
         yield from self._far_away(1000.0, 0.2)
-        yield from self._everyone("recover", self._other_place(), after=self._bad_again)
+        yield from self._everyone(
+            "recover", self._other_place(), after=self._bad_phases_since_recovery
+        )
 
     def _silent_again(self) -> Steps:
         if not self._gains_used:

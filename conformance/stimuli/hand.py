@@ -302,7 +302,9 @@ class HandScript(Script[Side]):
             yield from self._bad_commands("nan", self.plan.sides, [broken], 0.1)
         yield from self._far_away(1000.0, 0.15)
         if self.plan.phases & {"nan", "out-of-range"}:
-            yield from self._everyone("recover", self._other_place(), after=self._bad_again)
+            yield from self._everyone(
+                "recover", self._other_place(), after=self._bad_phases_since_recovery
+            )
 
     def _far_away(self, far: float, each: float) -> Steps:
         """Commands far beyond both ends, to all sides at once.
@@ -317,8 +319,8 @@ class HandScript(Script[Side]):
             yield from self._bad_commands("out-of-range", sides, kinds, each)
 
     @property
-    def _bad_again(self) -> str:
-        """The names of the phases of bad commands before the newest good step."""
+    def _bad_phases_since_recovery(self) -> str:
+        """The phases of bad commands since the last step that a hand can recover by."""
         names = [p.name for p in self.phases]
         last = max(i for i, name in enumerate(names) if name in ("restart", "resume", "recover"))
         return " ".join(dict.fromkeys(names[last + 1 :]))
