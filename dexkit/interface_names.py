@@ -117,7 +117,7 @@ def wait_for_interface(
     :raises DdsSetupError: it did not come in time.
     """
     end = now() + seconds
-    told = False
+    reported = False
     while True:
         try:
             name = find_interface(text)
@@ -127,9 +127,9 @@ def wait_for_interface(
         except DdsSetupError as error:
             if now() >= end:
                 raise
-            if not told:
+            if not reported:
                 waiting(str(error))
-                told = True
+                reported = True
         sleep(_POLL)
 
 

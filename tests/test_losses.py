@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.dds import DdsNode
+from dexkit.dds import DdsNode, Writer
 from dexkit.messages import message_type
 from dexkit.socket_losses import ReceiveBuffers
 from dexkit.traces import Recorder, open_trace
@@ -28,6 +28,21 @@ from tests.each import each
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, cmd, state
 
 MS = 1_000_000
+
+
+@contextmanager
+def recording_of_states(path: Path) -> Iterator[tuple[Recorder, DdsRecording, Writer]]:
+    """A recording of a state topic, and the hand's writer on it."""
+    domain = free_domain()
+    with (
+        DdsNode(domain) as hand,
+        DdsNode(domain) as node,
+        Recorder(path) as recorder,
+        DdsRecording(node, recorder, [STATE], types={STATE: STATE_TYPE}) as recording,
+    ):
+        writer = hand.writer(STATE, STATE_TYPE)
+        assert writer.wait_matched(10)
+        yield recorder, recording, writer
 
 
 # -- the arithmetic --------------------------------------------------------------------------------
@@ -44,50 +59,50 @@ def test_a_hole_in_a_regular_stream_is_estimated(
     losses = Losses()
     times = [round((n + jitter[n]) * period * MS) + T0 for n in range(60)]
     for n in (*range(30), *range(30 + hole, 60)):
-        losses.sample("rt/a", 1, times[n])
+        losses.note_sample("rt/a", 1, times[n])
     # nothing is claimed unless the system dropped something
-    assert not losses.look(1.0, 0, {})
-    assert losses.about == {}
+    assert not losses.update(1.0, 0, {})
+    assert losses.dropped_by_topic == {}
     for n in range(60, 90):
-        losses.sample("rt/a", 1, T0 + n * period * MS)
+        losses.note_sample("rt/a", 1, T0 + n * period * MS)
     again = T0 + (90 + hole) * period * MS
-    losses.sample("rt/a", 1, again)
-    assert losses.look(2.0, hole, {})
+    losses.note_sample("rt/a", 1, again)
+    assert losses.update(2.0, hole, {})
     assert losses
-    assert abs(losses.about["rt/a"] - hole) <= 1 + hole // 4
-    assert losses.about["rt/a"] <= losses.datagrams + 2
+    assert abs(losses.dropped_by_topic["rt/a"] - hole) <= 1 + hole // 4
+    assert losses.dropped_by_topic["rt/a"] <= losses.datagrams + 2
 
 
 def test_an_estimate_never_exceeds_what_was_dropped() -> None:
     losses = Losses()
     for topic in ("rt/a", "rt/b"):
         for n in (*range(50), *range(150, 160)):
-            losses.sample(topic, 7, T0 + n * 2 * MS)
-    losses.look(0.0, 98, {})
-    assert losses.about == {"rt/a": 50, "rt/b": 50}
+            losses.note_sample(topic, 7, T0 + n * 2 * MS)
+    losses.update(0.0, 98, {})
+    assert losses.dropped_by_topic == {"rt/a": 50, "rt/b": 50}
 
 
 def test_a_gap_that_shows_later_still_counts_and_much_later_does_not() -> None:
     losses = Losses()
     for n in range(50):
-        losses.sample("rt/a", 1, T0 + n * 2 * MS)
-    losses.look(0.0, 30, {})
-    assert losses.about == {}
-    losses.sample("rt/a", 1, T0 + 80 * 2 * MS)
-    losses.look(0.5, 0, {})
-    assert losses.about == {"rt/a": 30}
-    losses.sample("rt/a", 1, T0 + 180 * 2 * MS)
-    losses.look(50.0, 0, {})
-    assert losses.about == {"rt/a": 30}
+        losses.note_sample("rt/a", 1, T0 + n * 2 * MS)
+    losses.update(0.0, 30, {})
+    assert losses.dropped_by_topic == {}
+    losses.note_sample("rt/a", 1, T0 + 80 * 2 * MS)
+    losses.update(0.5, 0, {})
+    assert losses.dropped_by_topic == {"rt/a": 30}
+    losses.note_sample("rt/a", 1, T0 + 180 * 2 * MS)
+    losses.update(50.0, 0, {})
+    assert losses.dropped_by_topic == {"rt/a": 30}
 
 
 def test_untimed_and_unordered_samples_are_accepted() -> None:
     losses = Losses()
     for source in (0, 0, 5, 3, 0, T0, T0, 0, T0 + 1, 2**62):
         for _ in range(9):
-            losses.sample("rt/a", 1, source)
-    losses.look(0.0, 1, {})
-    assert sum(losses.about.values()) <= 2
+            losses.note_sample("rt/a", 1, source)
+    losses.update(0.0, 1, {})
+    assert sum(losses.dropped_by_topic.values()) <= 2
 
 
 _HALF = frozenset(Random(2).sample(range(1000), 500))
@@ -108,14 +123,14 @@ def test_samples_that_a_steady_state_topic_lacks(kept: Callable[[int], bool], mi
     for n in range(1000):
         if kept(n):
             late = (n * 31) % 7 == 0  # written a quarter of a period late, the next one in time
-            losses.state("rt/a/state", 1, T0 + n * 2 * MS + late * MS // 2)
-    losses.state("rt/a/state", 1, T0 + 1000 * 2 * MS)
-    assert losses.look(0.0, 0, {}) == bool(missing)
+            losses.note_state("rt/a/state", 1, T0 + n * 2 * MS + late * MS // 2)
+    losses.note_state("rt/a/state", 1, T0 + 1000 * 2 * MS)
+    assert losses.update(0.0, 0, {}) == bool(missing)
     found = sum(gaps.missing for gaps in losses.gaps.values())
     assert abs(found - missing) <= 0.1 * missing
     assert not losses  # whoever is to blame
-    assert (f"about {found} missing" in losses.brief()) == bool(missing)
-    assert any("missing" in text for text in losses.sentences()) == bool(missing)
+    assert (f"about {found} missing" in losses.status()) == bool(missing)
+    assert any("missing" in text for text in losses.describe()) == bool(missing)
     assert losses.metadata()["missing about"] == str(found)
 
 
@@ -124,33 +139,33 @@ def test_a_writer_that_catches_up_lacks_nothing_and_an_irregular_one_is_not_judg
     times = [T0 + n * 2 * MS for n in range(300)]
     times[100:110] = [T0 + 109 * 2 * MS + n for n in range(10)]  # stood still, then all at once
     for time_ns in times:
-        losses.state("rt/a/state", 1, time_ns)
+        losses.note_state("rt/a/state", 1, time_ns)
     random = Random(5)
     at = T0
     for _ in range(300):
         at += int(2 * MS * 10 ** random.uniform(-2, 2))
-        losses.state("rt/b/state", 2, at)
+        losses.note_state("rt/b/state", 2, at)
     assert losses.gaps == {}
 
 
 def test_what_the_kernel_dropped_is_not_said_twice() -> None:
     losses = Losses()
     for n in (*range(100), *range(150, 300)):
-        losses.sample("rt/a/state", 1, T0 + n * 2 * MS)
-        losses.state("rt/a/state", 1, T0 + n * 2 * MS)
-    losses.look(0.0, 50, {})
-    assert losses.about == {"rt/a/state": 50}
+        losses.note_sample("rt/a/state", 1, T0 + n * 2 * MS)
+        losses.note_state("rt/a/state", 1, T0 + n * 2 * MS)
+    losses.update(0.0, 50, {})
+    assert losses.dropped_by_topic == {"rt/a/state": 50}
     assert losses.gaps == {}
 
 
 def test_loss_that_dds_reports_is_a_loss() -> None:
     losses = Losses()
-    assert losses.look(0.0, 0, {}, {"rt/a/state": 3})
+    assert losses.update(0.0, 0, {}, {"rt/a/state": 3})
     assert losses
-    assert losses.brief() == "3 lost"
-    assert "3 samples of rt/a/state were lost (reported by DDS)" in losses.sentences()
+    assert losses.status() == "3 lost"
+    assert "3 samples of rt/a/state were lost (reported by DDS)" in losses.describe()
     assert losses.metadata()["lost rt/a/state"] == "3"
-    assert not losses.look(1.0, 0, {}, {"rt/a/state": 3})
+    assert not losses.update(1.0, 0, {}, {"rt/a/state": 3})
 
 
 @each("name", ["unitree_go::msg::dds_::LowState_", "unitree_hg::msg::dds_::LowState_"])
@@ -166,20 +181,12 @@ def test_clock_in_a_message_is_read_from_its_bytes(name: str) -> None:
 
 def test_gaps_of_a_writer_are_in_the_file_and_in_the_status(tmp_path: Path) -> None:
     """The time at which a sample is written is given, so that a busy machine changes nothing."""
-    domain = free_domain()
     path = tmp_path / "a.mcap"
-    with (
-        DdsNode(domain) as hand,
-        DdsNode(domain) as node,
-        Recorder(path) as recorder,
-        DdsRecording(node, recorder, [STATE], types={STATE: STATE_TYPE}) as recording,
-    ):
-        writer = hand.writer(STATE, STATE_TYPE)
-        assert writer.wait_matched(10)
+    with recording_of_states(path) as (recorder, recording, writer):
         for n in (*range(100), *range(140, 200)):
             writer.write_raw(state(float(n)), T0 + n * 2 * MS)
         wait_until(lambda: recorder.offered.get(STATE) == 160)
-        wait_until(lambda: "about 40 missing" in recording.losses.brief())
+        wait_until(lambda: "about 40 missing" in recording.losses.status())
     about = open_trace(path).metadata["dexkit_recorder"]
     assert about["missing about"] == "40"
     assert about[f"gaps {STATE}"] == "1, about 40 samples, longest 0.082 s"
@@ -187,16 +194,16 @@ def test_gaps_of_a_writer_are_in_the_file_and_in_the_status(tmp_path: Path) -> N
 
 def test_pauses_are_reported_with_their_time() -> None:
     losses = Losses()
-    assert losses.turn(10.0, T0) is None
-    assert losses.turn(10.0 + PAUSE - 0.01, T0) is None
-    pause = losses.turn(13.5, T0)
+    assert losses.note_loop(10.0, T0) is None
+    assert losses.note_loop(10.0 + PAUSE - 0.01, T0) is None
+    pause = losses.note_loop(13.5, T0)
     assert pause is not None
     assert "did not run for 3.0 s from 2026-11-21 08:57:05 UTC" in str(pause)
     assert not losses  # a pause in which nothing was lost
     for n in range(100):
-        losses.turn(20.0 + n, T0)
+        losses.note_loop(20.0 + n, T0)
     assert losses.paused == 101
-    assert len(losses.sentences()) == 21
+    assert len(losses.describe()) == 21
     assert losses.metadata()["pauses"].endswith("101 in all")
 
 
@@ -222,16 +229,8 @@ def test_what_a_reader_refused_is_in_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dexkit.traces.dds_recording.MOST", 10)
-    domain = free_domain()
     path = tmp_path / "a.mcap"
-    with (
-        DdsNode(domain) as hand,
-        DdsNode(domain) as node,
-        Recorder(path) as recorder,
-        DdsRecording(node, recorder, [STATE], types={STATE: STATE_TYPE}) as recording,
-    ):
-        writer = hand.writer(STATE, STATE_TYPE)
-        assert writer.wait_matched(10)
+    with recording_of_states(path) as (_, recording, writer):
         take = recording._read_samples
         monkeypatch.setattr(recording, "_read_samples", lambda: None)  # busy with something else
         for n in range(40):

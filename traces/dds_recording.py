@@ -175,7 +175,7 @@ class DdsRecording:
             self._wake.wait(_IDLE)
             self._wake.clear()
             stopping = self._stopping
-            pause = self.losses.turn(time.clock_gettime(time.CLOCK_BOOTTIME), time.time_ns())
+            pause = self.losses.note_loop(time.clock_gettime(time.CLOCK_BOOTTIME), time.time_ns())
             if pause is not None:
                 _log.warning("%s", pause)
             changed |= self._discover()
@@ -202,7 +202,7 @@ class DdsRecording:
         for (topic, _), reader in self._readers.items():
             if count := reader.lost:
                 lost[topic] = lost.get(topic, 0) + count
-        return self.losses.look(now, self._sockets.count_new_drops(), refused, lost)
+        return self.losses.update(now, self._sockets.count_new_drops(), refused, lost)
 
     def _discover(self) -> bool:
         with self._fresh_lock:
@@ -259,9 +259,9 @@ class DdsRecording:
             for sample in samples:
                 # a writer may send no timestamp, which DDS gives as a negative number
                 source = max(sample.source_timestamp_ns, 0)
-                self.losses.sample(topic, sample.writer, source)
+                self.losses.note_sample(topic, sample.writer, source)
                 if tick is not None:
-                    self.losses.state(topic, sample.writer, tick(sample.data) or source)
+                    self.losses.note_state(topic, sample.writer, tick(sample.data) or source)
                 self.recorder.put(topic, type_name, sample.data, sample.reception_ns, source)
 
     def _channel_metadata(self, key: tuple[str, str]) -> dict[str, str]:

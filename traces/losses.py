@@ -1,6 +1,6 @@
 """Count samples that are missing in a recording, as far as the recorder can detect; no I/O.
 
-Five things are counted:
+What is counted:
 
 * *datagrams* that the kernel dropped because the socket's receive buffer was full. An exact count,
   but not per topic. CycloneDDS 0.10 gives readers no sequence numbers, and its "sample lost" status
@@ -9,7 +9,6 @@ Five things are counted:
 * samples *refused* because the reader's queue was full. An exact count per topic.
 * samples that are *probably missing* on each topic: when datagrams were dropped, gaps in a writer's
   source timestamps are divided by its period. An estimate.
-
 * *gaps* of a state topic that comes at a steady rate: by the robot's own clock where the message
   has one (``tick``), else by the writer's source timestamps. An estimate, whoever is to blame:
   samples that were lost on the network, or a writer that stood still.
@@ -157,22 +156,22 @@ class Losses:
         self.lost: dict[str, int] = {}
         self.refused: dict[str, int] = {}
         self._paces: dict[tuple[str, int], _Pace] = {}
-        self._gaps_said: dict[str, Gaps] = {}
+        self._gaps_reported: dict[str, Gaps] = {}
         self.pauses: list[Pause] = []
         self.paused = 0
-        self._about: Counter[str] = Counter()
+        self._missing_at_drops: Counter[str] = Counter()
         self._holes = 0
         self._streams: dict[tuple[str, int], _Stream] = {}
-        self._turn: float | None = None
+        self._last_loop: float | None = None
         self._until = float("-inf")
 
-    def turn(self, now: float, wall_ns: int) -> Pause | None:
+    def note_loop(self, now: float, wall_ns: int) -> Pause | None:
         """Note one iteration of the recorder's loop.
 
         :param now: seconds of a clock that counts suspension, too.
         :returns: the pause that has just ended, if there was one.
         """
-        before, self._turn = self._turn, now
+        before, self._last_loop = self._last_loop, now
         if before is None or now - before < PAUSE:
             return None
         pause = Pause(now - before, wall_ns)
@@ -181,7 +180,7 @@ class Losses:
             self.pauses.append(pause)
         return pause
 
-    def sample(self, topic: str, writer: int, source_ns: int) -> None:
+    def note_sample(self, topic: str, writer: int, source_ns: int) -> None:
         """Note a received sample. Those of one writer must come in order."""
         stream = self._streams.get((topic, writer))
         if stream is None:
@@ -201,7 +200,7 @@ class Losses:
             share = _SHARE if known else 1 / stream.intervals
             stream.period += (passed - stream.period) * share
 
-    def state(self, topic: str, writer: int, at_ns: int) -> None:
+    def note_state(self, topic: str, writer: int, at_ns: int) -> None:
         """Note a received sample of a state topic, which comes at a steady rate.
 
         :param at_ns: when it was written, by a clock of the writer's.
@@ -224,14 +223,14 @@ class Losses:
                 old.missing + pace.missing,
                 max(old.longest, pace.longest * 1e-9),
             )
-        dropped = self.about
+        dropped = self.dropped_by_topic
         left = {
             topic: replace(gaps, missing=gaps.missing - dropped.get(topic, 0))
             for topic, gaps in found.items()
         }
         return {topic: gaps for topic, gaps in left.items() if gaps.missing > 0}
 
-    def look(
+    def update(
         self,
         now: float,
         dropped: int,
@@ -248,8 +247,8 @@ class Losses:
         news = dropped > 0
         if (lost or {}) != self.lost:
             self.lost, news = dict(lost or {}), True
-        if (gaps := self.gaps) != self._gaps_said:
-            self._gaps_said, news = gaps, True
+        if (gaps := self.gaps) != self._gaps_reported:
+            self._gaps_reported, news = gaps, True
         self.datagrams += dropped
         if dropped:
             self._until = now + _GAP_WINDOW
@@ -257,27 +256,27 @@ class Losses:
             self.refused, news = dict(refused), True
         for stream in self._streams.values():
             if stream.missing and now <= self._until:
-                self._about[stream.topic] += stream.missing
+                self._missing_at_drops[stream.topic] += stream.missing
                 self._holes += stream.holes
                 news = True
             stream.missing = stream.holes = 0
         return news
 
     @property
-    def about(self) -> dict[str, int]:
+    def dropped_by_topic(self) -> dict[str, int]:
         """Estimated missing samples, by topic.
 
         In total at most the dropped datagrams, plus one for each gap: CycloneDDS 0.10
         does not deliver the first sample of a reliable writer after one (measured).
         """
-        total = self._about.total()
+        total = self._missing_at_drops.total()
         scale = min(1.0, (self.datagrams + self._holes) / total) if total else 0.0
-        return {topic: round(n * scale) for topic, n in sorted(self._about.items())}
+        return {topic: round(n * scale) for topic, n in sorted(self._missing_at_drops.items())}
 
     def __bool__(self) -> bool:
         return bool(self.datagrams or sum(self.refused.values()) or sum(self.lost.values()))
 
-    def brief(self) -> str:
+    def status(self) -> str:
         """The losses in a few words, for a status line; empty when there are none."""
         parts = []
         if self.datagrams:
@@ -290,33 +289,35 @@ class Losses:
             parts.append(f"about {missing} missing")
         return ", ".join(parts)
 
-    def sentences(self) -> list[str]:
-        """Losses and pauses as sentences for the user."""
-        said = [str(pause) for pause in self.pauses]
+    def describe(self) -> list[str]:
+        """Losses and pauses, one sentence each, for the user."""
+        lines = [str(pause) for pause in self.pauses]
         if self.paused > len(self.pauses):
-            said.append(f"and {self.paused - len(self.pauses)} pauses more")
+            lines.append(f"and {self.paused - len(self.pauses)} pauses more")
         if self.datagrams:
-            topics = ", ".join(f"about {n} of {topic}" for topic, n in self.about.items() if n)
-            said.append(
+            topics = ", ".join(
+                f"about {n} of {topic}" for topic, n in self.dropped_by_topic.items() if n
+            )
+            lines.append(
                 f"at least {self.datagrams} datagrams were lost because the receive buffer was full"
                 + (f" (samples: {topics})" if topics else "")
             )
-        said += [
+        lines += [
             f"{n} samples of {topic} were lost because too many waited to be taken"
             for topic, n in sorted(self.refused.items())
             if n
         ]
-        said += [
+        lines += [
             f"{n} samples of {topic} were lost (reported by DDS)"
             for topic, n in sorted(self.lost.items())
             if n
         ]
-        said += [
+        lines += [
             f"about {gaps.missing} samples of {topic} are missing ({gaps.count} gaps, the longest "
             f"{gaps.longest:.3f} s): they were lost on the way, or their writer stood still"
             for topic, gaps in self.gaps.items()
         ]
-        return said
+        return lines
 
     def metadata(self) -> dict[str, str]:
         """Losses and pauses as a metadata record of the recording."""
@@ -331,7 +332,7 @@ class Losses:
             f"gaps {topic}": f"{g.count}, about {g.missing} samples, longest {g.longest:.3f} s"
             for topic, g in self.gaps.items()
         }
-        values |= {f"lost about {topic}": str(n) for topic, n in self.about.items() if n}
+        values |= {f"lost about {topic}": str(n) for topic, n in self.dropped_by_topic.items() if n}
         values |= {f"refused {topic}": str(n) for topic, n in sorted(self.refused.items()) if n}
         if self.pauses:
             values["pauses"] = "; ".join(

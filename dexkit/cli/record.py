@@ -84,7 +84,7 @@ def command(
             _refuse_empty(node, recording, time.monotonic() - started)
     for topic, why in recording.unknown.items():
         click.echo(one_line(f"warning: {topic} was not recorded: {why}", REMARK), err=True)
-    for text in (*recording.losses.sentences(), recorder.displaced):
+    for text in (*recording.losses.describe(), recorder.displaced):
         if text:
             click.echo(one_line(f"warning: {text}", REMARK), err=True)
     dropped = recorder.dropped
@@ -98,7 +98,7 @@ def command(
 
 
 def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:
-    brief = recording.losses.brief()
+    brief = recording.losses.status()
     return f"{recorder.dropped} dropped" + (f", {brief}" if brief else "")
 
 
