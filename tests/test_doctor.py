@@ -6,18 +6,14 @@ One look sees all situations, each on a domain of its own.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
-import os
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -29,11 +25,13 @@ from dexkit.doctor import Finding, Observations, Scope, diagnose, readiness
 from dexkit.doctor import dds as doctor_dds
 from dexkit.doctor.rtps import parse_message, unicast_port
 from dexkit.doctor.type_hashes import TYPE_HASHES
+from dexkit.domains import ReservedDomain
 from dexkit.messages import unitree_go as go
 from dexkit.messages import unitree_hg as hg
 from dexkit.models import DIALECTS
 from tests import doctor_packets as packets
-from tests.dds_helpers import free_domain
+from tests.dds_helpers import free_domain, wait_until
+from tests.patience import PATIENCE
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
@@ -182,12 +180,23 @@ class _Looked:
         return {r.dialect: r.missing for r in found}
 
 
+def _reserved() -> ReservedDomain:
+    """The first domain, as soon as no other worker, checkout or user of this machine has it."""
+    found: list[ReservedDomain] = []
+
+    def reserve() -> bool:
+        with contextlib.suppress(OSError):
+            found.append(ReservedDomain(_FIRST_DOMAIN))
+        return bool(found)
+
+    wait_until(reserve, 4 * PATIENCE)
+    return found[0]
+
+
 @pytest.fixture(scope="module")
 def looked() -> _Looked:
-    lock = Path(tempfile.gettempdir()) / f"dexkit-test-doctor-{os.getuid()}"
     with contextlib.ExitStack() as stack:
-        # other workers use the same domains
-        fcntl.flock(stack.enter_context(lock.open("w")), fcntl.LOCK_EX)
+        stack.enter_context(_reserved())
         world = _World(stack)
         _build(world)
         world.start()
