@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,16 @@ def opened(
         yield hand
 
 
+def exchange(hand: Dex1Serial, command: HandCommand) -> HandState:
+    """As the hand's, and again where a busy machine has paused this program."""
+    while True:
+        try:
+            return hand.exchange(command)
+        except HandTimeout as error:
+            if "this program was paused" not in error.message:
+                raise
+
+
 def drive(
     hand: Dex1Serial,
     command: HandCommand,
@@ -56,10 +67,10 @@ def drive(
 ) -> HandState:
     end = time.monotonic() + timeout
     while True:
-        state = hand.exchange(command)
+        state = exchange(hand, command)
         if until(state):
             return state
-        assert time.monotonic() < end, f"still at {state.q[0]:.2f} rad"
+        assert time.monotonic() < end, f"{hand.side} does not get there with {command}"
         time.sleep(0.002)
 
 
@@ -68,6 +79,10 @@ def wait_for(condition: Callable[[], object], timeout: float = PATIENCE) -> None
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
+
+
+def arrived(state: HandState) -> bool:
+    return abs(float(state.q[0]) - 5.4) < 0.05
 
 
 def moving(state: HandState) -> bool:
@@ -89,7 +104,7 @@ def test_driver_moves_measures_and_brakes_on_close() -> None:
             assert way.mode[0] == JointMode.FOC
             assert float(way.tau_est[0]) > 0
             before = time.monotonic()
-            end = drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
+            end = drive(hand, OPEN, lambda s: arrived(s) and abs(float(s.dq[0])) < 0.01)
             assert float(end.temperature[0]) == pytest.approx(25, abs=5)
             assert end.winding_temperature is not None
             assert float(end.voltage[0]) == 24.0
@@ -254,20 +269,24 @@ def test_motor_that_answers_late_is_found() -> None:
 @each(
     ("spec", "fails"),
     [
-        ("short:for=150ms", True),
-        ("drop:for=150ms", True),
-        ("corrupt:for=150ms", True),
-        ("delay:ms=60,for=150ms", True),
-        ("pause:ms=60,for=150ms", True),
+        ("short:for=400ms", True),
+        ("drop:for=400ms", True),
+        ("corrupt:for=400ms", True),
+        ("delay:ms=60,for=400ms", True),
+        ("pause:ms=60,for=400ms", True),
         ("pause:ms=5,for=150ms", False),
         ("stray:before=1,for=150ms", False),
         ("stray:before=0,after=2,for=150ms", False),
     ],
 )
-def test_a_damaged_answer_costs_its_own_exchange_only(spec: str, fails: bool) -> None:
+def test_a_damaged_answer_costs_its_own_exchange_only(
+    spec: str, fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What puts the vendor's library out of step for good (docs/sources/unitree-dex.md#g) passes
     without trace.
     """
+    # the emulator is as late as a busy machine makes it, beyond its fault
+    monkeypatch.setattr("dexkit.drivers.dex1_serial.line.LATE", 0.1)
     with Dex1Motors(start_pct=50.0) as motors, opened(motors) as hand:
         hand.exchange(BRAKE)
         patient = hand.configuration
@@ -279,7 +298,7 @@ def test_a_damaged_answer_costs_its_own_exchange_only(spec: str, fails: bool) ->
         failed = 0
         while schedule.active:
             try:
-                state = hand.exchange(OPEN)
+                state = exchange(hand, OPEN)
                 assert 2.6 < float(state.q[0]) < 5.6
             except HandTimeout:
                 failed += 1
@@ -288,21 +307,21 @@ def test_a_damaged_answer_costs_its_own_exchange_only(spec: str, fails: bool) ->
         # at once, or after what is still late
         for left in reversed(range(4)):
             try:
-                hand.exchange(BRAKE)
+                exchange(hand, BRAKE)
                 break
             except HandTimeout:
                 assert left
         # and in step: each answer belongs to its own command
-        drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
+        drive(hand, OPEN, arrived)
         for command, mode in ((BRAKE, 0), (OPEN, 1)) * 5:
-            assert hand.exchange(command).mode[0] == mode
+            assert exchange(hand, command).mode[0] == mode
 
 
 def test_late_answer_is_not_taken_for_the_next_one() -> None:
     with Dex1Motors() as motors, opened(motors) as hand:
         patient = hand.configuration
         hand.configuration = replace(patient, timeout=0.03)
-        motors.inject("delay:ms=36")
+        motors.inject("delay:ms=300")
         schedule = motors.bus(Side.LEFT).schedule
         wait_for(lambda: schedule.active)
         with pytest.raises(HandTimeout, match="motor 1 on"):
@@ -434,7 +453,7 @@ def test_unplugged_in_motion_and_plugged_in_again() -> None:
         wait_for(lambda: os.path.exists(motors.path))
         hand.open()
         assert motors.motor.mechanics.mode is JointMode.BRAKE
-        drive(hand, OPEN, lambda s: abs(float(s.q[0]) - 5.4) < 0.05)
+        drive(hand, OPEN, arrived)
     assert line_module._lines == {}
 
 
@@ -591,7 +610,9 @@ def calibrate(*arguments: str) -> tuple[object, str]:
     )
 
 
-def test_calibration_on_the_command_line() -> None:
+def test_calibration_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    patient = partial(Dex1Settings, timeout=TIMEOUT)
+    monkeypatch.setattr("dexkit.cli.calibrate_dex1.Dex1Settings", patient)
     with Dex1Motors((Side.RIGHT,), start_pct=0.0, zero_error=1.5) as motors:
         where = ("dex1-serial", "--side", "right", "--device", motors.path)
         error, said = calibrate(*where, "--dry-run")

@@ -6,7 +6,9 @@ The two motors of a robot may share a line. Two hands of one process then share 
 Unlike the vendor's library (docs/sources/unitree-dex.md#g "Receive behaviour"), this module finds
 frames by head and CRC, checks the id, discards received bytes before each command, and waits for a
 late answer before it sends the next command. A stray byte or a late answer costs at most one
-exchange.
+exchange. An answer does not say which command it belongs to, so that one that is later still is
+taken for that of the next command; the line is quiet for :data:`LATE` before two commands in a row
+until it counts as in step again.
 """
 
 from __future__ import annotations
@@ -32,6 +34,9 @@ log = logging.getLogger(__name__)
 
 LATE = 0.01
 """Seconds to wait for a late answer before the next command is sent."""
+_QUIET = 2
+"""Commands after a missing answer before which the line must have been quiet: a late answer may
+have been taken for that of the first, whose own is then found before the second."""
 _CHUNK = 4096
 _MAX_STRAY_CHUNKS = 64
 """Chunks discarded at most before a command: more than an adapter and the kernel buffer."""
@@ -74,7 +79,8 @@ class MotorLine:
         self.users = 0
         self._lock = threading.Lock()
         self._parser = FrameParser((DATA,))
-        self._answer_pending = False
+        self._quiet_needed = 0
+        """Commands before which the line must be quiet, as an answer may be late."""
         try:
             self._port: serial.Serial | None = serial.Serial(
                 path, baudrate, timeout=0, exclusive=True
@@ -116,16 +122,15 @@ class MotorLine:
                 self._close_port()
                 raise
             except BaseException:  # Ctrl-C, perhaps between the command and its answer
-                self._answer_pending = True
+                self._quiet_needed = _QUIET
                 raise
 
     def _exchange(
         self, fd: int, command: bytes, number: int, timeout: float, before: WriteDeadline | None
     ) -> MotorData:
         statistics, parser = self.statistics, self._parser
-        if self._answer_pending:
-            self._answer_pending = False
-            wait_readable([fd], LATE)
+        if self._quiet_needed and not wait_readable([fd], LATE):
+            self._quiet_needed -= 1
         for _ in range(_MAX_STRAY_CHUNKS):  # bounded, for a device that sends without end
             if not (data := self._read(fd)):
                 break
@@ -158,7 +163,7 @@ class MotorLine:
             statistics.stray += parser.skipped - skipped
             statistics.damaged += parser.crc_errors - errors
         statistics.timeouts += 1
-        self._answer_pending = True
+        self._quiet_needed = _QUIET
         raise HandTimeout(
             f"motor {number} on {self.path} does not answer",
             hint="check its supply, the cable and the id",
