@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -32,21 +35,43 @@ def run(*command: object, cwd: Path, check: bool = True) -> subprocess.Completed
     return result
 
 
+def made_once(
+    tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]
+) -> Path:
+    """A folder that the first worker of a distributed run makes, for all of them."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = folder / "done"
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            done.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("dist")
-    # by way of the sdist, as a package index would build it
-    run(UV, "build", "--quiet", "--python", sys.executable, "--out-dir", out, ROOT, cwd=out)
-    return next(out.glob("*.whl"))
+    def build(out: Path) -> None:
+        # by way of the sdist, as a package index would build it
+        run(UV, "build", "--quiet", "--python", sys.executable, "--out-dir", out, ROOT, cwd=out)
+
+    return next(made_once(tmp_path_factory, "dist", build).glob("*.whl"))
 
 
 class Installed:
     """A clean environment with only the wheel in it."""
 
-    def __init__(self, home: Path, python: str, wheel: Path, extra: str = "") -> None:
+    def __init__(self, home: Path) -> None:
         self.home = home
+
+    @classmethod
+    def make(cls, home: Path, python: str, wheel: Path, extra: str = "") -> Installed:
         run(UV, "venv", "--quiet", "--python", python, home / "env", cwd=home)
         run(UV, "pip", "install", "--quiet", "--python", home / "env", f"{wheel}{extra}", cwd=home)
+        return cls(home)
 
     def __call__(self, *command: object, check: bool = True) -> subprocess.CompletedProcess[str]:
         return run(
@@ -56,7 +81,10 @@ class Installed:
 
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    return Installed(tmp_path_factory.mktemp("clean"), sys.executable, wheel, "[conformance]")
+    def make(home: Path) -> None:
+        Installed.make(home, sys.executable, wheel, "[conformance]")
+
+    return Installed(made_once(tmp_path_factory, "clean", make))
 
 
 def test_wheel_holds_every_package_completely_and_once(wheel: Path) -> None:
@@ -149,7 +177,7 @@ def test_without_dds_everything_else_works(version: str, wheel: Path, tmp_path: 
     python = optional.python(version)
     if python is None:
         pytest.skip(f"no Python {version} on this machine")
-    newer = Installed(tmp_path, python, wheel)
+    newer = Installed.make(tmp_path, python, wheel)
     code = (
         "from dexkit.messages import message_type;"
         "m = message_type('unitree_go::msg::dds_::MotorCmds_');"
