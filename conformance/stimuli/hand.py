@@ -63,6 +63,7 @@ class HandScript(Script[Side]):
         self._codec = MotorCodec(plan.dialect)
         self._model: HandModel = model(plan.dialect.model)
         self._joints = {s: joints_of(plan.dialect, s) for s in Side}
+        self._strokes = {s: [j.stroke for j in joints] for s, joints in self._joints.items()}
         self._held: tuple[dict[Side, Pose], Payloads] = ({}, [])
         self._echoed = False
         """Whether a second client sends each command as well."""
@@ -187,14 +188,15 @@ class HandScript(Script[Side]):
 
     def _left(self, side: Side, here: Pose) -> float:
         """How far a hand is from its goal, in parts of its joints' ranges."""
-        there, joints = self._goal[side], self._joints[side]
-        return sum(abs(a - b) / j.stroke for a, b, j in zip(here, there, joints, strict=True))
+        strokes = self._strokes[side]
+        return sum(abs(a - b) / s for a, b, s in zip(here, self._goal[side], strokes, strict=True))
 
     def _near(self, side: Side, a: Pose, b: Pose, part: float = 1.0) -> bool:
-        return all(
-            abs(x - y) <= part * SETTLED * joint.stroke
-            for x, y, joint in zip(a, b, self._joints[side], strict=True)
-        )
+        part *= SETTLED
+        for x, y, stroke in zip(a, b, self._strokes[side], strict=True):
+            if not abs(x - y) <= part * stroke:
+                return False
+        return True
 
     def _everyone(
         self,

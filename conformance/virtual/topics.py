@@ -77,6 +77,9 @@ class _Player:
         self.trace = MemoryTrace(endpoints=self._service.endpoints())
         self._codec = codec_for(plan.dialect)
         self._topics = {s: self._codec.state_topics[s] for s in plan.sides}
+        self._sides: dict[str, list[Subject]] = {}
+        for side, topic in self._topics.items():
+            self._sides.setdefault(topic, []).append(side)
         self._newest: dict[str, bytes] = {}
         self._joined_at: float | None = None
         self._joined: dict[Subject, float] = {}
@@ -111,10 +114,11 @@ class _Player:
         return self._observe()
 
     def _advance(self, until: float) -> None:
-        service = self._service
+        service, tick = self._service, self._service.tick
         while self.now + 1e-9 < until:
-            self.now += service.tick
-            self._take(service.advance(service.tick))
+            self.now += tick
+            if samples := service.advance(tick):
+                self._take(samples)
 
     def _take(self, samples: Iterable[Sample]) -> None:
         """Record published states, and note the first one for a late reader."""
@@ -122,7 +126,7 @@ class _Player:
             log_ns = log_time_ns(self.now) + 100_000
             sent_ns = log_time_ns(sample.sent)
             self.trace.put(sample.topic, sample.type_name, log_ns, sent_ns, sample.payload)
-            sides = [s for s, topic in self._topics.items() if topic == sample.topic]
+            sides = self._sides.get(sample.topic)
             if not sides or sample.type_name != self._plan.dialect.state_type:
                 continue
             self._newest[sample.topic] = sample.payload
