@@ -221,7 +221,7 @@ def motor_line(case: Inputs, count: int) -> None:
             users=1,
             _lock=threading.Lock(),
             _parser=m4010.FrameParser((m4010.DATA,)),
-            _answer_pending=False,
+            _quiet_needed=0,
             _port=peer.near,
             before=None,
         )
