@@ -4,8 +4,9 @@ A check is a function of a :class:`Context` that returns an :class:`Outcome`. It
 missing evidence, and takes every limit from its requirement's tolerances, so that several hand
 models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.motion`,
-:mod:`~.force`, :mod:`~.safety`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`,
-:mod:`~.fingers` for hands of several joints, and :mod:`~.client` for the client that drives them.
+:mod:`~.force`, :mod:`~.drive`, :mod:`~.safety`, :mod:`~.uncommanded`, :mod:`~.lifecycle`,
+:mod:`~.tracking`, :mod:`~.fingers` for hands of several joints, and :mod:`~.client` for the
+client that drives them.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ __all__ = [
 ]
 
 _HAND = (
-    *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "safety"),
-    *("lifecycle", "tracking", "fingers", "operator", "uncommanded"),
+    *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "drive"),
+    *("safety", "lifecycle", "tracking", "fingers", "operator", "uncommanded"),
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),

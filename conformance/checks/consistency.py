@@ -10,6 +10,7 @@ a constant factor on dq (DEX1-FIELD-16 tells it), and torque only in contact.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -23,7 +24,7 @@ from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
 
-__all__: list[str] = []
+__all__ = ["contacts"]
 
 Rows: TypeAlias = NDArray[np.intp]
 
@@ -137,6 +138,63 @@ def jumps(ctx: Context) -> Outcome:
     )
     late = (change_rad - limit) / speed
     return outcome.about(joint).placed(change_rad, limit).if_late(late)
+
+
+_FOUGHT_OVER = (
+    *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "burst"),
+    "two-writers",
+)
+"""Stimuli with bad or contradictory commands: where they are obeyed, a hand may really shake."""
+
+
+@check("DEX1-FRESH-03", "DEX3-FRESH-03")
+def alternates(ctx: Context) -> Outcome:
+    """In how many of the cells of a window q goes forth and back, in the worst window."""
+    cell, count = (
+        ctx.tolerance("cell_s"),
+        round(ctx.tolerance("window_s") / ctx.tolerance("cell_s")),
+    )
+    worst: tuple[int, float, int, float] | None = None
+    for joint in range(len(ctx.joints)):
+        good = np.isfinite(ctx.states.q[:, joint])
+        t, q = ctx.states.t[good], ctx.states.q[good, joint]
+        for begin, end in (ctx.span(p) for n in _FOUGHT_OVER for p in ctx.phases(n)):
+            kept = (t < begin) | (t > end)
+            t, q = t[kept], q[kept]
+        if len(t) < _FEW:
+            continue
+        limit = max(
+            ctx.tolerance("min_turn_stroke", joint),
+            _fastest(ctx, joint) * ctx.tolerance("max_age_s"),
+        )
+        change = np.diff(q)
+        change[np.abs(change) < ctx.tolerance("ignored_stroke", joint)] = 0.0
+        cells = ((t[1:] - t[0]) / cell).astype(np.intp)
+        up, down = (
+            np.bincount(cells, weights=np.maximum(way * change, 0.0), minlength=count)
+            for way in (1, -1)
+        )
+        back = np.minimum(up, down)
+        often = np.convolve(back >= limit, np.ones(count), "valid")
+        i = int(np.argmax(often))
+        found = (int(often[i]), float(back[i : i + count].max()), joint, float(t[0]) + i * cell)
+        worst = found if worst is None or found > worst else worst
+    if worst is None:
+        return ctx.skipped("too few states with a position")
+    turns, back_rad, joint, at = worst
+    window = count * cell
+    text = ctx.named(
+        f"in the worst {window:.2g} s q goes forth and back within {cell:g} s {turns} times, by up "
+        f"to {back_rad:.3f} rad",
+        joint,
+    )
+    if turns <= ctx.tolerance("max_turns"):
+        return ctx.passed(f"{turns} times", text, turns=turns)
+    outcome = ctx.failed(
+        f"{turns} times", text, ctx.at(ctx.states.topic, at, at + window), turns=turns
+    )
+    # no delay puts an old state behind a new one
+    return outcome.about(joint).if_late(math.inf)
 
 
 def _filled(ctx: Context) -> bool:
@@ -289,6 +347,7 @@ class _Pressing:
     :param begin: seconds, as ``end``.
     :param tau: N m, the median of its size.
     :param q: rad, the median, as ``goal``, which is within the stroke.
+    :param kp: N m/rad, the least that is commanded.
     """
 
     begin: float
@@ -296,6 +355,7 @@ class _Pressing:
     tau: float
     q: float
     goal: float
+    kp: float
 
 
 def _newest(ctx: Context) -> tuple[Rows, Floats]:
@@ -325,20 +385,20 @@ def _stiffness(ctx: Context, rows: Rows) -> Floats:
     return np.asarray(ctx.commands.kp[np.maximum(rows, 0), 0])
 
 
-def _contacts(ctx: Context, touch: float) -> list[_Pressing]:
+def contacts(ctx: Context, touch: float) -> list[_Pressing]:
     """Consecutive pieces of all contacts in which a hand presses on an object that it touches."""
     states, spec = ctx.states, ctx.joints[0]
     rows, ages = _newest(ctx)
     goals = _goals(ctx, rows)
     depth, settle = ctx.tolerance("min_depth_stroke"), ctx.tolerance("settle_s")
-    usual = _usual_kp(ctx)
+    stiff, usual = _stiffness(ctx, rows), _usual_kp(ctx)
     with np.errstate(invalid="ignore"):
         pressing = (
             (ages < ctx.tolerance("max_age_s"))
             & (goals < touch - depth)
             & (states.q[:, 0] < touch + ctx.tolerance("near_stroke"))
             & (states.q[:, 0] > spec.q_min + ctx.tolerance("near_stroke"))
-            & (_stiffness(ctx, rows) >= 0.5 * usual)
+            & (stiff >= 0.5 * usual)
             & np.isfinite(states.tau[:, 0])
         )
     edges = np.flatnonzero(np.diff(np.concatenate(([0], pressing.view(np.int8), [0]))))
@@ -356,6 +416,7 @@ def _contacts(ctx: Context, touch: float) -> list[_Pressing]:
                         median(np.abs(states.tau[piece, 0])),
                         median(states.q[piece, 0]),
                         median(goals[piece]),
+                        float(stiff[piece].min()),
                     )
                 )
             begin += window
@@ -367,7 +428,7 @@ def force_in_every_contact(ctx: Context) -> Outcome:
     """The least size of tau_est of all pieces of all contacts with the object."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    found = _contacts(ctx, ctx.object_at)
+    found = contacts(ctx, ctx.object_at)
     if not found:
         return ctx.skipped("it never pressed on the object for long enough")
     least = min(found, key=lambda p: p.tau)
@@ -391,7 +452,7 @@ def stops_at_object(ctx: Context) -> Outcome:
     touch = ctx.object_at
     if touch is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    felt = [p for p in _contacts(ctx, touch) if p.tau >= ctx.tolerance("min_tau_nm")]
+    felt = [p for p in contacts(ctx, touch) if p.tau >= ctx.tolerance("min_tau_nm")]
     if not felt:
         return ctx.skipped("tau_est shows no contact with the object")
 

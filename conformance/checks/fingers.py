@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
-from dexkit.conformance.checks.motion import Step, not_driven, steps, steps_of
+from dexkit.conformance.checks.motion import half_way, not_driven, steps, steps_of
 from dexkit.conformance.checks.safety import arrival, stays, stopped
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import Phase
@@ -365,7 +365,7 @@ def stiffness(ctx: Context) -> Outcome:
                 ctx.named(f"with soft gains it goes {progress:.0%} of its way", step.joint),
                 ctx.at(ctx.states.topic, step.begin, step.end),
             ).about(step.joint)
-        quick, slow = (_half_way(s) for s in (reference, step))
+        quick, slow = (half_way(s) for s in (reference, step))
         if quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
         # a step that never gets half-way took at least as long as its phase
@@ -381,13 +381,6 @@ def stiffness(ctx: Context) -> Outcome:
         return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
     outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
     return outcome.timed(took, least, at_least=True)
-
-
-def _half_way(step: Step) -> float | None:
-    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
-    if not len(part) or not (part >= 0.5).any():
-        return None
-    return float(step.t[int(np.argmax(part >= 0.5))]) - step.begin
 
 
 @check("DEX3-FORCE-01")

@@ -93,6 +93,14 @@ def speed_of(step: Step) -> float | None:
     return 0.8 * abs(step.size) / max(float(step.t[high] - step.t[low]), 1e-3)
 
 
+def half_way(step: Step) -> float | None:
+    """Seconds from the command to half of a step's way; None if it did not get there."""
+    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
+    if not len(part) or not (part >= 0.5).any():
+        return None
+    return float(step.t[int(np.argmax(part >= 0.5))]) - step.begin
+
+
 def steps(ctx: Context) -> list[Step]:
     """The steps of this side's joints."""
     return [s for p in ctx.phases() for s in steps_of(ctx, p)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor
@@ -252,6 +253,41 @@ class FreezesOnce(Service):
             self.kept[sides] = (self.now + 0.3, super().payload(sides, length))
         until, old = self.kept.get(sides, (0.0, b""))
         return old if self.now < until else super().payload(sides, length)
+
+
+@wrong_hand(
+    ("DEX1-FRESH-03", "DEX3-FRESH-03"),
+    also=(
+        *("DEX1-FIELD-06", "DEX1-FIELD-16", "DEX1-FIELD-17", "DEX1-MOVE-06"),
+        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-16", "DEX3-MOVE-06"),
+    ),
+    whole=True,
+)
+class SwapsBuffers(Service):
+    """Publishes every second time what it measured 0.06 s ago, until it ends."""
+
+    ended = False
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.past: dict[tuple[Side, ...], deque[tuple[float, bytes]]] = {}
+        self.turn = 0
+
+    def publish(self) -> list[Sample]:
+        self.turn += 1
+        return super().publish()
+
+    def brake(self) -> None:
+        self.ended = True
+        super().brake()
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        newest = super().payload(sides, length)
+        past = self.past.setdefault(sides, deque())
+        past.append((self.now, newest))
+        while past[0][0] < self.now - 0.06:
+            past.popleft()
+        return newest if self.turn % 2 or self.ended else past[0][1]
 
 
 # of a Dex5-1, the first requirement that finds that nothing moves is about the mode byte

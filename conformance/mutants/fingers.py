@@ -524,6 +524,49 @@ class StuckWhenSoft(FingerService):
     hand_fault = _StuckWhenSoft
 
 
+class _DeafToTorque(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[2] = 0.0
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-04")
+class DeafToTorque(FingerService):
+    """Ignores the torque of a command."""
+
+    hand_fault = _DeafToTorque
+
+
+class _TurnedTorque(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[2] = -own[2]
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-04")
+class TurnedTorque(FingerService):
+    """Obeys the torque of a command with the wrong sign."""
+
+    hand_fault = _TurnedTorque
+
+
+class _Graded(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        between = (rows[3] > 0.25 * self.client_kp) & (rows[3] < self.client_kp)
+        own[3] = np.where(between, self.client_kp, rows[3])
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-05")
+class TwoGrades(FingerService):
+    """Knows a soft grip and a firm one: from a quarter of the client's stiffness on, all of it."""
+
+    hand_fault = _Graded
+
+
 # --------------------------------------------------------------------------------- mode byte
 
 
@@ -591,6 +634,26 @@ class FingersInNewtonMetres(FingerService):
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] *= self.torque_units[: len(motors)]
+
+
+@wrong_hand("DEX3-FORCE-04")
+class UnsignedForce(Dex3Service):
+    """Has unsigned sensors of the current: each torque is that of closing."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        joints = hand.model.joints[hand.side][: len(motors)]
+        closing = np.array([j.closing or 1 for j in joints])
+        motors["tau_est"] = closing * np.abs(motors["tau_est"])
+
+
+@wrong_hand("DEX3-FORCE-05", sides=BOTH)
+class ForceOfOtherGear(Dex3Service):
+    """Publishes 40 % of the torque, as if it had another gear."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= 0.4
 
 
 @wrong_hand("DEX3-FORCE-02", brief=True)

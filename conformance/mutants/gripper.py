@@ -480,6 +480,30 @@ class DeafToVelocity(ReferenceService):
 # ------------------------------------------------------------------------------------ force
 
 
+class _DeafToTorque(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        return replace(super().accept(motor), tau=0.0)
+
+
+@wrong_hand("DEX1-GAIN-03")
+class DeafToTorque(ReferenceService):
+    """Ignores the torque of a command."""
+
+    hand = _DeafToTorque
+
+
+class _UnsignedTorque(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        return replace(super().accept(motor), tau=abs(motor.tau))
+
+
+@wrong_hand("DEX1-GAIN-03")
+class UnsignedTorque(ReferenceService):
+    """Opens with the torque of a command, whatever its sign is."""
+
+    hand = _UnsignedTorque
+
+
 @wrong_hand("DEX1-FORCE-01")
 class NoForce(_Fields):
     """Does not fill tau_est."""
@@ -498,7 +522,7 @@ class ForceAtRest(_Fields):
         return {**fields, "tau_est": fields["tau_est"] - 0.4}
 
 
-@wrong_hand("DEX1-FORCE-03")
+@wrong_hand("DEX1-FORCE-03", also=("DEX1-FORCE-08",))
 class UnsignedForce(_Fields):
     """Reports the magnitude of the force."""
 
@@ -544,6 +568,53 @@ class ForceBeforeCommands(_Fields):
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         return fields if self.hands[side].goal else {**fields, "tau_est": -0.6}
+
+
+@wrong_hand("DEX1-FORCE-08")
+class AlwaysClosing(_Fields):
+    """Has an unsigned sensor of the current: its torque is always that of closing."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return {**fields, "tau_est": -abs(fields["tau_est"])}
+
+
+@wrong_hand("DEX1-FORCE-08")
+class FeelsClosingOnly(_Fields):
+    """Publishes no torque towards open."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return {**fields, "tau_est": min(fields["tau_est"], 0.0)}
+
+
+class _Saturates(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return replace(accepted, kp=min(accepted.kp, 2.0))
+
+
+@wrong_hand("DEX1-FORCE-09")
+class StiffnessSaturates(ReferenceService):
+    """Has a kp of 2 N m/rad at most."""
+
+    hand = _Saturates
+
+
+class _WeakAgain(ReferenceHand):
+    contacts = 0
+    touching = False
+
+    def motor_torque(self) -> float:
+        tau, touches = super().motor_torque(), self.contact() > 0.0
+        self.contacts += touches and not self.touching
+        self.touching = touches
+        return 0.4 * tau if touches and self.contacts > 1 else tau
+
+
+@wrong_hand("DEX1-FORCE-09")
+class WeakAgain(ReferenceService):
+    """Presses with 40 % of the force from its second contact on."""
+
+    hand = _WeakAgain
 
 
 # ----------------------------------------------------------------------------------- safety

@@ -7,9 +7,10 @@ id and time-out bit are for the Dex3-1 alone.
 ============== =====================================================================================
 listen         no commands; state must flow
 approach       slowly to nearly open
-joint          one joint after the other closes and opens again; where there are many, all of
-               them open together at the end. Joints that share a motor are one.
-step           one hand closes and opens again, the other holds
+joint          one joint after the other closes; then every second one opens, and the others.
+               Where there are many, all of them open together. Joints that share a motor are one.
+step           one hand closes while the other holds; it opens while the other closes; the other
+               opens
 fingerprint    steps to compare the ``recover`` steps with
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
 range, empty,  limits, no motors, one too few, one and more too many, two mode bytes with each
@@ -19,9 +20,11 @@ negative,
 foreign
 beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
-stiff, soft    the same step with the client's gains and with a tenth of its stiffness
+stiff, soft,   a step with the client's gains, with a tenth of its stiffness and with a third of it
+mild
 limp           zero gains, with a q far towards closed
 lock           the same with the client's gains and status 0 or mode 0
+push, pull     a torque alone, without a position gain: towards closed, and towards open
 replay         a recorded session, as recorded
 single         commands that are sent once
 load           many commands a second, and a reader that is slow
@@ -71,8 +74,12 @@ BEYOND = 25.0
 """Percent of closing by which an object is squeezed."""
 SOFTER = 0.1
 """Stiffness of a soft step as a part of the client's."""
-_BOTH_WAYS = 8
-"""Motors of a hand up to which each of them closes and opens alone."""
+MILD = 1.0 / 3.0
+"""The same of a step with the stiffness of Unitree's C++ example, 0.5 N m/rad where its grip has
+1.5 (docs/sources/unitree-dex.md#b1)."""
+_OPENED = 8
+"""Motors of a hand up to which their opening is judged as their closing is."""
+_PUSH, _PUSH_DAMPING, _PUSH_SECONDS = 0.3, 0.5, 0.3  # N m, N m s/rad, s
 _SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of the former
 # of the latter, N m/rad and N m s/rad: still under way two seconds later
 _SLOW_GAINS = (0.2, 0.4)
@@ -92,14 +99,15 @@ class FingerScript(HandScript):
 
     motion = "joint"
     _settling = 0.2
+    _standing = 0.1
+    _least = 0.5
 
     def _provoke(self) -> Steps:
         sides, phases = self.plan.sides, self.plan.phases
         if "joint" in phases:
             yield from self._one_by_one()
         if "step" in phases:
-            for side in sides:
-                yield from self._alone(side)
+            yield from self._alone()
         if "fingerprint" in phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place(), most=1.5)
@@ -110,11 +118,13 @@ class FingerScript(HandScript):
             yield from self._foreign()
         if "burst" in phases:
             yield from self._flood()
-        if phases & {"stiff", "soft"}:
+        if phases & {"stiff", "soft", "mild"}:
             yield from self._stiff_and_soft()
         for name in ("limp", "lock"):
             if name in phases:
                 yield from self._unpulled(name)
+        if "push" in phases:
+            yield from self._pushes()
         if "replay" in phases and self.plan.session is not None:
             yield from self._replay(self.plan.session)
             yield from self._everyone("center", {s: self._home(s) for s in sides})
@@ -187,25 +197,28 @@ class FingerScript(HandScript):
         self._report("one joint after the other: no other joint may move")
         sides = self.plan.sides
         motors = self._model.motors
-        ways = (CLOSED, OPEN) if len(motors) <= _BOTH_WAYS else (CLOSED,)
-        for joints in motors:
-            for percent in ways:
-                targets = {
-                    s: {joint: self._pose(s, percent)[joint] for joint in joints} for s in sides
-                }
-                for s, moved in targets.items():
-                    self._goal[s] = tuple(moved.get(i, q) for i, q in enumerate(self._goal[s]))
-                phase = self._begin("joint", sides, targets=targets)
-                yield from self._until_settled(phase, sides, least=0.6, most=1.5)
-        if OPEN not in ways:
-            yield from self._to("center", OPEN)
+        turns = [(joints, CLOSED) for joints in motors]
+        few = len(motors) <= _OPENED
+        if few:  # no two neighbours together: those are the ones that get mixed up
+            turns += [(sum(motors[i::2], ()), OPEN) for i in (0, 1)]
+        for joints, percent in turns:
+            targets = {s: {joint: self._pose(s, percent)[joint] for joint in joints} for s in sides}
+            for s, moved in targets.items():
+                self._goal[s] = tuple(moved.get(i, q) for i, q in enumerate(self._goal[s]))
+            phase = self._begin("joint", sides, targets=targets)
+            yield from self._until_settled(phase, sides, least=0.6, most=1.5)
+        if not few:
+            yield from self._turn("center", {s: self._pose(s, OPEN) for s in sides}, least=0.5)
 
-    def _alone(self, side: Side) -> Steps:
-        self._report(f"the {side} hand alone; the other one must not move")
-        for percent in (CLOSED - 5.0, OPEN):
-            self._goal[side] = self._pose(side, percent)
-            phase = self._begin("step", (side,), targets={side: dict(enumerate(self._goal[side]))})
-            yield from self._until_settled(phase, (side,), least=0.6, most=1.5)
+    def _alone(self) -> Steps:
+        """Each hand closes and opens; one closes while the one before it opens."""
+        self._report("one hand after the other; a hand that is not commanded must not move")
+        before: dict[Side, Pose] = {}
+        for side in self.plan.sides:
+            closed = self._pose(side, CLOSED - 5.0)
+            yield from self._turn("step", {**before, side: closed}, least=0.6)
+            before = {side: self._pose(side, OPEN)}
+        yield from self._turn("step", before, least=0.6)
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
@@ -307,7 +320,10 @@ class FingerScript(HandScript):
     def _stiff_and_soft(self) -> Steps:
         self._report("a stiff step and a soft one: the gains must make a difference")
         yield from self._to("center", OPEN)
-        for name, percent, part in (("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, SOFTER)):
+        steps = [("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, SOFTER)]
+        if "mild" in self.plan.phases:
+            steps.append(("mild", CLOSED - 5.0, MILD))
+        for name, percent, part in steps:
             poses = {s: self._pose(s, percent) for s in self.plan.sides}
             targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
             phase = self._begin(name, self.plan.sides, targets=targets)
@@ -342,6 +358,25 @@ class FingerScript(HandScript):
             }
         yield from self._hold(0.5, motors)
         self._end(phase)
+        yield from self._to("center", OPEN)
+
+    def _pushes(self) -> Steps:
+        """Close and open all flexing joints by a torque alone."""
+        self._report("a torque without a position gain: the joints must move with it")
+        sides = self.plan.sides
+        for name, way, percent in (("push", 1, 100.0), ("pull", -1, 0.0)):
+            targets = {s: self._pose(s, percent) for s in sides}
+            flexing = {s: [i for i, j in enumerate(self._joints[s]) if j.closing] for s in sides}
+            phase = self._begin(
+                name, sides, targets={s: {i: targets[s][i] for i in flexing[s]} for s in sides}
+            )
+            motors = {s: list(self._motors(s, self._goal[s])) for s in sides}
+            for s in sides:
+                for i in flexing[s]:
+                    tau = way * math.copysign(_PUSH, self._joints[s][i].closing)
+                    motors[s][i] = replace(motors[s][i], tau=tau, kp=0.0, kd=_PUSH_DAMPING)
+            yield from self._hold(_PUSH_SECONDS, motors)
+            self._end(phase)
         yield from self._to("center", OPEN)
 
     def _drive(

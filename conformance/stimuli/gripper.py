@@ -16,6 +16,7 @@ foreign
 beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
 limp           zero gains, with a q far towards closed
+pull, push     a torque alone, without a position gain: towards closed, and towards open
 replay         a recorded session, as recorded
 single         commands that are sent once
 load           many commands a second, and a reader that is slow
@@ -54,6 +55,9 @@ __all__ = ["GripperScript"]
 
 # of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)
 LEAD = 0.18 / 5.4
+_PUSH = (0.25, 1.0)
+"""Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
+_PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -91,8 +95,8 @@ class GripperScript(HandScript):
             yield from self._foreign()
         if "burst" in self.plan.phases:
             yield from self._flood()
-        if "limp" in self.plan.phases and self._gains_used:
-            yield from self._limp()
+        if self.plan.phases & {"limp", "push"} and self._gains_used:
+            yield from self._undriven()
         if not self._gains_used:
             self._gainless = True
         if "replay" in self.plan.phases and self.plan.session is not None:
@@ -243,19 +247,47 @@ class GripperScript(HandScript):
             return
         sides = self.plan.sides
         yield from self._everyone("center", {s: (self._low(s),) for s in sides})
-        yield from self._drive(sides, {})
+        pressing = [s for s in sides if s in self.plan.objects]
+        yield from self._drive([s for s in sides if s not in pressing], self._squeeze(pressing))
         yield from self._silence("silence", self._model.command_timeout + 0.6)
         yield from self._everyone("resume", self._other_place())
 
-    def _limp(self) -> Steps:
-        self._report("commands without force (zero gains): the hand must not be pulled")
+    def _undriven(self) -> Steps:
+        """Commands without a position gain."""
         sides = self.plan.sides
         yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
-        low = {s: self._low(s) for s in sides}
-        phase = self._begin("limp", sides, targets={s: {0: q} for s, q in low.items()})
-        yield from self._hold(0.5, {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in low.items()})
-        self._end(phase)
+        if "limp" in self.plan.phases:
+            self._report("commands without force (zero gains): the hand must not be pulled")
+            low = {s: self._low(s) for s in sides}
+            phase = self._begin("limp", sides, targets={s: {0: q} for s, q in low.items()})
+            yield from self._hold(0.5, {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in low.items()})
+            self._end(phase)
+        if "push" in self.plan.phases:
+            yield from self._pushes(sides)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
+
+    def _pushes(self, sides: Sequence[Side]) -> Steps:
+        """Close and open by a torque alone, which grows until the hand moves."""
+        self._report("a torque without a position gain: the hand must move with it")
+        for name, way, end in (("pull", -1, 0.0), ("push", 1, self._stroke)):
+            phase = self._begin(name, sides, targets={s: {0: end} for s in sides})
+            torque = dict.fromkeys(sides, _PUSH[0])
+            while self._elapsed(phase) < _PUSH_SECONDS:
+                for s in sides:
+                    if way * self._obs.dq.get(s, (0.0,))[0] < _PUSH_SPEED * self._stroke:
+                        torque[s] = min(torque[s] * 1.02, _PUSH[1])
+                yield from self._command(
+                    {
+                        s: (Motor(self._goal[s][0], tau=way * torque[s], kp=0.0, kd=_PUSH_DAMPING),)
+                        for s in sides
+                    }
+                )
+            self._end(phase)
+
+    def _squeeze(self, sides: Sequence[Side]) -> dict[Side, Motors]:
+        """Commands into the objects of these sides."""
+        depth = 1.5 * LEAD * self._stroke
+        return {s: (Motor(q=self.plan.objects[s] - depth),) for s in sides}
 
     def _squeeze_and_silence(self) -> Steps:
         sides = self.plan.sides
@@ -264,11 +296,11 @@ class GripperScript(HandScript):
         if free:
             nearly_closed = dict.fromkeys(free, (0.15 * self._stroke,))
             yield from self._everyone("center", {**self._goal, **nearly_closed})
-        beyond = {s: self.plan.objects[s] - 1.5 * LEAD * self._stroke for s in pressing}
-        squeeze = {s: (Motor(q=q),) for s, q in beyond.items()}
+        squeeze = self._squeeze(pressing)
         if pressing:
             self._report("squeezing the object")
-            phase = self._begin("squeeze", pressing, targets={s: {0: q} for s, q in beyond.items()})
+            beyond = {s: {0: motors[0].q} for s, motors in squeeze.items()}
+            phase = self._begin("squeeze", pressing, targets=beyond)
             yield from self._hold(1.5, squeeze)
             self._end(phase)
         if not self.plan.phases & {"silence", "resume", "rejected"}:

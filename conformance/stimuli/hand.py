@@ -56,7 +56,11 @@ class HandScript(Script[Side]):
     """The stimulus for hands; subclasses have the phases of their models."""
 
     _settling = 0.4
-    """Seconds that a hand must stand near its goal."""
+    """Seconds that a hand must stand near its goal in a step whose end is judged for ripple."""
+    _standing = 0.4
+    """The same in every other step."""
+    _least = 0.6
+    """Least duration of such a step, s."""
 
     def __init__(self, plan: Plan[Side], report: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(plan, report)
@@ -149,14 +153,22 @@ class HandScript(Script[Side]):
         yield from self._repeat(seconds, lambda: self._command(motors))
 
     def _until_settled(
-        self, phase: Phase | None, sides: Sequence[Side], *, least: float, most: float
+        self,
+        phase: Phase | None,
+        sides: Sequence[Side],
+        *,
+        least: float,
+        most: float,
+        stand: float | None = None,
     ) -> Steps:
         """Hold the goals until the sides have stood near them for a while.
 
+        :param stand: seconds; None for those of a step whose end is judged for ripple.
         :param most: seconds; a hand that still comes nearer then is slow, not wrong, and is given
             up to :data:`PATIENCE` more.
         """
         begin = nearer_at = self._obs.now_ns
+        stand = self._settling if stand is None else stand
         best = math.inf
         near_since: int | None = None
         low: dict[Side, Pose] = {}
@@ -175,7 +187,7 @@ class HandScript(Script[Side]):
                 high = {s: tuple(map(max, high[s], q[s])) for s in sides}
                 if not all(self._near(s, low[s], high[s], 0.5) for s in sides):
                     near_since = None
-            settled = near_since is not None and now - near_since >= self._settling * 1e9
+            settled = near_since is not None and now - near_since >= stand * 1e9
             left = sum(self._left(s, q[s]) for s in sides if s in q)
             if left < best - 0.01:
                 best, nearer_at = left, now
@@ -203,15 +215,18 @@ class HandScript(Script[Side]):
         name: str,
         poses: Mapping[Side, Pose],
         *,
-        least: float = 0.6,
         most: float = 2.5,
         **params: str,
     ) -> Steps:
         """A step of all sides at once, as a phase."""
+        # a center is no step to be judged: a hand that is there already is not held
+        least = self._standing + 0.1 if name == "center" else self._least
         self._goal.update(poses)
         targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
         phase = self._begin(name, self.plan.sides, targets=targets, **params)
-        yield from self._until_settled(phase, self.plan.sides, least=least, most=most)
+        yield from self._until_settled(
+            phase, self.plan.sides, least=least, most=most, stand=self._standing
+        )
 
     def _in_turn(self, name: str) -> Steps:
         """Steps of one side while the other rests, and of both in opposite directions, as phases
@@ -224,10 +239,21 @@ class HandScript(Script[Side]):
             turns[-1][side] = away[side]
             turns.append({side: home[side]})
         for goals in turns:
-            self._goal.update(goals)
-            targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
-            phase = self._begin(name, tuple(goals), targets=targets)
-            yield from self._until_settled(phase, tuple(goals), least=0.5, most=1.5)
+            yield from self._turn(name, goals, least=0.5, stand=self._standing)
+
+    def _turn(
+        self,
+        name: str,
+        goals: Mapping[Side, Pose],
+        *,
+        least: float,
+        stand: float | None = None,
+    ) -> Steps:
+        """A step of some sides while the others rest, as a phase."""
+        self._goal.update(goals)
+        targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
+        phase = self._begin(name, tuple(goals), targets=targets)
+        yield from self._until_settled(phase, tuple(goals), least=least, most=1.5, stand=stand)
 
     def _approach(self) -> Steps:
         """Slowly to the middle: the first motion of an unknown hand."""

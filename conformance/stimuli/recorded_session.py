@@ -18,6 +18,8 @@ from dexkit.traces import open_trace, sample_path
 __all__ = ["DEFAULT_SECONDS", "Session"]
 
 DEFAULT_SECONDS = 10.0
+FINGERS_SECONDS = 6.0
+"""The same for hands of several joints, whose other stimuli take longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,8 @@ class Session:
                 hint="give one: --trace FILE.mcap",
             )
         path = session if isinstance(session, Path) else sample_path(session)
-        return cls.load(path, seconds=DEFAULT_SECONDS)
+        fingers = not model(hand_model).dialects[0].is_gripper
+        return cls.load(path, seconds=FINGERS_SECONDS if fingers else DEFAULT_SECONDS)
 
     def for_hand(self, target: Dialect) -> Session:
         """The session itself, if a hand of that dialect can be asked to repeat it.

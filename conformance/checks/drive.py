@@ -1,0 +1,275 @@
+"""Do torque and gains mean what they say? tau_est against motion and command, and the feed-forward
+torque and the stiffness of commands against motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.motion import Step, half_way, steps, steps_of
+from dexkit.conformance.stimulus_record import Phase
+
+__all__: list[str] = []
+
+_STEPS = (
+    *("step", "joint", "ends", "fingerprint", "recover", "resume", "center", "beside"),
+    *("company", "restart", "service-restart"),
+)
+"""Phases in which a joint moves freely by a position command."""
+_LEAST_STEP = 0.1  # of the stroke
+_REST_S, _REST_PART = 0.1, 0.01  # before a step: seconds, and part of the stroke that q may vary
+_BEGUN, _WAY = 0.01, 0.5  # parts of a step between which the motor cannot but drive the joint
+_STRONG = 0.5  # of the largest tau_est: values that count
+_CLEAR = 0.75  # part of them that must have the same sign
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """A stretch in which the motor drives a joint: at the beginning of a step, or into an object.
+
+    :param way: direction in which it drives: 1 or -1.
+    :param tau: largest tau_est in size, N m.
+    :param sign: of tau_est towards ``way``; 0 where it has both signs, or none worth the name.
+    :param contact: whether it presses on the object.
+    """
+
+    joint: int
+    way: int
+    begin: float
+    end: float
+    tau: float
+    sign: int
+    contact: bool = False
+
+    def __str__(self) -> str:
+        if self.contact:
+            return "pressing on the object"
+        return f"driven towards {'larger' if self.way > 0 else 'smaller'} q"
+
+
+def _drive_of(ctx: Context, step: Step) -> _Drive | None:
+    """The beginning of a step: up to half of its way, from rest."""
+    joint, states = step.joint, ctx.states
+    before = states.q[states.between(step.begin - _REST_S, step.begin), joint]
+    if abs(step.size) < _LEAST_STEP * step.stroke or not len(before):
+        return None
+    if not float(np.ptp(before)) <= _REST_PART * step.stroke:
+        return None  # it was still under way: its torque may brake it
+    way = 1 if step.size > 0 else -1
+    part = (step.q - step.start) / step.size
+    half = np.flatnonzero(part >= _WAY)
+    if not len(half):
+        return None  # whether it arrives is judged by other requirements
+    # before it moves, tau_est may be that of the command before
+    begin = float(step.t[np.argmax(part >= _BEGUN)])
+    return _driven(ctx, joint, way, begin, float(step.t[half[0]]))
+
+
+def _driven(
+    ctx: Context, joint: int, way: int, begin: float, end: float, *, contact: bool = False
+) -> _Drive | None:
+    tau = ctx.states.tau[ctx.states.between(begin, end), joint] * way
+    tau = tau[np.isfinite(tau)]
+    if not len(tau):
+        return None
+    largest = float(np.abs(tau).max())
+    sign = 0
+    if largest >= ctx.tolerance("min_tau_nm"):
+        strong = tau[np.abs(tau) >= _STRONG * largest]
+        part = float(np.mean(strong > 0))
+        sign = 1 if part >= _CLEAR else -1 if part <= 1 - _CLEAR else 0
+    return _Drive(joint, way, begin, end, largest, sign, contact)
+
+
+def _drives(ctx: Context) -> Iterator[_Drive]:
+    for phase in (p for name in _STEPS for p in ctx.phases(name)):
+        for step in steps_of(ctx, phase):
+            found = _drive_of(ctx, step)
+            if found is not None:
+                yield found
+    if len(ctx.joints) == 1 and ctx.object_at is not None:
+        for piece in contacts(ctx, ctx.object_at):
+            found = _driven(ctx, 0, -1, piece.begin, piece.end, contact=True)
+            if found is not None:
+                yield found
+
+
+@check("DEX1-FORCE-08", "DEX3-FORCE-04")
+def one_sign(ctx: Context) -> Outcome:
+    """Whether tau_est has one sign towards the motion that the motor causes, in both directions."""
+    found = list(_drives(ctx))
+    if not found:
+        return ctx.skipped("no step from rest was made half-way")
+    for joint in range(len(ctx.joints)):
+        mine = sorted((d for d in found if d.joint == joint), key=lambda d: d.begin)
+        signs = [d.sign for d in mine if d.sign]
+        usual = 1 if sum(signs) >= 0 else -1
+        odd = [d for d in mine if d.sign == -usual]
+        if odd:
+            return _turned(ctx, odd, len(signs))
+        for way in (1, -1):
+            free = [d for d in mine if not d.contact]
+            here, there = ([d.tau for d in free if d.way == w] for w in (way, -way))
+            if min(len(here), len(there)) < 2:
+                continue
+            least = ctx.tolerance("min_part") * float(np.median(there))
+            if float(np.median(there)) >= ctx.tolerance("min_tau_nm") and max(here) < least:
+                return _one_way(ctx, next(d for d in free if d.way == way), max(here))
+    told = sum(bool(d.sign) for d in found)
+    text = f"tau_est has one sign towards the motion in {told} drives from rest; {len(found)} made"
+    return ctx.passed(f"{told} of {len(found)}", text)
+
+
+def _turned(ctx: Context, odd: Sequence[_Drive], among: int) -> Outcome:
+    first = odd[0]
+    text = ctx.named(
+        f"tau_est has the other sign in {len(odd)} of {among} drives; the first at "
+        f"{first.begin:.2f} s, {first}, with {first.tau:.2f} N m",
+        first.joint,
+    )
+    places = [ctx.at(ctx.states.topic, d.begin, d.end) for d in odd[:5]]
+    outcome = ctx.failed("two signs", text, *places, turned=len(odd))
+    return outcome.about(first.joint)
+
+
+def _one_way(ctx: Context, drive: _Drive, most: float) -> Outcome:
+    text = ctx.named(f"tau_est is at most {most:.3f} N m in size while {drive}", drive.joint)
+    place = ctx.at(ctx.states.topic, drive.begin, drive.end)
+    return ctx.failed("one direction", text, place, tau_nm=most).about(drive.joint)
+
+
+# ------------------------------------------------------------------------------------- strength
+
+
+@check("DEX1-FORCE-09")
+def as_commanded(ctx: Context) -> Outcome:
+    """The least tau_est in contact, as a part of kp times the distance to the goal."""
+    touch = ctx.object_at
+    if touch is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, float, float, float, float] | None = None
+    for piece in contacts(ctx, touch):
+        asked = min(piece.kp * (piece.q - piece.goal), ctx.tolerance("max_asked_nm"))
+        if asked >= ctx.tolerance("min_asked_nm"):
+            found = (piece.tau / asked, piece.tau, asked, piece.begin, piece.end)
+            worst = found if worst is None else min(worst, found)
+    if worst is None:
+        return ctx.skipped("it never pressed on the object for long enough")
+    part, tau, asked, begin, end = worst
+    text = f"tau_est of {tau:.2f} N m in contact, where kp times the distance is {asked:.2f} N m"
+    limit = ctx.tolerance("min_part")
+    if part >= limit:
+        met = ctx.passed(f"{part:.0%}", text, part=part)
+        return met.pressed(tau, limit * asked, at_least=True)
+    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
+    return outcome.pressed(tau, limit * asked, at_least=True)
+
+
+@check("DEX3-FORCE-05")
+def joints_as_commanded(ctx: Context) -> Outcome:
+    """The least tau_est of pressing joints, as a part of kp times the distance to the goal."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, int, float, float, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        begin = max(begin, end - 0.5)
+        rows = ctx.states.between(begin, end)
+        given = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        given &= np.isfinite(ctx.commands.q).all(axis=1)
+        if not given.any() or not len(ctx.states.t[rows]):
+            continue
+        q, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
+        goal, kp = (np.median(a[given], axis=0) for a in (ctx.commands.q, ctx.commands.kp))
+        for joint, spec in enumerate(ctx.joints):
+            asked = min(float(kp[joint] * (goal[joint] - q[joint])) * spec.closing, spec.tau_max)
+            if not spec.closing or asked < ctx.tolerance("min_asked_nm"):
+                continue
+            felt = abs(float(tau[joint]))  # its sign is judged by DEX3-FORCE-01
+            found = (felt / asked, joint, felt, asked, begin, end)
+            worst = found if worst is None or found < worst else worst
+    if worst is None:
+        return ctx.skipped("no joint was held back by the object")
+    part, joint, felt, asked, begin, end = worst
+    text = ctx.named(
+        f"tau_est of {felt:.2f} N m in contact, where kp times the distance is {asked:.2f} N m",
+        joint,
+    )
+    limit = ctx.tolerance("min_part")
+    if part >= limit:
+        met = ctx.passed(f"{part:.0%}", text, part=part)
+        return met.pressed(felt, limit * asked, at_least=True)
+    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
+    return outcome.about(joint).pressed(felt, limit * asked, at_least=True)
+
+
+# ----------------------------------------------------------------------- commands: torque, gains
+
+
+def _pushed(ctx: Context, phase: Phase) -> Iterator[tuple[int, float]]:
+    """Joints that a phase pushes, and how far each moves towards its target, rad."""
+    for step in steps_of(ctx, phase):
+        yield step.joint, (float(step.q[-1]) - step.start) * (1 if step.size > 0 else -1)
+
+
+@check("DEX1-GAIN-03", "DEX3-GAIN-04")
+def torque_drives(ctx: Context) -> Outcome:
+    """Motion by a commanded torque without a position gain.
+
+    A torque towards larger q (of a gripper) or closing (of fingers) must move the joint; the
+    opposite one must not move it the wrong way.
+    """
+    least: tuple[float, float, int, Phase] | None = None
+    for phase in ctx.phases():
+        for joint, moved in _pushed(ctx, phase):
+            part = moved / ctx.joints[joint].stroke
+            if least is None or part < least[0]:
+                least = part, moved, joint, phase
+    if least is None:
+        return ctx.skipped("no state while a torque was commanded")
+    for phase in ctx.phases("pull"):
+        for joint, moved in _pushed(ctx, phase):
+            if moved < -ctx.tolerance("min_motion_stroke", joint):
+                text = ctx.named(
+                    f"moved by {-moved:.2f} rad against a torque that was commanded", joint
+                )
+                place = ctx.at(ctx.states.topic, *ctx.span(phase))
+                return ctx.failed("against it", text, place, motion_rad=moved).about(joint)
+    _, moved, joint, phase = least
+    text = ctx.named(f"moved by {moved:.2f} rad while a torque was commanded", joint)
+    if moved >= ctx.tolerance("min_motion_stroke", joint):
+        return ctx.passed(f"{moved:.2f} rad", text, motion_rad=moved)
+    place = ctx.at(ctx.states.topic, *ctx.span(phase))
+    return ctx.failed(f"{moved:.2f} rad", text, place, motion_rad=moved).about(joint)
+
+
+@check("DEX3-GAIN-05")
+def grades_of_stiffness(ctx: Context) -> Outcome:
+    """Time to half-way of a step with a third of the client's stiffness, compared with its own."""
+    stiff = {s.joint: s for p in ctx.phases("stiff") for s in steps_of(ctx, p)}
+    worst: tuple[float, int, float, float] | None = None
+    for step in steps(ctx):
+        reference = stiff.get(step.joint)
+        quick = half_way(reference) if reference is not None else None
+        if quick is None:
+            return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
+        slow = half_way(step)
+        took, quick = slow if slow is not None else step.end - step.begin, max(quick, 1e-3)
+        if worst is None or took / quick < worst[0]:
+            worst = took / quick, step.joint, took, quick
+    if worst is None:
+        return ctx.skipped("no state during the steps")
+    ratio, joint, took, quick = worst
+    least = ctx.tolerance("min_ratio") * quick
+    text = ctx.named(
+        f"a step with a third of the stiffness takes {ratio:.1f} times as long to half-way", joint
+    )
+    if ratio >= ctx.tolerance("min_ratio"):
+        return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
+    outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
+    return outcome.timed(took, least, at_least=True)
