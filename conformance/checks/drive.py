@@ -110,7 +110,8 @@ def one_sign(ctx: Context) -> Outcome:
         signs = [d.sign for d in mine if d.sign]
         usual = 1 if sum(signs) >= 0 else -1
         odd = [d for d in mine if d.sign == -usual]
-        if odd:
+        # a single one may be what was left of the motion before
+        if len(odd) >= ctx.tolerance("min_odd"):
             return _turned(ctx, odd, len(signs))
         for way in (1, -1):
             free = [d for d in mine if not d.contact]

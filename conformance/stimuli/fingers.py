@@ -9,8 +9,7 @@ listen         no commands; state must flow
 approach       slowly to nearly open
 joint          one joint after the other closes; then every second one opens, and the others.
                Where there are many, all of them open together. Joints that share a motor are one.
-step           one hand closes while the other holds; it opens while the other closes; the other
-               opens
+step           one hand closes and opens again, the other holds
 fingerprint    steps to compare the ``recover`` steps with
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
 range, empty,  limits, no motors, one too few, one and more too many, two mode bytes with each
@@ -107,7 +106,8 @@ class FingerScript(HandScript):
         if "joint" in phases:
             yield from self._one_by_one()
         if "step" in phases:
-            yield from self._alone()
+            for side in sides:
+                yield from self._alone(side)
         if "fingerprint" in phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place(), most=1.5)
@@ -210,15 +210,10 @@ class FingerScript(HandScript):
         if not few:
             yield from self._turn("center", {s: self._pose(s, OPEN) for s in sides}, least=0.5)
 
-    def _alone(self) -> Steps:
-        """Each hand closes and opens; one closes while the one before it opens."""
-        self._report("one hand after the other; a hand that is not commanded must not move")
-        before: dict[Side, Pose] = {}
-        for side in self.plan.sides:
-            closed = self._pose(side, CLOSED - 5.0)
-            yield from self._turn("step", {**before, side: closed}, least=0.6)
-            before = {side: self._pose(side, OPEN)}
-        yield from self._turn("step", before, least=0.6)
+    def _alone(self, side: Side) -> Steps:
+        self._report(f"the {side} hand alone; the other one must not move")
+        for percent in (CLOSED - 5.0, OPEN):
+            yield from self._turn("step", {side: self._pose(side, percent)}, least=0.6)
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
