@@ -1,0 +1,96 @@
+"""Test the checks of torque, stiffness and the course of q, and the length of runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.requirements import catalogue, select
+from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.selection import length
+from dexkit.conformance.stimuli import Session, phases_for
+from dexkit.conformance.virtual import Service
+from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
+from dexkit.hand import Side
+from dexkit.models import MODELS
+
+
+def judged(service: type[Service], *ids: str) -> list[Result]:
+    """The results of these requirements in a run of the stimuli that they need, and more steps."""
+    wanted = select(catalogue("dex1-1"), prefixes=ids)
+    plan = replace(plan_for(sides=(Side.RIGHT,)), phases=phases_for(wanted) | {"fingerprint"})
+    return [r for r in run_mutant(service, plan).results if r.requirement.id in ids]
+
+
+class InContact(ReferenceService):
+    """Publishes a torque on the object alone."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        found, hand = super().fields(side), self.hands[side]
+        return {**found, "tau_est": found["tau_est"] if hand.contact() else 0.0}
+
+
+class Turned(ReferenceService):
+    """Publishes every torque with the other sign."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        found = super().fields(side)
+        return {**found, "tau_est": -found["tau_est"]}
+
+
+class AlwaysOpening(ReferenceService):
+    """Publishes the torque's size while it moves, and the true one on the object."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        found, hand = super().fields(side), self.hands[side]
+        tau = found["tau_est"]
+        return {**found, "tau_est": tau if hand.contact() else abs(tau)}
+
+
+class _Strong(ReferenceHand):
+    tau_max = 20.0
+
+    def accept(self, motor: Any) -> Any:
+        accepted = super().accept(motor)
+        return replace(accepted, kp=4.0 * accepted.kp)
+
+
+class Servo(ReferenceService):
+    """Is four times as stiff as it is commanded."""
+
+    hand = _Strong
+
+
+def test_one_sign_of_force_is_asked_for_and_not_which() -> None:
+    ids = ("DEX1-FORCE-08", "DEX1-FORCE-01")
+    for service in (ReferenceService, Turned, InContact):
+        assert {r.verdict for r in judged(service, *ids)} == {Verdict.PASS}, service
+    (turned,) = judged(AlwaysOpening, "DEX1-FORCE-08")
+    assert turned.verdict is Verdict.WARN
+    assert turned.figure == "two signs"
+
+
+def test_a_stiffer_servo_is_no_weaker_than_commanded() -> None:
+    (strength,) = judged(Servo, "DEX1-FORCE-09")
+    assert strength.verdict is Verdict.PASS
+
+
+def test_a_torque_moves_the_gripper_one_way_at_least() -> None:
+    class _Clamped(ReferenceHand):
+        def accept(self, motor: Any) -> Any:
+            return replace(super().accept(motor), tau=max(motor.tau, 0.0))
+
+    class Clamped(ReferenceService):
+        hand = _Clamped
+
+    (result,) = judged(Clamped, "DEX1-GAIN-03")
+    assert result.verdict is Verdict.PASS
+
+
+def test_a_default_run_of_hands_is_short_enough() -> None:
+    """The hands' own time to arrive is not in this length: six seconds of a Dex3-1."""
+    for name in ("dex1-1", "dex3-1"):
+        stimuli = length(name, phases_for(catalogue(name)))
+        session = Session.default(name).duration if MODELS[name].session else 0.0
+        assert stimuli + session <= 84.0, name
