@@ -374,8 +374,7 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", also=("DEX3-SAFE-06",), whole=True)
-@wrong_hand("DEX5-MOVE-03", whole=True)
+@wrong_hand("DEX3-MOVE-03", whole=True)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
