@@ -1,5 +1,5 @@
-"""Do torque and gains mean what they say? tau_est against motion and command, and the feed-forward
-torque and the stiffness of commands against motion.
+"""Check tau_est against motion and command, and the feed-forward torque and stiffness of commands
+against motion.
 """
 
 from __future__ import annotations
@@ -121,9 +121,9 @@ def one_sign(ctx: Context) -> Outcome:
             least = ctx.tolerance("min_part") * float(np.median(there))
             if float(np.median(there)) >= ctx.tolerance("min_tau_nm") and max(here) < least:
                 return _one_way(ctx, next(d for d in free if d.way == way), max(here))
-    told = sum(bool(d.sign) for d in found)
-    text = f"tau_est has one sign towards the motion in {told} drives from rest; {len(found)} made"
-    return ctx.passed(f"{told} of {len(found)}", text)
+    clear = sum(bool(d.sign) for d in found)
+    text = f"tau_est has one sign towards the motion in {clear} drives from rest; {len(found)} made"
+    return ctx.passed(f"{clear} of {len(found)}", text)
 
 
 def _turned(ctx: Context, odd: Sequence[_Drive], among: int) -> Outcome:
