@@ -42,7 +42,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak platforms campaign campaign-sample lint format docs bench lock clean
+.PHONY: help setup demo test soak platforms wheels campaign campaign-sample lint format docs bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -67,6 +67,10 @@ campaign-sample: $(STAMP) ## two minutes of it, all cases in miniature
 
 platforms: $(STAMP) ## each Python from 3.10 to 3.13: DDS, conformance, both directions with the 0.10.2 wheel
 	$(RUN) python -m tools.platforms $(ARGS)
+
+wheels: $(STAMP) ## self-contained wheels of cyclonedds into dist/wheels: SOURCE=checkout of its C library
+	$(RUN) python -m tools.wheels --source "$(or $(SOURCE),$(error SOURCE must name a checkout: \
+		git clone --branch 0.10.5 --depth 1 https://github.com/eclipse-cyclonedds/cyclonedds))" $(ARGS)
 
 lint: $(STAMP) ## ruff and mypy strict
 	$(RUN) ruff check .

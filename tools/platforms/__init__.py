@@ -3,6 +3,8 @@
 For each of 3.10 to 3.13: an environment, ``dexkit setup-dds``, the conformance suite on a simulated
 Dex1-1, and both directions with Unitree's Python SDK on the cyclonedds wheel 0.10.2 in another
 process (:mod:`tools.platforms.peer`). An interpreter that is missing is reported, not passed over.
+``make wheels`` does the same with wheels that it has built, and without the libraries of this
+machine.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ __all__ = ["VERSIONS", "Report", "Step", "report_table", "try_all"]
 ROOT = Path(__file__).resolve().parents[2]
 VERSIONS = ("3.10", "3.11", "3.12", "3.13")
 _PEER = Path(__file__).with_name("peer.py")
+_CHECK_WHEEL = ROOT / "packaging" / "wheels" / "check_wheel.py"
 _SDK = "unitree-sdk2==1.0.1"
 _WHEEL = "cyclonedds==0.10.2"
 _TRIES = 4  # of the suite
@@ -66,11 +69,20 @@ class Report:
         return bool(self.steps) and all(step.passed for step in self.steps)
 
 
-def try_all(versions: Iterable[str], out: Path, progress: Callable[[str], object]) -> list[Report]:
+def try_all(
+    versions: Iterable[str],
+    out: Path,
+    progress: Callable[[str], object],
+    wheels: Path | None = None,
+    enter: Sequence[str] = (),
+) -> list[Report]:
     """Try each version, and write ``platforms.json`` into ``out``.
 
     :param out: folder for the environments and the logs of the steps; its environments are made
         anew.
+    :param wheels: folder of self-contained wheels of cyclonedds, to be tried instead of what
+        ``dexkit setup-dds`` would find or build.
+    :param enter: put before the commands that run dexkit.
     """
     out.mkdir(parents=True, exist_ok=True)
     reports = []
@@ -80,7 +92,7 @@ def try_all(versions: Iterable[str], out: Path, progress: Callable[[str], object
             progress(f"Python {version}: missing on this machine")
             reports.append(Report(version))
         else:
-            reports.append(_Trial(version, python, out, progress).run())
+            reports.append(_Trial(version, python, out, progress, wheels, enter).run())
         about = {"machine": platform.machine(), "system": _system()}
         text = json.dumps({**about, "reports": [asdict(r) for r in reports]}, indent=1)
         (out / "platforms.json").write_text(text + "\n")
@@ -112,13 +124,21 @@ def report_table(reports: Iterable[Report]) -> str:
 
 class _Trial:
     def __init__(
-        self, version: str, python: str, out: Path, progress: Callable[[str], object]
+        self,
+        version: str,
+        python: str,
+        out: Path,
+        progress: Callable[[str], object],
+        wheels: Path | None,
+        enter: Sequence[str],
     ) -> None:
         self._report = Report(version, python)
         self._out = out
         self._env = out / f"env-{version}"
         self._log = out / f"{version}.log"
         self._progress = progress
+        self._wheels = wheels
+        self._enter = list(enter)
 
     def run(self) -> Report:
         """Do the steps, to the first that fails."""
@@ -126,6 +146,7 @@ class _Trial:
         self._report.exact = self._output([self._report.python, "-V"]).split()[-1]
         _ = (
             self._step("environment", self._make_environment)
+            and (self._wheels is None or self._step("wheel", self._install_wheel))
             and self._step("setup-dds", self._setup_dds)
             and self._step("conformance", self._conformance)
             and self._step("both ways", self._both_ways)
@@ -149,13 +170,20 @@ class _Trial:
                       "-e", f"{ROOT}[conformance]"])  # fmt: skip
         return self._output([self._env / "bin/dexkit", "--version"]).strip()
 
+    def _install_wheel(self) -> str:
+        self._output([UV, "pip", "install", "--quiet", "--python", self._env, "--no-deps",
+                      "--no-index", "--reinstall", "--find-links", self._wheels,
+                      "cyclonedds"])  # fmt: skip
+        return self._output([*self._enter, self._env / "bin/python", _CHECK_WHEEL]).strip()
+
     def _setup_dds(self) -> str:
-        return self._last_line([self._env / "bin/dexkit", "setup-dds"], "DDS works")
+        command = [*self._enter, self._env / "bin/dexkit", "setup-dds"]
+        return self._last_line(command, "DDS works")
 
     def _conformance(self) -> str:
         """The suite; again, where the machine was too busy for a verdict."""
-        command: list[str | Path] = [self._env / "bin/pytest", "conformance/", "--backend",
-                                     "sim-dex1", "--quick", "-p", "no:cacheprovider"]  # fmt: skip
+        command = [*self._enter, self._env / "bin/pytest", "conformance/", "--backend",
+                   "sim-dex1", "--quick", "-p", "no:cacheprovider"]  # fmt: skip
         for left in reversed(range(_TRIES)):
             try:
                 return self._last_line(command, "drop-in: ")
@@ -186,14 +214,17 @@ class _Trial:
         with reserve_free_domain() as reserved:
             domain = str(reserved.domain)
             service = subprocess.Popen(
-                [self._env / "bin/dexkit", "serve", "sim-dex1", "--side", "left",
+                [*self._enter, self._env / "bin/dexkit", "serve", "sim-dex1", "--side", "left",
                  "--domain", domain],
                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             )  # fmt: skip
             try:
                 assert service.stdout is not None
-                if not (line := service.stdout.readline()).startswith("ready:"):
-                    raise RuntimeError(f"dexkit serve does not come up: {line}")
+                said: list[str] = []  # notes come before it, of priorities for example
+                while not (said and said[-1].startswith("ready:")):
+                    said.append(service.stdout.readline())
+                    if not said[-1]:
+                        raise RuntimeError(f"dexkit serve does not come up: {' '.join(said)}")
                 found = json.loads(self._output([peer, "-I", _PEER, domain]).splitlines()[-1])
             finally:
                 service.send_signal(signal.SIGTERM)
