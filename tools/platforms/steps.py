@@ -14,13 +14,13 @@ from pathlib import Path
 from dexkit.domains import reserve_free_domain
 from tools.platforms.interpreters import UV, find_python
 
-__all__ = ["ROOT", "Command", "Report", "Step", "Trial"]
+__all__ = ["ROOT", "SDK", "Command", "Report", "Step", "Trial"]
 
 ROOT = Path(__file__).resolve().parents[2]
 Command = Sequence[str | Path]
 
 _PEER = Path(__file__).with_name("peer.py")
-_SDK = "unitree-sdk2==1.0.1"
+SDK = "unitree-sdk2==1.0.1"
 _WHEEL = "cyclonedds==0.10.2"
 _PATIENCE = 900.0  # seconds for any one step; the longest, the suite, takes two minutes
 
@@ -100,7 +100,7 @@ class Trial:
                 raise RuntimeError("needs Python 3.10, for which the wheel 0.10.2 is")
             self.output([UV, "venv", "--quiet", "--python", base, home])
             self.output([UV, "pip", "install", "--quiet", "--python", home, "--no-deps",
-                          _WHEEL, _SDK, "rich-click", "click", "rich"])  # fmt: skip
+                          _WHEEL, SDK, "rich-click", "click", "rich"])  # fmt: skip
         return python
 
     def both_ways(self, serve: Command, peer: Command = ()) -> str:
