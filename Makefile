@@ -42,10 +42,10 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak platforms campaign campaign-sample lint format docs bench lock clean
+.PHONY: help setup demo test soak platforms aarch64 wheels campaign campaign-sample lint format docs bench lock clean
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
 
 setup: $(STAMP) ## create the environment (PYTHON_VERSION=3.12 for another Python, DDS=no without DDS)
 
@@ -67,6 +67,13 @@ campaign-sample: $(STAMP) ## two minutes of it, all cases in miniature
 
 platforms: $(STAMP) ## each Python from 3.10 to 3.13: DDS, conformance, both directions with the 0.10.2 wheel
 	$(RUN) python -m tools.platforms $(ARGS)
+
+aarch64: $(STAMP) ## dexkit on an emulated aarch64 processor (qemu-user), heard and moved by a client on x86-64
+	$(RUN) python -m tools.aarch64 $(ARGS)
+
+wheels: $(STAMP) ## self-contained wheels of cyclonedds into dist/wheels: SOURCE=checkout of its C library
+	$(RUN) python -m tools.wheels --source "$(or $(SOURCE),$(error SOURCE must name a checkout: \
+		git clone --branch 0.10.5 --depth 1 https://github.com/eclipse-cyclonedds/cyclonedds))" $(ARGS)
 
 lint: $(STAMP) ## ruff and mypy strict
 	$(RUN) ruff check .

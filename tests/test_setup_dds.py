@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import runpy
 import shutil
 import signal
 import struct
@@ -519,6 +520,67 @@ def test_the_build_gets_the_library_and_the_flag_of_3_13(version: tuple[int, int
     assert "--no-cache-dir" in script.commands[number]
 
 
+def test_a_wheel_alone_is_made_for_an_interpreter_that_nothing_may_be_installed_into(
+    tmp_path: Path,
+) -> None:
+    system = dataclasses.replace(
+        with_python(kind="system", not_writable="Read-only file system"),
+        installed=Installed("11.0.1"),
+    )
+    wanted = plan.make_plan(system, plan.Options(keep_wheel=True, install=False))
+    assert wanted.action == plan.Build(LIBRARY)
+    script = Script()
+    execute.carry_out(wanted, system, script, lambda text: None, tmp_path, install=False)
+    assert not [c for c in script.commands if "install" in c]
+    assert "-c" in script.commands[-1]  # it was tried
+    assert len(list(tmp_path.glob("*.whl"))) == 1
+
+
+class SourceScript(Script):
+    """Leaves also what cmake would install."""
+
+    def run(
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        *,
+        to_the_end: bool = False,
+    ) -> Done:
+        for word in command:
+            if word.startswith("-DCMAKE_INSTALL_PREFIX="):
+                prefix = Path(word.partition("=")[2])
+                (prefix / "lib").mkdir(parents=True)
+                (prefix / "lib/libddsc.so").write_bytes(b"library")
+                (prefix / "include/dds").mkdir(parents=True)
+                (prefix / "include/dds/dds.h").touch()
+        return super().run(command, environment, to_the_end=to_the_end)
+
+
+def test_a_library_from_source_is_in_the_wheel_with_its_licences(tmp_path: Path) -> None:
+    source, out = tmp_path / "source", tmp_path / "out"
+    source.mkdir()
+    options = plan.Options(source=str(source), source_version="0.10.5", keep_wheel=True)
+    wanted = plan.make_plan(MACHINE, options)
+    (source / "LICENSE").write_text("EPL")
+    with pytest.raises(DdsBuildFailed, match=r"NOTICE\.md"):
+        execute.carry_out(wanted, MACHINE, SourceScript(), lambda text: None, out)
+    (source / "NOTICE.md").write_text("notice")
+    script = SourceScript()
+    execute.carry_out(wanted, MACHINE, script, lambda text: None, out)
+    (wheel,) = out.glob("*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        names = packed.namelist()
+        licence = packed.read("cyclonedds-0.10.5.dist-info/licenses/cyclonedds/LICENSE")
+    assert "cyclonedds.libs/libddsc.so" in names
+    assert "cyclonedds-0.10.5.dist-info/licenses/cyclonedds/NOTICE.md" in names
+    assert licence == b"EPL"
+    # no folder of this Python's own link command, which a wheel for other machines must not name
+    (number,) = [n for n, c in enumerate(script.commands) if "--no-binary" in c]
+    environment = script.environments[number]
+    assert environment["LDSHARED"] == f"{PYTHON.compiler} -shared"
+    assert environment["LDFLAGS"].endswith("-Wl,-rpath,$ORIGIN/../cyclonedds.libs")
+
+
 @each(
     "changes, word",
     [
@@ -683,6 +745,19 @@ def test_a_broken_log_or_source_is_one_error(
     for arguments in (("--log", tmp_path / "none" / "log"), ("--from-source", tmp_path)):
         assert run_command("--dry-run", *arguments) == 2
         assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_a_wheel_alone_needs_a_place(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command("--no-install", "--dry-run") == 2
+    assert "--wheel DIR" in capsys.readouterr().err
+
+
+def test_the_recipe_of_the_wheels_asks_for_what_dexkit_needs_but_the_binding() -> None:
+    path = Path(__file__).parents[1] / "packaging" / "wheels" / "backend.py"
+    recipe = runpy.run_path(str(path))
+    needed = recipe["get_requires_for_build_wheel"]()
+    assert any(word.startswith("click") for word in needed)
+    assert not any(word.startswith("cyclonedds") for word in needed)
 
 
 @each("version", ["3.12", "3.13"])

@@ -39,6 +39,7 @@ __all__ = ["command"]
     metavar="DIR",
     help="Keep the wheel here, for other environments and machines.",
 )
+@click.option("--no-install", is_flag=True, help="Only make the wheel that --wheel keeps.")
 @click.option(
     "--replace", is_flag=True, help="Replace an installed cyclonedds that works, or is not 0.10.x."
 )
@@ -51,7 +52,12 @@ __all__ = ["command"]
     "[default: dexkit/setup-dds.log in the user's folder for logs]",
 )
 def command(
-    source: Path | None, wheel_folder: Path | None, replace: bool, dry_run: bool, log: Path | None
+    source: Path | None,
+    wheel_folder: Path | None,
+    no_install: bool,
+    replace: bool,
+    dry_run: bool,
+    log: Path | None,
 ) -> None:
     """Find or build CycloneDDS 0.10 for this Python.
 
@@ -70,6 +76,8 @@ def command(
     from dexkit.setup_dds.running import Interrupted, ProcessRunner
     from dexkit.stop_signals import stop_on_signals
 
+    if no_install and wheel_folder is None:
+        raise click.UsageError("--no-install needs --wheel DIR, where the wheel is kept")
     with _log_file(log) as (file, path), stop_on_signals() as stop:
         runner = ProcessRunner(file, stop)
         try:
@@ -79,6 +87,7 @@ def command(
                 source_version=version,
                 replace=replace,
                 keep_wheel=wheel_folder is not None,
+                install=not no_install,
             )
             plan = make_plan(machine, options)
             _say_plan(machine, plan)
@@ -87,7 +96,7 @@ def command(
                 click.echo("dry run: nothing was changed")
                 return
             progress = _Progress(file)
-            found = carry_out(plan, machine, runner, progress, wheel_folder)
+            found = carry_out(plan, machine, runner, progress, wheel_folder, install=not no_install)
         except Interrupted:
             click.echo("interrupted; nothing was installed", err=True)
             raise click.exceptions.Exit(130) from None
@@ -96,7 +105,10 @@ def command(
             if error.exit_code == 1:
                 error.hint = f"{error.hint}\nlog: {path}"
             raise
-        _say_result(found, plan)
+        if no_install:
+            click.echo(f"the wheel works: cyclonedds {found.version}; nothing was installed")
+        else:
+            _say_result(found, plan)
 
 
 def _look(runner: Runner, source: Path | None) -> tuple[Machine, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shlex
@@ -50,11 +49,14 @@ def carry_out(
     runner: Runner,
     progress: Callable[[str], object],
     wheel_folder: Path | None = None,
+    *,
+    install: bool = True,
 ) -> Installed:
     """Do what a plan says, and try the result.
 
     :param wheel_folder: where the wheel is also kept.
-    :returns: what is installed at the end, tried.
+    :param install: False makes the wheel, and leaves the environment alone.
+    :returns: what is installed at the end, or the unpacked wheel; tried.
     :raises DdsBuildFailed: a step failed; the environment is as it was, unless it says otherwise.
     :raises Interrupted: the user stopped it; the environment is as it was.
     """
@@ -69,10 +71,12 @@ def carry_out(
         trial = folder / "trial"
         with zipfile.ZipFile(wheel) as packed:
             packed.extractall(trial)
-        task.check(str(trial), "; nothing was installed")
+        tried = task.check(str(trial), "; nothing was installed")
         if wheel_folder is not None:
             _keep(wheel, wheel_folder)
             progress(f"kept: {wheel_folder / wheel.name}{_needs(plan)}")
+        if not install:
+            return tried
         progress(f"installing into {machine.interpreter.packages}")
         task.install(wheel)
     return task.check("", "; it is installed, and worked in a temporary folder")
@@ -127,10 +131,14 @@ class _Task:
             )
         }
         for name in ("LICENSE", "NOTICE.md"):
-            with contextlib.suppress(OSError):
-                files[f"dist-info/licenses/cyclonedds/{name}"] = Path(
-                    action.folder, name
-                ).read_bytes()
+            try:
+                text = Path(action.folder, name).read_bytes()
+            except OSError as error:
+                raise DdsBuildFailed(
+                    f"{action.folder} has no {name}: {error.strerror}",
+                    hint="the licence belongs into the wheel; use a complete checkout",
+                ) from error
+            files[f"dist-info/licenses/cyclonedds/{name}"] = text
         return library, files
 
     def _build(self, library: Library, module: str, files: Mapping[str, bytes], rpath: str) -> Path:
@@ -139,6 +147,9 @@ class _Task:
         try_compiler(self._machine, self._runner, self.folder, prefix)
         self._progress(f"building cyclonedds {BINDING} against {library.header_version} (10 s)")
         environment = build_environment(os.environ, self._machine, self.folder, prefix, rpath)
+        if files:
+            # a wheel for other machines names no folder of this Python's own link command
+            environment["LDSHARED"] = f"{self._interpreter.compiler} -shared"
         built = self._pip_wheel("--no-binary", environment)
         (self.folder / "pinned").mkdir()
         pinned = self.folder / "pinned" / built.name

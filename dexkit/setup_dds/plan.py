@@ -31,12 +31,14 @@ class Options:
     :ivar source_version: its version; empty if the folder is no such checkout.
     :ivar replace: whether a cyclonedds is replaced that works, or is not 0.10.x.
     :ivar keep_wheel: a wheel is wanted, also where a working cyclonedds is installed.
+    :ivar install: False where only the wheel is wanted.
     """
 
     source: str = ""
     source_version: str = ""
     replace: bool = False
     keep_wheel: bool = False
+    install: bool = True
 
 
 @dataclass(frozen=True)
@@ -106,13 +108,13 @@ def make_plan(machine: Machine, options: Options | None = None) -> Plan:
     _check_interpreter(interpreter)
     looked_at = []
     installed = machine.installed
-    if installed.version:
+    if installed.version and options.install:
         problem = _installed_problem(machine, options)
         if not problem and not options.source and not options.keep_wheel:
             looked_at.append(f"installed: cyclonedds {installed.version}")
             return Plan(Keep(), tuple(looked_at), _notes(machine))
         looked_at.append(f"installed: cyclonedds {installed.version}: {problem or 'it works'}")
-    _check_environment(machine)
+    _check_environment(machine, options.install)
     if options.source:
         _check_source(options)
         action: FromIndex | Build | BuildSource = BuildSource(
@@ -208,16 +210,16 @@ def file_version(path: str) -> str:
     return match[1] if match else ""
 
 
-def _check_environment(machine: Machine) -> None:
+def _check_environment(machine: Machine, install: bool) -> None:
     interpreter = machine.interpreter
-    if interpreter.kind == "system":
+    if interpreter.kind == "system" and install:
         raise InterpreterRefused(
             f"{interpreter.executable} belongs to {machine.distribution.name}, and pip must not "
             "change it (PEP 668)",
             hint="make an environment, install dexkit there, and type this again: "
             "python3 -m venv env && . env/bin/activate",
         )
-    if interpreter.not_writable:
+    if interpreter.not_writable and install:
         raise InterpreterRefused(
             f"nothing can be installed into {interpreter.packages}: {interpreter.not_writable}",
             hint="use an environment of your own: python3 -m venv env && . env/bin/activate",

@@ -3,74 +3,43 @@
 For each of 3.10 to 3.13: an environment, ``dexkit setup-dds``, the conformance suite on a simulated
 Dex1-1, and both directions with Unitree's Python SDK on the cyclonedds wheel 0.10.2 in another
 process (:mod:`tools.platforms.peer`). An interpreter that is missing is reported, not passed over.
+``make wheels`` does the same with wheels that it has built, and without the libraries of this
+machine.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import platform
 import shutil
-import signal
-import subprocess
-import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 
-from dexkit.domains import reserve_free_domain
 from tools.platforms.interpreters import UV, find_python
+from tools.platforms.steps import ROOT, Report, Step, Trial
 
 __all__ = ["VERSIONS", "Report", "Step", "report_table", "try_all"]
 
-ROOT = Path(__file__).resolve().parents[2]
 VERSIONS = ("3.10", "3.11", "3.12", "3.13")
-_PEER = Path(__file__).with_name("peer.py")
-_SDK = "unitree-sdk2==1.0.1"
-_WHEEL = "cyclonedds==0.10.2"
+_CHECK_WHEEL = ROOT / "packaging" / "wheels" / "check_wheel.py"
 _TRIES = 4  # of the suite
-_PATIENCE = 900.0  # seconds for any one step; the longest, the suite, takes two minutes
 
 
-@dataclass
-class Step:
-    """One step of one interpreter.
-
-    :ivar passed: whether it did what it should.
-    :ivar said: the line that shows it, or the error.
-    :ivar seconds: how long it took.
-    """
-
-    name: str
-    passed: bool
-    said: str
-    seconds: float
-
-
-@dataclass
-class Report:
-    """One interpreter.
-
-    :ivar python: its path; empty if it is missing.
-    :ivar exact: its whole version.
-    """
-
-    version: str
-    python: str = ""
-    exact: str = ""
-    steps: list[Step] = field(default_factory=list)
-
-    @property
-    def passed(self) -> bool:
-        """Whether all steps were done and passed; False for one that is missing."""
-        return bool(self.steps) and all(step.passed for step in self.steps)
-
-
-def try_all(versions: Iterable[str], out: Path, progress: Callable[[str], object]) -> list[Report]:
+def try_all(
+    versions: Iterable[str],
+    out: Path,
+    progress: Callable[[str], object],
+    wheels: Path | None = None,
+    enter: Sequence[str] = (),
+) -> list[Report]:
     """Try each version, and write ``platforms.json`` into ``out``.
 
     :param out: folder for the environments and the logs of the steps; its environments are made
         anew.
+    :param wheels: folder of self-contained wheels of cyclonedds, to be tried instead of what
+        ``dexkit setup-dds`` would find or build.
+    :param enter: put before the commands that run dexkit.
     """
     out.mkdir(parents=True, exist_ok=True)
     reports = []
@@ -80,7 +49,7 @@ def try_all(versions: Iterable[str], out: Path, progress: Callable[[str], object
             progress(f"Python {version}: missing on this machine")
             reports.append(Report(version))
         else:
-            reports.append(_Trial(version, python, out, progress).run())
+            reports.append(_Trial(version, python, out, progress, wheels, enter).run())
         about = {"machine": platform.machine(), "system": _system()}
         text = json.dumps({**about, "reports": [asdict(r) for r in reports]}, indent=1)
         (out / "platforms.json").write_text(text + "\n")
@@ -110,117 +79,64 @@ def report_table(reports: Iterable[Report]) -> str:
     return "\n".join(lines)
 
 
-class _Trial:
+class _Trial(Trial):
     def __init__(
-        self, version: str, python: str, out: Path, progress: Callable[[str], object]
+        self,
+        version: str,
+        python: str,
+        out: Path,
+        progress: Callable[[str], object],
+        wheels: Path | None,
+        enter: Sequence[str],
     ) -> None:
-        self._report = Report(version, python)
-        self._out = out
+        super().__init__(Report(version, python), out, out / f"{version}.log", progress)
         self._env = out / f"env-{version}"
-        self._log = out / f"{version}.log"
-        self._progress = progress
+        self._wheels = wheels
+        self._enter = list(enter)
 
     def run(self) -> Report:
         """Do the steps, to the first that fails."""
-        self._log.write_text("")
-        self._report.exact = self._output([self._report.python, "-V"]).split()[-1]
+        self.report.exact = self.output([self.report.python, "-V"]).strip().removeprefix("Python ")
+        serve: list[str | Path] = [*self._enter, self._env / "bin/dexkit", "serve", "sim-dex1"]
         _ = (
-            self._step("environment", self._make_environment)
-            and self._step("setup-dds", self._setup_dds)
-            and self._step("conformance", self._conformance)
-            and self._step("both ways", self._both_ways)
+            self.step("environment", self._make_environment)
+            and (self._wheels is None or self.step("wheel", self._install_wheel))
+            and self.step("setup-dds", self._setup_dds)
+            and self.step("conformance", self._conformance)
+            and self.step("both ways", lambda: self.both_ways(serve))
         )
-        return self._report
-
-    def _step(self, name: str, do: Callable[[], str]) -> bool:
-        self._progress(f"Python {self._report.exact}: {name}")
-        begin = time.monotonic()
-        try:
-            said, passed = do(), True
-        except (OSError, RuntimeError, subprocess.SubprocessError, ValueError) as error:
-            said, passed = " ".join(str(error).split()), False
-        self._report.steps.append(Step(name, passed, said, round(time.monotonic() - begin, 1)))
-        return passed
+        return self.report
 
     def _make_environment(self) -> str:
         shutil.rmtree(self._env, ignore_errors=True)
-        self._output([UV, "venv", "--quiet", "--python", self._report.python, self._env])
-        self._output([UV, "pip", "install", "--quiet", "--python", self._env,
+        self.output([UV, "venv", "--quiet", "--python", self.report.python, self._env])
+        self.output([UV, "pip", "install", "--quiet", "--python", self._env,
                       "-e", f"{ROOT}[conformance]"])  # fmt: skip
-        return self._output([self._env / "bin/dexkit", "--version"]).strip()
+        return self.output([self._env / "bin/dexkit", "--version"]).strip()
+
+    def _install_wheel(self) -> str:
+        assert self._wheels is not None
+        self.output([UV, "pip", "install", "--quiet", "--python", self._env, "--no-deps",
+                      "--no-index", "--reinstall", "--find-links", self._wheels,
+                      "cyclonedds"])  # fmt: skip
+        return self.output([*self._enter, self._env / "bin/python", _CHECK_WHEEL]).strip()
 
     def _setup_dds(self) -> str:
-        return self._last_line([self._env / "bin/dexkit", "setup-dds"], "DDS works")
+        command: list[str | Path] = [*self._enter, self._env / "bin/dexkit", "setup-dds"]
+        return self.last_line(command, "DDS works")
 
     def _conformance(self) -> str:
         """The suite; again, where the machine was too busy for a verdict."""
-        command: list[str | Path] = [self._env / "bin/pytest", "conformance/", "--backend",
-                                     "sim-dex1", "--quick", "-p", "no:cacheprovider"]  # fmt: skip
+        command: list[str | Path] = [*self._enter, self._env / "bin/pytest", "conformance/",
+                                     "--backend", "sim-dex1", "--quick",
+                                     "-p", "no:cacheprovider"]  # fmt: skip
         for left in reversed(range(_TRIES)):
             try:
-                return self._last_line(command, "drop-in: ")
+                return self.last_line(command, "drop-in: ")
             except RuntimeError:
-                log = self._log.read_text().splitlines()
+                log = self.log.read_text().splitlines()
                 verdict = next((x for x in reversed(log) if x.startswith("drop-in: ")), "")
                 if not verdict.startswith("drop-in: INCONCLUSIVE") or not left:
                     raise RuntimeError(verdict or "the suite did not come to a verdict") from None
-                self._progress("the machine was too busy for a verdict; again")
+                self.progress("the machine was too busy for a verdict; again")
         raise AssertionError("there is a first try")
-
-    def _peer(self) -> Path:
-        """The Python of the SDK's environment; made once."""
-        home = self._out / "peer"
-        python = home / "bin" / "python"
-        if not python.exists():
-            base = find_python("3.10")
-            if base is None:
-                raise RuntimeError("needs Python 3.10, for which the wheel 0.10.2 is")
-            self._output([UV, "venv", "--quiet", "--python", base, home])
-            self._output([UV, "pip", "install", "--quiet", "--python", home, "--no-deps",
-                          _WHEEL, _SDK, "rich-click", "click", "rich"])  # fmt: skip
-        return python
-
-    def _both_ways(self) -> str:
-        """The SDK reads states of ``dexkit serve`` and moves the gripper by commands."""
-        peer = self._peer()
-        with reserve_free_domain() as reserved:
-            domain = str(reserved.domain)
-            service = subprocess.Popen(
-                [self._env / "bin/dexkit", "serve", "sim-dex1", "--side", "left",
-                 "--domain", domain],
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            )  # fmt: skip
-            try:
-                assert service.stdout is not None
-                if not (line := service.stdout.readline()).startswith("ready:"):
-                    raise RuntimeError(f"dexkit serve does not come up: {line}")
-                found = json.loads(self._output([peer, "-I", _PEER, domain]).splitlines()[-1])
-            finally:
-                service.send_signal(signal.SIGTERM)
-                service.communicate(timeout=30)
-        return (
-            f"cyclonedds {found['cyclonedds']} read {found['states']} states and moved it from "
-            f"{found['first']:.2f} to {found['last']:.2f} rad (asked: {found['target']})"
-        )
-
-    def _last_line(self, command: Sequence[str | Path], word: str) -> str:
-        lines = [line for line in self._output(command).splitlines() if word in line]
-        if not lines:
-            raise RuntimeError(f"it did not print {word!r}")
-        return lines[-1].strip(" =")
-
-    def _output(self, command: Sequence[str | Path]) -> str:
-        kept = {"VIRTUAL_ENV", "PYTHONPATH"}
-        env = {k: v for k, v in os.environ.items() if k not in kept}
-        done = subprocess.run(
-            [str(word) for word in command],
-            cwd=ROOT, env=env | {"UV_NO_PROGRESS": "1", "UV_PYTHON_DOWNLOADS": "never"},
-            capture_output=True, text=True, timeout=_PATIENCE, check=False,
-        )  # fmt: skip
-        with self._log.open("a") as log:
-            log.write(f"$ {' '.join(map(str, command))}\n{done.stdout}{done.stderr}\n")
-        if done.returncode:
-            lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
-            errors = [line for line in lines if line.startswith("error: ")]
-            raise RuntimeError((errors or lines or [f"exit code {done.returncode}"])[-1])
-        return done.stdout

@@ -47,7 +47,7 @@ def main(domain: int) -> int:
             arrived = abs(seen[-1] - TARGET) < _CLOSE
         time.sleep(_PERIOD)
     result = {
-        "cyclonedds": metadata.version("cyclonedds"),
+        "dds": f"cyclonedds {metadata.version('cyclonedds')}",
         "python": sys.version.split()[0],
         "states": len(seen),
         "first": seen[0] if seen else None,
