@@ -85,12 +85,14 @@ class _Player:
         self._joined: dict[Subject, float] = {}
         self._stopped: dict[str, float | None] = {}
         self._clients = 0
+        self._waited_ns = 0
 
     def carry_out(self, action: Action) -> Observation:
         """Carry out an action; the clock goes on by its duration."""
         if isinstance(action, Send):
             self._send(action)
             self._advance((action.until_ns - ORIGIN_NS) / 1e9)
+            self._waited_ns = action.until_ns
         elif isinstance(action, (Join, Leave)):
             comes = isinstance(action, Join)
             if action.role is Role.MONITOR:
@@ -150,7 +152,8 @@ class _Player:
     def _observe(self) -> Observation:
         newest = {s: self._newest[t] for s, t in self._topics.items() if t in self._newest}
         return Observation(
-            log_time_ns(self.now),
+            # the clock may be a fraction of a nanosecond short of what was waited for
+            max(log_time_ns(self.now), self._waited_ns),
             _Poses(self._codec, newest, 0),
             _Poses(self._codec, newest, 1),
             dict(self._joined),
