@@ -25,7 +25,7 @@ from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
 from dexkit.messages.schemas import omgidl
 from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, by_channel
-from dexkit.traces.names import USB, dds_topic, dds_type, select_topics
+from dexkit.traces.names import SESSION, USB, dds_topic, dds_type, select_topics
 from dexkit.traces.records import Schema
 
 if TYPE_CHECKING:
@@ -524,8 +524,8 @@ class Trace:
                 message_encoding=channel.message_encoding,
                 problem=problem,
             )
-            # transfers of a conformance run on USB are there on purpose, for its judge
-            if problem and count and not channel.topic.startswith(USB):
+            # these are there on purpose, for other readers than this one
+            if problem and count and not channel.topic.startswith((USB, SESSION)):
                 self._file.warn(f"{_shorten(channel.topic)}: {problem}")
         types: dict[str, set[str]] = {}
         for info in self._info.values():

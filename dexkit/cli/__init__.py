@@ -34,6 +34,8 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "diff": ("dexkit.cli.diff", "Compare two recordings of one session."),
     "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
+    "export": ("dexkit.cli.export", "Write recordings in another format."),
+    "import": ("dexkit.cli.import_", "Write sessions of other formats as recordings."),
     "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
     "install-service": (
         "dexkit.cli.install_service",

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 from dexkit.traces.names import dds_topic
 
-__all__ = ["NOMINAL", "RECORD", "absent_fields", "absent_key"]
+__all__ = ["EPOCH_NS", "NOMINAL", "RECORD", "absent_fields", "absent_key"]
 
 RECORD = "dexkit_import"
 """Name of the metadata record."""
 NOMINAL = "nominal"
 """Value of its ``clock``: the source has no times, only a rate that was asked for."""
+EPOCH_NS = 86_400 * 10**9
+"""Where nominal times begin in a session without a date: 1970-01-02, for 0 means "unknown"."""
 _ABSENT = "absent "
 
 

@@ -11,12 +11,11 @@ import struct
 from dataclasses import dataclass
 
 from dexkit.errors import OversizeError, TruncatedError, WireError
-from dexkit.traces.names import dds_type
+from dexkit.traces.names import SESSION, dds_type
 from dexkit.traces.reader import Definition
 
 __all__ = [
     "COMPRESSED_IMAGE",
-    "GROUP",
     "JOINT_STATE",
     "STRING",
     "CompressedImage",
@@ -30,9 +29,6 @@ __all__ = [
     "encode_string",
     "group_topic",
 ]
-
-GROUP = "session"
-"""Second part of the topics of what is no DDS topic of Unitree's: ``rt/session/left_arm/state``."""
 
 _HEADER = b"\x00\x01\x00\x00"
 _MAX = 64 * 2**20  # bytes of one message
@@ -107,7 +103,7 @@ class CompressedImage:
 
 def group_topic(part: str, what: str) -> str:
     """The topic of a part: ``rt/session/left_arm/state``."""
-    return f"rt/{GROUP}/{part}/{what}"
+    return f"{SESSION}{part}/{what}"
 
 
 class _Out:

@@ -19,6 +19,7 @@ from dexkit.messages import Columns, message_type
 from dexkit.models import model
 from dexkit.robots import ROBOTS
 from dexkit.topics import roles
+from dexkit.traces.names import SESSION
 from dexkit.traces.reader import SampleArray, Trace
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.imported import RECORD, absent_fields
@@ -199,7 +200,7 @@ def _pressure(columns: Columns, sensors: Sequence[Any]) -> tuple[Floats | None, 
 def _joint_states(topic: str, samples: SampleArray) -> Iterator[Stream]:
     """Groups of joints as an import writes them: ``rt/session/PART/state``."""
     pieces = topic.split("/")
-    if len(pieces) != 4 or pieces[1] != ros_types.GROUP or pieces[3] not in ("state", "cmd"):
+    if not topic.startswith(SESSION) or len(pieces) != 4 or pieces[3] not in ("state", "cmd"):
         return
     decoded = [ros_types.decode_joint_state(data) for data in samples.payloads]
     if not decoded:
