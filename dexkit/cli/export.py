@@ -18,7 +18,7 @@ __all__ = ["command"]
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["rosbag2", "parquet", "csv"]),
+    type=click.Choice(["lerobot", "episodes", "rosbag2", "parquet", "csv"]),
     required=True,
     help="The format.",
 )
@@ -30,10 +30,25 @@ __all__ = ["command"]
     show_default=True,
     help="Storage of a ROS 2 bag.",
 )
-def command(sessions: tuple[Path, ...], form: str, out: Path, storage: str) -> int:
+@click.option(
+    "--fps",
+    type=click.IntRange(1, 1000),
+    metavar="N",
+    help="Frames a second of lerobot and episodes.  [default: measured]",
+)
+@click.option("--task", metavar="TEXT", help="Task of all episodes.  [default: the recording's]")
+def command(
+    sessions: tuple[Path, ...],
+    form: str,
+    out: Path,
+    storage: str,
+    fps: int | None,
+    task: str | None,
+) -> int:
     """Write the recordings SESSION... to the folder DIR in another format.
 
-    Of several, each gets a folder of its name in DIR.
+    lerobot makes one dataset (v3.0) and episodes one task folder of them; of the others, several
+    recordings get a folder of their name each.
 
     Exit code: 0 all is exported, 1 a recording is damaged or was refused (the others are
     exported), 2 wrong usage, or nothing could be exported.
@@ -41,6 +56,10 @@ def command(sessions: tuple[Path, ...], form: str, out: Path, storage: str) -> i
     from dexkit.traces import open_trace
     from dexkit.traces.sessions import rosbag, tables
 
+    if form in ("lerobot", "episodes"):
+        return _frames(sessions, form, out, fps, task)
+    if fps is not None or task is not None:
+        raise UsageError(f"--fps and --task are for lerobot and episodes, not for {form}")
     several = len(sessions) > 1
     if several and len({p.stem for p in sessions}) < len(sessions):
         raise UsageError("two of the recordings have the same name", hint="export them one by one")
@@ -70,3 +89,34 @@ def command(sessions: tuple[Path, ...], form: str, out: Path, storage: str) -> i
     if not done:
         raise SessionError("none of the recordings could be exported")
     return 1 if trouble else 0
+
+
+def _frames(
+    sessions: tuple[Path, ...], form: str, out: Path, fps: int | None, task: str | None
+) -> int:
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions import episodes_out, lerobot_out
+
+    traces, refused = [], []
+    for path in sessions:
+        try:
+            traces.append(open_trace(path))
+        except DexkitError as error:
+            if len(sessions) == 1:
+                raise
+            refused.append(f"{path}: refused: {error}")
+    if not traces:
+        raise SessionError("none of the recordings could be exported")
+    if form == "lerobot":
+        result = lerobot_out.export_dataset(traces, out, fps=fps, task=task)
+    else:
+        result = episodes_out.export_episodes(traces, out, fps=fps, task=task)
+    for trace in traces:
+        for text in trace.warnings:
+            click.echo(one_line(f"warning: {trace.path}: {text}", REMARK), err=True)
+    for text in (*refused, *result.problems):
+        click.echo(one_line(f"warning: {text}", REMARK), err=True)
+    for text in result.lost:
+        click.echo(one_line(f"not in {form}: {text}", REMARK), err=True)
+    click.echo(f"{out}: {lerobot_out.describe(result)}")
+    return 1 if refused or result.problems or any(t.damage for t in traces) else 0

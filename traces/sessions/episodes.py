@@ -259,7 +259,7 @@ def session_of(
     if not items:
         raise SessionError(f"{source} has no frame that can be used")
     rate = _rate(document, options, problems)
-    times, clock, rate, items = _times(document, items, rate, problems)
+    times, clock, rate, first = _times(document, items, rate, problems)
     parts, carried = _parts(items, problems)
     if not parts:
         raise SessionError(
@@ -276,8 +276,9 @@ def session_of(
         folder=folder,
         cameras=list(_cameras(items, folder, problems)),
         problems=problems,
+        first_ns=first,
     )
-    session.rest = _rest(items, carried, {c.name for c in session.cameras})
+    session.rest = _rest(items, carried, {c.name for c in session.cameras}, first is not None)
     session.about = {
         "info": json.dumps(document.info, ensure_ascii=False),
         "text": json.dumps(document.text, ensure_ascii=False),
@@ -303,15 +304,15 @@ def _rate(document: Document, options: Options, problems: Problems) -> float:
 
 def _times(
     document: Document, items: list[dict[str, Any]], rate: float, problems: Problems
-) -> tuple[NDArray[np.int64], str, float, list[dict[str, Any]]]:
-    """Times of the frames, the kind of clock, the rate, and the frames in that order."""
+) -> tuple[NDArray[np.int64], str, float, int | None]:
+    """Times, kind of clock, rate, and the time of frame 0 if the clock is nominal."""
     stamps = [_stamp(item) for item in items]
     if all(s is not None for s in stamps):
         times = [s for s in stamps if s is not None]
         if all(a < b for a, b in pairwise(times)):
             found = np.array(times, dtype=np.int64)
             period = float(np.median(np.diff(found))) if len(found) > 1 else _NS / rate
-            return found, MEASURED, _NS / period, items
+            return found, MEASURED, _NS / period, None
         problems.add("the times of the frames do not ascend; nominal ones are used")
     indexes = [_index(item) for item in items]
     numbers = [n for n in indexes if n is not None]
@@ -319,12 +320,8 @@ def _times(
         problems.add("the numbers of the frames (idx) do not ascend; they are counted instead")
         numbers = list(range(len(items)))
     first = _day(document.info.get("date"))
-    return (
-        np.array([first + round(n * _NS / rate) for n in numbers], dtype=np.int64),
-        NOMINAL,
-        rate,
-        items,
-    )
+    times_ns = np.array([first + round(n * _NS / rate) for n in numbers], dtype=np.int64)
+    return times_ns, NOMINAL, rate, first
 
 
 def _index(item: Mapping[str, Any]) -> int | None:
@@ -530,15 +527,20 @@ def _cameras(items: Sequence[dict[str, Any]], folder: Path, problems: Problems) 
                 problems.add(f"{key}.{name}: pictures that are missing", path)
             paths.append(path)
         if any(paths):
-            yield Camera(name, tuple(paths))
+            yield Camera(name, tuple(paths), key)
 
 
-def _rest(items: Sequence[dict[str, Any]], carried: Carried, cameras: Iterable[str]) -> list[str]:
-    """What of each frame no part and no camera carries, as JSON; empty where it does not change."""
+def _rest(
+    items: Sequence[dict[str, Any]], carried: Carried, cameras: Iterable[str], numbered: bool
+) -> list[str]:
+    """What of each frame no part and no camera carries, as JSON; empty where it does not change.
+
+    :param numbered: the number of a frame follows from its time.
+    """
     found: list[str] = []
     before: str | None = None
     for i, item in enumerate(items):
-        rest = {k: v for k, v in item.items() if k != "idx"}
+        rest = {k: v for k, v in item.items() if k != "idx" or not numbered}
         for key in _DIRECTIONS:
             if isinstance(rest.get(key), dict):
                 rest[key] = {

@@ -24,10 +24,8 @@ COLUMNS = {
     ("state", "dq"): "observation.velocity",
     ("state", "tau"): "observation.effort",
     ("command", "q"): ACTION,
-    ("command", "dq"): "action.velocity",
-    ("command", "tau"): "action.effort",
 }
-"""The feature of each kind and field; velocity and effort are written only if all parts have
+"""The feature of each kind and field; velocity and effort are written only if all states have
 them. ``observation.velocity`` and ``observation.effort`` are unitree_lerobot's names."""
 PRESSURE = "observation.pressure"
 EXTENSION = "dexkit"

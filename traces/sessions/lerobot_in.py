@@ -131,7 +131,7 @@ class Dataset:
         kept = self._extension.get("sessions")
         origin = kept.get(str(episode), {}) if isinstance(kept, dict) else {}
         start = str(origin.get("start_ns", "")) if isinstance(origin, dict) else ""
-        if start.isdigit() and len(start) < 19:
+        if start.isdigit() and len(start) < 20 and int(start) < 2**62:
             session.times_ns = session.times_ns - times[0] + int(start)
             session.clock = str(origin.get("clock", NOMINAL))
         tasks = self._task_texts(row, table)
@@ -381,7 +381,7 @@ class Dataset:
             yield Camera(
                 name,
                 (relative,) * table.num_rows,
-                tuple((first + stamps).tolist()),
+                seconds=tuple((first + stamps).tolist()),
             )
 
     def _rest(self, table: Any, count: int) -> list[str]:

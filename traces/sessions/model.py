@@ -112,11 +112,13 @@ class Camera:
 
     :param name: ``color_0``.
     :param paths: relative to the session's folder; empty where the frame has none.
+    :param group: ``colors`` or ``depths``.
     :param seconds: of a video, the time within the file at each frame; None for single pictures.
     """
 
     name: str
     paths: tuple[str, ...]
+    group: str = "colors"
     seconds: tuple[float, ...] | None = None
 
 
@@ -130,6 +132,7 @@ class Session:
     :param clock: :data:`~dexkit.traces.sessions.imported.NOMINAL` or :data:`MEASURED`.
     :param rate: frames a second, nominal or measured.
     :param folder: to which the paths of pictures are relative.
+    :param first_ns: of a nominal clock, the time of frame 0; None where times are measured.
     :param rest: per frame, what neither a part nor a camera holds, as JSON; empty texts where it is
         the same as in the frame before.
     :param about: further facts for the metadata record.
@@ -146,6 +149,7 @@ class Session:
     folder: Path
     cameras: list[Camera] = field(default_factory=list)
     rest: Sequence[str] = ()
+    first_ns: int | None = None
     about: dict[str, str] = field(default_factory=dict)
     corrections: list[str] = field(default_factory=list)
     problems: Problems = field(default_factory=Problems)
@@ -215,7 +219,8 @@ def _record(session: Session, embed: bool) -> dict[str, str]:
         "frames": str(len(session)),
         "pictures": "embedded" if embed else "referenced",
         "pictures_folder": str(session.folder.absolute()),
-        "cameras": json.dumps([c.name for c in session.cameras]),
+        "cameras": json.dumps({c.name: c.group for c in session.cameras}),
+        **({} if session.first_ns is None else {"first_ns": str(session.first_ns)}),
         **session.about,
     }
     if session.clock == NOMINAL:

@@ -11,6 +11,9 @@ __all__ = ["gap_of", "hold", "interpolate", "period_of"]
 
 Times = NDArray[np.int64]
 
+# ns by which a sample may be beside a wanted time and be taken as it is: times that are calculated
+# twice differ by rounding.
+_SNAP = 1000
 # A gap is longer than so many usual periods, and at least so many seconds.
 _PERIODS = 10
 _LEAST = 0.1
@@ -36,7 +39,7 @@ def hold(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None
     if not len(times_ns):
         return out
     limit = gap_of(times_ns) if gap is None else gap
-    before = np.searchsorted(times_ns, at_ns, side="right") - 1
+    before = np.searchsorted(times_ns, at_ns + _SNAP, side="right") - 1
     good = before >= 0
     age = at_ns - times_ns[np.maximum(before, 0)]
     good &= age <= limit * 1e9
@@ -55,8 +58,8 @@ def interpolate(times_ns: Times, values: Floats, at_ns: Times, gap: float | None
         return out
     limit = gap_of(times_ns) if gap is None else gap
     last = len(times_ns) - 1
-    after = np.searchsorted(times_ns, at_ns, side="left")
-    exact = (after <= last) & (times_ns[np.minimum(after, last)] == at_ns)
+    after = np.searchsorted(times_ns, at_ns - _SNAP, side="left")
+    exact = (after <= last) & (times_ns[np.minimum(after, last)] <= at_ns + _SNAP)
     out[exact] = values[after[exact]]
     inside = ~exact & (after > 0) & (after <= last)
     a, b = after[inside] - 1, after[inside]
