@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from dexkit.cli.options import FILE, Number
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
+
+if TYPE_CHECKING:
+    from dexkit.traces.sessions.episodes import Options
+    from dexkit.traces.sessions.sources import Entry
 
 __all__ = ["command"]
 
@@ -40,6 +46,12 @@ __all__ = ["command"]
     metavar="MODEL",
     help="Model of the hands, e.g. dex3-1, or none.  [default: told by joints and limits]",
 )
+@click.option(
+    "--wire",
+    type=FILE,
+    metavar="FILE",
+    help="A recording made while the episodes were: it gives their frames true times.",
+)
 @click.option("--embed-pictures", is_flag=True, help="Put single pictures into the recording.")
 @click.option("--keep-sides", is_flag=True, help="Do not exchange hands that look swapped.")
 @click.option("--force", is_flag=True, help="Overwrite existing recordings.")
@@ -50,6 +62,7 @@ def command(
     chosen: tuple[str, ...],
     rate: float | None,
     hand: str | None,
+    wire: Path | None,
     embed_pictures: bool,
     keep_sides: bool,
     force: bool,
@@ -69,7 +82,10 @@ def command(
 
     if hand not in (None, "none"):
         model(hand)  # refused before anything is read
-    entries = find(source, form, Options(rate=rate, hand=hand, correct=not keep_sides))
+    options = Options(rate=rate, hand=hand, correct=not keep_sides)
+    entries = find(source, form, options)
+    if wire is not None:
+        entries = _beside(source, entries, wire, options)
     if chosen:
         known = {e.name: e for e in entries} | {e.name.rpartition("/")[2]: e for e in entries}
         if missing := [name for name in chosen if name not in known]:
@@ -107,3 +123,19 @@ def command(
     if not done:
         raise SessionError(f"none of the {len(entries)} sessions of {source} can be imported")
     return 1 if trouble else 0
+
+
+def _beside(source: Path, entries: list[Entry], wire: Path, options: Options) -> list[Entry]:
+    """The same episodes, with the times of the wire."""
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions.episodes import episode_folders
+    from dexkit.traces.sessions.sources import beside
+
+    folders = episode_folders(source)
+    if len(folders) != len(entries):
+        raise UsageError("--wire is for episodes of xr_teleoperate")
+    trace = open_trace(wire)
+    return [
+        replace(beside(folder, trace, options), name=entry.name)
+        for folder, entry in zip(folders, entries, strict=True)
+    ]

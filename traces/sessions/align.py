@@ -63,18 +63,21 @@ class Alignment:
         return max(self.correlation, 0.0) * min(1.0, lead / 0.2)
 
 
-def align(tracks: Sequence[Track], *, least_overlap: float = 1.0) -> Alignment | None:
+def align(
+    tracks: Sequence[Track], *, least_overlap: float = 1.0, step: float = _STEP
+) -> Alignment | None:
     """The shift at which B correlates best with A; None without motion or overlap.
 
     :param least_overlap: seconds that both must cover at a shift for it to count; at least half of
         the shorter side.
+    :param step: seconds of a step of the grid; a parabola refines the best one.
     """
     tracks = [t for t in tracks if len(t.a_times) > 1 and len(t.b_times) > 1]
     if not tracks:
         return None
     a_begin, a_end = _span([t.a_times for t in tracks])
     b_begin, b_end = _span([t.b_times for t in tracks])
-    step = max(_STEP, max(a_end - a_begin, b_end - b_begin) / 1e9 / _LONGEST)
+    step = max(step, max(a_end - a_begin, b_end - b_begin) / 1e9 / _LONGEST)
     a_grid = np.arange(a_begin, a_end + 1, round(step * 1e9))
     b_grid = np.arange(b_begin, b_end + 1, round(step * 1e9))
     size = 1 << int(np.ceil(np.log2(len(a_grid) + len(b_grid))))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from dexkit.traces.sessions.frames import RULE, Source, open_source, sample
 from dexkit.traces.sessions.lerobot_out import Result
 from dexkit.traces.sessions.model import REST_TOPIC
 from dexkit.traces.sessions.pictures import parse_picture, safe_path
+from dexkit.traces.sessions.resample import hold, interpolate
 from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Stream
 
 __all__ = ["export_episodes"]
@@ -30,6 +32,8 @@ __all__ = ["export_episodes"]
 _KEYS = {STATE: "states", COMMAND: "actions"}
 _COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
 _EXTENSION = "dexkit"
+_ALIGNED = "aligned"
+"""In the record of an episode whose times were taken from the wire."""
 
 
 def export_episodes(
@@ -181,8 +185,11 @@ def _as_it_was(
         m.log_time_ns: _object(ros_types.decode_string(m.data)) or {}
         for m in (trace.messages([REST_TOPIC]) if REST_TOPIC in trace.topics else ())
     }
-    times = {t for s in source.streams for t in s.times_ns.tolist()} | rest.keys()
-    times |= {t for p in source.pictures for t in p.times_ns.tolist()}
+    if _ALIGNED in record:  # every frame has its number, and the hands are the wire's
+        times = set(rest)
+    else:
+        times = {t for s in source.streams for t in s.times_ns.tolist()} | rest.keys()
+        times |= {t for p in source.pictures for t in p.times_ns.tolist()}
     ordered = sorted(times)
     groups = _object(record.get("cameras")) or {}
     first = int(record["first_ns"]) if record.get("first_ns", "").isdigit() else None
@@ -197,7 +204,14 @@ def _as_it_was(
             item = {"idx": number, **item}
         items[t] = item
     for s in source.streams:
-        _fill(s, items, str(names.get(s.part, s.part)))
+        name = str(names.get(s.part, s.part))
+        if _ALIGNED in record and s.samples is not None and s.model:
+            _fill(_at_frames(s, ordered), items, name)
+        else:
+            _fill(s, items, name)
+    if _ALIGNED in record:
+        for t, item in items.items():
+            item["timestamp_ns"] = t
     pictures: list[tuple[str, bytes]] = []
     for p in source.pictures:
         group = str(groups.get(p.camera, "colors"))
@@ -223,6 +237,24 @@ def _as_it_was(
     return _object(record.get("info")) or {}, words, [items[t] for t in ordered], pictures
 
 
+def _at_frames(stream: Stream, times: Sequence[int]) -> Stream:
+    """A stream of the wire at the times of the frames; without those where it has a gap."""
+    at = np.array(times, dtype=np.int64)
+    method = hold if stream.kind == COMMAND else interpolate
+    values = {f: method(stream.times_ns, v, at) for f, v in stream.values.items()}
+    good = np.isfinite(values["q"]).all(axis=1)
+    pressure = stream.pressure
+    if pressure is not None:
+        pressure = interpolate(stream.times_ns, pressure, at)[good]
+    return replace(
+        stream,
+        times_ns=at[good],
+        values={f: v[good] for f, v in values.items()},
+        pressure=pressure,
+        samples=None,
+    )
+
+
 def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> None:
     """Put the values of a stream where they stood."""
     key = _KEYS[stream.kind]
@@ -238,3 +270,6 @@ def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> Non
             for column, table in columns.items():
                 row: list[float] = np.asarray(table[i]).tolist()
                 entry[column] = row
+        if stream.pressure is not None and isinstance(items[t].get("tactiles") or {}, dict):
+            pressed = items[t]["tactiles"] = items[t].get("tactiles") or {}
+            pressed[name] = np.nan_to_num(stream.pressure[i]).tolist()

@@ -55,12 +55,14 @@ class Source:
 
     :param streams: those with at least two samples.
     :param lost: what frames cannot hold.
+    :param problems: what cannot be read.
     """
 
     trace: Trace
     streams: list[Stream]
     pictures: list[Pictures]
     lost: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
     @property
     def record(self) -> dict[str, str]:

@@ -158,7 +158,7 @@ class _Writer:
         pictures = [_load(source, frames, scheme) for frames in runs]
         self._scheme = scheme
         self._measured[name] = {k: round(v, 4) for k, v in source.measured.items()}
-        self.result.problems += [f"{name}: {text}" for text in told]
+        self.result.problems += [f"{name}: {text}" for text in (*source.problems, *told)]
         self._lost.update(dict.fromkeys(f"{name}: {text}" for text in source.lost))
         for frames, loaded in zip(runs, pictures, strict=True):
             self._add(source, frames, loaded, scheme)
@@ -396,7 +396,7 @@ def _scheme(source: Source) -> _Scheme:
         first = p.load(0)
         picture = parse_picture(first) if first is not None else None
         if picture is None:
-            source.lost.append(f"{p.camera}: its first picture cannot be read")
+            source.problems.append(f"{p.camera} is left out: its first picture cannot be read")
             continue
         cameras.append((p.camera, picture.height, picture.width, picture.channels))
     kept = {c[0] for c in cameras}

@@ -16,7 +16,7 @@ not have them.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,10 @@ __all__ = [
     "Part",
     "Problems",
     "Session",
+    "messages",
     "models_by_joints",
     "picture_topic",
+    "record_of",
     "reference_topic",
     "write",
 ]
@@ -185,31 +187,40 @@ def write(session: Session, out: Path, *, embed: bool = False, overwrite: bool =
     :raises TraceError: it cannot be written.
     """
     with RecordingWriter(out, overwrite=overwrite) as writer:
-        record = _record(session, embed)
-        sources: list[tuple[int, Callable[[int], bytes | None]]] = []
-        for part in session.parts:
-            for kind in (STATE, COMMAND):
-                if kind in part.values:
-                    sources.append(_part_channel(writer, record, session, part, kind))
-        for camera in session.cameras:
-            sources.append(_reference_channel(writer, session, camera))
-            if embed and camera.seconds is None:
-                sources.append(_picture_channel(writer, session, camera))
-        if any(session.rest):
-            channel = writer.add_channel(ros_types.STRING.definition(REST_TOPIC))
-            sources.append((channel, lambda i: _rest(session, i)))
-        for i, time_ns in enumerate(session.times_ns.tolist()):
-            for channel, encode in sources:
-                data = encode(i)
-                if data is not None:
-                    writer.put(channel, data, time_ns, time_ns)
-        for number, text in enumerate(session.problems.sentences(), 1):
-            record[f"problem {number}"] = text
-        writer.add_metadata(RECORD, record)
+        for time_ns, channel, data in messages(session, writer, embed=embed):
+            writer.put(channel, data, time_ns, time_ns)
+        writer.add_metadata(RECORD, record_of(session, embed=embed))
         return writer.written
 
 
-def _record(session: Session, embed: bool) -> dict[str, str]:
+def messages(
+    session: Session, writer: RecordingWriter, *, embed: bool = False
+) -> Iterator[tuple[int, int, bytes]]:
+    """The messages of a session in order of time: time, channel, payload.
+
+    Adds the channels to the recording, and to the session's facts what the record is to say.
+    """
+    sources: list[tuple[int, Callable[[int], bytes | None]]] = []
+    for part in session.parts:
+        for kind in (STATE, COMMAND):
+            if kind in part.values:
+                sources.append(_part_channel(writer, session, part, kind))
+    for camera in session.cameras:
+        sources.append(_reference_channel(writer, camera))
+        if embed and camera.seconds is None:
+            sources.append(_picture_channel(writer, session, camera))
+    if any(session.rest):
+        channel = writer.add_channel(ros_types.STRING.definition(REST_TOPIC))
+        sources.append((channel, lambda i: _rest(session, i)))
+    for i, time_ns in enumerate(session.times_ns.tolist()):
+        for channel, encode in sources:
+            data = encode(i)
+            if data is not None:
+                yield time_ns, channel, data
+
+
+def record_of(session: Session, *, embed: bool = False) -> dict[str, str]:
+    """What the metadata record says, after all messages were made."""
     record = {
         "version": __version__,
         "format": session.form,
@@ -229,6 +240,8 @@ def _record(session: Session, embed: bool) -> dict[str, str]:
         )
     for number, text in enumerate(session.corrections, 1):
         record[f"correction {number}"] = text
+    for number, text in enumerate(session.problems.sentences(), 1):
+        record[f"problem {number}"] = text
     return record
 
 
@@ -237,7 +250,7 @@ def _rest(session: Session, i: int) -> bytes | None:
 
 
 def _part_channel(
-    writer: RecordingWriter, record: dict[str, str], session: Session, part: Part, kind: str
+    writer: RecordingWriter, session: Session, part: Part, kind: str
 ) -> tuple[int, Callable[[int], bytes | None]]:
     values = part.values[kind]
     if part.model is None:
@@ -248,9 +261,9 @@ def _part_channel(
     cmd, state = dialect.topics(part.side)
     topic, type_name = (cmd, dialect.cmd_type) if kind == COMMAND else (state, dialect.state_type)
     channel = writer.add_channel(definition(topic, message_type(type_name)))
-    record[absent_key(topic)] = " ".join(f for f in FIELDS[kind] if f not in values)
+    session.about[absent_key(topic)] = " ".join(f for f in FIELDS[kind] if f not in values)
     if kind == COMMAND:
-        record[f"filled {topic}"] = "kp, kd and mode, as xr_teleoperate sends them"
+        session.about[f"filled {topic}"] = "kp, kd and mode, as xr_teleoperate sends them"
     _note_rounding(session, part, kind, values)
     encode = _motor_encoder(dialect, part.model, kind)
     return channel, lambda i: _motors(values, encode, i)
@@ -322,7 +335,7 @@ def _mode(dialect: Dialect, joint: int) -> int:
 
 
 def _reference_channel(
-    writer: RecordingWriter, session: Session, camera: Camera
+    writer: RecordingWriter, camera: Camera
 ) -> tuple[int, Callable[[int], bytes | None]]:
     channel = writer.add_channel(ros_types.STRING.definition(reference_topic(camera.name)))
 

@@ -7,11 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.errors import SessionError
+from dexkit.traces.reader import Trace
 from dexkit.traces.sessions import episodes, jsonl, lerobot_in, rosbag, tables
+from dexkit.traces.sessions.beside import write_beside
 from dexkit.traces.sessions.episodes import DEFAULT, Options
+from dexkit.traces.sessions.imported import NOMINAL
 from dexkit.traces.sessions.model import Session, write
 
-__all__ = ["FORMATS", "Entry", "Report", "find"]
+__all__ = ["FORMATS", "Entry", "Report", "beside", "find"]
 
 FORMATS = ("episodes", "jsonl", "lerobot", "rosbag2", "tables")
 
@@ -41,6 +44,21 @@ class Entry:
 
     name: str
     convert: Callable[[Path, bool, bool], Report]
+
+
+def beside(folder: Path, wire: Trace, options: Options = DEFAULT) -> Entry:
+    """An episode with the times of a recording that was made beside it."""
+
+    def convert(out: Path, embed: bool, overwrite: bool) -> Report:
+        session = episodes.read_episode(folder, options)
+        if session.clock != NOMINAL:
+            raise SessionError(f"{folder} has times of its own")
+        written, times = write_beside(session, wire, out, embed=embed, overwrite=overwrite)
+        return Report(
+            f"{session.form}, {times}", written, session.corrections, session.problems.sentences()
+        )
+
+    return Entry(folder.name, convert)
 
 
 def find(source: Path, form: str | None = None, options: Options = DEFAULT) -> list[Entry]:
