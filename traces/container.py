@@ -152,6 +152,11 @@ class Container:
         self._size = 0
         self._complete_definitions = False
 
+    @property
+    def attachments(self) -> int:
+        """Attachments in the file."""
+        return len(self._found.attachments)
+
     # -- warnings ------------------------------------------------------------------------------
 
     def warn(self, text: str) -> None:
