@@ -23,6 +23,7 @@ __all__ = ["cli", "main"]
 
 # name -> (module, one-line help); the help is here so that `dexkit --help` imports nothing
 _COMMANDS: dict[str, tuple[str, str]] = {
+    "audit": ("dexkit.cli.audit", "Judge every session of an archive."),
     "backends": ("dexkit.cli.backends", "List the backends that can be served."),
     "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
     "bridge": ("dexkit.cli.bridge", "Translate between Dex1 dialects."),

@@ -194,8 +194,8 @@ class Columns:
                 return np.nan, np.nan
             for at in places:
                 for _, values in group.words.parts(leaf, at):
-                    low.append(float(np.min(values)))
-                    high.append(float(np.max(values)))
+                    low.append(float(values.min()))
+                    high.append(float(values.max()))
         # numpy's, which pass NaN on
         return (float(np.min(low)), float(np.max(high))) if low else (np.nan, np.nan)
 
