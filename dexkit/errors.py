@@ -27,6 +27,8 @@
     ├── TraceError
     │   ├── TraceUnreadable                 not an mcap file, or nothing in it can be read
     │   └── TraceUnsupported                readable, but of a schema or encoding dexkit lacks
+    ├── SessionError                    a session of another format cannot be read or written
+    │   └── ExtraMissing (ImportError)      it needs a library of one of dexkit's extras
     ├── BackendError
     │   ├── UnknownBackend (LookupError)    no backend has that name
     │   ├── BackendConflict                 two installed packages claim one name
@@ -64,6 +66,7 @@ __all__ = [
     "DexkitError",
     "EmulatorError",
     "EncodeError",
+    "ExtraMissing",
     "HandError",
     "HandFault",
     "HandLost",
@@ -74,6 +77,7 @@ __all__ = [
     "ModelBroken",
     "OutputError",
     "OversizeError",
+    "SessionError",
     "SigningError",
     "TopicConflict",
     "TraceError",
@@ -211,6 +215,18 @@ class TraceUnreadable(TraceError):
 
 class TraceUnsupported(TraceError):
     """A schema or message encoding that dexkit does not know."""
+
+
+class SessionError(DexkitError):
+    """A session in another format than dexkit's recordings cannot be read or written."""
+
+    exit_code = 2
+
+
+class ExtraMissing(SessionError, ImportError):
+    """A format needs a library that one of dexkit's extras installs."""
+
+    __str__ = DexkitError.__str__
 
 
 class BackendError(DexkitError):

@@ -419,3 +419,25 @@ def test_a_recording_that_grows_while_it_is_opened_is_read_as_it_was(
         shown = size
         cut.write_bytes(whole[:size])
         assert read(path) == read(cut), size
+
+
+@pytest.mark.parametrize("left_out", [0, 1, -1])
+def test_a_message_that_the_index_leaves_out_is_read_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_out: int
+) -> None:
+    from mcap._chunk_builder import ChunkBuilder
+
+    genuine = ChunkBuilder.end
+
+    def end(self: ChunkBuilder) -> bytes:
+        for index in self.message_indices.values():
+            del index.records[left_out]
+        return genuine(self)
+
+    monkeypatch.setattr(ChunkBuilder, "end", end)
+    path = tmp_path / "index.mcap"
+    every = [row for row in rows(8) if row[0] == STATE]
+    path.write_bytes(mcap_bytes(every, Shape(chunk_size=1 << 20)))
+    trace = open_trace(path)
+    assert sum(len(s) for s in trace.load().values()) == len(every)
+    assert any("the message index of the chunk" in text for text in trace.damage)

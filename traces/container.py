@@ -152,6 +152,11 @@ class Container:
         self._size = 0
         self._complete_definitions = False
 
+    @property
+    def attachments(self) -> int:
+        """Attachments in the file."""
+        return len(self._found.attachments)
+
     # -- warnings ------------------------------------------------------------------------------
 
     def warn(self, text: str) -> None:
@@ -625,20 +630,17 @@ class Container:
         Damaged messages are left out and reported, as are contradictions to the message index.
         """
         data = self._unpack(file, segment)
-        at = 0
         index = _message_index(file, segment) if segment.index[1] else None
         if index is not None:
             channels, times, starts = index
-            if _are_contiguous(data, starts):
-                at = self._scan(data, segment, [], int(starts[0]))
-                if at == starts[0]:
-                    heads = rows_at(data, starts, HEADS.itemsize).view(HEADS)[:, 0]
-                    if not (
-                        np.array_equal(heads["channel"], channels)
-                        and np.array_equal(heads["log"], times)
-                    ):
-                        self._report_index_damage(segment)
-                    return data, starts, heads
+            heads = _heads_at(data, starts)
+            if heads is not None and self._scan_between(data, segment, starts, heads):
+                if not (
+                    np.array_equal(heads["channel"], channels)
+                    and np.array_equal(heads["log"], times)
+                ):
+                    self._report_index_damage(segment)
+                return data, starts, heads
         found: list[int] = []
         self._scan(data, segment, found)
         begins = np.array(found, dtype=np.int64)
@@ -694,8 +696,39 @@ class Container:
             return b""
         return data
 
+    def _scan_between(
+        self, data: bytes, segment: Segment, starts: NDArray[np.int64], heads: Heads
+    ) -> bool:
+        """Scan what lies between the messages at ``starts``: the definition of a channel comes
+        before its first message.
+
+        :returns: whether all of ``data`` are these messages and few other records.
+        """
+        ends = starts + HEAD.size + heads["length"].astype(np.int64)
+        if ends[-1] != len(data) or (ends[:-1] > starts[1:]).any():
+            return False
+        between = np.flatnonzero(ends[:-1] < starts[1:])
+        if len(between) > _MAX_FOREIGN:
+            return False
+        places = [(0, int(starts[0])), *zip(ends[between], starts[between + 1], strict=True)]
+        for begin, end in places:
+            found: list[int] = []
+            for _, _, at in walk(data, int(begin), int(end), messages=found):
+                begin = at
+            if found or begin != end:
+                return False
+        for begin, end in places:
+            self._scan(data, segment, [], int(end), begin=int(begin))
+        return True
+
     def _scan(
-        self, data: bytes, segment: Segment, found: list[int], stop: int | None = None
+        self,
+        data: bytes,
+        segment: Segment,
+        found: list[int],
+        stop: int | None = None,
+        *,
+        begin: int = 0,
     ) -> int:
         """Scan the records of a segment; append the offsets of messages to ``found``.
 
@@ -704,8 +737,8 @@ class Container:
         """
         odd = 0
         bad = ""
-        at = after = 0
-        for opcode, at, after in walk(data, 0, stop, messages=found):
+        at = after = begin
+        for opcode, at, after in walk(data, begin, stop, messages=found):
             if after > len(data):
                 bad = "a record is longer than what is left"
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -845,18 +878,15 @@ def _message_index(
     return np.concatenate(channels)[order], entries[::2][order], starts[order]
 
 
-def _are_contiguous(data: bytes, starts: NDArray[np.int64]) -> bool:
-    """Whether messages begin at ``starts``, each where the last ends, up to the end of ``data``."""
+def _heads_at(data: bytes, starts: NDArray[np.int64]) -> Heads | None:
+    """The heads of the messages at these offsets, in rising order; None if one is no message."""
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - HEADS.itemsize:
-        return False
+        return None
     heads = rows_at(data, starts, HEADS.itemsize).view(HEADS)[:, 0]
-    lengths = heads["length"].astype(np.int64)
-    return bool(
-        (heads["opcode"] == Opcode.MESSAGE).all()
-        and (lengths >= 22).all()
-        and int(starts[-1] + 9 + lengths[-1]) == len(data)
-        and np.array_equal((starts + 9 + lengths)[:-1], starts[1:])
-    )
+    lengths = heads["length"]
+    if (heads["opcode"] != Opcode.MESSAGE).any() or (lengths < LEAST[Opcode.MESSAGE]).any():
+        return None
+    return None if (lengths > len(data)).any() else heads
 
 
 def _open_nonblocking(path: str, flags: int) -> int:

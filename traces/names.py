@@ -10,10 +10,13 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable
 
-__all__ = ["USB", "dds_topic", "dds_type", "select_topics"]
+__all__ = ["SESSION", "USB", "dds_topic", "dds_type", "select_topics"]
 
 USB = "usb/"
 """Beginning of the channels that hold USB transfers and no DDS samples."""
+
+SESSION = "rt/session/"
+"""Beginning of the topics that hold what an imported session has and no DDS topic carries."""
 
 
 def dds_topic(name: str) -> str:

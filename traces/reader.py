@@ -25,7 +25,7 @@ from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
 from dexkit.messages.schemas import omgidl
 from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, by_channel
-from dexkit.traces.names import USB, dds_topic, dds_type, select_topics
+from dexkit.traces.names import SESSION, USB, dds_topic, dds_type, select_topics
 from dexkit.traces.records import Schema
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_CHUNK",
     "ChannelInfo",
+    "Definition",
     "SampleArray",
     "Trace",
     "TraceEndpoint",
@@ -94,6 +95,20 @@ class ChannelInfo:
     def supported(self) -> bool:
         """Whether the payloads can be decoded by :mod:`dexkit.messages`."""
         return not self.problem
+
+
+@dataclass(frozen=True)
+class Definition:
+    """How a channel stands in the file: what a copy of it needs.
+
+    :param topic: as recorded.
+    :param schema: name, encoding and text of its schema; None without one.
+    """
+
+    topic: str
+    message_encoding: str
+    metadata: dict[str, str]
+    schema: tuple[str, str, bytes] | None
 
 
 @dataclass(frozen=True)
@@ -247,6 +262,36 @@ class Trace:
     def channels(self) -> list[ChannelInfo]:
         """Every channel, by topic. Two types on one topic are two channels."""
         return sorted(self._info.values(), key=lambda c: (c.topic, c.type_name))
+
+    @property
+    def definitions(self) -> dict[tuple[str, str], Definition]:
+        """Each channel as it stands in the file, by topic and type.
+
+        :raises TraceUnsupported: two channels of one topic and type differ in their schema or
+            encoding, so that their messages cannot be told apart.
+        """
+        found: dict[tuple[str, str], Definition] = {}
+        for i, info in self._info.items():
+            channel = self._file.channels[i]
+            schema = self._file.schemas.get(channel.schema_id)
+            one = Definition(
+                info.recorded_topic,
+                info.message_encoding,
+                info.metadata,
+                (schema.name, schema.encoding, schema.data) if schema else None,
+            )
+            other = found.setdefault((info.topic, info.type_name), one)
+            if (one.schema, one.message_encoding) != (other.schema, other.message_encoding):
+                raise TraceUnsupported(
+                    f"{self.path.name} has two channels {_shorten(info.topic)} of type "
+                    f"{_shorten(info.type_name)} with different schemas"
+                )
+        return found
+
+    @property
+    def attachments(self) -> int:
+        """Attachments in the file, which dexkit does not read."""
+        return self._file.attachments
 
     @property
     def topics(self) -> list[str]:
@@ -479,8 +524,8 @@ class Trace:
                 message_encoding=channel.message_encoding,
                 problem=problem,
             )
-            # transfers of a conformance run on USB are there on purpose, for its judge
-            if problem and count and not channel.topic.startswith(USB):
+            # these are there on purpose, for other readers than this one
+            if problem and count and not channel.topic.startswith((USB, SESSION)):
                 self._file.warn(f"{_shorten(channel.topic)}: {problem}")
         types: dict[str, set[str]] = {}
         for info in self._info.values():

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
+from dexkit.conformance.rows import finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
@@ -53,13 +54,15 @@ class _Joint:
         """The measurements of a joint: states that repeat q and a dq that is not 0 are none."""
         states = ctx.states
         q, dq = states.q[:, joint], states.dq[:, joint]
-        good = np.isfinite(q) & np.isfinite(dq)
+        good = finite_rows(q, dq)
         t, q, dq = states.clock[good], q[good], dq[good]
         if len(t):
             same = (np.diff(q) == 0) & (np.diff(dq) == 0) & (dq[1:] != 0)
             rises = np.maximum.accumulate(t)[:-1] < t[1:]
-            new = np.concatenate(([True], ~same & rises))
-            t, q, dq = t[new], q[new], dq[new]
+            new = ~same & rises
+            if not new.all():
+                new = np.concatenate(([True], new))
+                t, q, dq = t[new], q[new], dq[new]
         return cls(t, q, dq)
 
     def windows(self, seconds: float, longest: float) -> tuple[Rows, Rows]:
@@ -91,10 +94,11 @@ class _Joint:
 def _fastest(ctx: Context, joint: int) -> float:
     """The joint's fastest speed, rad/s: as reported, or its profile's where dq is not filled."""
     dq = np.abs(ctx.states.dq[:, joint])
-    dq = dq[np.isfinite(dq)]
+    dq = dq[finite_rows(dq)]
     if not len(dq) or not dq.any():
         return ctx.joints[joint].dq_max
-    fast = float(np.sort(dq)[int(_FAST * (len(dq) - 1))])
+    row = int(_FAST * (len(dq) - 1))
+    fast = float(np.partition(dq, row)[row])
     return max(_OWN * fast, ctx.tolerance("min_speed"))
 
 
@@ -104,7 +108,7 @@ def jumps(ctx: Context) -> Outcome:
     states = ctx.states
     worst: tuple[float, float, float, int, float, float] | None = None
     for joint in range(len(ctx.joints)):
-        good = np.isfinite(states.q[:, joint])
+        good = finite_rows(states.q[:, joint])
         t, q = states.clock[good], states.q[good, joint]
         if len(t) < _FEW:
             continue

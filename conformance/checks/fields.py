@@ -12,6 +12,7 @@ from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import joints_of
+from dexkit.conformance.rows import finite_rows
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
@@ -199,25 +200,26 @@ def _windows(t: Floats, window: float) -> Windows:
 
 def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     states = ctx.states
-    good = np.isfinite(states.q[:, joint]) & np.isfinite(states.dq[:, joint])
+    good = finite_rows(states.q[:, joint], states.dq[:, joint])
     t, q, dq = states.clock[good], states.q[good, joint], states.dq[good, joint]
     if len(t) < 10 or float(t[-1] - t[0]) <= 0:
         return ctx.skipped("too few states")
     if not dq.any():
         return ctx.absent("dq is not filled (0 throughout)")
     window = ctx.tolerance("window_s")
-    which = good.tobytes()  # the same for all joints, unless some states lack joints
+    # the same for all joints, unless some states lack joints
+    which = b"" if isinstance(good, slice) else good.tobytes()
     if which not in known:
         known[which] = _windows(t, window)
     starts, ends, span = known[which]
     if not len(starts):
         return ctx.skipped("the states are too far apart to derive a velocity")
     slope = (q[ends] - q[starts]) / span
-    cumulated = np.concatenate(([0.0], np.cumsum((dq[1:] + dq[:-1]) / 2 * np.diff(t))))
-    mean = (cumulated[ends] - cumulated[starts]) / span
     moving = np.abs(slope) > 0.5
     if moving.sum() < 50:
         return ctx.skipped("the hand hardly moves in this recording")
+    cumulated = np.concatenate(([0.0], np.cumsum((dq[1:] + dq[:-1]) / 2 * np.diff(t))))
+    mean = (cumulated[ends] - cumulated[starts]) / span
     size = math.sqrt(sums.mean(slope[moving] ** 2))
     error = math.sqrt(sums.mean((mean - slope)[moving] ** 2)) / size
     text = ctx.named(

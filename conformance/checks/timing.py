@@ -16,7 +16,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
 from dexkit.conformance.measure import Measure
-from dexkit.conformance.median import median
+from dexkit.conformance.median import median, percentile
+from dexkit.conformance.rows import finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 
@@ -71,12 +72,6 @@ def gap_measures(found: Iterable[tuple[float, float]], limit: float) -> list[Mea
     return [Measure(b - a, limit, span=(a, b)) for a, b in found]
 
 
-def _observed(ctx: Context) -> tuple[Floats, float]:
-    """Intervals between states, and the seconds that they add up to."""
-    intervals = np.diff(ctx.states.clock)
-    return intervals, total(intervals)
-
-
 def _spans(ctx: Context, names: tuple[str, ...]) -> list[tuple[float, float]]:
     """Begin and end of the phases of these names."""
     return [ctx.span(p) for name in names for p in ctx.recording.phases(name, ctx.side)]
@@ -97,11 +92,19 @@ def _slow_stretches(ctx: Context) -> list[tuple[float, float, Floats]]:
     window = ctx.tolerance("window_s")
     passed = np.concatenate(([0.0], np.cumsum(lengths)))
     found: list[tuple[int, int]] = []
-    for at in np.arange(0.0, float(passed[-1]) - window, _STRIDE):
-        i, j = (int(k) for k in np.searchsorted(passed, (at, at + window)))
-        seconds = float(passed[j] - passed[i]) - float(lengths[i:j].max(initial=0.0))
-        if j - i < 2 or not slow(ctx, (j - i - 1) / seconds):
-            continue
+    starting = np.arange(0.0, float(passed[-1]) - window, _STRIDE)
+    if (lengths >= 0).all():
+        rows = np.searchsorted(passed, (starting, starting + window)).T
+    else:  # unsorted: what is found for a time depends on which others are looked for with it
+        each = [np.searchsorted(passed, (at, at + window)) for at in starting]
+        rows = np.array(each, dtype=np.intp).reshape(-1, 2)
+    rows = rows[rows[:, 1] - rows[:, 0] >= 2]
+    first, last = rows.T
+    longest = np.maximum.reduceat(np.append(lengths, 0.0), rows.ravel())[::2] if len(rows) else 0.0
+    seconds = passed[last] - passed[first] - np.maximum(longest, 0.0)
+    with np.errstate(divide="ignore"):
+        rates = (last - first - 1) / seconds
+    for i, j in rows[rates < least_rate(ctx)].tolist():
         if found and i <= found[-1][1]:
             found[-1] = found[-1][0], j
         else:
@@ -129,7 +132,7 @@ def _exactly(
 
 def _rate(ctx: Context) -> tuple[float, float] | None:
     """(mean rate outside of gaps, seconds observed), or None if that is too short."""
-    intervals, _ = _observed(ctx)
+    intervals = np.diff(ctx.states.clock)
     steady = intervals[intervals <= _GAP]
     seconds = total(steady)
     if seconds < ctx.tolerance("min_observed_s"):
@@ -227,7 +230,7 @@ def vendor_rate(ctx: Context) -> Outcome:
     outcome = ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
     if rate > most:
         return outcome.rated(rate, most, seconds, at_most=True).if_late(math.inf)
-    return too_slow(ctx, outcome.rated(rate, least, seconds), rate, _observed(ctx)[0])
+    return too_slow(ctx, outcome.rated(rate, least, seconds), rate, np.diff(ctx.states.clock))
 
 
 @check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03")
@@ -266,7 +269,8 @@ def no_gap(ctx: Context) -> Outcome:
 @check("DEX1-RATE-04", "DEX3-RATE-04")
 def regular(ctx: Context) -> Outcome:
     """99th percentile of the intervals in sliding windows, by source timestamp and reception."""
-    intervals, seconds = _observed(ctx)
+    intervals = np.diff(ctx.states.clock)
+    seconds = total(intervals)
     if seconds < ctx.tolerance("min_observed_s"):
         return _too_short(ctx)
     p50, p99 = np.percentile(intervals, [50, 99])
@@ -337,7 +341,7 @@ def _worst_p99(ctx: Context, clock: Floats) -> tuple[float, float, float]:
     starts = np.arange(begin, max(end - window, begin) + _STRIDE / 2, 5 * _STRIDE)
     rows = np.searchsorted(clock[:-1], (starts, starts + window))
     found = [
-        (float(np.percentile(intervals[i:j], 99)), float(clock[i]), float(clock[j]))
+        (percentile(intervals[i:j], 99), float(clock[i]), float(clock[j]))
         for i, j in rows.T.tolist()
         if j - i >= 100  # of fewer, one is more than 1 %
     ]
@@ -370,12 +374,13 @@ def not_frozen(ctx: Context) -> Outcome:
     worst = 0.0
     for joint in range(len(ctx.joints)):
         t, q = ctx.states.t, ctx.states.q[:, joint]
-        good = np.isfinite(q)
+        good = finite_rows(q)
         t, q = t[good], q[good]
-        changes = np.flatnonzero(np.diff(q) != 0) + 1
+        steps = np.diff(q)
+        changes = np.flatnonzero(steps) + 1
         if len(changes) < 2:
             continue
-        jump = np.abs(np.diff(q)[changes - 1])
+        jump = np.abs(steps[changes - 1])
         # before the first command a hand may rest for any time
         first = np.inf if not len(ctx.commands) else max(float(t[0]), float(ctx.commands.t[0]))
         changes = np.concatenate(([0], changes))
@@ -383,7 +388,7 @@ def not_frozen(ctx: Context) -> Outcome:
         sent = np.diff(changes)
         begin, end = t[changes[:-1]], t[changes[1:] - 1]
         begin[0] = min(first, end[0])
-        usual = 2 * float(np.percentile(jump, 99))  # with rare measurements every change is a jump
+        usual = 2 * percentile(jump, 99)  # with rare measurements every change is a jump
         at_once = t[changes[1:]] - t[changes[1:] - 1] < 0.05
         frozen = (jump >= max(ctx.tolerance("min_jump_stroke", joint), usual)) & at_once
         frozen &= sent >= ctx.tolerance("min_samples")
@@ -412,7 +417,8 @@ def not_frozen(ctx: Context) -> Outcome:
                 .timed(float(held[i]), limit)
                 .if_late(float(held[i]) - limit)
             )
-    if not any(len(np.unique(c)) > 3 for c in ctx.states.q.T):
+    # the first second is enough of a hand that moves in it
+    if not any(len(np.unique(c)) > 3 for q in (ctx.states.q[:500], ctx.states.q) for c in q.T):
         return ctx.skipped("the hand does not move in this recording")
     return ctx.passed(
         f"{worst * 1e3:.0f} ms",
@@ -441,6 +447,17 @@ def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float)
     return max(begin, float(t[first + there[-1] + 1])) if len(there) else begin
 
 
+def _medians(rows: Floats) -> Floats:
+    """The median of each row; of rows of five by comparing columns, as it is needed mostly."""
+    if rows.shape[1] != 5:
+        return np.asarray(np.median(rows, axis=1))
+    a, b, c, d, e = rows.T
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    # the least and the greatest of the four are out; of low, high and e the middle one is it
+    return np.asarray(np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e)))
+
+
 @check("DEX1-FRESH-01", "DEX3-FRESH-01")
 def fresh(ctx: Context) -> Outcome:
     """How long a position stays the same while the hand moves."""
@@ -458,14 +475,15 @@ def fresh(ctx: Context) -> Outcome:
 
 def _fresh(ctx: Context, joint: int) -> Outcome:
     t, q = ctx.states.t, ctx.states.q[:, joint]
-    good = np.isfinite(q)
+    good = finite_rows(q)
     t, q = t[good], q[good]
     if len(q) < 2:
         return ctx.skipped("fewer than two states with a position")
-    changes = np.flatnonzero(np.diff(q) != 0) + 1
+    steps = np.diff(q)
+    changes = np.flatnonzero(steps) + 1
     if len(changes) < 3:
         return ctx.skipped("the hand does not move in this recording")
-    size = np.diff(q)[changes - 1]
+    size = steps[changes - 1]
     least = ctx.tolerance("min_change_stroke", joint)
     big = np.abs(size) >= least
     same_way = np.sign(size[1:]) == np.sign(size[:-1])
@@ -486,7 +504,7 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     starts = t[changes][:-1][moving]
     rows = sliding_window_view(holds, count)
     near = starts[count - 1 :] - starts[: len(rows)] <= ctx.tolerance("window_s")
-    medians = np.where(near, np.median(rows, axis=1), median(holds))
+    medians = np.where(near, _medians(rows), median(holds))
     worst = int(np.argmax(medians))
     hold = median(holds)
     text = f"a new value every {hold * 1e3:.1f} ms while moving (median of {len(holds)})"

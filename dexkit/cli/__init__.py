@@ -23,20 +23,26 @@ __all__ = ["cli", "main"]
 
 # name -> (module, one-line help); the help is here so that `dexkit --help` imports nothing
 _COMMANDS: dict[str, tuple[str, str]] = {
+    "audit": ("dexkit.cli.audit", "Judge every session of an archive."),
     "backends": ("dexkit.cli.backends", "List the backends that can be served."),
     "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
     "bridge": ("dexkit.cli.bridge", "Translate between Dex1 dialects."),
     "calibrate": ("dexkit.cli.calibrate", "Measure and store a gripper's zero and speed."),
     "check": ("dexkit.cli.check", "Check a recording against the requirements."),
     "compare": ("dexkit.cli.compare", "Compare several results."),
+    "cut": ("dexkit.cli.cut", "Write a part of a recording."),
     "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (90 s)."),
+    "diff": ("dexkit.cli.diff", "Compare two recordings of one session."),
     "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
     "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
+    "export": ("dexkit.cli.export", "Write recordings in another format."),
+    "import": ("dexkit.cli.import_", "Write sessions of other formats as recordings."),
     "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
     "install-service": (
         "dexkit.cli.install_service",
         "Write systemd units and udev rules that serve hands.",
     ),
+    "merge": ("dexkit.cli.merge", "Write several recordings as one."),
     "models": ("dexkit.cli.models", "Print hands and robots: joints, limits, topics, rates."),
     "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),

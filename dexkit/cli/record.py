@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 import time
@@ -11,8 +12,8 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit import threads
-from dexkit.cli.options import dds_options, duration_option, topic_option
-from dexkit.errors import TraceError, UsageError
+from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
+from dexkit.errors import DexkitError, TraceError, UsageError
 from dexkit.escaping import REMARK, one_line
 from dexkit.stop_signals import stop_on_signals
 
@@ -31,6 +32,13 @@ __all__ = ["command"]
 @duration_option()
 @click.option("--force", is_flag=True, help="Overwrite OUT, once there is something to write.")
 @click.option(
+    "--beside-episodes",
+    "episodes",
+    type=FILE,
+    metavar="DIR",
+    help="Where xr_teleoperate writes its episodes meanwhile: each gets the times of the wire.",
+)
+@click.option(
     "--compression",
     type=click.Choice(["zstd", "lz4", "none"]),
     default="zstd",
@@ -44,6 +52,7 @@ def command(
     interface: str,
     duration: float | None,
     force: bool,
+    episodes: Path | None,
     compression: str,
 ) -> int:
     """Record DDS topics to OUT, an mcap file, until Ctrl-C.
@@ -52,8 +61,13 @@ def command(
     timestamp, and with ros2msg schemas, as PlotJuggler, Foxglove and readers of ROS 2 bags want
     them. Killing the recorder costs at most half a second.
 
+    With --beside-episodes, each episode that was written to DIR meanwhile is merged with the
+    recording into OUT_NAME.mcap: hands as they were on the wire, arms and pictures at the true time
+    of their frames.
+
     Exit codes: 0 a complete recording, as far as this machine can know; 1 nothing was received,
-    or something is missing (it is reported), or OUT was renamed meanwhile; 2 wrong usage, or OUT
+    or something is missing (it is reported), or OUT was renamed meanwhile, or an episode
+    could not be merged; 2 wrong usage, or OUT
     cannot be written (any more).
     """
     from dexkit.dds import DdsNode
@@ -62,6 +76,7 @@ def command(
 
     if out.exists() and not out.is_dir() and not force:
         raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
+    before = _episodes(episodes) if episodes is not None else {}
     started = time.monotonic()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
@@ -94,7 +109,54 @@ def command(
     click.echo(
         f"{out}: {recorder.written} messages ({per_topic}), {_describe_losses(recorder, recording)}"
     )
-    return 1 if dropped or recording.losses or recorder.displaced else 0
+    merged = True
+    if episodes is not None:
+        merged = _merge_episodes(out, episodes, before, force)
+    return 1 if dropped or recording.losses or recorder.displaced or not merged else 0
+
+
+def _episodes(folder: Path) -> dict[Path, tuple[int, int]]:
+    """The episodes below a folder, each with the time and size of its file.
+
+    :raises UsageError: it is not a folder. One that is not there yet is empty.
+    """
+    from dexkit.traces.sessions.episodes import DATA, episode_folders
+
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder")
+    found = {}
+    for episode in episode_folders(folder) if folder.exists() else ():
+        with contextlib.suppress(FileNotFoundError):  # it may be deleted meanwhile
+            status = (episode / DATA).stat()
+            found[episode] = (status.st_mtime_ns, status.st_size)
+    return found
+
+
+def _merge_episodes(
+    out: Path, folder: Path, before: dict[Path, tuple[int, int]], force: bool
+) -> bool:
+    """Merge the episodes that are new or changed; whether there are some and all are merged."""
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions.sources import beside
+
+    new = [e for e, status in _episodes(folder).items() if before.get(e) != status]
+    if not new:
+        click.echo(one_line(f"warning: no episode was written to {folder}", REMARK), err=True)
+        return False
+    trace, whole = open_trace(out), True
+    for episode in new:
+        name = "_".join(episode.relative_to(folder).parts) or episode.name
+        target = out.with_name(f"{out.stem}_{name}.mcap")
+        try:
+            report = beside(episode, trace).convert(target, False, force)
+        except DexkitError as error:
+            whole = False
+            click.echo(one_line(f"warning: {episode}: not merged: {error}", REMARK), err=True)
+            continue
+        for text in (*report.corrections, *report.problems):
+            click.echo(one_line(f"warning: {episode}: {text}", REMARK), err=True)
+        click.echo(one_line(f"{target}: {report.messages} messages ({report.form})", REMARK))
+    return whole
 
 
 def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:

@@ -19,7 +19,7 @@ from dexkit.messages.codec import check_count, check_end, is_big, truncated
 from dexkit.messages.layout import Field, Primitive, Struct, max_size
 from dexkit.messages.packed import Words, aligned, pieces, rows_at
 
-__all__ = ["Columns"]
+__all__ = ["Columns", "encode_columns"]
 
 _STEP = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\[(?P<index>\d*)\])?")
 _UINT32 = (struct.Struct("<I"), struct.Struct(">I"))
@@ -194,8 +194,8 @@ class Columns:
                 return np.nan, np.nan
             for at in places:
                 for _, values in group.words.parts(leaf, at):
-                    low.append(float(np.min(values)))
-                    high.append(float(np.max(values)))
+                    low.append(float(values.min()))
+                    high.append(float(values.max()))
         # numpy's, which pass NaN on
         return (float(np.min(low)), float(np.max(high))) if low else (np.nan, np.nan)
 
@@ -231,6 +231,42 @@ class Columns:
             if index is None and member.array is not None:
                 return (member.array,)
         return ()
+
+
+def encode_columns(
+    kind: Struct,
+    example: bytes,
+    values: Sequence[tuple[Sequence[str | int], NDArray[Any]]],
+    n: int,
+) -> list[bytes]:
+    """Encode many samples of one shape at once: the reverse of :class:`Columns`.
+
+    :param example: a sample of that shape, little endian; it gives what ``values`` does not name.
+    :param values: for a number in the message, by names of members and places in lists, its value
+        in each sample, shape (n,), in its own type.
+    :param n: how many samples.
+    """
+    dtype = _dtype(kind, _counts(kind, example, False), "<", len(example))
+    rows: NDArray[np.void] = np.zeros(n, dtype)
+    raw = rows.view(np.uint8).reshape(n, len(example))
+    raw[:] = np.frombuffer(example, np.uint8)
+    for steps, column in values:
+        (member, *rest) = steps
+        here: NDArray[Any]
+        if str(member) in (dtype.names or ()):
+            here = rows[str(member)]
+        else:  # structs of a fixed array are members of their own
+            field = next(f for f in kind.fields if f.name == member)
+            here = rows[field.places()[int(rest.pop(0))]]
+        for step in rest[:-1]:
+            here = here[step] if isinstance(step, str) else here[:, step]
+        if not rest:
+            rows[str(member)] = column
+        elif isinstance(rest[-1], str):
+            here[rest[-1]] = column
+        else:
+            here[:, rest[-1]] = column
+    return [row.tobytes() for row in raw]
 
 
 class _Group:

@@ -25,7 +25,7 @@ _ROOT = str(Path(__file__).resolve().parents[2])
 _TYPE = "unitree_go::msg::dds_::MotorCmds_"
 _TOPICS = ("rt/dexkit/setup/there", "rt/dexkit/setup/back")
 _AGAIN = 0.2  # seconds until the message is sent again
-_PATIENCE = 20.0  # seconds for discovery and for the answer, together some 0.3 s
+_PATIENCE = 90.0  # seconds for each of discovery and answer: some 0.3 s, in an emulator 20 s
 
 
 def command(python: str, folder: str = "", *, send: bool) -> list[str]:

@@ -1,0 +1,370 @@
+"""The summary page of an audit: worst files first, trends, groups; in the style of the reports."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+
+from dexkit import __version__
+from dexkit.conformance.audit.records import FINDING, FileRecord, State
+from dexkit.conformance.report.charts import Line, chart
+from dexkit.conformance.report.html import document
+from dexkit.conformance.report.labels import ANSWERS, VERDICTS
+from dexkit.conformance.requirements import LAYERS, catalogue
+from dexkit.conformance.results import Overall, Verdict
+from dexkit.conformance.run_record import catalogue_digest
+from dexkit.escaping import html as escape
+
+__all__ = ["Group", "Summary", "render"]
+
+_WORST = 200
+"""Files with something to say that the page lists; the tables have all."""
+_ROWS = 60
+"""Rows of a group's table."""
+_MOST = 3
+"""Requirements that are named for a file or a group."""
+_DAY = 86_400.0
+
+_ABOUT, _REQUIREMENT, _SIDE, _VERDICT, _OBSERVED = (
+    list(FINDING).index(name) for name in ("about", "requirement", "side", "verdict", "observed")
+)
+
+
+@dataclass
+class Group:
+    """Files that have something in common."""
+
+    files: int = 0
+    failing: int = 0
+    unusable: int = 0
+    seconds: float = 0.0
+    failures: Counter[str] = field(default_factory=Counter)
+
+    def add(self, record: FileRecord, failed: Iterable[str]) -> None:
+        """Count a file."""
+        self.files += 1
+        self.failing += record.failed
+        self.unusable += record.exit_code == 2
+        self.seconds += record.facts.get("duration_s") or 0.0
+        self.failures.update(failed)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """What the page says of one file."""
+
+    name: str
+    overall: str
+    state: State
+    error: str
+    where: str
+    failed: tuple[tuple[str, str], ...]
+    more: int
+
+
+class Summary:
+    """What the page says, collected file by file: its size does not grow with the archive's.
+
+    :ivar groups: by title (``robot``, ``model``, ...) and name.
+    :ivar requirements: by ``hand`` or ``client`` and id: in how many files it fails, and warns.
+    """
+
+    def __init__(self) -> None:
+        self.all = Group()
+        self.states: Counter[State] = Counter()
+        self.overall: Counter[str] = Counter()
+        self.groups: dict[str, dict[str, Group]] = {}
+        self.requirements: dict[tuple[str, str], Counter[str]] = {}
+        self.days: dict[float, Group] = {}
+        self.clients: Counter[str] = Counter()
+        self.truncated = self.damaged = 0
+        self._worst: list[tuple[tuple[int, int, int], int, _Line]] = []
+        self._count = 0
+
+    def add(self, record: FileRecord) -> None:
+        """Count a file."""
+        facts = record.facts
+        verdicts = record.verdicts()
+        failed = [name for name, verdict in verdicts.items() if verdict is Verdict.FAIL]
+        self.all.add(record, failed)
+        self.states[record.state] += 1
+        self.overall[record.overall or str(Overall.INCONCLUSIVE)] += 1
+        self.truncated += bool(facts.get("truncated"))
+        self.damaged += bool(facts.get("damage"))
+        if record.client:
+            self.clients[record.client] += 1
+        for about, found in (("hand", verdicts), ("client", record.verdicts(about_client=True))):
+            for name, verdict in found.items():
+                if verdict in (Verdict.FAIL, Verdict.WARN):
+                    counts = self.requirements.setdefault((about, name), Counter())
+                    counts[str(verdict)] += 1
+        for title, name in self._group_names(record):
+            group = self.groups.setdefault(title, {}).setdefault(name, Group())
+            group.add(record, failed)
+        if day := _day(facts.get("recorded_at", "")):
+            self.days.setdefault(day, Group()).add(record, failed)
+        self._rank(record, failed)
+
+    def _group_names(self, record: FileRecord) -> list[tuple[str, str]]:
+        found = [(key, value) for key, value in record.facts.get("labels", {}).items()]
+        if dialect := record.facts.get("dialect"):
+            found.append(("dialect", dialect))
+        folder = record.name.rpartition("/")[0]
+        return [*found, ("folder", folder)] if folder else found
+
+    def _rank(self, record: FileRecord, failed: Sequence[str]) -> None:
+        badness = record.badness
+        if badness == (0, 0, 0):
+            return
+        shown = []
+        for finding in record.findings:
+            named = finding[_REQUIREMENT] in failed and finding[_ABOUT] != "client"
+            if named and finding[_VERDICT] == "fail":
+                text = f"{finding[_SIDE]}: {finding[_OBSERVED]}"
+                shown.append((finding[_REQUIREMENT], text))
+        line = _Line(
+            record.name,
+            record.overall,
+            record.state,
+            record.error,
+            _where(record.facts),
+            tuple(shown[:_MOST]),
+            max(0, len(shown) - _MOST),
+        )
+        # the heap's smallest is the least bad, and of equals the last one
+        entry = (tuple(-n for n in badness), -self._count, line)
+        self._count += 1
+        heapq.heappush(self._worst, entry)  # type: ignore[misc]
+        if len(self._worst) > _WORST:
+            heapq.heappop(self._worst)
+
+    @property
+    def worst(self) -> list[_Line]:
+        """Files with failures, errors or warnings, worst first."""
+        return [line for _, _, line in sorted(self._worst, reverse=True)]
+
+    @property
+    def remarkable(self) -> int:
+        """How many files have failures, errors or warnings."""
+        return self._count
+
+
+def _day(recorded_at: str) -> float:
+    try:
+        moment = datetime.fromisoformat(recorded_at)
+    except ValueError:
+        return 0.0
+    return moment.timestamp() // _DAY * _DAY
+
+
+def _where(facts: Mapping[str, Any]) -> str:
+    labels = [f"{key} {value}" for key, value in facts.get("labels", {}).items()]
+    parts = [facts.get("recorded_at", ""), facts.get("dialect", ""), *labels]
+    return ", ".join(part for part in parts if part)
+
+
+def render(summary: Summary, *, locations: Sequence[str], left: int = 0) -> str:
+    """The page as text.
+
+    :param left: files that were not examined, because the audit was stopped.
+    """
+    sections = [
+        _head(summary, left),
+        _facts(summary, locations),
+        _worst(summary),
+        _trend(summary),
+        _requirements(summary, "hand", "Requirements that hands do not meet"),
+        _requirements(summary, "client", "Requirements that clients do not meet"),
+        *(_groups(title, groups) for title, groups in sorted(summary.groups.items(), key=_order)),
+    ]
+    return document(f"Audit of {_count(summary.all.files, 'file')}", "".join(sections))
+
+
+def _order(item: tuple[str, Any]) -> tuple[bool, str]:
+    return item[0] in ("dialect", "folder"), item[0]
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds / 3600:,.1f} h" if seconds >= 7200 else f"{seconds / 60:.1f} min"
+
+
+def _head(summary: Summary, left: int) -> str:
+    every = summary.all
+    if every.failing:
+        css, title = "bad", f"{_count(every.failing, 'file')} with a failure"
+    elif every.unusable or left or not every.files:
+        css, title = "open", "No failure, and not all could be judged"
+    else:
+        css, title = "ok", "No failure"
+    chips = "".join(
+        f'<span class="chip {ANSWERS[o].css}">{summary.overall[str(o)]} {ANSWERS[o].text}</span>'
+        for o in Overall
+    )
+    chips += "".join(
+        f'<span class="chip open">{n} {escape(str(state))}</span>'
+        for state, n in summary.states.items()
+        if state is not State.JUDGED
+    )
+    for n, text in ((summary.damaged, "damaged"), (summary.truncated, "unfinished")):
+        chips += f'<span class="chip open">{n} {text}</span>' if n else ""
+    stopped = f"<p>Stopped before its end: {_count(left, 'file')} not examined.</p>" if left else ""
+    return (
+        f'<header class="verdict {css}"><p class="question">Audit of recorded sessions</p>'
+        f"<h1>{title}<small>of {every.files:,}, {_span(every.seconds)}</small></h1>"
+        f'{stopped}</header><div class="chips">{chips}</div>'
+    )
+
+
+def _facts(summary: Summary, locations: Sequence[str]) -> str:
+    times = sorted(summary.days)
+    rows = {
+        "where": ", ".join(locations),
+        "recorded": f"{_date(times[0])} to {_date(times[-1])}" if times else "unknown",
+        "dexkit": __version__,
+        "catalogue": catalogue_digest()[:16],
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+    if summary.clients:
+        rows["clients"] = ", ".join(f"{n} {verdict}" for verdict, n in summary.clients.items())
+    cells = "".join(f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())
+    return f'<dl class="facts">{cells}</dl>'
+
+
+def _date(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; the cells are HTML, the first of each row is its heading."""
+    head = "".join(f'<th scope="col">{h}</th>' for h in heads)
+    body = "".join(
+        f'<tr><th scope="row">{row[0]}</th>'
+        + "".join(
+            f'<td data-run="{h}">{cell}</td>' for h, cell in zip(heads[1:], row[1:], strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    return (
+        f'<div class="wrap"><table class="matrix"><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _worst(summary: Summary) -> str:
+    lines = summary.worst
+    if not lines:
+        return ""
+    rest = summary.remarkable - len(lines)
+    more = f"<p>{_count(rest, 'file')} more: see the table of files.</p>" if rest else ""
+    rows = []
+    for line in lines:
+        if line.overall:
+            answer = ANSWERS[Overall(line.overall)]
+            verdict = f'<b class="{answer.css}">{answer.text}</b>'
+        else:
+            verdict = f'<b class="open">{escape(str(line.state))}</b>'
+        found = [f"<code>{escape(name)}</code> {escape(text)}" for name, text in line.failed]
+        found += [f"and {line.more} more"] if line.more else []
+        found += [escape(line.error)] if line.error else []
+        where = f"<span class='dim'>{escape(line.where)}</span>" if line.where else ""
+        rows.append((f"{escape(line.name)}{where and '<br>' + where}", verdict, "<br>".join(found)))
+    return f"<h2>Worst files</h2>{_table(('file', 'verdict', 'why'), rows)}{more}"
+
+
+def _trend(summary: Summary) -> str:
+    """The part of files that fail, and that cannot be used, day by day."""
+    days = sorted(summary.days)
+    if len(days) < 2:
+        return ""
+    x = (np.array(days) - days[0]) / _DAY
+    groups = [summary.days[day] for day in days]
+    failing = np.array([100 * g.failing / g.files for g in groups])
+    unusable = np.array([100 * g.unusable / g.files for g in groups])
+    draw = "dots" if len(days) < 8 else "line"
+    plot = chart(
+        "files with a failure, and files that cannot be used, per cent by day",
+        [
+            Line("with a failure", "bad", x, failing, draw),
+            Line("not usable or inconclusive", "other", x, unusable, draw),
+        ],
+        y_unit="%",
+        span=(0.0, float(x[-1])),
+        x_unit=f"days since {_date(days[0])}",
+        include=(0.0,),
+    )
+    changes = _changes(summary, days)
+    return f"<h2>Over time</h2>{plot}{changes}"
+
+
+def _changes(summary: Summary, days: Sequence[float]) -> str:
+    """Requirements that fail more, or less, in the later half of the days than before."""
+    halves = []
+    for some in (days[: len(days) // 2], days[len(days) // 2 :]):
+        files = sum(summary.days[day].files for day in some)
+        counts: Counter[str] = Counter()
+        for day in some:
+            counts.update(summary.days[day].failures)
+        halves.append({name: n / files for name, n in counts.items()})
+    before, after = halves
+    change = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in before.keys() | after.keys()}
+    ordered = sorted(change, key=lambda n: (-abs(change[n]), n))[:10]
+    rows = [
+        (f"<code>{escape(n)}</code>", f"{before.get(n, 0.0):.0%}", f"{after.get(n, 0.0):.0%}")
+        for n in ordered
+        if abs(change[n]) >= 0.005
+    ]
+    middle = _date(days[len(days) // 2])
+    heads = ("part of files in which it fails", f"before {middle}", "since then")
+    return _table(heads, rows) if rows else ""
+
+
+def _requirements(summary: Summary, about: str, title: str) -> str:
+    found = {name: c for (who, name), c in summary.requirements.items() if who == about}
+    if not found:
+        return ""
+    titles = {r.id: r.title for name in LAYERS for r in catalogue(None, name)}
+    ordered = sorted(found, key=lambda n: (-found[n]["fail"], -found[n]["warn"], n))
+    rows = [
+        (
+            f"<code>{escape(n)}</code> {escape(titles.get(n, ''))}",
+            f'<span class="{VERDICTS[Verdict.FAIL].css}">{found[n]["fail"]}</span>',
+            f'<span class="{VERDICTS[Verdict.WARN].css}">{found[n]["warn"]}</span>',
+        )
+        for n in ordered
+    ]
+    return f"<h2>{title}</h2>{_table(('requirement', 'files that fail', 'warnings'), rows)}"
+
+
+def _groups(title: str, groups: Mapping[str, Group]) -> str:
+    if len(groups) < 2:
+        return ""
+    ordered = sorted(groups, key=lambda n: (-groups[n].failing / groups[n].files, n))
+    rows = []
+    for name in ordered[:_ROWS]:
+        group = groups[name]
+        most = [f"<code>{escape(n)}</code> ({k})" for n, k in group.failures.most_common(_MOST)]
+        rows.append(
+            (
+                escape(name),
+                f"{group.files:,}",
+                _span(group.seconds),
+                f"{group.failing} ({group.failing / group.files:.0%})",
+                str(group.unusable),
+                ", ".join(most),
+            )
+        )
+    rest = len(ordered) - len(rows)
+    more = f"<p>and {rest} more</p>" if rest else ""
+    heads = (title, "files", "recorded", "failing", "not usable", "most frequent failures")
+    return f"<h2>By {escape(title)}</h2>{_table(heads, rows)}{more}"

@@ -1,0 +1,189 @@
+"""``dexkit audit``: judge every session of an archive."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.options import Number, quiet_option
+from dexkit.cli.status_line import StatusLine
+from dexkit.console import Console
+from dexkit.errors import ConformanceError
+from dexkit.stop_signals import stop_on_signals
+
+if TYPE_CHECKING:
+    from dexkit.conformance.audit.audit import Outcome
+
+_STATUS_PERIOD = 0.2  # seconds
+_FAIL_ON = ("never", "fail", "unusable", "warn")
+
+
+@click.command("audit")
+@click.argument("locations", nargs=-1, required=True, metavar="PATH|URL...")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("audit-out"),
+    show_default=True,
+    metavar="DIR",
+    help="Where the journal, the tables and the page are kept. What it has of unchanged files is "
+    "used again.",
+)
+@click.option("--fresh", is_flag=True, help="Judge all files again.")
+@click.option(
+    "--fail-on",
+    type=click.Choice(_FAIL_ON),
+    default="unusable",
+    show_default=True,
+    help="What the exit code shows; each includes those before it.",
+)
+@click.option(
+    "--format",
+    "table_format",
+    type=click.Choice(["auto", "parquet", "jsonl"]),
+    default="auto",
+    show_default=True,
+    help="Format of the tables; auto is Parquet if pyarrow is installed.",
+)
+@click.option(
+    "--label",
+    "labels",
+    multiple=True,
+    metavar="KEY",
+    help="Group sessions also by this key of their metadata, besides robot, operator, task and "
+    "site; may be repeated.",
+)
+@click.option(
+    "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
+)
+@click.option(
+    "--timeout",
+    type=Number(min=1),
+    default=600.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds for one file.",
+)
+@click.option(
+    "--memory",
+    type=click.IntRange(256, 2**24),
+    default=4096,
+    show_default=True,
+    metavar="MIB",
+    help="Memory for one file.",
+)
+@click.option(
+    "--max-size",
+    type=click.IntRange(1, 2**24),
+    default=8192,
+    show_default=True,
+    metavar="MIB",
+    help="Largest object of a URL that is copied to this machine's temporary folder.",
+)
+@quiet_option()
+def command(
+    locations: tuple[str, ...],
+    out: Path,
+    fresh: bool,
+    fail_on: str,
+    table_format: str,
+    labels: tuple[str, ...],
+    jobs: int | None,
+    timeout: float,
+    memory: int,
+    max_size: int,
+    quiet: bool,
+) -> None:
+    """Judge every recorded session (mcap file) in folders or behind URLs, as 'dexkit check' does.
+
+    Writes a row for each file, and for each requirement and side, as Parquet or JSON lines, and a
+    summary page. Whatever is wrong with a file is a row, and no end. An audit that was stopped
+    goes on when it is called again (docs/audit.md).
+
+    Exit code: 0 every MUST that could be judged is met in every file, 1 one is not, 2 a file is
+    not usable, damaged or inconclusive, or there is none; see --fail-on. 130 interrupted.
+    """
+    from dexkit.conformance.audit.audit import FAIL_ON, Audit, Limits
+    from dexkit.conformance.audit.examine import LABELS
+    from dexkit.conformance.audit.sessions import is_url
+
+    assert _FAIL_ON == FAIL_ON
+    limits = Limits(seconds=timeout, memory=memory * 2**20, max_size=max_size * 2**20)
+    audit = Audit(
+        locations,
+        out.absolute(),
+        labels=[*LABELS, *labels],
+        limits=limits,
+        fresh=fresh,
+        parquet=None if table_format == "auto" else table_format == "parquet",
+        working_folder=Path.cwd(),
+    )
+    # Python's worker processes begin with the working folder in front of their import path
+    os.chdir("/")
+    status = StatusLine(quiet)
+    last = 0.0
+
+    def progress(outcome: Outcome) -> None:
+        nonlocal last
+        if status and time.monotonic() - last >= _STATUS_PERIOD:
+            last = time.monotonic()
+            status.show(_status(outcome))
+
+    with stop_on_signals() as stop:
+        outcome = audit.run(limits.pool(jobs), stop, progress)
+    status.clear()
+    _print(Console(), outcome)
+    if stop:
+        raise click.Abort
+    if not outcome.total:
+        raise ConformanceError(
+            "there is no session, which is not a pass",
+            hint="sessions are files that end in .mcap; 'dexkit import' makes them of others"
+            if any(map(is_url, locations))
+            else "sessions are files that end in .mcap",
+        )
+    sys.exit(outcome.exit_code(fail_on))
+
+
+def _status(outcome: Outcome) -> str:
+    rest = outcome.remaining_s
+    parts = [f"{outcome.done:,} of {outcome.total:,} files"]
+    if outcome.seconds:
+        parts.append(f"{outcome.examined_s / outcome.seconds:,.0f} times real time")
+    parts.append(f"{outcome.failing} with a failure")
+    if rest is not None:
+        parts.append(f"{_duration(rest)} left")
+    return ", ".join(parts)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _print(console: Console, outcome: Outcome) -> None:
+    console.print(
+        f"{outcome.done:,} of {outcome.total:,} files, {outcome.recorded_s / 3600:,.2f} h: "
+        f"{outcome.failing} with a failure, {outcome.unusable} not usable or inconclusive, "
+        f"{outcome.warned} with a warning",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if outcome.reused:
+        console.print(f"{outcome.reused:,} unchanged since the last audit", highlight=False)
+    if outcome.examined_s and outcome.seconds:
+        console.print(
+            f"{outcome.examined_s / outcome.seconds:,.0f} times real time "
+            f"({outcome.seconds:.1f} s)",
+            highlight=False,
+        )
+    for path in outcome.files:
+        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    if outcome.stopped:
+        console.print("stopped before its end; the same command goes on", highlight=False)

@@ -1,0 +1,128 @@
+"""``dexkit cut``: a part of a recording, by time, phase and topic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.options import FILE, Number, topic_option
+from dexkit.errors import UsageError
+from dexkit.escaping import REMARK, one_line
+
+if TYPE_CHECKING:
+    from dexkit.traces import Trace
+    from dexkit.traces.sessions.edit import Metadata, Span
+
+__all__ = ["command"]
+
+
+@click.command("cut")
+@click.argument("file", type=FILE)
+@click.argument("out", type=FILE)
+@click.option("--from", "begin", type=Number(), metavar="S", help="From S seconds after the start.")
+@click.option("--to", "end", type=Number(), metavar="S", help="To S seconds after the start.")
+@click.option(
+    "--phase",
+    "phases",
+    multiple=True,
+    metavar="NAME",
+    help="The phases of that name of a conformance run; may be repeated.",
+)
+@click.option(
+    "--margin",
+    type=Number(min=0),
+    default=0.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds to keep before and after each phase.",
+)
+@topic_option("Keep", "all")
+@click.option("--force", is_flag=True, help="Overwrite OUT.")
+def command(
+    file: Path,
+    out: Path,
+    begin: float | None,
+    end: float | None,
+    phases: tuple[str, ...],
+    margin: float,
+    topics: tuple[str, ...],
+    force: bool,
+) -> int:
+    """Write a part of the recording FILE to OUT.
+
+    Times count from the first message; negative ones from the last. Payloads, times, schemas and
+    metadata stay as they are; OUT says what it is a part of.
+
+    Exit code: 0 written, 1 the recording is damaged (what can be read of it is cut), 2 wrong
+    usage, nothing left, or an unusable file.
+    """
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions.edit import cut
+
+    trace = open_trace(file)
+    spans, metadata = _spans(trace, begin, end, phases, margin)
+    written = cut(
+        trace, out, spans=spans, topics=topics or None, metadata=metadata, overwrite=force
+    )
+    for warning in trace.warnings:
+        click.echo(one_line(f"warning: {warning}", REMARK), err=True)
+    if trace.attachments:
+        click.echo(f"warning: {trace.attachments} attachments are left out", err=True)
+    click.echo(f"{out}: {written} of {trace.message_count} messages")
+    return 1 if trace.damage else 0
+
+
+def _spans(
+    trace: Trace,
+    begin: float | None,
+    end: float | None,
+    phases: tuple[str, ...],
+    margin: float,
+) -> tuple[list[Span], Metadata]:
+    """The times to keep, and the metadata without phases that are not whole in them."""
+    from dexkit.conformance.stimulus_record import RECORD, Stimulus
+    from dexkit.traces.sessions.edit import Span
+
+    # the last message belongs to the recording
+    first, last = trace.first_ns, trace.last_ns + 1
+    low = first if begin is None else _instant(trace, begin)
+    high = last if end is None else _instant(trace, end)
+    if high <= low:
+        raise UsageError("--to must be later than --from")
+    spans = [Span(low, high)]
+    stimulus = Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
+    if phases:
+        if stimulus is None:
+            raise UsageError(
+                f"{trace.path.name} has no phases: no conformance run recorded it",
+                hint="name times with --from and --to",
+            )
+        known = [p for p in stimulus.phases if p.end_ns]
+        if missing := set(phases) - {p.name for p in known}:
+            raise UsageError(
+                f"{trace.path.name} has no phase {', '.join(sorted(missing))}",
+                hint=f"it has: {', '.join(dict.fromkeys(p.name for p in known))}",
+            )
+        extra = round(margin * 1e9)
+        limits = [
+            (max(p.begin_ns - extra, low), min(p.end_ns + extra, high))
+            for p in known
+            if p.name in phases
+        ]
+        spans = [Span(b, e) for b, e in limits if e > b]
+        if not spans:
+            raise UsageError(f"no phase {', '.join(phases)} lies between --from and --to")
+    if stimulus is None:
+        return spans, trace.metadata
+    stimulus.phases = [
+        p
+        for p in stimulus.phases
+        if p.end_ns and any(s.begin_ns <= p.begin_ns and p.end_ns <= s.end_ns for s in spans)
+    ]
+    return spans, {**trace.metadata, RECORD: stimulus.to_metadata()}
+
+
+def _instant(trace: Trace, seconds: float) -> int:
+    return (trace.first_ns if seconds >= 0 else trace.last_ns) + round(seconds * 1e9)

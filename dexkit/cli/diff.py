@@ -1,0 +1,130 @@
+"""``dexkit diff``: what two recordings of one session differ in."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dexkit.cli.options import FILE, Number, json_option, topic_option
+from dexkit.escaping import REMARK, one_line
+
+if TYPE_CHECKING:
+    from dexkit.traces.sessions.compare import Comparison
+
+__all__ = ["command"]
+
+
+@click.command("diff")
+@click.argument("a", type=FILE)
+@click.argument("b", type=FILE)
+@click.option(
+    "--offset",
+    type=Number(),
+    metavar="S",
+    help="B is S seconds later than A.  [default: found by the commands]",
+)
+@click.option(
+    "--tolerance",
+    type=Number(min=0),
+    default=0.05,
+    show_default=True,
+    metavar="RAD",
+    help="Positions that are closer are the same.",
+)
+@topic_option("Compare", "all")
+@json_option("Print JSON.")
+def command(
+    a: Path,
+    b: Path,
+    offset: float | None,
+    tolerance: float,
+    topics: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Compare two runs of one session: topics, rates, gaps, and the position of every joint.
+
+    B is put on A's clock by the correlation of the commands (of the states, where there are no
+    commands), and each joint is compared at A's times where both have values.
+
+    Exit code: 0 the same topics and positions, 1 they differ or a recording is damaged, 2 they
+    cannot be compared.
+    """
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions.compare import compare
+
+    traces = [open_trace(a), open_trace(b)]
+    found = compare(*traces, topics=topics or None, offset=offset, tolerance=tolerance)
+    for trace in traces:
+        for warning in trace.warnings:
+            click.echo(one_line(f"warning: {trace.path}: {warning}", REMARK), err=True)
+    if as_json:
+        click.echo(json.dumps(_finite({"equal": found.equal, **asdict(found)}), indent=1))
+    else:
+        _print(found)
+    return 0 if found.equal and not any(t.damage for t in traces) else 1
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print(found: Comparison) -> None:
+    from rich.table import Table
+
+    from dexkit.console import Console
+    from dexkit.console import markup as escape
+
+    console = Console(width=max(Console().width, 120))
+    how = "as stated"
+    if found.alignment is not None:
+        how = (
+            f"correlation {found.alignment.correlation:.4f}, "
+            f"elsewhere at most {found.alignment.elsewhere:.4f}"
+        )
+    console.print(
+        f"B is {found.offset:+.4f} s later than A ({how}); {found.overlap:.3f} s in common",
+        highlight=False,
+    )
+    for name, topics in zip("AB", found.only, strict=True):
+        if topics:
+            console.print(f"only in {name}: {escape(', '.join(topics))}", highlight=False)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("topic", no_wrap=True)
+    for heading in ("messages A", "B", "mean Hz A", "B", "longest gap s A", "B"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for t in found.topics:
+        table.add_row(
+            escape(t.topic) + ("" if t.types[0] == t.types[1] else " (types differ)"),
+            *(f"{n:,}" for n in t.messages),
+            *(f"{r:.1f}" for r in t.rates),
+            *(f"{g:.3f}" for g in t.gaps),
+        )
+    console.print(table)
+    joints = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in ("joint", "what"):
+        joints.add_column(heading, no_wrap=True)
+    for heading in ("rms rad", "worst rad", "at s", f"first > {found.tolerance:g} at s"):
+        joints.add_column(heading, justify="right", no_wrap=True)
+    for j in found.joints:
+        first = "" if j.first_at is None else f"{j.first_at:.3f}"
+        joints.add_row(
+            escape(j.joint),
+            j.kind,
+            *((f"{j.rms:.4f}", f"{j.worst:.4f}", f"{j.worst_at:.3f}") if j.samples else "---"),
+            first if j.samples else "no time in common",
+        )
+    console.print()
+    console.print(joints)
+    for note in found.notes:
+        console.print(f"note: {note}", highlight=False)
+    console.print("the same" if found.equal else "they differ")

@@ -1,0 +1,122 @@
+"""``dexkit export``: recordings in other formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from dexkit.cli.options import FILE
+from dexkit.errors import DexkitError, SessionError, UsageError
+from dexkit.escaping import REMARK, one_line
+
+__all__ = ["command"]
+
+
+@click.command("export")
+@click.argument("sessions", type=FILE, nargs=-1, required=True, metavar="SESSION...")
+@click.option(
+    "--to",
+    "form",
+    type=click.Choice(["lerobot", "episodes", "rosbag2", "parquet", "csv"]),
+    required=True,
+    help="The format.",
+)
+@click.option("--out", type=FILE, required=True, metavar="DIR", help="The folder to write.")
+@click.option(
+    "--storage",
+    type=click.Choice(["sqlite3", "mcap"]),
+    default="sqlite3",
+    show_default=True,
+    help="Storage of a ROS 2 bag.",
+)
+@click.option(
+    "--fps",
+    type=click.IntRange(1, 1000),
+    metavar="N",
+    help="Frames a second of lerobot and episodes.  [default: measured]",
+)
+@click.option("--task", metavar="TEXT", help="Task of all episodes.  [default: the recording's]")
+def command(
+    sessions: tuple[Path, ...],
+    form: str,
+    out: Path,
+    storage: str,
+    fps: int | None,
+    task: str | None,
+) -> int:
+    """Write the recordings SESSION... to the folder DIR in another format.
+
+    lerobot makes one dataset (v3.0) and episodes one task folder of them; of the others, several
+    recordings get a folder of their name each.
+
+    Exit code: 0 all is exported, 1 a recording is damaged or was refused (the others are
+    exported), 2 wrong usage, or nothing could be exported.
+    """
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions import rosbag, tables
+
+    if form in ("lerobot", "episodes"):
+        return _frames(sessions, form, out, fps, task)
+    if fps is not None or task is not None:
+        raise UsageError(f"--fps and --task are for lerobot and episodes, not for {form}")
+    several = len(sessions) > 1
+    if several and len({p.stem for p in sessions}) < len(sessions):
+        raise UsageError("two of the recordings have the same name", hint="export them one by one")
+    done, trouble = 0, False
+    for path in sessions:
+        target = out / path.stem if several else out
+        try:
+            trace = open_trace(path)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if form == "rosbag2":
+                lost = rosbag.export_bag(trace, target, storage=storage)
+            else:
+                lost = tables.export_tables(trace, target, form)
+        except DexkitError as error:
+            if not several:
+                raise
+            trouble = True
+            click.echo(one_line(f"warning: {path}: refused: {error}", REMARK), err=True)
+            continue
+        done += 1
+        trouble |= bool(trace.damage)
+        for text in trace.warnings:
+            click.echo(one_line(f"warning: {path}: {text}", REMARK), err=True)
+        for text in lost:
+            click.echo(one_line(f"not in {form}: {text}", REMARK), err=True)
+        click.echo(one_line(f"{target}: {trace.message_count} messages", REMARK))
+    if not done:
+        raise SessionError("none of the recordings could be exported")
+    return 1 if trouble else 0
+
+
+def _frames(
+    sessions: tuple[Path, ...], form: str, out: Path, fps: int | None, task: str | None
+) -> int:
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions import episodes_out, lerobot_out
+
+    traces, refused = [], []
+    for path in sessions:
+        try:
+            traces.append(open_trace(path))
+        except DexkitError as error:
+            if len(sessions) == 1:
+                raise
+            refused.append(f"{path}: refused: {error}")
+    if not traces:
+        raise SessionError("none of the recordings could be exported")
+    if form == "lerobot":
+        result = lerobot_out.export_dataset(traces, out, fps=fps, task=task)
+    else:
+        result = episodes_out.export_episodes(traces, out, fps=fps, task=task)
+    for trace in traces:
+        for text in trace.warnings:
+            click.echo(one_line(f"warning: {trace.path}: {text}", REMARK), err=True)
+    for text in (*refused, *result.problems):
+        click.echo(one_line(f"warning: {text}", REMARK), err=True)
+    for text in result.lost:
+        click.echo(one_line(f"not in {form}: {text}", REMARK), err=True)
+    click.echo(f"{out}: {lerobot_out.describe(result)}")
+    return 1 if refused or result.problems or any(t.damage for t in traces) else 0

@@ -1,0 +1,141 @@
+"""``dexkit import``: sessions of other formats as recordings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.options import FILE, Number
+from dexkit.errors import DexkitError, SessionError, UsageError
+from dexkit.escaping import REMARK, one_line
+
+if TYPE_CHECKING:
+    from dexkit.traces.sessions.episodes import Options
+    from dexkit.traces.sessions.sources import Entry
+
+__all__ = ["command"]
+
+
+@click.command("import")
+@click.argument("source", type=FILE)
+@click.argument("out", type=FILE)
+@click.option(
+    "--from",
+    "form",
+    type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
+    help="The format of SOURCE.  [default: told by its files]",
+)
+@click.option(
+    "--episode",
+    "chosen",
+    multiple=True,
+    metavar="NAME",
+    help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
+)
+@click.option(
+    "--rate",
+    type=Number(min=0.1, max=2000),
+    metavar="HZ",
+    help="Frames a second, where the source has no times.  [default: what it says]",
+)
+@click.option(
+    "--hand",
+    metavar="MODEL",
+    help="Model of the hands, e.g. dex3-1, or none.  [default: told by joints and limits]",
+)
+@click.option(
+    "--wire",
+    type=FILE,
+    metavar="FILE",
+    help="A recording made while the episodes were: it gives their frames true times.",
+)
+@click.option("--embed-pictures", is_flag=True, help="Put single pictures into the recording.")
+@click.option("--keep-sides", is_flag=True, help="Do not exchange hands that look swapped.")
+@click.option("--force", is_flag=True, help="Overwrite existing recordings.")
+def command(
+    source: Path,
+    out: Path,
+    form: str | None,
+    chosen: tuple[str, ...],
+    rate: float | None,
+    hand: str | None,
+    wire: Path | None,
+    embed_pictures: bool,
+    keep_sides: bool,
+    force: bool,
+) -> int:
+    """Write the sessions of SOURCE as recordings.
+
+    SOURCE is an episode of xr_teleoperate or a folder of them, a file of JSON lines, a LeRobot
+    dataset (v2.0, v2.1, v3.0), a ROS 2 bag (sqlite3 or mcap), or tables of dexkit export. OUT is
+    an mcap file for one session, and a folder for several.
+
+    Exit code: 0 all is imported, 1 something is left out (it is listed, and in the recording), 2
+    wrong usage, or nothing can be imported.
+    """
+    from dexkit.models import model
+    from dexkit.traces.sessions.episodes import Options
+    from dexkit.traces.sessions.sources import find
+
+    if hand not in (None, "none"):
+        model(hand)  # refused before anything is read
+    options = Options(rate=rate, hand=hand, correct=not keep_sides)
+    entries = find(source, form, options)
+    if wire is not None:
+        entries = _beside(source, entries, wire, options)
+    if chosen:
+        known = {e.name: e for e in entries} | {e.name.rpartition("/")[2]: e for e in entries}
+        if missing := [name for name in chosen if name not in known]:
+            raise UsageError(
+                f"{source} has no session {', '.join(missing)}",
+                hint=f"it has: {', '.join(e.name for e in entries[:20])}"
+                + (f" and {len(entries) - 20} more" if len(entries) > 20 else ""),
+            )
+        entries = list(dict.fromkeys(known[name] for name in chosen))
+    one = out.suffix == ".mcap"
+    if one and len(entries) > 1:
+        raise UsageError(
+            f"{source} has {len(entries)} sessions, which do not fit into one recording",
+            hint=f"name a folder (OUT without .mcap), or one of them: --episode {entries[0].name}",
+        )
+    done, trouble = 0, False
+    for entry in entries:
+        target = out if one else out / f"{entry.name}.mcap"
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            report = entry.convert(target, embed_pictures, force)
+        except DexkitError as error:
+            if len(entries) == 1:
+                raise
+            trouble = True
+            click.echo(one_line(f"warning: {entry.name}: refused: {error}", REMARK), err=True)
+            continue
+        done += 1
+        trouble |= bool(report.problems)
+        for text in report.corrections:
+            click.echo(one_line(f"corrected: {entry.name}: {text}", REMARK), err=True)
+        for text in report.problems:
+            click.echo(one_line(f"warning: {entry.name}: {text}", REMARK), err=True)
+        click.echo(one_line(f"{target}: {report.messages} messages ({report.form})", REMARK))
+    if not done:
+        raise SessionError(f"none of the {len(entries)} sessions of {source} can be imported")
+    return 1 if trouble else 0
+
+
+def _beside(source: Path, entries: list[Entry], wire: Path, options: Options) -> list[Entry]:
+    """The same episodes, with the times of the wire."""
+    from dexkit.traces import open_trace
+    from dexkit.traces.sessions.episodes import episode_folders
+    from dexkit.traces.sessions.sources import beside
+
+    folders = episode_folders(source)
+    if len(folders) != len(entries):
+        raise UsageError("--wire is for episodes of xr_teleoperate")
+    trace = open_trace(wire)
+    return [
+        replace(beside(folder, trace, options), name=entry.name)
+        for folder, entry in zip(folders, entries, strict=True)
+    ]

@@ -1,0 +1,290 @@
+"""Recordings are cut, merged and compared: ``dexkit cut``, ``dexkit merge``, ``dexkit diff``."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.cli import cli
+from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
+from dexkit.errors import DexkitError, TraceError, TraceUnsupported, UsageError
+from dexkit.hand import Side
+from dexkit.traces import Recorder, open_trace, sample_path
+from dexkit.traces.sessions.align import Track, align
+from dexkit.traces.sessions.compare import compare
+from dexkit.traces.sessions.edit import CUT, Span, clock_offset, cut, merge
+from dexkit.traces.sessions.resample import gap_of, hold, interpolate
+from dexkit.traces.sessions.streams import COMMAND, streams_of
+from tests.each import each
+from tests.trace_helpers import (
+    CMD,
+    CMD_TYPE,
+    STATE,
+    STATE_TYPE,
+    T0,
+    cmd,
+    mcap_bytes,
+    rows,
+    state,
+    write,
+)
+
+STATE_KIND = "state"
+PICK = sample_path("dex1_pick_place")
+
+
+def messages(path: Path) -> list[tuple[str, int, int, bytes]]:
+    return [
+        (m.topic, m.log_time_ns, m.publish_time_ns, m.data) for m in open_trace(path).messages()
+    ]
+
+
+def dexkit(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(cli, [str(a) for a in arguments], standalone_mode=False)
+    if isinstance(result.exception, DexkitError):
+        return result.exception.exit_code, result.exception.message
+    assert result.exception is None, result.exception
+    return int(result.return_value or 0), result.output
+
+
+def test_a_cut_has_the_messages_of_its_times_unchanged(tmp_path: Path) -> None:
+    whole = messages(PICK)
+    begin, end = T0 + 3 * 10**9, T0 + 5 * 10**9
+    written = cut(open_trace(PICK), tmp_path / "a.mcap", spans=[Span(begin, end)], topics=["*/cmd"])
+    expected = [m for m in whole if begin <= m[1] < end and m[0].endswith("/cmd")]
+    assert written == len(expected) > 500
+    assert messages(tmp_path / "a.mcap") == expected
+    part = open_trace(tmp_path / "a.mcap")
+    assert not part.warnings
+    assert part.metadata["provenance"] == open_trace(PICK).metadata["provenance"]
+    assert part.metadata[CUT]["spans"] == f"{begin} {end}"
+    assert {c.schema_encoding for c in part.channels} == {"omgidl"}
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.lists(st.integers(0, 60), min_size=0, max_size=4, unique=True))
+def test_pieces_of_a_recording_merge_to_the_recording(
+    tmp_path_factory: pytest.TempPathFactory, places: list[int]
+) -> None:
+    folder = tmp_path_factory.mktemp("pieces")
+    source = write(folder / "source.mcap", mcap_bytes(rows(60)))
+    ends = [T0 - 1, *(T0 + p * 2_000_000 for p in sorted(places)), T0 + 10**10]
+    parts = []
+    for i, (begin, end) in enumerate(itertools.pairwise(ends)):
+        trace = open_trace(source)
+        if any(begin <= m.log_time_ns < end for m in trace.messages()):
+            parts.append(folder / f"{i}.mcap")
+            # each piece overlaps with the one before it
+            cut(trace, parts[-1], spans=[Span(begin - 5_000_000, end)])
+    done = merge([open_trace(p) for p in parts], folder / "merged.mcap")
+    assert sorted(messages(folder / "merged.mcap")) == sorted(messages(source))
+    assert done.written == len(messages(source))
+
+
+def test_a_phase_is_cut_with_its_record(tmp_path: Path) -> None:
+    source = tmp_path / "run.mcap"
+    phases = [
+        Phase(name, (Side.LEFT,), T0 + i * 40_000_000, T0 + (i + 1) * 40_000_000)
+        for i, name in enumerate(["listen", "step", "silence"])
+    ]
+    with Recorder(source) as recorder:
+        recorder.add_metadata(RECORD, Stimulus(phases=phases).to_metadata())
+        for topic, log, publish, data in rows(60):
+            recorder.put(topic, STATE_TYPE if topic == STATE else CMD_TYPE, data, log, publish)
+    assert dexkit("cut", source, tmp_path / "step.mcap", "--phase", "step")[0] == 0
+    part = open_trace(tmp_path / "step.mcap")
+    assert [p.name for p in Stimulus.from_metadata(part.metadata[RECORD]).phases] == ["step"]
+    assert phases[1].begin_ns <= part.first_ns
+    assert part.last_ns < phases[1].end_ns
+    assert "messages" not in part.metadata["dexkit_recorder"]
+    code, text = dexkit("cut", source, tmp_path / "x.mcap", "--phase", "walk")
+    assert (code, text) == (2, "run.mcap has no phase walk")
+
+
+def test_what_cannot_be_cut_leaves_no_file(tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    for arguments in (
+        ["--from", 1000],
+        ["--topic", "rt/nothing"],
+        ["--phase", "step"],
+        ["--from", 3, "--to", 3],
+    ):
+        code, _ = dexkit("cut", PICK, out, *arguments)
+        assert code == 2
+        assert not out.exists()
+    kept = write(out, b"something else")
+    assert dexkit("cut", PICK, out)[0] == 2
+    assert dexkit("cut", PICK, out, "--force", "--from", 1000)[0] == 2
+    assert kept.read_bytes() == b"something else"
+    assert dexkit("cut", PICK, out, "--force", "--to", 1)[0] == 0
+    assert dexkit("cut", out, out, "--force")[0] == 2
+
+
+def test_a_damaged_recording_is_cut_as_far_as_it_can_be_read(tmp_path: Path) -> None:
+    data = bytearray(mcap_bytes(rows(200)))
+    data[data.index(state(0.01 * 50)) + 20] ^= 0xFF
+    source = write(tmp_path / "damaged.mcap", bytes(data))
+    code, text = dexkit("cut", source, tmp_path / "out.mcap")
+    assert code == 1, text
+    assert 0 < len(messages(tmp_path / "out.mcap")) < 300
+
+
+def test_clocks_of_two_recorders_are_compared_by_common_messages(tmp_path: Path) -> None:
+    a = write(tmp_path / "a.mcap", mcap_bytes(rows(60)))
+    late = [(t, log + 250_000_000, sent, data) for t, log, sent, data in rows(60)]
+    b = write(tmp_path / "b.mcap", mcap_bytes(late))
+    assert clock_offset(open_trace(a), open_trace(b)) == pytest.approx(0.25)
+    code, text = dexkit("merge", "--align", a, b, tmp_path / "out.mcap")
+    assert (code, "90 duplicates" in text) == (0, True)
+    assert messages(tmp_path / "out.mcap") == messages(a)
+    assert dexkit("merge", a, b, tmp_path / "shifted.mcap", "--shift", f"{b}=-0.25")[0] == 0
+    assert messages(tmp_path / "shifted.mcap") == messages(a)
+    stranger = write(tmp_path / "c.mcap", mcap_bytes(rows(60, T0 + 1)))
+    with pytest.raises(UsageError, match="0 messages in common"):
+        clock_offset(open_trace(a), open_trace(stranger))
+
+
+def test_recordings_of_different_schemas_are_not_merged(tmp_path: Path) -> None:
+    a = write(tmp_path / "a.mcap", mcap_bytes(rows(10)))
+    b = write(tmp_path / "b.mcap", mcap_bytes(rows(10), encoding="omgidl"))
+    with pytest.raises(TraceError, match="another schema"):
+        merge([open_trace(a), open_trace(b)], tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_one_topic_with_two_schemas_is_refused(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "a test")
+        for text in (b"float32 q\n", b"float64 q\n"):
+            schema = writer.register_schema("a/msg/B", "ros2msg", text)
+            channel = writer.register_channel("/b", "cdr", schema)
+            writer.add_message(channel, 1, b"\x00\x01\x00\x00", 1)
+        writer.finish()
+    with pytest.raises(TraceUnsupported, match="two channels"):
+        cut(open_trace(tmp_path / "two.mcap"), tmp_path / "out.mcap")
+
+
+def test_streams_have_the_joints_of_the_profile() -> None:
+    found = {(s.part, s.kind): s for s in streams_of(open_trace(sample_path("dex3_pinch")))}
+    assert set(found) == {
+        (f"{s}_hand", k) for s in ("left", "right") for k in (STATE_KIND, COMMAND)
+    }
+    left = found["left_hand", STATE_KIND]
+    assert left.names[:4] == ("left_thumb_0", "left_thumb_1", "left_thumb_2", "left_middle_0")
+    assert left.pressure is not None
+    assert left.pressure.shape == (len(left), 33)
+    legacy = {(s.part, s.kind): s for s in streams_of(open_trace(sample_path("dex1_legacy_v1_1")))}
+    samples = open_trace(sample_path("dex1_legacy_v1_1")).samples("rt/unitree_actuator/state")
+    # 0 is the right gripper on that topic
+    right = legacy["right_hand", STATE_KIND].q[:, 0]
+    assert np.array_equal(right, samples.columns()["states[0].q"])
+
+
+def test_two_runs_are_aligned_and_compared(tmp_path: Path) -> None:
+    later = tmp_path / "later.mcap"
+    merge([open_trace(PICK)], later, shifts=[12.345])
+    part = tmp_path / "part.mcap"
+    whole = open_trace(later)
+    cut(whole, part, spans=[Span(whole.first_ns + 2 * 10**9, whole.first_ns + 17 * 10**9)])
+    found = compare(open_trace(PICK), open_trace(part))
+    assert found.offset == pytest.approx(12.345, abs=2e-3)
+    assert found.equal
+    assert {j.joint for j in found.joints} == {"left_gripper", "right_gripper"}
+    assert all(j.worst < 0.03 for j in found.joints)
+    code, text = dexkit("diff", PICK, part, "--json")
+    assert code == 0
+    assert json.loads(text)["equal"] is True
+    moved = compare(open_trace(PICK), open_trace(part), offset=12.0, tolerance=0.1)
+    assert not moved.equal
+    assert moved.joints[0].first_at is not None
+
+
+def test_a_hand_that_does_less_differs_where_it_does(tmp_path: Path) -> None:
+    def session(path: Path, stuck_after: float) -> Path:
+        t = np.arange(0, 6, 0.01)
+        q = 2 + 1.5 * np.sin(t + 0.4 * t**1.5)
+        made = [(CMD, T0 + int(a * 1e9), T0, cmd(float(b))) for a, b in zip(t, q, strict=True)]
+        for a, b in zip(t, q, strict=True):
+            here = float(b if a < stuck_after else np.interp(stuck_after, t, q))
+            made.append((STATE, T0 + int(a * 1e9) + 1000, T0, state(here)))
+        return write(path, mcap_bytes(made))
+
+    good = session(tmp_path / "good.mcap", 99)
+    stuck = session(tmp_path / "stuck.mcap", 4.0)
+    found = compare(open_trace(good), open_trace(stuck))
+    command, measured = (next(j for j in found.joints if j.kind == k) for k in (COMMAND, "state"))
+    assert command.worst < 0.01
+    assert measured.first_at == pytest.approx(4.0, abs=0.1)
+    assert dexkit("diff", good, stuck)[0] == 1
+    only = tmp_path / "commands.mcap"
+    cut(open_trace(good), only, topics=[CMD])
+    code, text = dexkit("diff", good, only)
+    assert code == 1
+    assert f"only in A: {STATE}" in text
+
+
+def test_sessions_without_a_common_motion_are_refused() -> None:
+    for other, why in (
+        ("dex1_hand_dropout", "not runs of one session"),
+        ("dex3_pinch", "no joint moves in both"),
+    ):
+        code, text = dexkit("diff", PICK, sample_path(other))
+        assert code == 2
+        assert why in text
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.floats(-3, 3),
+    st.floats(0.5, 2),
+    st.integers(20, 200),
+    st.integers(0, 2**31),
+)
+def test_a_shift_is_found_at_any_rate(shift: float, scale: float, rate: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # a motion without period: sums of sines of unrelated speeds
+    speeds, phases = rng.uniform(0.3, 2.0, 6), rng.uniform(0, 6, 6)
+
+    def q(t: np.ndarray) -> np.ndarray:
+        return np.sin(np.outer(t, speeds) + phases).sum(axis=1)[:, None]
+
+    a, b = np.arange(0, 30, 0.01), np.arange(5, 20, 1 / rate)
+    track = Track(
+        (T0 + a * 1e9).astype(np.int64),
+        q(a),
+        (T0 + (b + shift) * 1e9).astype(np.int64),
+        q(b) * scale,
+    )
+    found = align([track])
+    assert found is not None
+    assert found.offset == pytest.approx(shift, abs=0.02)
+    assert found.correlation > 0.99
+
+
+def test_still_joints_cannot_be_aligned() -> None:
+    t = np.arange(0, 10 * 10**9, 10**7)
+    assert align([Track(t, np.zeros((len(t), 1)), t, np.ones((len(t), 1)))]) is None
+
+
+@each("method", [hold, interpolate])
+def test_nothing_is_filled_in_across_a_gap(method: object) -> None:
+    times = np.array([0, 10, 20, 30, 1030, 1040]) * 10**6
+    values = np.arange(6, dtype=float)[:, None]
+    at = np.array([-5, 0, 15, 30, 100, 500, 1035, 1041]) * 10**6
+    assert gap_of(times) == 0.1
+    got = method(times, values, at)[:, 0]  # type: ignore[operator]
+    if method is hold:
+        assert np.array_equal(got, [np.nan, 0, 1, 3, 3, np.nan, 4, 5], equal_nan=True)
+    else:
+        expected = [np.nan, 0, 1.5, 3, np.nan, np.nan, 4.5, np.nan]
+        assert np.array_equal(got, expected, equal_nan=True)

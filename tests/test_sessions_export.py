@@ -1,0 +1,155 @@
+"""Recordings become other formats and come back: ``dexkit export``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+
+from dexkit.messages import message_type
+from dexkit.traces import open_trace, sample_path
+from dexkit.traces.sessions import tables
+from dexkit.traces.sessions.edit import Span, cut
+from dexkit.traces.writer import RecordingWriter, definition
+from tests.each import each
+from tests.messages_helpers import NAMES, messages
+from tests.test_sessions_import import dexkit
+
+T0 = 1_795_251_429_000_000_000
+
+
+def rows(path: Path) -> list[tuple[str, int, int, bytes]]:
+    return sorted(
+        (m.topic, m.log_time_ns, m.publish_time_ns, m.data) for m in open_trace(path).messages()
+    )
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a second of a session with every kind of topic of a Dex3."""
+    out = tmp_path_factory.mktemp("part") / "part.mcap"
+    trace = open_trace(sample_path("dex3_pinch"))
+    begin = trace.first_ns + 5 * 10**9
+    cut(trace, out, spans=[Span(begin, begin + 10**9 // 4)])
+    return out
+
+
+@each("form", ["csv", "parquet"])
+def test_tables_give_the_recording_back(tmp_path: Path, part: Path, form: str) -> None:
+    code, output = dexkit("export", part, "--to", form, "--out", tmp_path / "t")
+    assert code == 0, output
+    assert dexkit("import", tmp_path / "t", tmp_path / "back.mcap")[0] == 0
+    back = open_trace(tmp_path / "back.mcap")
+    assert rows(tmp_path / "back.mcap") == rows(part)
+    assert back.metadata == open_trace(part).metadata
+    about = json.loads((tmp_path / "t" / "session.json").read_text())
+    assert any("padding" in text for text in about["lost"])
+    assert dexkit("export", part, "--to", form, "--out", tmp_path / "t")[0] == 2  # it exists
+
+
+def test_a_parquet_table_has_the_values_of_the_messages(tmp_path: Path, part: Path) -> None:
+    assert dexkit("export", part, "--to", "parquet", "--out", tmp_path / "t")[0] == 0
+    entries = json.loads((tmp_path / "t" / "session.json").read_text())["topics"]
+    for entry in entries:
+        table = pq.read_table(tmp_path / "t" / entry["file"])
+        sent = list(open_trace(part).messages([entry["topic"]]))
+        mt = message_type(entry["type"])
+        assert table["log_time_ns"].to_pylist() == [m.log_time_ns for m in sent]
+        assert table[f"{mt.motor_sequence}[2].q"].type == "float"
+        for i in (0, len(sent) - 1):
+            motors = getattr(mt.decode(sent[i].data), mt.motor_sequence)
+            for j, motor in enumerate(motors):
+                assert table[f"{mt.motor_sequence}[{j}].q"][i].as_py() == motor.q
+
+
+@settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(
+    st.sampled_from(NAMES).flatmap(
+        lambda n: st.tuples(st.just(n), st.lists(messages(n, 2), max_size=2))
+    )
+)
+def test_messages_of_every_type_survive_tables(
+    tmp_path_factory: pytest.TempPathFactory, made: tuple[str, list[Any]]
+) -> None:
+    name, found = made
+    folder = tmp_path_factory.mktemp("any")
+    mt = message_type(name)
+    with RecordingWriter(folder / "a.mcap") as writer:
+        number = writer.add_channel(definition("rt/any", mt))
+        for i, message in enumerate(found):
+            writer.put(number, mt.encode(message), T0 + i)
+    for form in ("csv", "parquet"):
+        tables.export_tables(open_trace(folder / "a.mcap"), folder / form, form)
+        if found:
+            tables.import_tables(folder / form, folder / f"{form}.mcap")
+            assert rows(folder / f"{form}.mcap") == rows(folder / "a.mcap")
+
+
+def test_damaged_tables_lose_their_rows_only(tmp_path: Path, part: Path) -> None:
+    assert dexkit("export", part, "--to", "csv", "--out", tmp_path / "t")[0] == 0
+    first, second, *_ = sorted((tmp_path / "t").glob("*.csv"))
+    lines = first.read_text().splitlines()
+    cells = lines[3].split(",")
+    cells[7] = "many"
+    lines[3] = ",".join(cells)
+    lines[5] = lines[5][:40]
+    first.write_text("\n".join(lines))
+    second.write_bytes(b"\xff\xfe")
+    code, output = dexkit("import", tmp_path / "t", tmp_path / "back.mcap")
+    assert code == 1
+    assert "row 4, and 1 more" in output
+    assert "not UTF-8" in output
+    lost = len(second.read_bytes())
+    assert lost == 2
+    names = {m[0] for m in rows(tmp_path / "back.mcap")}
+    assert len(names) == 3
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_bag_gives_the_payloads_back(tmp_path: Path, part: Path, storage: str) -> None:
+    out = tmp_path / "bag"
+    code, output = dexkit("export", part, "--to", "rosbag2", "--storage", storage, "--out", out)
+    assert (code, "publish time" in output) == (0, True)
+    with AnyReader([out]) as reader:
+        topics = {c.topic for c in reader.connections}
+        connection, _, raw = next(reader.messages())
+        value = reader.deserialize(raw, connection.msgtype)
+    assert topics == {f"/dex3/{s}/{k}" for s in ("left", "right") for k in ("state", "cmd")}
+    motors = getattr(value, "motor_state", None) or value.motor_cmd
+    assert len(motors) == 7
+    assert dexkit("import", out, tmp_path / "back.mcap")[0] == 0
+    assert [(t, log, d) for t, log, _, d in rows(tmp_path / "back.mcap")] == [
+        (t, log, d) for t, log, _, d in rows(part)
+    ]
+    back, source = open_trace(tmp_path / "back.mcap").metadata, open_trace(part).metadata
+    assert {k: back[k] for k in source} == source
+
+
+def test_several_recordings_are_exported_and_one_refused(tmp_path: Path, part: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"nothing")
+    code, output = dexkit("export", part, bad, "--to", "csv", "--out", tmp_path / "all")
+    assert (code, "bad.mcap: refused" in output) == (1, True)
+    assert [p.name for p in (tmp_path / "all").iterdir()] == ["part"]
+    assert dexkit("export", bad, "--to", "csv", "--out", tmp_path / "one")[0] == 2
+
+
+def test_values_that_equal_are_told_apart(tmp_path: Path) -> None:
+    mt = message_type("unitree_go::msg::dds_::MotorCmds_")
+    motor = mt.motor_type.cls
+    values = [0.0, -0.0, np.float32(np.nan).item(), float("inf"), 1e-45, 3.4028234e38]
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        number = writer.add_channel(definition("rt/dex1/left/cmd", mt))
+        for i, q in enumerate(values):
+            writer.put(number, mt.encode(mt.cls([motor(q=q)] * (i % 3))), T0 + i)
+    for form in ("csv", "parquet"):
+        tables.export_tables(open_trace(tmp_path / "a.mcap"), tmp_path / form, form)
+        tables.import_tables(tmp_path / form, tmp_path / f"{form}.mcap")
+        assert rows(tmp_path / f"{form}.mcap") == rows(tmp_path / "a.mcap")

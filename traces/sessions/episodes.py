@@ -1,0 +1,594 @@
+"""Episodes of xr_teleoperate: ``data.json`` of every published version of its writer.
+
+The versions say ``1.0.0`` all; they are told apart by what they write
+(docs/sources/sessions.md#a1): ``left_hand`` for ``left_ee`` before v1.0, joint names of the left
+arm before v1.4, a file that is written item by item since v1.3. An interrupted file is salvaged up
+to its last whole item.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.errors import SessionError
+from dexkit.hand import Floats, Side
+from dexkit.models import HandModel, model
+from dexkit.traces.sessions.imported import EPOCH_NS, NOMINAL
+from dexkit.traces.sessions.model import (
+    MEASURED,
+    Camera,
+    Part,
+    Problems,
+    Session,
+    models_by_joints,
+)
+from dexkit.traces.sessions.pictures import safe_path
+from dexkit.traces.sessions.sides import swap_states, swapped_sides
+from dexkit.traces.sessions.streams import COMMAND, HAND, STATE
+
+__all__ = [
+    "DATA",
+    "DEFAULT",
+    "Document",
+    "Options",
+    "episode_folders",
+    "parse_document",
+    "read_document",
+    "read_episode",
+    "session_of",
+]
+
+DATA = "data.json"
+_LARGEST = 1 << 30
+_DIRECTIONS = {"states": STATE, "actions": COMMAND}
+_COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
+_PICTURES = ("colors", "depths")
+_HANDS = {f"{side}_{end}": f"{side}{HAND}" for side in Side for end in ("ee", "hand")}
+_NS = 10**9
+# Hz that are believed of a file.
+_RATES = (0.1, 2000.0)
+# Share of samples that must lie within a model's limits, and how far beyond they may lie, rad.
+_WITHIN, _BEYOND = 0.99, 0.35
+_VERSIONS = {
+    "old": "xr_teleoperate before v1.0 (left_hand, right_hand)",
+    "whole": "xr_teleoperate v1.0 to v1.2 (written at the end)",
+    "streamed": "xr_teleoperate v1.3 or later (written item by item)",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to import.
+
+    :param rate: frames a second in place of the file's; None for that.
+    :param hand: the model's name; ``"none"`` for no model; None to tell it by the number of joints.
+    :param correct: exchange sides where version and data say that they are swapped.
+    """
+
+    rate: float | None = None
+    hand: str | None = None
+    correct: bool = True
+
+
+DEFAULT = Options()
+"""Everything told by the source."""
+
+
+@dataclass
+class Document:
+    """The contents of a ``data.json``.
+
+    :param items: the frames, unchecked.
+    :param streamed: it was written item by item.
+    :param whole: it ends as it should.
+    """
+
+    info: dict[str, Any] = field(default_factory=dict)
+    text: dict[str, Any] = field(default_factory=dict)
+    items: list[Any] = field(default_factory=list)
+    streamed: bool = False
+    whole: bool = True
+    rest: dict[str, Any] = field(default_factory=dict)
+
+
+# -- the file ------------------------------------------------------------------------------------
+
+
+def read_document(path: Path) -> Document:
+    """Read a ``data.json``.
+
+    :raises SessionError: it cannot be read, or no item in it is whole.
+    """
+    try:
+        with open(path, "rb", opener=lambda p, f: os.open(p, f | os.O_NONBLOCK)) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise SessionError(f"cannot read {path}: it is not an ordinary file")
+            data = file.read(_LARGEST + 1)
+    except OSError as error:
+        raise SessionError(f"cannot read {path}: {error.strerror}") from error
+    if len(data) > _LARGEST:
+        raise SessionError(f"cannot read {path}: it is larger than {_LARGEST >> 30} GB")
+    # an interrupted file may end within a character
+    return parse_document(data.decode("utf-8-sig", "replace"), str(path))
+
+
+def parse_document(text: str, origin: str) -> Document:
+    """Read the text of a ``data.json``, up to the last whole item if it is cut.
+
+    :param origin: what to call it.
+    :raises SessionError: there is no whole item in it.
+    """
+    try:
+        found = json.loads(text)
+        whole = True
+    except ValueError:
+        found, whole = _salvage(text), False
+    except RecursionError:
+        raise SessionError(f"{origin} is nested too deeply") from None
+    if not isinstance(found, dict) or not isinstance(found.get("data"), list):
+        raise SessionError(
+            f"{origin} is not an episode: " + ("it has no list 'data'" if whole else "no JSON")
+        )
+    if not found["data"]:
+        raise SessionError(f"{origin} has no whole item")
+    info, words = found.get("info"), found.get("text")
+    return Document(
+        info=info if isinstance(info, dict) else {},
+        text=words if isinstance(words, dict) else {},
+        items=found["data"],
+        # whole documents are indented below the brace, streamed ones are not
+        streamed=re.match(r'\s*\{\s*\n"', text) is not None,
+        whole=whole,
+        rest={k: v for k, v in found.items() if k not in ("info", "text", "data")},
+    )
+
+
+def _salvage(text: str) -> dict[str, Any]:
+    """What is whole at the beginning of a document: its members, and the items of ``data``."""
+    decoder = json.JSONDecoder()
+    space = re.compile(r"[\s,]*")
+    found: dict[str, Any] = {}
+
+    def skip(at: int) -> int:
+        match = space.match(text, at)
+        return match.end() if match else at
+
+    at = skip(0)
+    if text[at : at + 1] != "{":
+        return found
+    at = skip(at + 1)
+    try:
+        while text[at : at + 1] == '"':
+            key, at = decoder.raw_decode(text, at)
+            at = skip(at)
+            if text[at : at + 1] != ":":
+                break
+            at = skip(at + 1)
+            if key == "data" and text[at : at + 1] == "[":
+                items: list[Any] = []
+                found["data"] = items
+                at = skip(at + 1)
+                while text[at : at + 1] == "{":
+                    item, at = decoder.raw_decode(text, at)
+                    items.append(item)
+                    at = skip(at)
+                if text[at : at + 1] != "]":
+                    break
+                at = skip(at + 1)
+            else:
+                found[key], at = decoder.raw_decode(text, at)
+                at = skip(at)
+    except (ValueError, RecursionError):
+        pass
+    return found
+
+
+def episode_folders(source: Path) -> list[Path]:
+    """The folders with an episode below ``source``, or itself, in order.
+
+    :raises SessionError: it cannot be read.
+    """
+    if source.name == DATA and source.is_file():
+        return [source.parent]
+    try:
+        if (source / DATA).exists():
+            return [source]
+        found = []
+        for folder, names, files in os.walk(source):
+            names.sort()
+            if DATA in files:
+                found.append(Path(folder))
+                names.clear()
+        return found
+    except OSError as error:
+        raise SessionError(f"cannot read {source}: {error.strerror}") from error
+
+
+def read_episode(folder: Path, options: Options = DEFAULT) -> Session:
+    """Read one episode.
+
+    :raises SessionError: no frame in it can be used.
+    """
+    document = read_document(folder / DATA)
+    form = _VERSIONS[_layout(document)]
+    session = session_of(document, folder / DATA, folder, form, options)
+    session.name = folder.name
+    return session
+
+
+def _layout(document: Document) -> str:
+    for item in document.items:
+        states = item.get("states") if isinstance(item, dict) else None
+        if isinstance(states, dict) and ("left_hand" in states or "right_hand" in states):
+            return "old"
+    return "streamed" if document.streamed else "whole"
+
+
+# -- the frames ----------------------------------------------------------------------------------
+
+
+def session_of(
+    document: Document, source: Path, folder: Path, form: str, options: Options = DEFAULT
+) -> Session:
+    """Make a session of frames as xr_teleoperate has them.
+
+    :raises SessionError: no frame can be used.
+    """
+    problems = Problems()
+    if not document.whole:
+        problems.add("the file is cut or damaged; it is read up to its last whole item")
+    items = []
+    for i, item in enumerate(document.items):
+        if isinstance(item, dict):
+            items.append(item)
+        else:
+            problems.add("items that are no objects are left out", f"item {i}")
+    if not items:
+        raise SessionError(f"{source} has no frame that can be used")
+    rate = _rate(document, options, problems)
+    times, clock, rate, first = _times(document, items, rate, problems)
+    parts, carried = _parts(items, problems)
+    if not parts:
+        raise SessionError(
+            f"{source} has no frame with joint positions", hint="; ".join(problems.sentences()[:3])
+        )
+    parts = [_as_hand(p, options, problems) for p in parts]
+    session = Session(
+        source=source,
+        form=form,
+        times_ns=times,
+        clock=clock,
+        rate=rate,
+        parts=parts,
+        folder=folder,
+        cameras=list(_cameras(items, folder, problems)),
+        problems=problems,
+        first_ns=first,
+    )
+    session.rest = _rest(items, carried, {c.name for c in session.cameras}, first is not None)
+    session.about = {
+        "info": json.dumps(document.info, ensure_ascii=False),
+        "text": json.dumps(document.text, ensure_ascii=False),
+        "rest": json.dumps(document.rest, ensure_ascii=False),
+        "task": str(document.text.get("goal", "")),
+        "names": json.dumps(_names(items)),
+    }
+    correct_sides(session, form, options)
+    return session
+
+
+def _rate(document: Document, options: Options, problems: Problems) -> float:
+    if options.rate is not None:
+        return options.rate
+    image = document.info.get("image")
+    value: Any = image.get("fps") if isinstance(image, dict) else None
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if is_number and _RATES[0] <= value <= _RATES[1]:
+        return float(value)
+    problems.add("the file states no rate (info.image.fps); 30 Hz are assumed")
+    return 30.0
+
+
+def _times(
+    document: Document, items: list[dict[str, Any]], rate: float, problems: Problems
+) -> tuple[NDArray[np.int64], str, float, int | None]:
+    """Times, kind of clock, rate, and the time of frame 0 if the clock is nominal."""
+    stamps = [_stamp(item) for item in items]
+    if all(s is not None for s in stamps):
+        times = [s for s in stamps if s is not None]
+        if all(a < b for a, b in pairwise(times)):
+            found = np.array(times, dtype=np.int64)
+            period = float(np.median(np.diff(found))) if len(found) > 1 else _NS / rate
+            return found, MEASURED, _NS / period, None
+        problems.add("the times of the frames do not ascend; nominal ones are used")
+    indexes = [_index(item) for item in items]
+    numbers = [n for n in indexes if n is not None]
+    if len(numbers) < len(items) or any(a >= b for a, b in pairwise(numbers)):
+        problems.add("the numbers of the frames (idx) do not ascend; they are counted instead")
+        numbers = list(range(len(items)))
+    first = _day(document.info.get("date"))
+    times_ns = np.array([first + round(n * _NS / rate) for n in numbers], dtype=np.int64)
+    return times_ns, NOMINAL, rate, first
+
+
+def _index(item: Mapping[str, Any]) -> int | None:
+    """The number of a frame, where the source has one."""
+    n = item.get("idx")
+    return n if isinstance(n, int) and not isinstance(n, bool) and 0 <= n < 10**9 else None
+
+
+def _stamp(item: Mapping[str, Any]) -> int | None:
+    """The time of a frame, ns since the epoch, where the source has one."""
+    value = item.get("timestamp_ns")
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**62:
+        return value
+    for key in ("timestamp", "time", "t"):
+        value = item.get(key)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < 4e9:
+            return round(value * _NS)
+    return None
+
+
+def _day(date: object) -> int:
+    """Midnight of the file's date, UTC, in ns; :data:`EPOCH_NS` where it has none."""
+    try:
+        found = datetime.strptime(str(date), "%Y-%m-%d").replace(tzinfo=timezone.utc)
+        return max(int(found.timestamp()) * _NS, EPOCH_NS)
+    except (ValueError, OverflowError):
+        return EPOCH_NS
+
+
+def _numbers(value: object) -> tuple[float, ...] | None:
+    """A list of numbers; None if it is anything else."""
+    if not isinstance(value, list):
+        return None
+    for v in value:
+        if isinstance(v, bool) or not isinstance(v, (int, float)):
+            return None
+    try:
+        return tuple(float(v) for v in value)
+    except OverflowError:
+        return None
+
+
+Carried = dict[tuple[str, str, str], set[int]]
+"""By direction, part and column of the source: the frames that a part carries."""
+
+
+def _parts(items: Sequence[dict[str, Any]], problems: Problems) -> tuple[list[Part], Carried]:
+    names: dict[str, None] = {}
+    for item in items:
+        for key in _DIRECTIONS:
+            group = item.get(key)
+            if isinstance(group, dict):
+                names.update(dict.fromkeys(n for n in group if isinstance(n, str)))
+            elif group is not None:
+                problems.add(f"'{key}' is no object", _place(item))
+    parts, carried = [], Carried()
+    for name in names:
+        values: dict[str, dict[str, Floats]] = {}
+        count = 0
+        for key, kind in _DIRECTIONS.items():
+            columns, frames, width = _table(items, key, name, problems)
+            if columns:
+                values[kind] = columns
+                carried.update(frames)
+                count = width
+        widths = {v["q"].shape[1] for v in values.values()}
+        if len(widths) > 1:
+            problems.add(
+                f"{name}: states have {values[STATE]['q'].shape[1]} joints and actions "
+                f"{values[COMMAND]['q'].shape[1]}; they are kept as two groups"
+            )
+            for kind, columns in values.items():
+                width = columns["q"].shape[1]
+                parts.append(Part(f"{name}_{kind}", _joint_names(name, width), {kind: columns}))
+        elif values:
+            parts.append(Part(_HANDS.get(name, name), _joint_names(name, count), values))
+    return parts, carried
+
+
+def _joint_names(part: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{part}_{i}" for i in range(count))
+
+
+def _table(
+    items: Sequence[dict[str, Any]], key: str, name: str, problems: Problems
+) -> tuple[dict[str, Floats], Carried, int]:
+    """The columns of a part in one direction, the frames that have them, and their width."""
+    rows: dict[str, list[tuple[float, ...] | None]] = {f: [] for f in _COLUMNS}
+    for item in items:
+        group = item.get(key)
+        entry = group.get(name) if isinstance(group, dict) else None
+        for field_, column in _COLUMNS.items():
+            value = entry.get(column) if isinstance(entry, dict) else None
+            numbers = _numbers(value)
+            if numbers is None and value is not None:
+                problems.add(f"{key}.{name}.{column} is no list of numbers", _place(item))
+            if numbers and not np.isfinite(numbers).all():
+                problems.add(f"{key}.{name}.{column} has values that are not finite", _place(item))
+                numbers = None
+            rows[field_].append(numbers or None)
+    widths = Counter(len(r) for r in rows["q"] if r)
+    if not widths:
+        return {}, {}, 0
+    width = widths.most_common(1)[0][0]
+    found: dict[str, Floats] = {}
+    frames: Carried = {}
+    for field_, column in _COLUMNS.items():
+        table = np.full((len(items), width), np.nan)
+        there = set()
+        for i, row in enumerate(rows[field_]):
+            if row and len(row) == width:
+                table[i] = row
+                there.add(i)
+            elif row:
+                problems.add(
+                    f"{key}.{name}.{column}: frames with {len(row)} values instead of {width} are "
+                    "left out",
+                    _place(items[i]),
+                )
+        if field_ != "q" and there and not there >= _present(found["q"]):
+            problems.add(f"{key}.{name}.{column} is not in every frame; it is kept as JSON only")
+            continue
+        if there:
+            found[field_] = table
+            frames[key, name, column] = there
+    return found, frames, width
+
+
+def _present(table: Floats) -> set[int]:
+    return set(np.flatnonzero(np.isfinite(table).all(axis=1)).tolist())
+
+
+def _place(item: Mapping[str, Any]) -> str:
+    return f"item {item['idx']}" if isinstance(item.get("idx"), int) else "an item without idx"
+
+
+def _as_hand(part: Part, options: Options, problems: Problems) -> Part:
+    """The part as a hand of a model, if it is one."""
+    if not part.name.endswith(HAND) or options.hand == "none":
+        return part
+    count = len(part.joints)
+    if options.hand is not None:
+        hand = model(options.hand)
+        if len(hand.joints[Side.LEFT]) != count:
+            problems.add(f"{part.name} has {count} joints, which is no {hand.name}")
+            return part
+        return _named(part, hand)
+    fitting = [m for m in models_by_joints(count) if _within_limits(part, m)]
+    if len(fitting) == 1:
+        return _named(part, fitting[0])
+    if fitting:
+        names = ", ".join(m.name for m in fitting)
+        problems.add(f"{part.name} may be one of {names}; it is kept as a group of joints")
+    elif candidates := models_by_joints(count):
+        names = ", ".join(m.name for m in candidates)
+        problems.add(
+            f"{part.name} has as many joints as {names}, but positions far outside its limits; "
+            "it is kept as a group of joints"
+        )
+    return part
+
+
+def _named(part: Part, hand: HandModel) -> Part:
+    joints = hand.joints[Side(part.name.removesuffix(HAND))]
+    return Part(part.name, tuple(j.name for j in joints), part.values, hand)
+
+
+def _within_limits(part: Part, hand: HandModel) -> bool:
+    joints = hand.joints[Side(part.name.removesuffix(HAND))]
+    low = np.array([j.q_min for j in joints]) - _BEYOND
+    high = np.array([j.q_max for j in joints]) + _BEYOND
+    for columns in part.values.values():
+        q = columns["q"][np.isfinite(columns["q"]).all(axis=1)]
+        if len(q) and ((q >= low) & (q <= high)).mean() < _WITHIN:
+            return False
+    return True
+
+
+def _cameras(items: Sequence[dict[str, Any]], folder: Path, problems: Problems) -> Iterator[Camera]:
+    names: dict[tuple[str, str], None] = {}
+    for item in items:
+        for key in _PICTURES:
+            group = item.get(key)
+            if isinstance(group, dict):
+                names.update(dict.fromkeys((key, n) for n in group))
+    for key, name in names:
+        paths = []
+        for item in items:
+            group = item.get(key)
+            path = group.get(name) if isinstance(group, dict) else None
+            if not isinstance(path, str) or not path:
+                problems.add(f"{key}.{name}: frames without a picture", _place(item))
+                paths.append("")
+                continue
+            file = safe_path(folder, path)
+            if file is None:
+                problems.add(
+                    f"{key}.{name}: pictures outside the session's folder are left out", path
+                )
+                paths.append("")
+                continue
+            if not file.exists():
+                problems.add(f"{key}.{name}: pictures that are missing", path)
+            paths.append(path)
+        if any(paths):
+            yield Camera(name, tuple(paths), key)
+
+
+def _rest(
+    items: Sequence[dict[str, Any]], carried: Carried, cameras: Iterable[str], numbered: bool
+) -> list[str]:
+    """What of each frame no part and no camera carries, as JSON; empty where it does not change.
+
+    :param numbered: the number of a frame follows from its time.
+    """
+    found: list[str] = []
+    before: str | None = None
+    for i, item in enumerate(items):
+        rest = {k: v for k, v in item.items() if k != "idx" or not numbered}
+        for key in _DIRECTIONS:
+            if isinstance(rest.get(key), dict):
+                rest[key] = {
+                    name: {
+                        c: v for c, v in entry.items() if i not in carried.get((key, name, c), ())
+                    }
+                    if isinstance(entry, dict)
+                    else entry
+                    for name, entry in rest[key].items()
+                }
+        for key in _PICTURES:
+            if isinstance(rest.get(key), dict):
+                rest[key] = {
+                    n: v for n, v in rest[key].items() if n not in cameras or not isinstance(v, str)
+                }
+        text = json.dumps(rest, ensure_ascii=False, sort_keys=False)
+        found.append("" if text == before else text)
+        before = text
+    return found
+
+
+def _names(items: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """How the source calls each hand: ``{"left_hand": "left_ee"}``."""
+    found = {}
+    for item in items:
+        for key in _DIRECTIONS:
+            group = item.get(key)
+            if isinstance(group, dict):
+                found.update({_HANDS[n]: n for n in group if n in _HANDS})
+    return found
+
+
+def correct_sides(session: Session, form: str, options: Options) -> None:
+    """Exchange the hands' states where the data show that they are swapped."""
+    evidence = swapped_sides(session.parts, session.rate)
+    if evidence is None or not evidence.swapped:
+        return
+    hands = [p for p in session.parts if p.name.endswith(HAND)]
+    six = all(len(p.joints) == 6 for p in hands)
+    why = (
+        "xr_teleoperate v1.0 and v1.1 record the states of Inspire hands so"
+        if six
+        else "the program that wrote it mixed up the order of the two hands"
+    )
+    if options.correct:
+        session.parts = swap_states(session.parts)
+        session.corrections.append(
+            f"states of left and right hand exchanged: in the source, {evidence}; {why}"
+        )
+    else:
+        session.problems.add(f"left and right hand look swapped: {evidence}; left as they are")

@@ -1,0 +1,275 @@
+"""Write episodes as xr_teleoperate does since v1.3.
+
+A session that was imported from an episode is written with its own frames, item by item as it was;
+any other recording is sampled at one rate.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexkit import __version__
+from dexkit.errors import SessionError
+from dexkit.hand import Floats
+from dexkit.traces.reader import Trace
+from dexkit.traces.sessions import ros_types
+from dexkit.traces.sessions.frames import RULE, Source, open_source, sample
+from dexkit.traces.sessions.lerobot_out import Result
+from dexkit.traces.sessions.model import REST_TOPIC
+from dexkit.traces.sessions.pictures import parse_picture, safe_path
+from dexkit.traces.sessions.resample import hold, interpolate
+from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Stream
+
+__all__ = ["export_episodes"]
+
+_KEYS = {STATE: "states", COMMAND: "actions"}
+_COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
+_EXTENSION = "dexkit"
+_ALIGNED = "aligned"
+"""In the record of an episode whose times were taken from the wire."""
+
+
+def export_episodes(
+    traces: Sequence[Trace], out: Path, *, fps: int | None = None, task: str | None = None
+) -> Result:
+    """Write recordings as the episodes of a task folder.
+
+    :param fps: frames a second of recordings that are sampled; None for their own rate.
+    :param task: of all episodes; None for what each recording says.
+    :raises SessionError: ``out`` exists, cannot be written, or no recording can be used.
+    """
+    if out.exists():
+        raise SessionError(f"{out} exists", hint="choose another name, or delete it")
+    part = out.with_name(out.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    result = Result()
+    try:
+        for trace in traces:
+            try:
+                for info, text, items, pictures in _episodes(trace, fps, task, result):
+                    folder = part / f"episode_{result.episodes:04d}"
+                    for kind in ("colors", "depths", "audios"):
+                        (folder / kind).mkdir(parents=True, exist_ok=True)
+                    for name, data in pictures:
+                        target = safe_path(folder, name)
+                        if target is not None:
+                            target.parent.mkdir(parents=True, exist_ok=True)
+                            target.write_bytes(data)
+                    (folder / "data.json").write_text(_text(info, text, items), encoding="utf-8")
+                    result.episodes += 1
+                    result.frames += len(items)
+            except SessionError as error:
+                if len(traces) == 1:
+                    raise
+                result.problems.append(f"{trace.path.name}: refused: {error.message}")
+        if not result.episodes:
+            raise SessionError("none of the recordings can be exported")
+        part.rename(out)
+    except OSError as error:
+        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return result
+
+
+def _text(info: Any, text: Any, items: Sequence[Any]) -> str:
+    def dump(value: Any) -> str:
+        return json.dumps(value, ensure_ascii=False, indent=4)
+
+    frames = ",\n".join(map(dump, items))
+    return f'{{\n"info": {dump(info)},\n"text": {dump(text)},\n"data": [\n{frames}\n]\n}}'
+
+
+Episode = tuple[Any, Any, "list[dict[str, Any]]", "list[tuple[str, bytes]]"]
+
+
+def _episodes(trace: Trace, fps: int | None, task: str | None, result: Result) -> Iterator[Episode]:
+    source = open_source(trace)
+    names = _object(source.record.get("names"))
+    if names is not None and fps is None:
+        yield _as_it_was(source, names, task, result)
+        return
+    rate = fps or max(1, round(source.rate))
+    result.fps = rate
+    runs, told = sample(source, rate)
+    lost = ["times of the recording: the rate stands in info.image.fps, the start in info.dexkit"]
+    lost += [f"{trace.path.name}: {text}" for text in source.lost]
+    result.problems += [f"{trace.path.name}: {text}" for text in told]
+    result.lost += [text for text in lost if text not in result.lost]
+    parts = sorted({s.part for s in source.streams})
+    for frames in runs:
+        items, pictures = [], []
+        for i, time_ns in enumerate(frames.times_ns.tolist()):
+            item: dict[str, Any] = {"idx": i, "timestamp_ns": time_ns, "colors": {}, "depths": {}}
+            for kind, key in _KEYS.items():
+                item[key] = {_name(p): _entry({}) for p in parts} | {"body": {"qpos": []}}
+                for s in source.streams:
+                    if s.kind == kind:
+                        row = {f: frames.values[s.part, kind, f][i] for f in s.values}
+                        item[key][_name(s.part)] = _entry(row)
+            for p in source.pictures:
+                data = p.load(int(frames.pictures[p.camera][i]))
+                picture = parse_picture(data) if data is not None else None
+                if data is None or picture is None:
+                    text = f"{trace.path.name}: {p.camera}: pictures that cannot be read"
+                    if text not in result.problems:
+                        result.problems.append(text)
+                    continue
+                suffix = "jpg" if picture.form == "jpeg" else "png"
+                path = f"colors/{i:06d}_{p.camera}.{suffix}"
+                item["colors"][p.camera] = path
+                pictures.append((path, data))
+            pressed = {
+                _name(part): [float(v) for v in table[i]] for part, table in frames.pressure.items()
+            }
+            item |= {"tactiles": pressed or None, "audios": None, "sim_state": None}
+            items.append(item)
+        goal = task or source.task
+        info = _info(source, rate, result, int(frames.times_ns[0]))
+        yield info, {"goal": goal, "desc": "", "steps": ""}, items, pictures
+
+
+def _info(source: Source, rate: int, result: Result, start_ns: int) -> dict[str, Any]:
+    joints = {_name(s.part): list(s.names) for s in source.streams}
+    elements = {_name(s.part): list(s.elements) for s in source.streams if s.elements}
+    return {
+        "version": "1.0.0",
+        "date": "",
+        "author": f"dexkit {__version__}",
+        "image": {"width": 0, "height": 0, "fps": rate},
+        "depth": {"width": 0, "height": 0, "fps": rate},
+        "audio": {"sample_rate": 16000, "channels": 1, "format": "PCM", "bits": 16},
+        "joint_names": joints,
+        "tactile_names": elements,
+        "sim_state": "",
+        _EXTENSION: {
+            "source": source.trace.path.name,
+            "start_ns": start_ns,
+            "resampling": RULE,
+            "measured_hz": {k: round(v, 4) for k, v in source.measured.items()},
+            "lost": list(result.lost),
+        },
+    }
+
+
+def _name(part: str) -> str:
+    """What xr_teleoperate calls a part."""
+    return f"{part.removesuffix(HAND)}_ee" if part.endswith(HAND) else part
+
+
+def _entry(row: Mapping[str, Floats]) -> dict[str, list[float]]:
+    return {c: row[f].tolist() if f in row else [] for f, c in _COLUMNS.items()}
+
+
+def _object(text: str | None) -> dict[str, Any] | None:
+    try:
+        found = json.loads(text or "")
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _as_it_was(
+    source: Source, names: Mapping[str, Any], task: str | None, result: Result
+) -> Episode:
+    """The frames of an imported episode, each as it stood in its file."""
+    record, trace = source.record, source.trace
+    rest = {
+        m.log_time_ns: _object(ros_types.decode_string(m.data)) or {}
+        for m in (trace.messages([REST_TOPIC]) if REST_TOPIC in trace.topics else ())
+    }
+    if _ALIGNED in record:  # every frame has its number, and the hands are the wire's
+        times = set(rest)
+    else:
+        times = {t for s in source.streams for t in s.times_ns.tolist()} | rest.keys()
+        times |= {t for p in source.pictures for t in p.times_ns.tolist()}
+    ordered = sorted(times)
+    groups = _object(record.get("cameras")) or {}
+    first = int(record["first_ns"]) if record.get("first_ns", "").isdigit() else None
+    rate = float(record.get("rate_hz", "30"))
+    items: dict[int, dict[str, Any]] = {}
+    current: dict[str, Any] = {}
+    for i, t in enumerate(ordered):
+        current = rest.get(t, current)
+        item = json.loads(json.dumps(current))
+        if "idx" not in item:
+            number = i if first is None else round((t - first) * rate / 1e9)
+            item = {"idx": number, **item}
+        items[t] = item
+    for s in source.streams:
+        name = str(names.get(s.part, s.part))
+        if _ALIGNED in record and s.samples is not None and s.model:
+            _fill(_at_frames(s, ordered), items, name)
+        else:
+            _fill(s, items, name)
+    if _ALIGNED in record:
+        for t, item in items.items():
+            item["timestamp_ns"] = t
+    pictures: list[tuple[str, bytes]] = []
+    for p in source.pictures:
+        group = str(groups.get(p.camera, "colors"))
+        for i, t in enumerate(p.times_ns.tolist()):
+            path = p.paths[i] if p.paths else f"{group}/{i:06d}_{p.camera}.jpg"
+            entry = items[t].setdefault(group, {})
+            if isinstance(entry, dict):
+                entry[p.camera] = path
+            data = p.load(i)
+            if data is not None:
+                pictures.append((path, data))
+            elif (text := f"{trace.path.name}: {p.camera}: pictures that cannot be read") not in (
+                result.problems
+            ):
+                result.problems.append(text)
+    for key in record:
+        if key.startswith(("rounded ", "correction ")):
+            result.lost.append(f"{trace.path.name}: {key}: {record[key]}")
+    result.fps = result.fps or round(rate)
+    words = _object(record.get("text")) or {}
+    if task is not None:
+        words["goal"] = task
+    return _object(record.get("info")) or {}, words, [items[t] for t in ordered], pictures
+
+
+def _at_frames(stream: Stream, times: Sequence[int]) -> Stream:
+    """A stream of the wire at the times of the frames; without those where it has a gap."""
+    at = np.array(times, dtype=np.int64)
+    method = hold if stream.kind == COMMAND else interpolate
+    values = {f: method(stream.times_ns, v, at) for f, v in stream.values.items()}
+    good = np.isfinite(values["q"]).all(axis=1)
+    pressure = stream.pressure
+    if pressure is not None:
+        pressure = interpolate(stream.times_ns, pressure, at)[good]
+    return replace(
+        stream,
+        times_ns=at[good],
+        values={f: v[good] for f, v in values.items()},
+        pressure=pressure,
+        samples=None,
+    )
+
+
+def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> None:
+    """Put the values of a stream where they stood."""
+    key = _KEYS[stream.kind]
+    for suffix in (f"_{STATE}", f"_{COMMAND}"):
+        name = name.removesuffix(suffix)
+    columns = {c: stream.values[f] for f, c in _COLUMNS.items() if f in stream.values}
+    for i, t in enumerate(stream.times_ns.tolist()):
+        group = items[t].setdefault(key, {})
+        if not isinstance(group, dict):
+            continue
+        entry = group.setdefault(name, {})
+        if isinstance(entry, dict):
+            for column, table in columns.items():
+                row: list[float] = np.asarray(table[i]).tolist()
+                entry[column] = row
+        if stream.pressure is not None and isinstance(items[t].get("tactiles") or {}, dict):
+            pressed = items[t]["tactiles"] = items[t].get("tactiles") or {}
+            pressed[name] = np.nan_to_num(stream.pressure[i]).tolist()

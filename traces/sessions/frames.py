@@ -1,0 +1,246 @@
+"""A recording as frames of one rate: states interpolated, commands held, nothing across a gap.
+
+The grid is in the recording's own time: frame k is at start + k / fps. Where a stream has a gap
+there, there is no frame, and a new run of frames begins behind it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.errors import SessionError
+from dexkit.hand import Floats
+from dexkit.traces.names import SESSION
+from dexkit.traces.reader import Trace
+from dexkit.traces.sessions import ros_types
+from dexkit.traces.sessions.imported import RECORD
+from dexkit.traces.sessions.model import REST_TOPIC
+from dexkit.traces.sessions.pictures import read_picture
+from dexkit.traces.sessions.resample import gap_of, hold, interpolate, period_of
+from dexkit.traces.sessions.streams import COMMAND, FIELDS, Stream, streams_of
+
+__all__ = ["RULE", "Frames", "Pictures", "Source", "open_source", "sample"]
+
+RULE = (
+    "states are interpolated between their neighbours, commands and pictures are the newest at the "
+    "time of the frame (zero-order hold); no frame lies in a gap of any of them, which is ten "
+    "usual periods, at least 0.1 s"
+)
+_LEAST = 2  # frames of a run
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """The single pictures of a camera.
+
+    :param load: the picture at a place, as its file has it; None where it cannot be had.
+    :param paths: where they are, or were, relative to the session.
+    """
+
+    camera: str
+    times_ns: NDArray[np.int64]
+    load: Callable[[int], bytes | None]
+    paths: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class Source:
+    """A recording to be sampled.
+
+    :param streams: those with at least two samples.
+    :param lost: what frames cannot hold.
+    :param problems: what cannot be read.
+    """
+
+    trace: Trace
+    streams: list[Stream]
+    pictures: list[Pictures]
+    lost: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def record(self) -> dict[str, str]:
+        """The record of its import, if it was imported."""
+        return self.trace.metadata.get(RECORD, {})
+
+    @property
+    def measured(self) -> dict[str, float]:
+        """Hz of each topic, from its usual period."""
+        found = {s.topic: _rate(s.times_ns) for s in self.streams}
+        found |= {p.camera: _rate(p.times_ns) for p in self.pictures}
+        return {name: rate for name, rate in found.items() if rate}
+
+    @property
+    def rate(self) -> float:
+        """Frames a second that it has: its pictures', its commands', else its states', in Hz."""
+        for times in (
+            [p.times_ns for p in self.pictures],
+            [s.times_ns for s in self.streams if s.kind == COMMAND],
+            [s.times_ns for s in self.streams],
+        ):
+            rates = [r for t in times if (r := _rate(t))]
+            if rates:
+                return min(rates)
+        return 0.0
+
+    @property
+    def task(self) -> str:
+        """What was to be done, as the recording says it."""
+        return self.record.get("task", "")
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """One run of frames without a gap.
+
+    :param times_ns: shape (n,).
+    :param values: by part, kind and field; shape (n, joints).
+    :param pressure: by part, shape (n, elements).
+    :param pictures: by camera, the place of each frame's picture.
+    """
+
+    times_ns: NDArray[np.int64]
+    values: dict[tuple[str, str, str], Floats]
+    pressure: dict[str, Floats]
+    pictures: dict[str, NDArray[np.intp]]
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+
+def _rate(times: NDArray[np.int64]) -> float:
+    period = period_of(times)
+    return 1.0 / period if period > 0 else 0.0
+
+
+def open_source(trace: Trace) -> Source:
+    """The streams and pictures of a recording.
+
+    :raises SessionError: it has no joints.
+    """
+    lost = []
+    streams = []
+    for stream in streams_of(trace):
+        if len(stream) >= _LEAST:
+            streams.append(stream)
+        else:
+            lost.append(f"{stream.topic}: a single sample")
+    if not streams:
+        raise SessionError(f"{trace.path} has no joints of a known hand, robot or session")
+    known = {s.topic for s in streams}
+    for channel in trace.channels:
+        if channel.message_count and channel.topic not in known | _session_topics(trace):
+            lost.append(f"{channel.topic}: no joints in it")
+    if REST_TOPIC in trace.topics:
+        lost.append(f"{REST_TOPIC}: what an imported session has beside joints and pictures")
+    pictures = _pictures(trace, lost)
+    commands = [s for s in streams if s.kind == COMMAND]
+    if there := [f for f in FIELDS[COMMAND][1:] if any(f in s.values for s in commands)]:
+        lost.append(f"{', '.join(there)} of the commands")
+    return Source(trace, streams, pictures, lost)
+
+
+def _session_topics(trace: Trace) -> set[str]:
+    return {t for t in trace.topics if t.startswith(SESSION)}
+
+
+def _pictures(trace: Trace, lost: list[str]) -> list[Pictures]:
+    record = trace.metadata.get(RECORD, {})
+    try:
+        cameras = json.loads(record.get("cameras", "{}"))
+        names = [c for c in cameras if isinstance(c, str)]
+    except (ValueError, TypeError):
+        names = []
+    folder = Path(record.get("pictures_folder", "."))
+    found = []
+    for name in names:
+        embedded = ros_types.group_topic(name, "compressed")
+        referenced = ros_types.group_topic(name, "reference")
+        if embedded in trace.topics:
+            messages = list(trace.messages([embedded]))
+            data = [ros_types.decode_compressed_image(m.data).data for m in messages]
+            times = np.array([m.log_time_ns for m in messages], dtype=np.int64)
+            found.append(Pictures(name, times, lambda i, data=data: data[i]))  # type: ignore[misc]
+        elif referenced in trace.topics:
+            messages = list(trace.messages([referenced]))
+            entries = [_reference(ros_types.decode_string(m.data)) for m in messages]
+            if any("seconds" in e for e in entries):
+                lost.append(f"{name}: its video stays where it is ({folder})")
+                continue
+            paths = tuple(str(e.get("path", "")) for e in entries)
+            times = np.array([m.log_time_ns for m in messages], dtype=np.int64)
+
+            def load(i: int, paths: Sequence[str] = paths) -> bytes | None:
+                picture, _ = read_picture(folder, paths[i])
+                return picture.data if picture is not None else None
+
+            found.append(Pictures(name, times, load, paths))
+    return found
+
+
+def _reference(text: str) -> dict[str, object]:
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
+    """The frames of a recording, in runs without gaps; and what was left out.
+
+    :raises SessionError: there is no time at which all streams have values.
+    """
+    every = [s.times_ns for s in source.streams] + [p.times_ns for p in source.pictures]
+    begin = max(int(t[0]) for t in every)
+    end = min(int(t[-1]) for t in every)
+    name = source.trace.path.name
+    if end <= begin:
+        raise SessionError(f"{name}: its streams have no time in common")
+    count = int((end - begin) * fps / 1e9 + 1e-6) + 1
+    grid = np.array([begin + round(k * 1e9 / fps) for k in range(count)], dtype=np.int64)
+    good = np.ones(count, dtype=np.bool_)
+    values: dict[tuple[str, str, str], Floats] = {}
+    pressure: dict[str, Floats] = {}
+    for s in source.streams:
+        method = hold if s.kind == COMMAND else interpolate
+        for f, table in s.values.items():
+            values[s.part, s.kind, f] = made = method(s.times_ns, table, grid)
+            if f == "q":
+                good &= np.isfinite(made).all(axis=1)
+        if s.pressure is not None:
+            pressure[s.part] = interpolate(s.times_ns, s.pressure, grid)
+    shown: dict[str, NDArray[np.intp]] = {}
+    for p in source.pictures:
+        places = np.arange(len(p.times_ns), dtype=np.float64)[:, None]
+        newest = hold(p.times_ns, places, grid, max(gap_of(p.times_ns), 1.5 / fps))[:, 0]
+        good &= np.isfinite(newest)
+        shown[p.camera] = np.nan_to_num(newest).astype(np.intp)
+    runs, told = [], []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    for a, b in edges.reshape(-1, 2).tolist():
+        if b - a < _LEAST:
+            told.append(f"a single frame between gaps, {(grid[a] - begin) / 1e9:.3f} s after start")
+            continue
+        cut = slice(a, b)
+        runs.append(
+            Frames(
+                grid[cut],
+                {k: v[cut] for k, v in values.items()},
+                {k: v[cut] for k, v in pressure.items()},
+                {k: v[cut] for k, v in shown.items()},
+            )
+        )
+    if not runs:
+        raise SessionError(f"{name}: there is no frame at which all streams have values")
+    if len(runs) > 1:
+        told.append(
+            f"{count - int(good.sum())} frames in gaps: it is written as {len(runs)} episodes"
+        )
+    return runs, told

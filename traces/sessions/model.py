@@ -1,0 +1,373 @@
+"""A session between its source format and a recording: frames of parts, pictures and the rest.
+
+Importers make a :class:`Session`, :func:`write` makes a recording of it:
+
+* a hand whose model is known goes to the topics of that model, so that everything that works on
+  recordings works on it;
+* other groups of joints go to ``rt/session/PART/state`` and ``.../cmd`` as JointState;
+* pictures are referenced by path and time, or embedded as they are;
+* everything else goes, as JSON, to ``rt/session/frame/rest``, so that nothing is lost.
+
+The metadata record :data:`~dexkit.traces.sessions.imported.RECORD` says where the session is from,
+whether its times were measured, what was corrected, and which fields are 0 because the source does
+not have them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit import __version__
+from dexkit.hand import Floats, JointMode, Side
+from dexkit.messages import message_type
+from dexkit.models import DIALECTS, Dialect, HandModel, ModeByte, model
+from dexkit.traces.sessions import ros_types
+from dexkit.traces.sessions.imported import NOMINAL, RECORD, absent_key
+from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, STATE
+from dexkit.traces.writer import RecordingWriter, definition
+
+__all__ = [
+    "MEASURED",
+    "REST_TOPIC",
+    "Camera",
+    "Part",
+    "Problems",
+    "Session",
+    "messages",
+    "models_by_joints",
+    "picture_topic",
+    "record_of",
+    "reference_topic",
+    "write",
+]
+
+MEASURED = "measured"
+"""Value of ``clock``: the source has times."""
+REST_TOPIC = ros_types.group_topic("frame", "rest")
+_REFERENCE, _PICTURE = "reference", "compressed"
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
+# Problems that are told one by one.
+_MOST = 200
+
+
+class Problems:
+    """What is wrong with a source, as sentences; the same thing at many places is one of them."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, list[str]] = {}
+
+    def add(self, what: str, place: str = "") -> None:
+        """Note a problem.
+
+        :param place: where; told for the first one, the others are counted.
+        """
+        if what in self._places or len(self._places) < _MOST:
+            self._places.setdefault(what, []).append(place)
+
+    def __bool__(self) -> bool:
+        return bool(self._places)
+
+    def sentences(self) -> list[str]:
+        """One a problem."""
+        found = []
+        for what, places in self._places.items():
+            more = f", and {len(places) - 1} more" if len(places) > 1 else ""
+            found.append(f"{what} ({places[0]}{more})" if places[0] else what + more)
+        if len(self._places) == _MOST:
+            found.append("and more, which is not listed")
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A hand or a group of joints over the frames of a session.
+
+    :param name: ``left_hand``, ``right_hand``, or a group's: ``left_arm``.
+    :param joints: names, in the order of the columns.
+    :param values: by kind and field of :data:`~dexkit.traces.sessions.streams.FIELDS`; shape
+        (frames, joints), a row of NaN where the frame has none. A field that the source does not
+        have is missing.
+    :param model: the hand's; None for a group without a profile.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    values: Mapping[str, Mapping[str, Floats]]
+    model: HandModel | None = None
+
+    @property
+    def side(self) -> Side:
+        """Of a hand."""
+        return Side(self.name.removesuffix(HAND))
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Pictures of one camera over the frames of a session.
+
+    :param name: ``color_0``.
+    :param paths: relative to the session's folder; empty where the frame has none.
+    :param group: ``colors`` or ``depths``.
+    :param seconds: of a video, the time within the file at each frame; None for single pictures.
+    """
+
+    name: str
+    paths: tuple[str, ...]
+    group: str = "colors"
+    seconds: tuple[float, ...] | None = None
+
+
+@dataclass(eq=False)
+class Session:
+    """One session.
+
+    :param source: the file or folder it was read from.
+    :param form: name of the format with its version.
+    :param times_ns: of the frames, ns since the epoch, strictly ascending, shape (frames,).
+    :param clock: :data:`~dexkit.traces.sessions.imported.NOMINAL` or :data:`MEASURED`.
+    :param rate: frames a second, nominal or measured.
+    :param folder: to which the paths of pictures are relative.
+    :param first_ns: of a nominal clock, the time of frame 0; None where times are measured.
+    :param rest: per frame, what neither a part nor a camera holds, as JSON; empty texts where it is
+        the same as in the frame before.
+    :param about: further facts for the metadata record.
+    :param corrections: what was changed and why.
+    :param problems: what could not be imported.
+    """
+
+    source: Path
+    form: str
+    times_ns: NDArray[np.int64]
+    clock: str
+    rate: float
+    parts: list[Part]
+    folder: Path
+    cameras: list[Camera] = field(default_factory=list)
+    rest: Sequence[str] = ()
+    first_ns: int | None = None
+    about: dict[str, str] = field(default_factory=dict)
+    corrections: list[str] = field(default_factory=list)
+    problems: Problems = field(default_factory=Problems)
+    name: str = ""
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+
+def models_by_joints(count: int) -> list[HandModel]:
+    """The hand models with so many joints."""
+    names = dict.fromkeys(d.model for d in DIALECTS.values())
+    return [m for m in map(model, names) if len(m.joints[Side.LEFT]) == count]
+
+
+def reference_topic(camera: str) -> str:
+    """The topic of the references to a camera's pictures."""
+    return ros_types.group_topic(camera, _REFERENCE)
+
+
+def picture_topic(camera: str) -> str:
+    """The topic of a camera's embedded pictures."""
+    return ros_types.group_topic(camera, _PICTURE)
+
+
+def write(session: Session, out: Path, *, embed: bool = False, overwrite: bool = False) -> int:
+    """Write a session as a recording.
+
+    :param embed: put single pictures into it, as their files are; those that cannot be read go to
+        the session's problems.
+    :returns: the number of messages.
+    :raises UsageError: ``out`` exists.
+    :raises TraceError: it cannot be written.
+    """
+    with RecordingWriter(out, overwrite=overwrite) as writer:
+        for time_ns, channel, data in messages(session, writer, embed=embed):
+            writer.put(channel, data, time_ns, time_ns)
+        writer.add_metadata(RECORD, record_of(session, embed=embed))
+        return writer.written
+
+
+def messages(
+    session: Session, writer: RecordingWriter, *, embed: bool = False
+) -> Iterator[tuple[int, int, bytes]]:
+    """The messages of a session in order of time: time, channel, payload.
+
+    Adds the channels to the recording, and to the session's facts what the record is to say.
+    """
+    sources: list[tuple[int, Callable[[int], bytes | None]]] = []
+    for part in session.parts:
+        for kind in (STATE, COMMAND):
+            if kind in part.values:
+                sources.append(_part_channel(writer, session, part, kind))
+    for camera in session.cameras:
+        sources.append(_reference_channel(writer, camera))
+        if embed and camera.seconds is None:
+            sources.append(_picture_channel(writer, session, camera))
+    if any(session.rest):
+        channel = writer.add_channel(ros_types.STRING.definition(REST_TOPIC))
+        sources.append((channel, lambda i: _rest(session, i)))
+    for i, time_ns in enumerate(session.times_ns.tolist()):
+        for channel, encode in sources:
+            data = encode(i)
+            if data is not None:
+                yield time_ns, channel, data
+
+
+def record_of(session: Session, *, embed: bool = False) -> dict[str, str]:
+    """What the metadata record says, after all messages were made."""
+    record = {
+        "version": __version__,
+        "format": session.form,
+        "source": session.source.name,
+        "clock": session.clock,
+        "rate_hz": f"{session.rate:g}",
+        "frames": str(len(session)),
+        "pictures": "embedded" if embed else "referenced",
+        "pictures_folder": str(session.folder.absolute()),
+        "cameras": json.dumps({c.name: c.group for c in session.cameras}),
+        **({} if session.first_ns is None else {"first_ns": str(session.first_ns)}),
+        **session.about,
+    }
+    if session.clock == NOMINAL:
+        record["clock_note"] = (
+            "the source has no times: those of this recording are frame number / rate_hz"
+        )
+    for number, text in enumerate(session.corrections, 1):
+        record[f"correction {number}"] = text
+    for number, text in enumerate(session.problems.sentences(), 1):
+        record[f"problem {number}"] = text
+    return record
+
+
+def _rest(session: Session, i: int) -> bytes | None:
+    return ros_types.encode_string(session.rest[i]) if session.rest[i] else None
+
+
+def _part_channel(
+    writer: RecordingWriter, session: Session, part: Part, kind: str
+) -> tuple[int, Callable[[int], bytes | None]]:
+    values = part.values[kind]
+    if part.model is None:
+        topic = ros_types.group_topic(part.name, "cmd" if kind == COMMAND else "state")
+        channel = writer.add_channel(ros_types.JOINT_STATE.definition(topic))
+        return channel, lambda i: _joint_state(session, part, values, i)
+    dialect = part.model.dialects[0]
+    cmd, state = dialect.topics(part.side)
+    topic, type_name = (cmd, dialect.cmd_type) if kind == COMMAND else (state, dialect.state_type)
+    channel = writer.add_channel(definition(topic, message_type(type_name)))
+    session.about[absent_key(topic)] = " ".join(f for f in FIELDS[kind] if f not in values)
+    if kind == COMMAND:
+        session.about[f"filled {topic}"] = "kp, kd and mode, as xr_teleoperate sends them"
+    _note_rounding(session, part, kind, values)
+    encode = _motor_encoder(dialect, part.model, kind)
+    return channel, lambda i: _motors(values, encode, i)
+
+
+def _note_rounding(session: Session, part: Part, kind: str, values: Mapping[str, Floats]) -> None:
+    for name, table in values.items():
+        with np.errstate(over="ignore", invalid="ignore"):
+            apart = np.abs(table.astype(np.float32).astype(np.float64) - table)
+        worst = np.nanmax(apart, initial=0.0)
+        if worst > 0:
+            session.about[f"rounded {part.name} {kind} {name}"] = (
+                f"to the float32 of the wire, by at most {worst:.3g}"
+            )
+
+
+def _joint_state(
+    session: Session, part: Part, values: Mapping[str, Floats], i: int
+) -> bytes | None:
+    if not np.isfinite(values["q"][i]).all():
+        return None
+    columns = [tuple(values[f][i].tolist()) if f in values else () for f in ("q", "dq", "tau")]
+    return ros_types.encode_joint_state(
+        ros_types.JointState(int(session.times_ns[i]), part.joints, *columns)
+    )
+
+
+def _motors(
+    values: Mapping[str, Floats], encode: Callable[[Mapping[str, Any]], bytes], i: int
+) -> bytes | None:
+    row = {name: table[i] for name, table in values.items()}
+    if not all(np.isfinite(v).all() and (np.abs(v) <= _FLOAT32_MAX).all() for v in row.values()):
+        return None
+    return encode(row)
+
+
+def _motor_encoder(
+    dialect: Dialect, hand: HandModel, kind: str
+) -> Callable[[Mapping[str, Any]], bytes]:
+    """Encodes the joints of one hand as a message of its dialect."""
+    mt = message_type(dialect.cmd_type if kind == COMMAND else dialect.state_type)
+    motor = mt.motor_type.cls
+    gains = hand.gains
+    units = dialect.torque_units or (1.0,) * len(gains)
+    tau_name = "tau" if kind == COMMAND else "tau_est"
+
+    def encode(row: Mapping[str, Any]) -> bytes:
+        motors = []
+        for j in range(len(gains)):
+            given = {"q": float(row["q"][j])}
+            if "dq" in row:
+                given["dq"] = float(row["dq"][j])
+            if "tau" in row:
+                given[tau_name] = float(row["tau"][j]) / units[j]
+            if kind == COMMAND:
+                given["kp"], given["kd"] = gains[j]
+                given["mode"] = _mode(dialect, j)
+            motors.append(motor(**given))
+        return mt.encode(mt.cls(**{mt.motor_sequence: motors}))
+
+    return encode
+
+
+def _mode(dialect: Dialect, joint: int) -> int:
+    """The mode byte of a command that is followed."""
+    if dialect.mode_byte is ModeByte.RIS:
+        return joint | int(JointMode.FOC) << 4
+    return int(JointMode.FOC) if dialect.mode_byte is ModeByte.STATUS else 0
+
+
+def _reference_channel(
+    writer: RecordingWriter, camera: Camera
+) -> tuple[int, Callable[[int], bytes | None]]:
+    channel = writer.add_channel(ros_types.STRING.definition(reference_topic(camera.name)))
+
+    def encode(i: int) -> bytes | None:
+        if not camera.paths[i]:
+            return None
+        reference: dict[str, Any] = {"path": camera.paths[i]}
+        if camera.seconds is not None:
+            reference["seconds"] = camera.seconds[i]
+        return ros_types.encode_string(json.dumps(reference))
+
+    return channel, encode
+
+
+def _picture_channel(
+    writer: RecordingWriter, session: Session, camera: Camera
+) -> tuple[int, Callable[[int], bytes | None]]:
+    from dexkit.traces.sessions.pictures import read_picture
+
+    channel = writer.add_channel(ros_types.COMPRESSED_IMAGE.definition(picture_topic(camera.name)))
+
+    def encode(i: int) -> bytes | None:
+        if not camera.paths[i]:
+            return None
+        picture, why = read_picture(session.folder, camera.paths[i])
+        if picture is None:
+            session.problems.add(f"{camera.name}: pictures that {why}", camera.paths[i])
+            return None
+        return ros_types.encode_compressed_image(
+            ros_types.CompressedImage(
+                int(session.times_ns[i]), camera.name, picture.form, picture.data
+            )
+        )
+
+    return channel, encode

@@ -1,0 +1,202 @@
+"""Payloads of earlier layouts of Unitree's messages, turned into the present ones by name.
+
+The layout of a bag is that of its schema. Bags without schemas are tried with the present layout
+and with the earlier ones (docs/sources/unitree-dex.md#a3, docs/sources/sessions.md#d2): plain CDR
+does not say which it is, but a payload has the right length for one of them only.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from dexkit.errors import TraceUnsupported, WireError
+from dexkit.messages import MessageType, message_type
+from dexkit.messages.layout import MAX_ELEMENTS, STRUCTS
+from dexkit.messages.layout import Struct as OwnStruct
+from dexkit.messages.schemas import omgidl
+from dexkit.traces import schemas
+from dexkit.traces.names import dds_type
+
+__all__ = [
+    "EARLIER",
+    "converter",
+    "decode",
+    "definition_text",
+    "earlier_layouts",
+    "matching_layout",
+]
+
+_FORMS = {
+    "bool": "?",
+    "u8": "B",
+    "i8": "b",
+    "u16": "H",
+    "i16": "h",
+    "u32": "I",
+    "i32": "i",
+    "u64": "Q",
+    "i64": "q",
+    "f32": "f",
+    "f64": "d",
+}
+
+_SENSOR = "float32[12] pressure\nfloat32[12] temperature\n"
+_MOTORS = "unitree_hg/MotorState[] motor_state\n"
+_PRESS = "unitree_hg/PressSensorState[] press_sensor_state\n"
+_IMU = "unitree_hg/IMUState imu_state\n"
+_POWER = "float32 power_v\nfloat32 power_a\n"
+_MORE = "float32 system_v\nfloat32 device_v\nuint32[2] error\n"
+_TAIL = "uint32[2] reserve\n"
+
+EARLIER: dict[str, dict[str, tuple[str, str]]] = {
+    "unitree_hg::msg::dds_::HandCmd_": {
+        "of 2024-08": ("unitree_hg/MotorCmd[] motor_cmd\n", ""),
+    },
+    "unitree_hg::msg::dds_::HandState_": {
+        "of 2024-08": (_MOTORS + _IMU + _PRESS + _POWER + _TAIL, _SENSOR),
+        "of 2024-12": (_MOTORS + _PRESS + _IMU + _POWER + _MORE + _TAIL, _SENSOR),
+    },
+}
+"""Layouts before the present one: by type and time, the members, and those of a sensor packet."""
+
+
+def earlier_layouts(type_name: str) -> dict[str, schemas.Struct]:
+    """The layouts that a type had before, by their time."""
+    return {
+        when: schemas.parse(
+            "ros2msg", STRUCTS[type_name].ros_name, definition_text(type_name, *members)
+        )
+        for when, members in EARLIER.get(type_name, {}).items()
+    }
+
+
+def definition_text(type_name: str, members: str, sensor: str) -> str:
+    """The ``ros2msg`` definition of an earlier layout, with the types that it needs."""
+    text = members
+    for inner in STRUCTS[type_name].depends():
+        package, _, name = inner.ros_name.split("/")
+        body = sensor if name == "PressSensorState" else _own_members(inner)
+        text += f"{'=' * 80}\nMSG: {package}/{name}\n{body}"
+    return text
+
+
+def _own_members(struct_: OwnStruct) -> str:
+    from dexkit.messages.schemas import ros2msg
+
+    return ros2msg(struct_).split("=" * 80)[0]
+
+
+def converter(
+    type_name: str, recorded: schemas.Struct
+) -> tuple[Callable[[bytes], bytes] | None, list[str]]:
+    """What turns payloads of a recorded layout into the present one.
+
+    :returns: (None if they are the same as they are; the members that differ).
+    :raises TraceUnsupported: dexkit does not know the type.
+    """
+    if type_name not in STRUCTS:
+        raise TraceUnsupported(f"dexkit does not know the type {type_name}")
+    own = schemas.parse("omgidl", type_name, omgidl(STRUCTS[type_name]))
+    breaking, _ = schemas.differences(recorded, own)
+    if not breaking:
+        return None, []
+    mt = message_type(type_name)
+
+    def convert(data: bytes) -> bytes:
+        return mt.encode(_message(mt.layout, mt.cls, decode(recorded, data)))
+
+    return convert, breaking
+
+
+def matching_layout(
+    type_name: str, payloads: Sequence[bytes]
+) -> tuple[str, schemas.Struct | None] | None:
+    """The layout with which all payloads can be read: its time and structure.
+
+    ``("present", None)`` for the present one, None if there is none.
+    """
+    mt: MessageType = message_type(type_name)
+    if not mt.columns(payloads).errors:
+        return "present", None
+    for when, layout in earlier_layouts(type_name).items():
+        try:
+            for data in payloads:
+                decode(layout, data)
+        except WireError:
+            continue
+        return when, layout
+    return None
+
+
+def decode(layout: schemas.Struct, data: bytes) -> dict[str, Any]:
+    """The values of a payload by member, read by any layout.
+
+    :raises WireError: the payload is not of this layout, or not plain CDR.
+    """
+    if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1):
+        raise WireError(f"{layout.name}: not plain CDR")
+    reader = _Reader(data[4:], "<" if data[1] else ">")
+    found: dict[str, Any] = reader.node(layout)
+    # writers may fill up to a multiple of four bytes
+    if reader.left >= 4:
+        raise WireError(f"{layout.name}: {reader.left} bytes are left over")
+    return found
+
+
+class _Reader:
+    def __init__(self, data: bytes, order: str) -> None:
+        self._data = data
+        self._order = order
+        self._at = 0
+
+    @property
+    def left(self) -> int:
+        return len(self._data) - self._at
+
+    def node(self, node: schemas.Node) -> Any:
+        if isinstance(node, schemas.Struct):
+            return {f.name: self.node(f.type) for f in node.fields}
+        if isinstance(node, schemas.Array):
+            return tuple(self.node(node.element) for _ in range(node.length))
+        if isinstance(node, schemas.Sequence):
+            count = self._number("I")
+            if count > MAX_ELEMENTS:
+                raise WireError(f"a sequence of {count} elements")
+            return [self.node(node.element) for _ in range(count)]
+        if node == "string":
+            size = self._number("I")
+            return self._take(size).rstrip(b"\x00").decode("utf-8", "replace")
+        if node not in _FORMS:
+            raise WireError(f"a {node} cannot be read")
+        return self._number(_FORMS[node])
+
+    def _take(self, size: int) -> bytes:
+        if size > self.left:
+            raise WireError("it ends within a member")
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+    def _number(self, form: str) -> Any:
+        size = struct.calcsize(form)
+        self._take(min(-self._at % size, self.left))
+        return struct.unpack(self._order + form, self._take(size))[0]
+
+
+def _message(layout: OwnStruct, cls: type[Any], values: dict[str, Any]) -> Any:
+    """A message of the present layout; members that the values lack have their default."""
+    given: dict[str, Any] = {}
+    for member in layout.fields:
+        if member.name not in values:
+            continue
+        value = values[member.name]
+        if isinstance(member.type, OwnStruct):
+            inner = member.type
+            kind = message_type(dds_type(inner.ros_name)).cls
+            if isinstance(value, list | tuple):
+                value = type(value)(_message(inner, kind, v) for v in value)
+            else:
+                value = _message(inner, kind, value)
+        given[member.name] = value
+    return cls(**given)

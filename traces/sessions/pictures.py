@@ -1,0 +1,86 @@
+"""Pictures of a session: their files, format and size, without a picture library."""
+
+from __future__ import annotations
+
+import os
+import stat
+import struct
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+__all__ = ["Picture", "parse_picture", "read_picture", "safe_path"]
+
+_LARGEST = 32 * 2**20
+_JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xDA)})
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A compressed picture.
+
+    :param form: ``jpeg`` or ``png``.
+    """
+
+    form: str
+    width: int
+    height: int
+    channels: int
+    data: bytes
+
+
+def safe_path(folder: Path, name: str) -> Path | None:
+    """The file that a session's path means; None if that is not below the session's folder."""
+    pure = PurePosixPath(name.replace("\\", "/"))
+    if not name or "\x00" in name or pure.is_absolute() or ".." in pure.parts:
+        return None
+    root = os.path.realpath(folder)
+    found = os.path.realpath(os.path.join(root, *pure.parts))
+    return Path(found) if os.path.commonpath([root, found]) == root else None
+
+
+def read_picture(folder: Path, name: str) -> tuple[Picture | None, str]:
+    """(the picture, or None; why it cannot be had, as the end of "pictures that ...")."""
+    path = safe_path(folder, name)
+    if path is None:
+        return None, "are not below the session's folder"
+    try:
+        with open(path, "rb", opener=lambda p, f: os.open(p, f | os.O_NONBLOCK)) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return None, "are not files"
+            data = file.read(_LARGEST + 1)
+    except FileNotFoundError:
+        return None, "are missing"
+    except OSError:
+        return None, "cannot be read"
+    if len(data) > _LARGEST:
+        return None, f"are larger than {_LARGEST >> 20} MB"
+    picture = parse_picture(data)
+    return picture, "" if picture is not None else "are neither JPEG nor PNG"
+
+
+def parse_picture(data: bytes) -> Picture | None:
+    """Format and size of a JPEG or PNG; None if it is neither, or has no size."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 26 and data[12:16] == b"IHDR":
+        width, height = struct.unpack(">II", data[16:24])
+        channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(data[25], 0)
+        return Picture("png", width, height, channels, data) if width and height else None
+    if data[:2] != b"\xff\xd8":
+        return None
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+        elif marker in _JPEG_WITHOUT_LENGTH:
+            at += 2
+        elif marker in _JPEG_FRAMES:
+            if at + 10 > len(data):
+                return None
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return Picture("jpeg", width, height, data[at + 9], data) if width and height else None
+        else:
+            at += 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
+    return None

@@ -1,0 +1,71 @@
+"""Values of a stream at other times: held or interpolated, never across a gap."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.hand import Floats
+
+__all__ = ["gap_of", "hold", "interpolate", "period_of"]
+
+Times = NDArray[np.int64]
+
+# ns by which a sample may be beside a wanted time and be taken as it is: times that are calculated
+# twice differ by rounding.
+_SNAP = 1000
+# A gap is longer than so many usual periods, and at least so many seconds.
+_PERIODS = 10
+_LEAST = 0.1
+
+
+def period_of(times_ns: Times) -> float:
+    """The median period, seconds; 0 with fewer than two samples."""
+    return float(np.median(np.diff(times_ns))) / 1e9 if len(times_ns) > 1 else 0.0
+
+
+def gap_of(times_ns: Times) -> float:
+    """Seconds between two samples from which on they are taken to be apart."""
+    return max(_PERIODS * period_of(times_ns), _LEAST)
+
+
+def hold(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None) -> Floats:
+    """The newest value at each time (zero-order hold); NaN before the first and within a gap.
+
+    :param values: shape (n, k).
+    :param gap: seconds; None for :func:`gap_of`.
+    """
+    out = np.full((len(at_ns), values.shape[1]), np.nan)
+    if not len(times_ns):
+        return out
+    limit = gap_of(times_ns) if gap is None else gap
+    before = np.searchsorted(times_ns, at_ns + _SNAP, side="right") - 1
+    good = before >= 0
+    age = at_ns - times_ns[np.maximum(before, 0)]
+    good &= age <= limit * 1e9
+    out[good] = values[before[good]]
+    return out
+
+
+def interpolate(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None) -> Floats:
+    """Values between neighbours on a straight line; NaN outside and within a gap.
+
+    :param values: shape (n, k).
+    :param gap: seconds; None for :func:`gap_of`.
+    """
+    out = np.full((len(at_ns), values.shape[1]), np.nan)
+    if not len(times_ns):
+        return out
+    limit = gap_of(times_ns) if gap is None else gap
+    last = len(times_ns) - 1
+    after = np.searchsorted(times_ns, at_ns - _SNAP, side="left")
+    exact = (after <= last) & (times_ns[np.minimum(after, last)] <= at_ns + _SNAP)
+    out[exact] = values[after[exact]]
+    inside = ~exact & (after > 0) & (after <= last)
+    a, b = after[inside] - 1, after[inside]
+    span = (times_ns[b] - times_ns[a]).astype(np.float64)
+    part = ((at_ns[inside] - times_ns[a]) / np.where(span > 0, span, 1.0))[:, None]
+    between = values[a] * (1 - part) + values[b] * part
+    between[span > limit * 1e9] = np.nan
+    out[inside] = between
+    return out

@@ -1,0 +1,269 @@
+"""ROS 2 bags, sqlite3 and mcap, in and out, with the library rosbags (the extra ``rosbag``).
+
+A bag's topics are the DDS topics without ``rt/``, and its payloads are the samples. So nothing is
+decoded, except where a bag has an earlier layout of one of Unitree's types (unitree_ros2 before
+v0.3.0 had that of 2024): these are turned into the present layout, which is noted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dexkit import __version__
+from dexkit.errors import ExtraMissing, SessionError, TraceUnsupported, WireError
+from dexkit.messages import message_type
+from dexkit.messages.layout import STRUCTS
+from dexkit.traces import schemas
+from dexkit.traces.names import dds_topic, dds_type
+from dexkit.traces.reader import Definition, Trace
+from dexkit.traces.sessions import old_layouts
+from dexkit.traces.sessions.imported import RECORD
+from dexkit.traces.sessions.model import Problems
+from dexkit.traces.writer import RecordingWriter, definition
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+__all__ = ["export_bag", "import_bag", "is_bag"]
+
+# Payloads by which the layout of a topic without a schema is told.
+_TRIED = 50
+# What a bag has no place for: kept beside it, under this key of its custom data.
+_LOSSES = "dexkit.lost"
+_METADATA = "dexkit.metadata "
+
+Convert = Callable[[bytes], bytes]
+
+
+def _library() -> Any:
+    try:
+        import rosbags.rosbag2 as library
+    except ImportError as error:
+        raise ExtraMissing(
+            "ROS 2 bags need the library rosbags", hint="pip install 'dexkit[rosbag]'"
+        ) from error
+    return library
+
+
+def is_bag(source: Path) -> bool:
+    """Whether it looks like a bag: a folder with ``metadata.yaml``, a ``.db3``, or an ``.mcap``."""
+    return (source / "metadata.yaml").is_file() or source.suffix in (".db3", ".mcap")
+
+
+def import_bag(
+    source: Path, out: Path, *, overwrite: bool = False
+) -> tuple[int, list[str], Problems]:
+    """Write a bag as a recording.
+
+    :returns: the number of messages, what was changed, and what could not be imported.
+    :raises ExtraMissing: rosbags is not installed.
+    :raises SessionError: it cannot be read, or nothing in it can be used.
+    """
+    library = _library()
+    problems = Problems()
+    corrections: list[str] = []
+    with RecordingWriter(out, overwrite=overwrite) as writer:
+        try:
+            with library.Reader(source) as reader:
+                channels = {}
+                for connection in reader.connections:
+                    found = _channel(reader, connection, problems, corrections)
+                    if found is not None:
+                        channel, convert = found
+                        channels[connection.id] = (writer.add_channel(channel), convert)
+                wanted = [c for c in reader.connections if c.id in channels]
+                if wanted:
+                    _copy(reader.messages(wanted), channels, writer, problems)
+                _write_metadata(writer, reader, source, problems, corrections)
+        except (SessionError, OSError):
+            raise
+        except Exception as error:  # the library has many, for files of every kind of damage
+            raise SessionError(f"{source} cannot be read as a ROS 2 bag: {error}") from error
+        if not writer.written:
+            raise SessionError(
+                f"{source} has no message that can be used",
+                hint="; ".join(problems.sentences()[:3]),
+            )
+        return writer.written, corrections, problems
+
+
+def _copy(
+    messages: Iterable[tuple[Connection, int, bytes]],
+    channels: dict[int, tuple[int, Convert | None]],
+    writer: RecordingWriter,
+    problems: Problems,
+) -> None:
+    for connection, time_ns, data in messages:
+        number, convert = channels[connection.id]
+        payload = bytes(data)
+        if convert is not None:
+            try:
+                payload = convert(payload)
+            except WireError as error:
+                problems.add(
+                    f"{connection.topic}: messages that cannot be read are left out",
+                    error.message,
+                )
+                continue
+        writer.put(number, payload, time_ns)
+
+
+def _channel(
+    reader: Any, connection: Connection, problems: Problems, corrections: list[str]
+) -> tuple[Definition, Convert | None] | None:
+    """How a connection is written; None if it is left out."""
+    topic, type_name = dds_topic(connection.topic), dds_type(connection.msgtype)
+    text = connection.msgdef.data if connection.msgdef else ""
+    encoding = getattr(connection.msgdef.format, "name", "")
+    encoding = {"MSG": "ros2msg", "IDL": "ros2idl"}.get(encoding, "")
+    if getattr(connection.ext, "serialization_format", "cdr") != "cdr":
+        problems.add(f"{connection.topic} is not CDR and is left out")
+        return None
+    if type_name not in STRUCTS:
+        if not text:
+            problems.add(
+                f"{connection.topic} is left out: the bag has no definition of {connection.msgtype}"
+            )
+            return None
+        return Definition(topic, "cdr", {}, (connection.msgtype, encoding, text.encode())), None
+    ours = definition(topic, message_type(type_name))
+    if text:
+        try:
+            recorded = schemas.parse(encoding, connection.msgtype, text)
+            convert, differences = old_layouts.converter(type_name, recorded)
+        except TraceUnsupported as error:
+            problems.add(f"{connection.topic} is left out: {error.message}")
+            return None
+        if convert is not None:
+            corrections.append(
+                f"{connection.topic}: an earlier layout of {connection.msgtype} turned into the "
+                f"present one ({'; '.join(differences)})"
+            )
+        return ours, convert
+    some = []
+    for _, _, data in reader.messages([connection]):
+        some.append(bytes(data))
+        if len(some) == _TRIED:
+            break
+    layout = old_layouts.matching_layout(type_name, some)
+    if layout is None:
+        problems.add(
+            f"{connection.topic} is left out: the bag has no definition of {connection.msgtype}, "
+            "and no known layout fits its messages"
+        )
+        return None
+    when, structure = layout
+    if structure is None:
+        return ours, None
+    corrections.append(
+        f"{connection.topic}: the bag has no definition of {connection.msgtype}; its messages fit "
+        f"the layout {when}, and are turned into the present one"
+    )
+    return ours, old_layouts.converter(type_name, structure)[0]
+
+
+def _write_metadata(
+    writer: RecordingWriter, reader: Any, source: Path, problems: Problems, corrections: list[str]
+) -> None:
+    """Write what the bag says beside its messages, and how it was imported."""
+    storage = getattr(reader.storage, "metadata", None)
+    record = {
+        "version": __version__,
+        "format": "ROS 2 bag",
+        "source": source.name,
+        "clock": "measured",
+    }
+    custom = getattr(storage, "custom", None)
+    kept: dict[str, dict[str, str]] = {}
+    for key, value in custom.items() if isinstance(custom, dict) else ():
+        values = _texts(value) if str(key).startswith(_METADATA) else None
+        if values is not None:
+            kept[str(key).removeprefix(_METADATA)] = values
+        else:
+            record[f"custom {key}"] = str(value)
+    # of a recording that was a session once, its own record stays
+    for name, values in kept.items():
+        writer.add_metadata(name, values)
+    for number, text in enumerate(corrections, 1):
+        record[f"correction {number}"] = text
+    for number, text in enumerate(problems.sentences(), 1):
+        record[f"problem {number}"] = text
+    if RECORD not in kept:
+        writer.add_metadata(RECORD, record)
+
+
+def _texts(value: object) -> dict[str, str] | None:
+    try:
+        found = json.loads(str(value))
+    except (ValueError, RecursionError):
+        return None
+    if isinstance(found, dict) and all(isinstance(v, str) for v in found.values()):
+        return found
+    return None
+
+
+def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str]:
+    """Write a recording as a bag, a folder.
+
+    :param storage: ``sqlite3`` or ``mcap``.
+    :returns: what the bag cannot hold.
+    :raises ExtraMissing: rosbags is not installed.
+    :raises SessionError: ``out`` exists or cannot be written.
+    """
+    library = _library()
+    plugin = library.StoragePlugin.MCAP if storage == "mcap" else library.StoragePlugin.SQLITE3
+    lost = ["source timestamps of the samples (publish time): a bag has one time a message"]
+    try:
+        writer = library.Writer(out, version=9, storage_plugin=plugin)
+        with writer:
+            connections = {}
+            for key, d in trace.definitions.items():
+                ros_name, text = _schema(key[1], d)
+                if not text or d.message_encoding != "cdr":
+                    lost.append(f"{key[0]}: it has no definition in ROS form")
+                    continue
+                try:
+                    digest = _type_hash(ros_name, text)
+                except Exception as error:  # of the library: a definition that it cannot read
+                    lost.append(f"{key[0]}: its definition cannot be read: {error}")
+                    continue
+                connections[key] = writer.add_connection(
+                    f"/{key[0].removeprefix('rt/')}", ros_name, msgdef=text, rihs01=digest
+                )
+            for m in trace.messages():
+                connection = connections.get((m.topic, m.type_name))
+                if connection is not None:
+                    writer.write(connection, m.log_time_ns, m.data)
+            for name, values in trace.metadata.items():
+                writer.set_custom_data(f"{_METADATA}{name}", json.dumps(values))
+            writer.set_custom_data(_LOSSES, json.dumps(lost))
+    except OSError as error:
+        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
+    except library.WriterError as error:
+        raise SessionError(f"cannot write {out}: {error}") from error
+    return lost
+
+
+def _type_hash(ros_name: str, text: str) -> str:
+    """The hash of a type's description, which readers of bags compare."""
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    is_idl = text.startswith("=" * 80)
+    store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, ros_name))
+    return store.hash_rihs01(ros_name)
+
+
+def _schema(type_name: str, d: Definition) -> tuple[str, str]:
+    """(name of the ROS 2 type, its definition)"""
+    if type_name in STRUCTS:
+        mt = message_type(type_name)
+        if d.schema is not None and d.schema[1] == "ros2msg":
+            return mt.ros_name, d.schema[2].decode("utf-8", "replace")
+        return mt.ros_name, mt.ros2msg
+    if d.schema is not None and d.schema[1] in ("ros2msg", "ros2idl"):
+        return d.schema[0], d.schema[2].decode("utf-8", "replace")
+    return "", ""

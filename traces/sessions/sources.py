@@ -1,0 +1,132 @@
+"""What a source to be imported is, and the sessions in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dexkit.errors import SessionError
+from dexkit.traces.reader import Trace
+from dexkit.traces.sessions import episodes, jsonl, lerobot_in, rosbag, tables
+from dexkit.traces.sessions.beside import write_beside
+from dexkit.traces.sessions.episodes import DEFAULT, Options
+from dexkit.traces.sessions.imported import NOMINAL
+from dexkit.traces.sessions.model import Session, write
+
+__all__ = ["FORMATS", "Entry", "Report", "beside", "find"]
+
+FORMATS = ("episodes", "jsonl", "lerobot", "rosbag2", "tables")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an import did.
+
+    :param corrections: what was changed and why.
+    :param problems: what could not be taken over.
+    """
+
+    form: str
+    messages: int
+    corrections: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One session of a source.
+
+    :param name: of its recording, without a suffix; folders between it and the source included.
+    :param convert: writes the recording; takes the file, whether pictures are embedded, and
+        whether an existing file is replaced.
+    """
+
+    name: str
+    convert: Callable[[Path, bool, bool], Report]
+
+
+def beside(folder: Path, wire: Trace, options: Options = DEFAULT) -> Entry:
+    """An episode with the times of a recording that was made beside it."""
+
+    def convert(out: Path, embed: bool, overwrite: bool) -> Report:
+        session = episodes.read_episode(folder, options)
+        if session.clock != NOMINAL:
+            raise SessionError(f"{folder} has times of its own")
+        written, times = write_beside(session, wire, out, embed=embed, overwrite=overwrite)
+        return Report(
+            f"{session.form}, {times}", written, session.corrections, session.problems.sentences()
+        )
+
+    return Entry(folder.name, convert)
+
+
+def find(source: Path, form: str | None = None, options: Options = DEFAULT) -> list[Entry]:
+    """The sessions of a source.
+
+    :param form: one of :data:`FORMATS`; None to tell it by the source.
+    :raises SessionError: it is of no known format, or there is no session in it.
+    :raises ExtraMissing: a library is missing.
+    """
+    if not source.exists():
+        raise SessionError(f"{source} does not exist")
+    form = form or _format(source)
+    if form == "tables":
+        return [Entry(source.name, lambda out, embed, force: _tables(source, out, force))]
+    if form == "rosbag2":
+        return [Entry(source.stem, lambda out, embed, force: _bag(source, out, force))]
+    if form == "jsonl":
+        return [_entry(source.stem, lambda: jsonl.read_lines(source, options))]
+    if form == "lerobot":
+        dataset = lerobot_in.Dataset(source, options)
+        return [
+            _entry(f"episode_{n:06d}", lambda n=n: dataset.read(n))  # type: ignore[misc]
+            for n in dataset.episodes
+        ]
+    folders = episodes.episode_folders(source)
+    if not folders:
+        raise SessionError(
+            f"{source} holds no session that dexkit knows",
+            hint="an episode has a data.json, a LeRobot dataset meta/info.json, a bag "
+            "metadata.yaml",
+        )
+    return [
+        _entry(
+            folder.name
+            if folder == source or not folder.is_relative_to(source)
+            else folder.relative_to(source).as_posix(),
+            lambda folder=folder: episodes.read_episode(folder, options),  # type: ignore[misc]
+        )
+        for folder in folders
+    ]
+
+
+def _format(source: Path) -> str:
+    if tables.is_tables(source):
+        return "tables"
+    if lerobot_in.is_dataset(source):
+        return "lerobot"
+    if rosbag.is_bag(source):
+        return "rosbag2"
+    if source.suffix in (".jsonl", ".ndjson"):
+        return "jsonl"
+    return "episodes"
+
+
+def _entry(name: str, read: Callable[[], Session]) -> Entry:
+    def convert(out: Path, embed: bool, overwrite: bool) -> Report:
+        session = read()
+        written = write(session, out, embed=embed, overwrite=overwrite)
+        return Report(session.form, written, session.corrections, session.problems.sentences())
+
+    return Entry(name, convert)
+
+
+def _bag(source: Path, out: Path, overwrite: bool) -> Report:
+    written, corrections, problems = rosbag.import_bag(source, out, overwrite=overwrite)
+    return Report("ROS 2 bag", written, corrections, problems.sentences())
+
+
+def _tables(source: Path, out: Path, overwrite: bool) -> Report:
+    written, problems = tables.import_tables(source, out, overwrite=overwrite)
+    return Report("tables", written, [], problems.sentences())

@@ -1,0 +1,225 @@
+"""The joints of a recording as streams: one table of numbers over time for each part and direction.
+
+A part is a hand of a side (``left_hand``), a robot (``g1``), or a group of joints that no message
+of Unitree's carries (``left_arm``, of an imported episode). Which topic, which motor and which
+joint belong together comes from the profiles in :mod:`dexkit.models` and :mod:`dexkit.robots`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.hand import Floats
+from dexkit.messages import Columns, message_type
+from dexkit.models import model
+from dexkit.robots import ROBOTS
+from dexkit.topics import roles
+from dexkit.traces.names import SESSION
+from dexkit.traces.reader import SampleArray, Trace
+from dexkit.traces.sessions import ros_types
+from dexkit.traces.sessions.imported import RECORD, absent_fields
+
+__all__ = ["COMMAND", "FIELDS", "HAND", "STATE", "Stream", "streams_of"]
+
+Times = NDArray[np.int64]
+
+STATE, COMMAND = "state", "command"
+HAND = "_hand"
+"""End of the name of a hand's part."""
+FIELDS = {STATE: ("q", "dq", "tau"), COMMAND: ("q", "dq", "tau", "kp", "kd")}
+"""The fields of a motor that a stream has, in this order. ``tau`` is ``tau_est`` of a state."""
+_MEMBERS = {
+    STATE: {"q": "q", "dq": "dq", "tau": "tau_est"},
+    COMMAND: {f: f for f in FIELDS[COMMAND]},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """What was said of one part, in one direction.
+
+    :param part: ``left_hand``, ``right_hand``, a robot's name, or the name of an imported group.
+    :param kind: :data:`STATE` or :data:`COMMAND`.
+    :param joints: names, in the order of the columns.
+    :param times_ns: reception, ns since the epoch, ascending, shape (n,).
+    :param values: by field of :data:`FIELDS`, rad, rad/s and N·m, shape (n, n_joints); a field
+        that the source does not have is missing here. NaN where a message lacks a joint.
+    :param pressure: of a state of a hand with sensors, as the message has it, shape
+        (n, number of elements); None without.
+    :param elements: a name for each of its columns.
+    :param model: the hand model's or robot's name; empty for a group without a profile.
+    """
+
+    part: str
+    kind: str
+    joints: tuple[str, ...]
+    times_ns: Times
+    values: Mapping[str, Floats]
+    topic: str
+    model: str = ""
+    pressure: Floats | None = None
+    elements: tuple[str, ...] = ()
+    samples: SampleArray | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    @property
+    def q(self) -> Floats:
+        """Positions, rad, shape (n, n_joints)."""
+        return self.values["q"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each joint that is its own in the whole recording: ``left_thumb_0``."""
+        if self.model and self.part.endswith(HAND):
+            return tuple(f"{self.part.removesuffix(HAND)}_{j}" for j in self.joints)
+        return self.joints
+
+    def between(self, begin_ns: int, end_ns: int) -> Stream:
+        """The part of it that was received in [begin, end)."""
+        a, b = np.searchsorted(self.times_ns, [begin_ns, end_ns])
+        return replace(
+            self,
+            times_ns=self.times_ns[a:b],
+            values={name: v[a:b] for name, v in self.values.items()},
+            pressure=None if self.pressure is None else self.pressure[a:b],
+            samples=None,
+        )
+
+
+def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream]:
+    """Every stream of a recording, in the order of topics; empty ones are left out.
+
+    :param topics: only these, in any spelling, patterns allowed.
+    :raises UsageError: a topic is not in the recording.
+    """
+    known = [c.topic for c in trace.channels if c.message_count]
+    wanted = known if topics is None else list(trace.load(topics, payloads=False))
+    found: list[Stream] = []
+    absent = absent_fields(trace.metadata.get(RECORD, {}))
+    for topic, samples in trace.load(sorted(set(wanted) & set(known)), decode=True).items():
+        for stream in _streams(topic, samples):
+            lacking = absent.get(topic, frozenset())
+            values = {f: v for f, v in stream.values.items() if f not in lacking}
+            if len(stream) and "q" in values:
+                found.append(replace(stream, values=values))
+    return found
+
+
+def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
+    if samples.type_name == ros_types.JOINT_STATE.dds_name and not samples.decoded:
+        yield from _joint_states(topic, samples)
+        return
+    if samples.problem:
+        return
+    for role in roles(topic, samples.type_name)[:1]:
+        if role.kind == "low":
+            continue  # a copy
+        kind = COMMAND if role.kind == "cmd" else STATE
+        hand = model(role.dialect.model)
+        columns = _columns(samples)
+        for side in role.sides:
+            joints = hand.joints[side]
+            first = role.dialect.index[side]
+            slots = range(first, first + len(joints))
+            pressure: Floats | None = None
+            elements: tuple[str, ...] = ()
+            if kind == STATE and hand.sensors:
+                pressure, elements = _pressure(columns, hand.sensors)
+            values = _values(columns, samples.type_name, kind, slots, role.dialect.torque_units)
+            yield Stream(
+                part=f"{side}{HAND}",
+                kind=kind,
+                joints=tuple(j.name for j in joints),
+                times_ns=samples.log_time_ns,
+                values=values,
+                topic=topic,
+                model=hand.name,
+                pressure=pressure,
+                elements=elements,
+                samples=samples,
+            )
+    for robot in ROBOTS.values():
+        directions = {
+            (robot.state_topic, robot.state_type): STATE,
+            (robot.cmd_topic, robot.cmd_type): COMMAND,
+            (robot.arm_topic, robot.cmd_type): COMMAND,
+        }
+        kind = directions.get((topic, samples.type_name), "")
+        if kind:
+            used = robot.arm_slots if topic == robot.arm_topic else robot.used
+            yield Stream(
+                part=f"{robot.name}_arms" if topic == robot.arm_topic else robot.name,
+                kind=kind,
+                joints=tuple(robot.joint(s).name for s in used),
+                times_ns=samples.log_time_ns,
+                values=_values(_columns(samples), samples.type_name, kind, used, ()),
+                topic=topic,
+                model=robot.name,
+                samples=samples,
+            )
+
+
+def _columns(samples: SampleArray) -> Columns:
+    return samples.decoded if samples.decoded is not None else samples.columns()
+
+
+def _values(
+    columns: Columns, type_name: str, kind: str, slots: Sequence[int], units: Sequence[float]
+) -> dict[str, Floats]:
+    sequence = message_type(type_name).motor_sequence
+    array = next(f for f in message_type(type_name).layout.fields if f.name == sequence).array
+    values = {}
+    with np.errstate(invalid="ignore"):
+        for name, member in _MEMBERS[kind].items():
+            paths = [f"{sequence}[{i}].{member}" for i in slots if array is None or i < array]
+            values[name] = columns.table(paths)
+    if units:
+        values["tau"] = values["tau"] * np.asarray(units)
+    return values
+
+
+def _pressure(columns: Columns, sensors: Sequence[Any]) -> tuple[Floats | None, tuple[str, ...]]:
+    """The sensor elements of the states; None if no state has sensor packets."""
+    if not len(columns) or columns.count("press_sensor_state").max() < len(sensors):
+        return None, ()
+    parts, names = [], []
+    for i, sensor in enumerate(sensors):
+        for slot in sensor.slots:
+            parts.append(f"press_sensor_state[{i}].pressure[{slot}]")
+            names.append(f"{sensor.place.replace(' ', '_')}_{slot}")
+    return columns.table(parts), tuple(names)
+
+
+def _joint_states(topic: str, samples: SampleArray) -> Iterator[Stream]:
+    """Groups of joints as an import writes them: ``rt/session/PART/state``."""
+    pieces = topic.split("/")
+    if not topic.startswith(SESSION) or len(pieces) != 4 or pieces[3] not in ("state", "cmd"):
+        return
+    decoded = [ros_types.decode_joint_state(data) for data in samples.payloads]
+    if not decoded:
+        return
+    names = decoded[0].names
+    good = [i for i, d in enumerate(decoded) if d.names == names]
+    values = {}
+    for name, column in (("q", "position"), ("dq", "velocity"), ("tau", "effort")):
+        rows = [getattr(decoded[i], column) for i in good]
+        if rows and len(rows[0]) == len(names):
+            values[name] = np.array(
+                [r if len(r) == len(names) else (np.nan,) * len(names) for r in rows], dtype=float
+            ).reshape(len(rows), len(names))
+    yield Stream(
+        part=pieces[2],
+        kind=COMMAND if pieces[3] == "cmd" else STATE,
+        joints=names,
+        times_ns=samples.log_time_ns[good],
+        values=values,
+        topic=topic,
+        samples=samples,
+    )

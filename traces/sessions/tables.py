@@ -1,0 +1,420 @@
+"""Recordings as tables: a folder with one CSV or Parquet file a topic, and back, value by value.
+
+Every member of a message is a column, named by its path (``motor_state[3].q``), in its own type; a
+shorter sequence leaves its columns empty. Messages of types that dexkit does not know have their
+payload as one column. ``session.json`` has what belongs to no topic.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.documents import write_file
+from dexkit.errors import SessionError
+from dexkit.messages import MessageType, message_type
+from dexkit.messages.columns import encode_columns
+from dexkit.messages.layout import Primitive, Struct
+from dexkit.traces.reader import ChannelInfo, Definition, Trace
+from dexkit.traces.sessions.lerobot_format import parquet_library
+from dexkit.traces.sessions.model import Problems
+from dexkit.traces.writer import RecordingWriter, definition
+
+__all__ = ["export_tables", "import_tables", "is_tables"]
+
+_ABOUT = "session.json"
+_KEY = "dexkit_tables"
+_TIMES = ("log_time_ns", "publish_time_ns")
+_PAYLOAD = "payload"
+# Elements of a sequence that have columns.
+_LONGEST = 256
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """A number in a message.
+
+    :param steps: names of members and places in lists, from the message inward.
+    """
+
+    path: str
+    steps: tuple[str | int, ...]
+    dtype: str
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is an integer."""
+        return self.dtype[0] != "f"
+
+
+def is_tables(source: Path) -> bool:
+    """Whether it looks like a folder of tables."""
+    try:
+        text = (source / _ABOUT).read_text(encoding="utf-8")
+        return _KEY in json.loads(text)
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def _leaves(kind: Struct, lengths: Mapping[str, int]) -> Iterator[_Leaf]:
+    """The numbers of a message whose sequences have these lengths."""
+    for member in kind.fields:
+        count = lengths.get(member.name, 0) if member.sequence else member.array
+        places: Sequence[tuple[str, tuple[str | int, ...]]]
+        if count is None:
+            places = [(member.name, (member.name,))]
+        else:
+            places = [(f"{member.name}[{i}]", (member.name, i)) for i in range(count)]
+        for path, steps in places:
+            if isinstance(member.type, Primitive):
+                yield _Leaf(path, steps, member.type.dtype)
+            else:
+                for inner in _leaves(member.type, {}):
+                    yield _Leaf(f"{path}.{inner.path}", (*steps, *inner.steps), inner.dtype)
+
+
+# -- out -----------------------------------------------------------------------------------------
+
+
+def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
+    """Write a recording as tables.
+
+    :param form: ``csv`` or ``parquet``.
+    :returns: what the tables cannot hold.
+    :raises ExtraMissing: pyarrow is not installed.
+    :raises SessionError: ``out`` exists or cannot be written.
+    """
+    lost = [
+        "encapsulation and padding bytes of the payloads, and sequence numbers of the messages",
+    ]
+    try:
+        out.mkdir(parents=True, exist_ok=False)
+        topics = []
+        for number, ((topic, type_name), d) in enumerate(sorted(trace.definitions.items())):
+            name = f"{number:03d}_{_file_name(topic)}.{form}"
+            entry = {
+                "topic": d.topic,
+                "type": type_name,
+                "file": name,
+                "message_encoding": d.message_encoding,
+                "metadata": d.metadata,
+                "schema": None
+                if d.schema is None
+                else [*d.schema[:2], base64.b64encode(d.schema[2]).decode()],
+            }
+            info = next(c for c in trace.channels if (c.topic, c.type_name) == (topic, type_name))
+            _export_topic(trace, info, out / name, form, entry, lost)
+            topics.append(entry)
+        about = {_KEY: 1, "topics": topics, "metadata": trace.metadata, "lost": lost}
+        write_file(out / _ABOUT, json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+    except FileExistsError:
+        raise SessionError(f"{out} exists", hint="choose another name, or delete it") from None
+    except OSError as error:
+        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
+    return lost
+
+
+def _file_name(topic: str) -> str:
+    return "".join(c if c.isalnum() and c.isascii() else "_" for c in topic)[:100]
+
+
+def _export_topic(
+    trace: Trace, info: ChannelInfo, path: Path, form: str, entry: dict[str, Any], lost: list[str]
+) -> None:
+    samples = trace.load([info.topic])[info.topic]
+    names: list[str] = list(_TIMES)
+    columns: list[_Column]
+    if info.problem or samples.type_name != info.type_name:
+        found = [m for m in trace.messages([info.topic]) if m.type_name == info.type_name]
+        entry["columns"] = _PAYLOAD
+        columns = [
+            _Column(np.array([m.log_time_ns for m in found], dtype=np.int64)),
+            _Column(np.array([m.publish_time_ns for m in found], dtype=np.int64)),
+        ]
+        names.append(_PAYLOAD)
+        _write(path, form, names, columns, [m.data for m in found])
+        return
+    decoded = samples.columns()
+    good = decoded.ok
+    if not good.all():
+        lost.append(f"{info.topic}: {np.count_nonzero(~good)} messages that cannot be decoded")
+    layout = message_type(info.type_name).layout
+    sequences = [f.name for f in layout.fields if f.sequence]
+    counts = {s: decoded.count(s)[good] for s in sequences}
+    lengths = {s: int(n.max(initial=0)) for s, n in counts.items()}
+    if too_long := [s for s, n in lengths.items() if n > _LONGEST]:
+        raise SessionError(
+            f"{info.topic} has {lengths[too_long[0]]} elements of {too_long[0]} in a message: a "
+            f"table holds {_LONGEST} at most"
+        )
+    entry["columns"] = "members"
+    columns = [_Column(samples.log_time_ns[good]), _Column(samples.publish_time_ns[good])]
+    for s in sequences:
+        names.append(f"len({s})")
+        columns.append(_Column(counts[s].astype(np.int32)))
+    for leaf in _leaves(layout, lengths):
+        values = decoded[leaf.path][good]
+        there = None
+        sequence, place = leaf.steps[0], leaf.steps[1] if len(leaf.steps) > 1 else 0
+        if sequence in counts and isinstance(place, int):
+            there = counts[str(sequence)] > place
+            values = np.where(there, values, 0.0)
+        names.append(leaf.path)
+        columns.append(_Column(values.astype(leaf.dtype), there))
+    _write(path, form, names, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """The values of a column.
+
+    :param there: which rows have one; None for all.
+    """
+
+    values: NDArray[Any]
+    there: NDArray[np.bool_] | None = None
+
+    def texts(self) -> list[str]:
+        """For CSV: the shortest text that is read as the same value."""
+        # by their bits: -0.0 equals 0.0 and NaN nothing
+        bits = self.values.view(f"u{self.values.itemsize}")
+        different, places = np.unique(bits, return_inverse=True)
+        different = different.view(self.values.dtype)
+        made = np.array([str(v) for v in different], dtype=object)[places]
+        if self.there is not None:
+            made = np.where(self.there, made, "")
+        found: list[str] = made.tolist()
+        return found
+
+
+def _write(
+    path: Path,
+    form: str,
+    names: Sequence[str],
+    columns: Sequence[_Column],
+    payloads: Sequence[bytes] | None = None,
+) -> None:
+    if form == "csv":
+        texts = [c.texts() for c in columns]
+        if payloads is not None:
+            texts.append([base64.b64encode(p).decode() for p in payloads])
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(names)
+            writer.writerows(zip(*texts, strict=True))
+        return
+    arrow, parquet = parquet_library()
+    arrays = [arrow.array(c.values, mask=None if c.there is None else ~c.there) for c in columns]
+    if payloads is not None:
+        arrays.append(arrow.array(payloads, type=arrow.binary()))
+    parquet.write_table(arrow.table(arrays, names=list(names)), str(path), compression="zstd")
+
+
+# -- in ------------------------------------------------------------------------------------------
+
+
+def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[int, Problems]:
+    """Write tables as a recording.
+
+    :returns: the number of messages, and what could not be imported.
+    :raises ExtraMissing: pyarrow is not installed.
+    :raises SessionError: they cannot be read, or nothing in them can be used.
+    """
+    try:
+        about = json.loads((source / _ABOUT).read_text(encoding="utf-8"))
+        topics = [e for e in about["topics"] if isinstance(e, dict)]
+        metadata = {
+            str(name): {str(k): str(v) for k, v in values.items()}
+            for name, values in about.get("metadata", {}).items()
+        }
+    except OSError as error:
+        raise SessionError(f"cannot read {source / _ABOUT}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise SessionError(
+            f"{source / _ABOUT} is not what dexkit export writes: {error}"
+        ) from error
+    problems = Problems()
+    rows: list[tuple[int, int, int, int, bytes]] = []
+    with RecordingWriter(out, overwrite=overwrite) as writer:
+        for name, values in metadata.items():
+            writer.add_metadata(name, values)
+        for entry in topics:
+            try:
+                channel, found = _import_topic(source, entry, problems)
+            except SessionError as error:
+                problems.add(error.message)
+                continue
+            number = writer.add_channel(channel)
+            rows += [
+                (log, len(rows) + i, sent, number, d) for i, (log, sent, d) in enumerate(found)
+            ]
+        for log, _, sent, number, data in sorted(rows, key=lambda r: r[:2]):
+            writer.put(number, data, log, sent)
+        if not writer.written:
+            raise SessionError(
+                f"{source} has no message that can be used",
+                hint="; ".join(problems.sentences()[:3]),
+            )
+        return writer.written, problems
+
+
+def _import_topic(
+    source: Path, entry: Mapping[str, Any], problems: Problems
+) -> tuple[Definition, list[tuple[int, int, bytes]]]:
+    name = str(entry.get("file", ""))
+    if Path(name).name != name or not name:
+        raise SessionError(f"{source / _ABOUT} leads out of its folder: {name!r}")
+    path = source / name
+    topic = str(entry.get("topic", ""))
+    header, columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+    if header[:2] != list(_TIMES):
+        raise SessionError(f"{name} does not begin with the columns {', '.join(_TIMES)}")
+    found: list[tuple[int, int, bytes]] = []
+    if entry.get("columns") == "payload":
+        schema = entry.get("schema")
+        try:
+            channel = Definition(
+                topic,
+                str(entry.get("message_encoding", "cdr")),
+                dict(entry.get("metadata", {})),
+                None
+                if schema is None
+                else (str(schema[0]), str(schema[1]), base64.b64decode(schema[2])),
+            )
+        except (ValueError, TypeError, LookupError) as error:
+            raise SessionError(f"{name}: its schema cannot be read: {error}") from error
+        for line, row in enumerate(zip(*columns, strict=True), 2):
+            try:
+                data = row[2] if isinstance(row[2], bytes) else base64.b64decode(row[2])
+                found.append((int(row[0]), int(row[1]), data))
+            except (ValueError, TypeError, LookupError):
+                problems.add(f"{name}: rows that cannot be read are left out", f"row {line}")
+        return channel, found
+    mt = message_type(str(entry.get("type", "")))
+    channel = definition(topic, mt, dict(entry.get("metadata", {})))
+    found, bad = _encode(mt, header, columns, name)
+    for number in bad:
+        problems.add(f"{name}: rows that cannot be read are left out", f"row {number + 2}")
+    return channel, found
+
+
+def _encode(
+    mt: MessageType, header: Sequence[str], columns: Sequence[Sequence[Any]], name: str
+) -> tuple[list[tuple[int, int, bytes]], list[int]]:
+    """The messages of a table, and the numbers of rows that are none."""
+    table = dict(zip(header, columns, strict=True))
+    sequences = [f.name for f in mt.layout.fields if f.sequence]
+    lengths = dict.fromkeys(sequences, 0)
+    for s in sequences:
+        while any(c.startswith(f"{s}[{lengths[s]}]") for c in header):
+            lengths[s] += 1
+            if lengths[s] > _LONGEST:
+                raise SessionError(f"{name} has too many columns of {s}")
+    leaves = list(_leaves(mt.layout, lengths))
+    wanted = [*(f"len({s})" for s in sequences), *(leaf.path for leaf in leaves)]
+    if missing := [p for p in wanted if p not in table]:
+        raise SessionError(f"{name} lacks {len(missing)} columns, {missing[0]} for one")
+    log, good = _numbers(table[_TIMES[0]], "i8")
+    sent, there = _numbers(table[_TIMES[1]], "i8")
+    good = good & there & (log >= 0) & (sent >= 0)
+    counts = np.zeros((len(log), len(sequences)), dtype=np.int64)
+    for i, s in enumerate(sequences):
+        counts[:, i], there = _numbers(table[f"len({s})"], "i4")
+        good &= there & (counts[:, i] >= 0) & (counts[:, i] <= lengths[s])
+    values = {leaf.path: _numbers(table[leaf.path], leaf.dtype) for leaf in leaves}
+    found: list[tuple[int, int, bytes] | None] = [None] * len(log)
+    for shape in np.unique(counts[good], axis=0) if good.any() else ():
+        sizes = dict(zip(sequences, shape.tolist(), strict=True))
+        own = list(_leaves(mt.layout, sizes))
+        rows = good & (counts == shape).all(axis=1)
+        for leaf in own:
+            rows &= values[leaf.path][1]
+        if not rows.any():
+            continue
+        elements = {
+            f.name: [message_type(f.type.dds_name).cls() for _ in range(sizes[f.name])]
+            for f in mt.layout.fields
+            if f.sequence and isinstance(f.type, Struct)
+        }
+        example = mt.encode(mt.cls(**elements))
+        data = encode_columns(
+            mt.layout,
+            example,
+            [(leaf.steps, values[leaf.path][0][rows]) for leaf in own],
+            int(rows.sum()),
+        )
+        for i, payload in zip(np.flatnonzero(rows).tolist(), data, strict=True):
+            found[i] = (int(log[i]), int(sent[i]), payload)
+    return [f for f in found if f is not None], [i for i, f in enumerate(found) if f is None]
+
+
+def _numbers(column: Sequence[Any], dtype: str) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """The values of a column, and which rows have one that its type can hold."""
+    kind = np.dtype(dtype)
+    if kind.kind == "f" and {type(v) for v in column} <= {float, type(None)}:
+        # one by one: 0.0 equals -0.0 and is not the same
+        doubles = np.array([0.0 if v is None else v for v in column], dtype=np.float64)
+        with np.errstate(over="ignore"):
+            values = doubles.astype(kind)
+        there = np.array([v is not None for v in column], dtype=np.bool_)
+        return values, there & (np.isinf(values) == np.isinf(doubles))
+    known: dict[Any, Any] = {}
+    for value in set(column):
+        known[value] = _number(value, kind)
+    found = [known[value] for value in column]
+    there = np.array([v is not None for v in found], dtype=np.bool_)
+    return np.array([0 if v is None else v for v in found], dtype=kind), there
+
+
+def _number(value: Any, kind: np.dtype[Any]) -> Any:
+    """A value of that type; None if it is none."""
+    if value is None or value == "" or isinstance(value, bytes):
+        return None
+    try:
+        if kind.kind == "f":
+            number = np.float64(value)
+            with np.errstate(over="ignore"):
+                single = kind.type(number)
+            return None if np.isinf(single) and not np.isinf(number) else single
+        if isinstance(value, float) and not value.is_integer():
+            return None
+        whole = int(value)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    limits = np.iinfo(kind) if kind.kind in "iu" else None
+    return whole if limits is None or limits.min <= whole <= limits.max else None
+
+
+def _read_csv(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SessionError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise SessionError(f"{path} is not UTF-8 text") from error
+    try:
+        header, *rows = csv.reader(text.splitlines()) or [[]]
+    except (ValueError, csv.Error) as error:
+        raise SessionError(f"{path} cannot be read as CSV: {error}") from error
+    width = len(header)
+    # a short row lacks its last values, which are then told as such
+    rows = [row[:width] + [""] * (width - len(row)) for row in rows]
+    return header, list(zip(*rows, strict=True)) if rows else [()] * width
+
+
+def _read_parquet(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
+    arrow, parquet = parquet_library()
+    try:
+        table = parquet.read_table(path)
+    except (OSError, ValueError, arrow.lib.ArrowException) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
+    return list(table.column_names), [c.to_pylist() for c in table.columns]
