@@ -37,6 +37,7 @@ __all__ = [
     "check_output_paths",
     "parse_json",
     "parse_toml",
+    "read_bytes",
     "read_json",
     "read_text",
     "read_toml",
@@ -46,6 +47,7 @@ __all__ = [
 
 LARGEST = 64 * 1024 * 1024
 """Bytes of a file that is read; a result of the largest run has less than one million."""
+_PIECE = 1 << 18
 DEEPEST = 32
 """Levels of a document; dexkit's own have less than ten."""
 _DIGITS = 20
@@ -58,22 +60,41 @@ _POLL_INTERVAL = 0.01  # seconds between attempts
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS})
 
 
+def read_bytes(
+    path: Path,
+    largest: int = LARGEST,
+    *,
+    error: type[DexkitError] = UsageError,
+    hint: str = "",
+) -> bytes:
+    """The content of an ordinary file of at most ``largest`` bytes.
+
+    :param error: what is raised when it cannot be read.
+    :param hint: what to do then.
+    """
+    data = bytearray()
+    try:
+        with open(path, "rb", opener=_open_without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
+            # in pieces: read(largest) would reserve so much memory first
+            while len(data) <= largest and (piece := file.read(_PIECE)):
+                data += piece
+    except (OSError, ValueError) as why:  # ValueError: a null character in the name
+        reason = why.strerror if isinstance(why, OSError) else str(why)
+        raise error(f"cannot read {path}: {reason}", hint=hint) from why
+    if len(data) > largest:
+        raise error(f"cannot read {path}: it is larger than {largest >> 20} MB", hint=hint)
+    return bytes(data)
+
+
 def read_text(path: Path, *, error: type[DexkitError] = UsageError, hint: str = "") -> str:
     """The text of a UTF-8 file, with or without a byte order mark.
 
     :param error: what is raised when it cannot be read.
     :param hint: what to do then.
     """
-    try:
-        with open(path, "rb", opener=_open_without_waiting) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
-            data = file.read(LARGEST + 1)
-    except (OSError, ValueError) as why:  # ValueError: a null character in the name
-        reason = why.strerror if isinstance(why, OSError) else str(why)
-        raise error(f"cannot read {path}: {reason}", hint=hint) from why
-    if len(data) > LARGEST:
-        raise error(f"cannot read {path}: it is larger than {LARGEST >> 20} MB", hint=hint)
+    data = read_bytes(path, error=error, hint=hint)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as why:

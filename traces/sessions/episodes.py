@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.documents import read_bytes
 from dexkit.errors import SessionError
 from dexkit.hand import Floats, Side
 from dexkit.models import HandModel, model
@@ -112,15 +112,7 @@ def read_document(path: Path) -> Document:
 
     :raises SessionError: it cannot be read, or no item in it is whole.
     """
-    try:
-        with open(path, "rb", opener=lambda p, f: os.open(p, f | os.O_NONBLOCK)) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise SessionError(f"cannot read {path}: it is not an ordinary file")
-            data = file.read(_LARGEST + 1)
-    except OSError as error:
-        raise SessionError(f"cannot read {path}: {error.strerror}") from error
-    if len(data) > _LARGEST:
-        raise SessionError(f"cannot read {path}: it is larger than {_LARGEST >> 30} GB")
+    data = read_bytes(path, _LARGEST, error=SessionError)
     # an interrupted file may end within a character
     return parse_document(data.decode("utf-8-sig", "replace"), str(path))
 
