@@ -713,7 +713,7 @@ class StopsInABurst(Service):
 
 @wrong_hand(
     ("DEX1-SAFE-08", "DEX3-SAFE-09"),
-    also=("DEX1-SAFE-09", "DEX3-SAFE-10", "DEX1-RATE-03", "DEX3-RATE-03", "DEX1-RATE-04"),
+    also=("DEX1-SAFE-09", "DEX3-SAFE-10", "DEX1-RATE-03", "DEX3-RATE-03"),
 )
 class GivesUpOnTwo(Service):
     """Ends when a second client commands it, and is restarted 0.4 s later."""
@@ -990,7 +990,7 @@ class WaitsForRest(Service):
         )
 
 
-@wrong_hand(("DEX1-TRACK-02", "DEX3-TRACK-02"))
+@wrong_hand(("DEX1-TRACK-02", "DEX3-TRACK-02"), also=("DEX1-GAIN-03",))
 class Delayed(Service):
     """Obeys each command 0.15 s late."""
 

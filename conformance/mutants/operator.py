@@ -64,7 +64,7 @@ class DeadBand(_DeadBand, ReferenceService):
     band = 0.14 / 5.4
 
 
-@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-02",))
+@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-02", "DEX1-FORCE-09"))
 class SaturatingGain(ReferenceService):
     """Takes no kp above 2: with the client's small lead it has 40 % of the force."""
 
