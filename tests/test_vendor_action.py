@@ -399,8 +399,13 @@ def instructions() -> list[tuple[str, str]]:
 def test_the_container_runs_dexkit_on_the_right_python_and_not_as_root() -> None:
     steps = instructions()
     words = [word for word, _ in steps]
-    assert set(words) <= {"FROM", "WORKDIR", "COPY", "RUN", "USER", "ENTRYPOINT", "CMD"}
-    assert all(rest.startswith("python:3.10-slim") for word, rest in steps if word == "FROM")
+    assert set(words) <= {"FROM", "WORKDIR", "COPY", "ENV", "RUN", "USER", "ENTRYPOINT", "CMD"}
+    # both stages have the same Python and library, and neither names a processor
+    assert all(rest.startswith("debian:13-slim") for word, rest in steps if word == "FROM")
+    runs = " ".join(rest for word, rest in steps if word == "RUN")
+    assert "setup-dds" in runs
+    assert "amd64" not in runs + str(steps)
+    assert "ca-certificates" in runs  # Debian's pip uses them in images on top of this one
     assert dict(steps)["USER"] == "1000"
     assert max(i for i, word in enumerate(words) if word == "RUN") < words.index("USER")
     assert json.loads(dict(steps)["ENTRYPOINT"]) == ["dexkit"]
