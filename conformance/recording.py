@@ -26,6 +26,8 @@ from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.robots import RobotModel
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
+from dexkit.traces.sessions.imported import NOMINAL, absent_fields
+from dexkit.traces.sessions.imported import RECORD as IMPORTED
 
 if TYPE_CHECKING:
     from dexkit.conformance.usb.recording import UsbRecording
@@ -235,6 +237,12 @@ class Recording:
         notes = [text for text in trace.warnings if not text.startswith(own)]
         if trace.truncated:
             notes.append("the recording is unfinished; it is judged as far as it goes")
+        imported = trace.metadata.get(IMPORTED, {})
+        if imported.get("clock") == NOMINAL or any(absent_fields(imported).values()):
+            notes.append(
+                "an imported session: times that nobody measured, and fields that are 0 because "
+                "its source does not have them, say nothing of a hand"
+            )
         notes += [
             f"{views[s].states.topic} says nothing of the {s} hand (all 0), and nobody drives it: "
             f"taken for a service of one hand; --side {s} judges it all the same"

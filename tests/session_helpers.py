@@ -100,7 +100,7 @@ def streamed(found: dict[str, Any], *, end: bool = True) -> str:
     """As v1.4 writes it, item by item; without ``end`` it was interrupted."""
     text = '{\n"info": ' + json.dumps(found["info"], indent=4) + ",\n"
     text += '"text": ' + json.dumps(found["text"], indent=4) + ',\n"data": [\n'
-    text += ",\n".join(json.dumps(item, indent=4) for item in found["data"])
+    text += ",\n".join(json.dumps(item) for item in found["data"])  # there with indent=4
     return text + ("\n]\n}" if end else "")
 
 

@@ -11,6 +11,7 @@ import pytest
 from dexkit.cli.record import _episodes, _merge_episodes
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.beside import find_times
+from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.episodes import read_episode
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.resample import hold, interpolate
@@ -19,6 +20,15 @@ from tests.session_helpers import document, episode, streamed
 from tests.test_sessions_import import dexkit, streams
 
 Made = tuple[Path, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def pick(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven seconds of a Dex1 session, with the motion of :func:`beside`."""
+    out = tmp_path_factory.mktemp("wire") / "pick.mcap"
+    trace = open_trace(sample_path("dex1_pick_place"))
+    cut(trace, out, spans=[Span(trace.first_ns + 3 * 10**9, trace.first_ns + 10 * 10**9)])
+    return out
 
 
 def beside(
@@ -70,13 +80,15 @@ def test_the_true_times_are_found(tmp_path: Path, name: str, rate: float, noise:
 
 
 def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
-    folder, at = beside(tmp_path / "e", "dex3_pinch", rate=26)
-    wire = sample_path("dex3_pinch")
+    folder, at = beside(tmp_path / "e", "dex3_pinch", rate=26, seconds=3.0)
+    wire = tmp_path / "wire.mcap"
+    whole = open_trace(sample_path("dex3_pinch"))
+    cut(whole, wire, spans=[Span(int(at[0]) - 10**9, int(at[-1]) + 10**9)])
     code, output = dexkit("import", folder, tmp_path / "m.mcap", "--wire", wire)
     assert (code, "confidence 1.00" in output) == (1, True), output  # its pictures are missing
     trace = open_trace(tmp_path / "m.mcap")
     record = trace.metadata[RECORD]
-    assert (record["clock"], record["wire"]) == ("measured", "dex3_pinch.mcap")
+    assert (record["clock"], record["wire"]) == ("measured", "wire.mcap")
     assert float(record["alignment_confidence"]) > 0.9
     got, source = streams(trace), streams(open_trace(wire))
     hand = got["left_hand", STATE]
@@ -95,7 +107,7 @@ def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
     original = json.loads((folder / "data.json").read_text())["data"]
     back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())["data"]
     assert [i["idx"] for i in back] == [i["idx"] for i in original]
-    for i in (0, 50, len(at) - 1):
+    for i in (0, 30, len(at) - 1):
         item = back[i]
         t = item["timestamp_ns"]
         assert t == arm.times_ns[i]
@@ -126,10 +138,10 @@ def test_an_episode_of_another_session_is_refused(tmp_path: Path) -> None:
         assert not (tmp_path / "m.mcap").exists()
 
 
-def test_an_episode_beyond_the_recording_is_refused(tmp_path: Path) -> None:
+def test_an_episode_beyond_the_recording_is_refused(tmp_path: Path, pick: Path) -> None:
     folder, at = beside(tmp_path / "e", "dex1_pick_place", rate=28)
     part = tmp_path / "part.mcap"
-    whole = open_trace(sample_path("dex1_pick_place"))
+    whole = open_trace(pick)
     middle = (int(at[len(at) // 2]) - whole.first_ns) / 1e9
     assert dexkit("cut", whole.path, part, "--to", middle)[0] == 0
     code, output = dexkit("import", folder, tmp_path / "m.mcap", "--wire", part)
@@ -137,24 +149,22 @@ def test_an_episode_beyond_the_recording_is_refused(tmp_path: Path) -> None:
     assert "%" in output
 
 
-def test_hands_that_stand_still_tell_no_time(tmp_path: Path) -> None:
+def test_hands_that_stand_still_tell_no_time(tmp_path: Path, pick: Path) -> None:
     folder, _ = beside(tmp_path / "e", "dex1_pick_place", rate=28)
     found = json.loads((folder / "data.json").read_text())
     for item in found["data"]:
         for side in ("left", "right"):
             item["actions"][f"{side}_ee"]["qpos"] = [2.7]
     (folder / "data.json").write_text(streamed(found))
-    code, output = dexkit(
-        "import", folder, tmp_path / "m.mcap", "--wire", sample_path("dex1_pick_place")
-    )
+    code, output = dexkit("import", folder, tmp_path / "m.mcap", "--wire", pick)
     assert (code, "no joint moves" in output) == (2, True)
 
 
 def test_record_merges_what_was_written_meanwhile(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, pick: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out.mcap"
-    out.write_bytes(sample_path("dex1_pick_place").read_bytes())
+    out.write_bytes(pick.read_bytes())
     folder = tmp_path / "task"
     assert _episodes(folder) == {}
     assert not _merge_episodes(out, folder, {}, False)
@@ -163,7 +173,7 @@ def test_record_merges_what_was_written_meanwhile(
     before = _episodes(folder)
     assert set(before) == {old}
     beside(folder / "episode_0001", "dex1_pick_place", rate=28)
-    beside(folder / "episode_0002", "dex1_pick_place", rate=25, begin=5.0, end=False)
+    beside(folder / "episode_0002", "dex1_pick_place", rate=25, seconds=4.0, end=False)
     assert _merge_episodes(out, folder, before, False)
     made = sorted(p.name for p in tmp_path.glob("out_*.mcap"))
     assert made == ["out_episode_0001.mcap", "out_episode_0002.mcap"]

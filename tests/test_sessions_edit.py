@@ -191,20 +191,21 @@ def test_streams_have_the_joints_of_the_profile() -> None:
 
 
 def test_two_runs_are_aligned_and_compared(tmp_path: Path) -> None:
-    later = tmp_path / "later.mcap"
-    merge([open_trace(PICK)], later, shifts=[12.345])
+    later, first = tmp_path / "later.mcap", tmp_path / "first.mcap"
+    cut(open_trace(PICK), first, spans=[Span(T0 + 3 * 10**9, T0 + 12 * 10**9)])
+    merge([open_trace(first)], later, shifts=[12.345])
     part = tmp_path / "part.mcap"
     whole = open_trace(later)
-    cut(whole, part, spans=[Span(whole.first_ns + 2 * 10**9, whole.first_ns + 17 * 10**9)])
-    found = compare(open_trace(PICK), open_trace(part))
+    cut(whole, part, spans=[Span(whole.first_ns + 2 * 10**9, whole.first_ns + 8 * 10**9)])
+    found = compare(open_trace(first), open_trace(part))
     assert found.offset == pytest.approx(12.345, abs=2e-3)
     assert found.equal
     assert {j.joint for j in found.joints} == {"left_gripper", "right_gripper"}
     assert all(j.worst < 0.03 for j in found.joints)
-    code, text = dexkit("diff", PICK, part, "--json")
+    code, text = dexkit("diff", first, part, "--json")
     assert code == 0
     assert json.loads(text)["equal"] is True
-    moved = compare(open_trace(PICK), open_trace(part), offset=12.0, tolerance=0.1)
+    moved = compare(open_trace(first), open_trace(part), offset=12.0, tolerance=0.1)
     assert not moved.equal
     assert moved.joints[0].first_at is not None
 

@@ -17,10 +17,12 @@ from PIL import Image
 
 from dexkit.messages import message_type
 from dexkit.traces import open_trace, sample_path
+from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.frames import open_source, sample
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.lerobot_out import statistics
+from dexkit.traces.sessions.model import picture_topic
 from dexkit.traces.sessions.streams import COMMAND, STATE
 from dexkit.traces.writer import RecordingWriter, definition
 from tests.each import each
@@ -180,6 +182,14 @@ def test_pictures_are_taken_over_as_they_are(tmp_path: Path, cameras: int) -> No
             assert np.array(stats["mean"]).shape == (3, 1, 1)
             assert stats["min"][0][0][0] == 0.0
             assert stats["max"][1][0][0] == pytest.approx(c / 255)
+        # and back
+        back = tmp_path / f"b{len(options)}.mcap"
+        assert dexkit("import", out, back)[0] == 0
+        for c in range(cameras):
+            got = open_trace(back).messages([picture_topic(f"color_{c}")])
+            assert [ros_types.decode_compressed_image(m.data).data for m in got] == [
+                made[c, i] for i in range(20)
+            ]
     (source / "colors" / "5_0.png").write_bytes(png(4, 4))
     code, output = dexkit(
         "export", tmp_path / "r0.mcap", "--to", "lerobot", "--out", tmp_path / "x"

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from dexkit.cli import cli
+from dexkit.conformance.recording import Recording
 from dexkit.errors import DexkitError, SessionError
 from dexkit.hand import Side
 from dexkit.messages import message_type
@@ -194,8 +195,8 @@ def test_nothing_to_import_is_an_error(tmp_path: Path) -> None:
 
 
 def test_swapped_states_are_exchanged_and_told(tmp_path: Path) -> None:
-    good = document(hand=6, frames=120, cameras=0, named=True)
-    bad = document(hand=6, frames=120, cameras=0, named=True, swapped=True)
+    good = document(hand=6, frames=90, cameras=0, named=True)
+    bad = document(hand=6, frames=90, cameras=0, named=True, swapped=True)
     trace = imported(tmp_path, whole(bad))
     record = trace.metadata[RECORD]
     assert "exchanged" in record["correction 1"]
@@ -211,7 +212,7 @@ def test_swapped_states_are_exchanged_and_told(tmp_path: Path) -> None:
 
 
 def test_grippers_with_swapped_order_are_found_in_the_data(tmp_path: Path) -> None:
-    trace = imported(tmp_path, streamed(document(400, "dex1-1", cameras=0, swapped=True)))
+    trace = imported(tmp_path, streamed(document(200, "dex1-1", cameras=0, swapped=True)))
     assert "mixed up the order" in trace.metadata[RECORD]["correction 1"]
 
 
@@ -621,3 +622,10 @@ def test_the_standard_types_are_those_of_ros() -> None:
     )
     data = ros_types.encode_string("text")
     assert store.deserialize_cdr(data, "std_msgs/msg/String").data == "text"
+
+
+def test_check_says_that_a_session_was_imported(tmp_path: Path) -> None:
+    source = episode(tmp_path / "e", streamed(document(frames=90, cameras=0)))
+    assert dexkit("import", source, tmp_path / "e.mcap")[0] == 0
+    notes = Recording.decode(open_trace(tmp_path / "e.mcap")).notes
+    assert any("an imported session" in note for note in notes)

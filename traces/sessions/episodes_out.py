@@ -80,11 +80,10 @@ def export_episodes(
 
 
 def _text(info: Any, text: Any, items: Sequence[Any]) -> str:
-    def dump(value: Any) -> str:
-        return json.dumps(value, ensure_ascii=False, indent=4)
-
-    frames = ",\n".join(map(dump, items))
-    return f'{{\n"info": {dump(info)},\n"text": {dump(text)},\n"data": [\n{frames}\n]\n}}'
+    """The file as xr_teleoperate lays it out, but for an item in one line."""
+    head = (json.dumps(value, ensure_ascii=False, indent=4) for value in (info, text))
+    frames = ",\n".join(json.dumps(item, ensure_ascii=False) for item in items)
+    return '{{\n"info": {},\n"text": {},\n"data": [\n{}\n]\n}}'.format(*head, frames)
 
 
 Episode = tuple[Any, Any, "list[dict[str, Any]]", "list[tuple[str, bytes]]"]

@@ -354,7 +354,10 @@ class Dataset:
                 continue
             name = key.removeprefix(PICTURES)
             if kind == "image":
-                problems.add(f"{name}: pictures inside the Parquet file are not taken over")
+                if (camera := _embedded(name, key, table)) is None:
+                    problems.add(f"{name}: its pictures are not in the Parquet file")
+                else:
+                    yield camera
                 continue
             chunks = self.info.get("chunks_size")
             size = chunks if isinstance(chunks, int) and chunks > 0 else 1000
@@ -411,6 +414,18 @@ class Dataset:
             return []
         numbers = dict.fromkeys(table["task_index"].to_pylist())
         return [self._tasks[n] for n in numbers if n in self._tasks]
+
+
+def _embedded(name: str, key: str, table: Any) -> Camera | None:
+    """A camera whose pictures are in the table; None if they are not."""
+    if key not in table.column_names:
+        return None
+    rows = table[key].to_pylist()
+    data = [r.get("bytes") if isinstance(r, dict) else None for r in rows]
+    if not any(isinstance(d, bytes) for d in data):
+        return None
+    paths = tuple(f"frame {i}" for i in range(len(data)))
+    return Camera(name, paths, load=lambda i: data[i] if isinstance(data[i], bytes) else None)
 
 
 def _read_json(path: Path) -> Any:

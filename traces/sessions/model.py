@@ -116,12 +116,14 @@ class Camera:
     :param paths: relative to the session's folder; empty where the frame has none.
     :param group: ``colors`` or ``depths``.
     :param seconds: of a video, the time within the file at each frame; None for single pictures.
+    :param load: of pictures without files of their own, the picture of a frame; they are embedded.
     """
 
     name: str
     paths: tuple[str, ...]
     group: str = "colors"
     seconds: tuple[float, ...] | None = None
+    load: Callable[[int], bytes | None] | None = None
 
 
 @dataclass(eq=False)
@@ -206,8 +208,9 @@ def messages(
             if kind in part.values:
                 sources.append(_part_channel(writer, session, part, kind))
     for camera in session.cameras:
-        sources.append(_reference_channel(writer, camera))
-        if embed and camera.seconds is None:
+        if camera.load is None:
+            sources.append(_reference_channel(writer, camera))
+        if camera.load is not None or (embed and camera.seconds is None):
             sources.append(_picture_channel(writer, session, camera))
     if any(session.rest):
         channel = writer.add_channel(ros_types.STRING.definition(REST_TOPIC))
@@ -353,14 +356,21 @@ def _reference_channel(
 def _picture_channel(
     writer: RecordingWriter, session: Session, camera: Camera
 ) -> tuple[int, Callable[[int], bytes | None]]:
-    from dexkit.traces.sessions.pictures import read_picture
+    from dexkit.traces.sessions.pictures import Picture, parse_picture, read_picture
 
     channel = writer.add_channel(ros_types.COMPRESSED_IMAGE.definition(picture_topic(camera.name)))
+
+    def load(i: int) -> tuple[Picture | None, str]:
+        if camera.load is None:
+            return read_picture(session.folder, camera.paths[i])
+        data = camera.load(i)
+        picture = parse_picture(data) if data is not None else None
+        return picture, "are missing, or neither JPEG nor PNG"
 
     def encode(i: int) -> bytes | None:
         if not camera.paths[i]:
             return None
-        picture, why = read_picture(session.folder, camera.paths[i])
+        picture, why = load(i)
         if picture is None:
             session.problems.add(f"{camera.name}: pictures that {why}", camera.paths[i])
             return None
