@@ -1,8 +1,9 @@
 """Make an archive of recorded sessions whose faults are known, to score an audit with.
 
-Sessions are the shipped samples again and again until the asked length, with seeded variations:
-which sample, when, which robot and operator, how late each message was received. Some have a
-fault. ``answers.json`` beside them says which file has which, and what an audit must find.
+Sessions are the shipped samples, a part of each again and again until the asked length, with
+seeded variations: which sample, when, which robot and operator, how late each message was
+received. Some have a fault. ``answers.json`` beside them says which file has which, and what an
+audit must find.
 """
 
 from __future__ import annotations
@@ -77,6 +78,11 @@ class Session:
     prefix: str
     topics: dict[str, Topic]
 
+    @property
+    def joints(self) -> int:
+        """Joints of a hand."""
+        return 7 if self.prefix == "DEX3" else 1
+
     def topic(self, side: str, what: str) -> Topic:
         """The states or commands of a side."""
         return next(t for n, t in self.topics.items() if f"/{side}/" in n and n.endswith(what))
@@ -108,18 +114,54 @@ class Session:
 
 
 def load(sample: str, seconds: float) -> Session:
-    """A sample again and again; what follows begins where the last turn ended, in time."""
+    """A sample, of which a part is played again and again until the session has that length."""
     trace = open_trace(sample_path(sample))
-    length = trace.last_ns - trace.first_ns + 2_000_000
-    turns = np.arange(max(1, round(seconds * 1e9 / length))) * length
     topics = {}
     for name, samples in trace.load().items():
         payloads = np.frombuffer(b"".join(samples.payloads), np.uint8)
-        payloads = np.tile(payloads.reshape(len(samples), -1), (len(turns), 1))
-        log = (samples.log_time_ns - trace.first_ns + turns[:, None]).ravel()
-        publish = (samples.publish_time_ns - trace.first_ns + turns[:, None]).ravel()
-        topics[name] = Topic(name, samples.type_name, log, publish, payloads)
-    return Session(_SAMPLES[sample], topics)
+        log, publish = (t - trace.first_ns for t in (samples.log_time_ns, samples.publish_time_ns))
+        topics[name] = Topic(
+            name, samples.type_name, log, publish, payloads.reshape(len(samples), -1).copy()
+        )
+    session = Session(_SAMPLES[sample], topics)
+    missing = seconds * 1e9 - (trace.last_ns - trace.first_ns)
+    if missing > 0.0:
+        begin, end = _loop(session)
+        _repeat(session, begin, end, round(missing / (end - begin)))
+    return session
+
+
+def _loop(session: Session) -> tuple[int, int]:
+    """Begin and end, ns, of a part after which the hands and their commands are where they were
+    at its begin, so that it can be played twice without a jump.
+    """
+    last = min(int(t.log[-1]) for t in session.topics.values())
+    grid = np.arange(1_500_000_000, last - 200_000_000, 20_000_000)
+    columns = []
+    for topic in session.topics.values():
+        rows = np.searchsorted(topic.log, grid) - 1
+        for joint in range(session.joints):
+            columns.append(topic.member("q", joint)[rows])
+            columns.append(topic.member("dq", joint)[rows] * np.float32(0.02))
+    worst = np.zeros((len(grid), len(grid)), dtype=np.float32)
+    for column in columns:
+        np.maximum(worst, np.abs(column[:, None] - column), out=worst)
+    worst[grid[None, :] - grid[:, None] < 5_000_000_000] = np.inf
+    first, second = np.unravel_index(int(np.argmin(worst)), worst.shape)
+    return int(grid[first]), int(grid[second])
+
+
+def _repeat(session: Session, begin: int, end: int, times: int) -> None:
+    """Play the part from ``begin`` to ``end``, ns, so many times more."""
+    for topic in session.topics.values():
+        first, second = np.searchsorted(topic.log, [begin, end]).tolist()
+        again = np.tile(np.arange(first, second), times)
+        rows = np.concatenate([np.arange(second), again, np.arange(second, len(topic.log))])
+        turns = np.repeat(np.arange(1, times + 1), second - first)
+        rest = np.full(len(topic.log) - second, times)
+        later = np.concatenate([np.zeros(second, np.int64), turns, rest]) * (end - begin)
+        topic.log, topic.publish = topic.log[rows] + later, topic.publish[rows] + later
+        topic.payloads = topic.payloads[rows]
 
 
 Random = np.random.Generator
@@ -186,7 +228,7 @@ def _out_of_stroke(session: Session, side: str, random: Random) -> None:
 def _frozen(session: Session, side: str, random: Random) -> None:
     states = session.topic(side, "/state")
     rows = _moving(states, random, 0.5)
-    for joint in range(7 if session.prefix == "DEX3" else 1):
+    for joint in range(session.joints):
         for name in ("q", "dq", "tau_est"):
             values = states.member(name, joint)
             values[rows] = values[rows.start]
@@ -199,7 +241,7 @@ def _order(session: Session, side: str, random: Random) -> None:
 
 
 def _turned(session: Session, side: str, random: Random) -> None:
-    for joint in range(7 if session.prefix == "DEX3" else 1):
+    for joint in range(session.joints):
         session.topic(side, "/state").member("dq", joint)[:] *= -1
 
 
@@ -239,12 +281,22 @@ def _damage(data: bytes, random: Random) -> bytes:
 
 
 FAULTS = (
-    # where states are missing, the hand seems to follow late
+    # TRACK-01: where q is missing or wrong, the hand seems not to follow
     Fault("gap", _gap, ("RATE-03",), ("FIELD-15", "RATE-05", "RATE-04", "TRACK-01")),
     Fault("slow", _slow, ("RATE-01",), ("RATE-02", "RATE-04", "FRESH-01", "RATE-05")),
     Fault("nan", _nan, ("FIELD-02",)),
-    Fault("out-of-stroke", _out_of_stroke, ("FIELD-03",), ("FIELD-14", "FIELD-15", "FIELD-17")),
-    Fault("frozen", _frozen, ("FRESH-02", "FIELD-15", "FRESH-01"), ("FIELD-16", "FIELD-17")),
+    Fault(
+        "out-of-stroke",
+        _out_of_stroke,
+        ("FIELD-03",),
+        ("FIELD-14", "FIELD-15", "FIELD-17", "TRACK-01"),
+    ),
+    Fault(
+        "frozen",
+        _frozen,
+        ("FRESH-02", "FIELD-15", "FRESH-01"),
+        ("FIELD-16", "FIELD-17", "TRACK-01"),
+    ),
     Fault("order", _order, ("ORDER-01",)),
     Fault("turned", _turned, ("FIELD-04", "FIELD-16"), ("FIELD-17",)),
     Fault("short", _short, ("FIELD-01",)),
