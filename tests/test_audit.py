@@ -370,3 +370,39 @@ def test_without_fsspec_a_url_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(__import__("sys").modules, "fsspec", None)
     with pytest.raises(DexkitError, match="needs fsspec"):
         list(sessions.find("s3://bucket"))
+
+
+def test_a_generated_archive_is_scored(tmp_path: Path) -> None:
+    """Every fault is found in a short session of each sample, and nothing else is blamed."""
+    from tools.generate_archive import FAULTS, generate
+    from tools.generate_archive.score import score
+
+    archive = tmp_path / "archive"
+    count = len(FAULTS) + 1
+    answers = generate(archive, count, len(FAULTS), seconds=1, samples=["dex1_pick_place"])
+    assert sorted(a.fault for a in answers) == ["", *sorted(f.name for f in FAULTS)]
+    audited(archive, tmp_path / "out")
+    found = score(archive, tmp_path / "out")
+    assert (found.text(), found.perfect) == (found.text(), True)
+    assert (found.good, found.found) == (1, len(FAULTS))
+
+
+def test_a_score_names_what_is_missed_and_wrongly_blamed(tmp_path: Path) -> None:
+    from tools.generate_archive import generate
+    from tools.generate_archive.score import score
+
+    archive = tmp_path / "archive"
+    answers = generate(archive, 2, 1, seconds=1, samples=["dex1_pick_place"])
+    again = generate(tmp_path / "again", 2, 1, seconds=1, samples=["dex1_pick_place"])
+    assert again == answers
+    for answer in answers:
+        twins = [(folder / answer.file).read_bytes() for folder in (archive, tmp_path / "again")]
+        assert twins[0] == twins[1]
+    for answer in answers:  # the faulty file is good, and the other way round
+        copied(archive, answer.file, "dex1_legacy_v1_1" if answer.fault else "dex1_hand_dropout")
+    audited(archive, tmp_path / "out")
+    found = score(archive, tmp_path / "out")
+    assert (found.found, len(found.missed), found.unread) == (0, 1, [])
+    assert len(found.blamed) == 1
+    assert "DEX1-RATE-03 left" in found.blamed[0]
+    assert not found.perfect
