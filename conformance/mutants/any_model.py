@@ -541,7 +541,7 @@ class OneWatchdogForBoth(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-ABUSE-01", "DEX3-ABUSE-01"), also=("DEX1-TRACK-02",))
+@wrong_hand(("DEX1-ABUSE-01", "DEX3-ABUSE-01"), also=("DEX1-TRACK-02", "DEX1-FORCE-09"))
 class WeakAfterNan(Service):
     """Uses a quarter of the stiffness since it has got a command that is not finite."""
 

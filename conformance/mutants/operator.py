@@ -226,6 +226,6 @@ class Springs(_OpenEnd, FingerService):
 
 @wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02", "DEX3-CMD-01"))
 # its delay is long compared with the steps of the light joints
-@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02", "DEX5-CMD-01"))
+@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02", "DEX5-CMD-01", "DEX5-GAIN-05"))
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
