@@ -187,7 +187,9 @@ class Dataset:
     def _open(self, path: Path) -> Any:
         if path not in self._tables:
             try:
-                self._tables = {path: self._parquet.read_table(path)}
+                table = self._parquet.read_table(path)
+                table.column_names  # noqa: B018 - decodes them
+                self._tables = {path: table}
             except FileNotFoundError:
                 raise SessionError(f"{path} is missing") from None
             except (OSError, ValueError, self._arrow_error) as error:
