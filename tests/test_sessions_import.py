@@ -164,6 +164,27 @@ def test_what_is_wrong_with_items_is_told_and_the_rest_stays(tmp_path: Path) -> 
     assert t[-1] - t[0] == round(29 * 1e9 / 30)
 
 
+def test_names_and_texts_that_no_file_can_hold_are_kept_as_json(tmp_path: Path) -> None:
+    found = document(frames=3, cameras=0)
+    found["text"]["goal"] = "half \ud800"
+    for item in found["data"]:
+        item["sim_state"] = "\ud800"
+        item["colors"] = {"../a": "x.jpg", "color_0": "\ud800.jpg"}
+        item["states"]["a/b"] = {"qpos": [1.0]}
+        item["states"]["left_arm"]["qpos"][0] = 1e308
+    trace = imported(tmp_path, json.dumps(found))
+    rest = json.loads(ros_types.decode_string(next(trace.messages([REST_TOPIC])).data))
+    assert rest["states"]["a/b"] == {"qpos": [1.0]}
+    assert rest["sim_state"] == "\ud800"
+    assert rest["colors"]["../a"] == "x.jpg"
+    code, output = dexkit("export", tmp_path / "e.mcap", "--to", "lerobot", "--out", tmp_path / "d")
+    assert (code, "no float32 can hold" in output) == (2, True)
+    code, _ = dexkit("export", tmp_path / "e.mcap", "--to", "episodes", "--out", tmp_path / "t")
+    assert code == 0
+    back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())
+    assert back == found
+
+
 def test_several_episodes_become_a_folder_of_recordings(tmp_path: Path) -> None:
     for task, goal in (("cup", "take the cup"), ("door", "open the door")):
         for i in range(2):

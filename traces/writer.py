@@ -73,8 +73,8 @@ class RecordingWriter:
             self.close()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a metadata record."""
-        self._writer.add_metadata(name, dict(values))
+        """Write a metadata record; what UTF-8 cannot hold is escaped."""
+        self._writer.add_metadata(_utf8(name), {_utf8(k): _utf8(v) for k, v in values.items()})
 
     def add_channel(self, channel: Definition) -> int:
         """Write a channel; :meth:`put` takes the number that is returned.
@@ -89,7 +89,10 @@ class RecordingWriter:
                 self._schemas[channel.schema] = self._writer.register_schema(*channel.schema)
             schema = self._schemas[channel.schema]
         number = self._writer.register_channel(
-            channel.topic, channel.message_encoding, schema, channel.metadata
+            _utf8(channel.topic),
+            channel.message_encoding,
+            schema,
+            {_utf8(k): _utf8(v) for k, v in channel.metadata.items()},
         )
         self._counts[number] = 0
         return number
@@ -127,3 +130,7 @@ class RecordingWriter:
             self._file.commit()
         except OSError as error:
             raise TraceError(f"cannot write {self.path}: {error.strerror or error}") from error
+
+
+def _utf8(text: str) -> str:
+    return text.encode("utf-8", "backslashreplace").decode()

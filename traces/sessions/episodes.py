@@ -366,7 +366,7 @@ def _parts(items: Sequence[dict[str, Any]], problems: Problems) -> tuple[list[Pa
         for key in _DIRECTIONS:
             group = item.get(key)
             if isinstance(group, dict):
-                names.update(dict.fromkeys(n for n in group if isinstance(n, str)))
+                names.update(dict.fromkeys(n for n in group if _is_name(n, problems)))
             elif group is not None:
                 problems.add(f"'{key}' is no object", _place(item))
     parts, carried = [], Carried()
@@ -391,6 +391,16 @@ def _parts(items: Sequence[dict[str, Any]], problems: Problems) -> tuple[list[Pa
         elif values:
             parts.append(Part(_HANDS.get(name, name), _joint_names(name, count), values))
     return parts, carried
+
+
+def _is_name(name: str, problems: Problems) -> bool:
+    """Whether it can be a part of a topic."""
+    if re.fullmatch(r"\w{1,64}", name, re.ASCII):
+        return True
+    problems.add(
+        "parts and cameras whose names are no words are kept as JSON only", repr(name[:40])
+    )
+    return False
 
 
 def _joint_names(part: str, count: int) -> tuple[str, ...]:
@@ -498,7 +508,7 @@ def _cameras(items: Sequence[dict[str, Any]], folder: Path, problems: Problems) 
         for key in _PICTURES:
             group = item.get(key)
             if isinstance(group, dict):
-                names.update(dict.fromkeys((key, n) for n in group))
+                names.update(dict.fromkeys((key, n) for n in group if _is_name(n, problems)))
     for key, name in names:
         paths = []
         for item in items:

@@ -62,7 +62,7 @@ def export_episodes(
                         if target is not None:
                             target.parent.mkdir(parents=True, exist_ok=True)
                             target.write_bytes(data)
-                    (folder / "data.json").write_text(_text(info, text, items), encoding="utf-8")
+                    (folder / "data.json").write_bytes(_text(info, text, items))
                     result.episodes += 1
                     result.frames += len(items)
             except SessionError as error:
@@ -79,11 +79,12 @@ def export_episodes(
     return result
 
 
-def _text(info: Any, text: Any, items: Sequence[Any]) -> str:
+def _text(info: Any, text: Any, items: Sequence[Any]) -> bytes:
     """The file as xr_teleoperate lays it out, but for an item in one line."""
     head = (json.dumps(value, ensure_ascii=False, indent=4) for value in (info, text))
     frames = ",\n".join(json.dumps(item, ensure_ascii=False) for item in items)
-    return '{{\n"info": {},\n"text": {},\n"data": [\n{}\n]\n}}'.format(*head, frames)
+    text = '{{\n"info": {},\n"text": {},\n"data": [\n{}\n]\n}}'.format(*head, frames)
+    return str(text).encode("utf-8", "backslashreplace")
 
 
 Episode = tuple[Any, Any, "list[dict[str, Any]]", "list[tuple[str, bytes]]"]

@@ -159,15 +159,16 @@ def _pictures(trace: Trace, lost: list[str]) -> list[Pictures]:
         names = []
     folder = Path(record.get("pictures_folder", "."))
     found = []
+    filled = {c.topic for c in trace.channels if c.message_count}
     for name in names:
         embedded = ros_types.group_topic(name, "compressed")
         referenced = ros_types.group_topic(name, "reference")
-        if embedded in trace.topics:
+        if embedded in filled:
             messages = list(trace.messages([embedded]))
             data = [ros_types.decode_compressed_image(m.data).data for m in messages]
             times = np.array([m.log_time_ns for m in messages], dtype=np.int64)
             found.append(Pictures(name, times, lambda i, data=data: data[i]))  # type: ignore[misc]
-        elif referenced in trace.topics:
+        elif referenced in filled:
             messages = list(trace.messages([referenced]))
             entries = [_reference(ros_types.decode_string(m.data)) for m in messages]
             if any("seconds" in e for e in entries):

@@ -160,7 +160,7 @@ class Dataset:
         if not path.is_file():
             return {}
         found = {}
-        for row in self._open(path).to_pylist():
+        for row in _table_rows(path, self._open(path)):
             texts = [v for v in row.values() if isinstance(v, str)]
             if isinstance(row.get("task_index"), int) and texts:
                 found[row["task_index"]] = texts[0]
@@ -176,7 +176,7 @@ class Dataset:
             for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
                 table = self._open(path)
                 wanted = [c for c in table.column_names if not c.startswith("stats/")]
-                rows += table.select(wanted).to_pylist()
+                rows += _table_rows(path, table.select(wanted))
         found = {
             row["episode_index"]: row for row in rows if isinstance(row.get("episode_index"), int)
         }
@@ -187,7 +187,9 @@ class Dataset:
     def _open(self, path: Path) -> Any:
         if path not in self._tables:
             try:
-                self._tables = {path: self._parquet.read_table(path)}
+                table = self._parquet.read_table(path)
+                table.column_names  # noqa: B018 - decodes them
+                self._tables = {path: table}
             except FileNotFoundError:
                 raise SessionError(f"{path} is missing") from None
             except (OSError, ValueError, self._arrow_error) as error:
@@ -414,6 +416,18 @@ class Dataset:
             return []
         numbers = dict.fromkeys(table["task_index"].to_pylist())
         return [self._tasks[n] for n in numbers if n in self._tasks]
+
+
+def _table_rows(path: Path, table: Any) -> list[dict[str, Any]]:
+    """The rows of a table.
+
+    :raises SessionError: a text in it is not UTF-8.
+    """
+    try:
+        found: list[dict[str, Any]] = table.to_pylist()
+    except ValueError as error:
+        raise SessionError(f"{path} cannot be read: {error}") from error
+    return found
 
 
 def _embedded(name: str, key: str, table: Any) -> Camera | None:

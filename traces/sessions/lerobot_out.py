@@ -77,7 +77,8 @@ class _Feature:
             tables = [frames.pressure[p] for p in self.parts]
         else:
             tables = [frames.values[p, self.kind, self.field] for p in self.parts]
-        return np.concatenate(tables, axis=1).astype(np.float32)
+        with np.errstate(over="ignore"):
+            return np.concatenate(tables, axis=1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,9 @@ class _Writer:
         elif scheme != self._scheme:
             raise SessionError("it has other joints, fields or cameras than the first recording")
         runs, told = sample(source, self.result.fps)
+        for feature in scheme.features:
+            if not all(np.isfinite(feature.matrix(frames)).all() for frames in runs):
+                raise SessionError(f"{name}: {feature.name} has values that no float32 can hold")
         # before anything is written: a picture that cannot be read refuses the whole recording
         pictures = [_load(source, frames, scheme) for frames in runs]
         self._scheme = scheme
@@ -498,7 +502,8 @@ def _combined(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def _write_json(path: Path, document: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(document, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(document, indent=4, ensure_ascii=False) + "\n"
+    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def describe(result: Result) -> str:

@@ -34,8 +34,11 @@ def safe_path(folder: Path, name: str) -> Path | None:
     pure = PurePosixPath(name.replace("\\", "/"))
     if not name or "\x00" in name or pure.is_absolute() or ".." in pure.parts:
         return None
-    root = os.path.realpath(folder)
-    found = os.path.realpath(os.path.join(root, *pure.parts))
+    try:
+        root = os.path.realpath(folder)
+        found = os.path.realpath(os.path.join(root, *pure.parts))
+    except ValueError:  # not a name that a file can have
+        return None
     return Path(found) if os.path.commonpath([root, found]) == root else None
 
 

@@ -118,7 +118,8 @@ class _Out:
         self._data += struct.pack(f"<{form}", value)
 
     def text(self, text: str) -> None:
-        data = text.encode()
+        # half a surrogate pair, which JSON can hold, becomes JSON's escape of it
+        data = text.encode("utf-8", "backslashreplace")
         self.number("I", len(data) + 1)
         self._data += data + b"\x00"
 

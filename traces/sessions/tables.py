@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.documents import write_file
-from dexkit.errors import SessionError
+from dexkit.errors import DexkitError, ExtraMissing, SessionError
 from dexkit.messages import MessageType, message_type
 from dexkit.messages.columns import encode_columns
 from dexkit.messages.layout import Primitive, Struct
@@ -249,7 +249,9 @@ def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[
         for entry in topics:
             try:
                 channel, found = _import_topic(source, entry, problems)
-            except SessionError as error:
+            except DexkitError as error:
+                if isinstance(error, ExtraMissing):
+                    raise
                 problems.add(error.message)
                 continue
             number = writer.add_channel(channel)
@@ -277,6 +279,8 @@ def _import_topic(
     header, columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     if header[:2] != list(_TIMES):
         raise SessionError(f"{name} does not begin with the columns {', '.join(_TIMES)}")
+    given = entry.get("metadata")
+    metadata = {str(k): str(v) for k, v in given.items()} if isinstance(given, dict) else {}
     found: list[tuple[int, int, bytes]] = []
     if entry.get("columns") == "payload":
         schema = entry.get("schema")
@@ -284,7 +288,7 @@ def _import_topic(
             channel = Definition(
                 topic,
                 str(entry.get("message_encoding", "cdr")),
-                dict(entry.get("metadata", {})),
+                metadata,
                 None
                 if schema is None
                 else (str(schema[0]), str(schema[1]), base64.b64decode(schema[2])),
@@ -299,7 +303,7 @@ def _import_topic(
                 problems.add(f"{name}: rows that cannot be read are left out", f"row {line}")
         return channel, found
     mt = message_type(str(entry.get("type", "")))
-    channel = definition(topic, mt, dict(entry.get("metadata", {})))
+    channel = definition(topic, mt, metadata)
     found, bad = _encode(mt, header, columns, name)
     for number in bad:
         problems.add(f"{name}: rows that cannot be read are left out", f"row {number + 2}")
@@ -417,4 +421,7 @@ def _read_parquet(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
     except (OSError, ValueError, arrow.lib.ArrowException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
-    return list(table.column_names), [c.to_pylist() for c in table.columns]
+    try:
+        return list(table.column_names), [c.to_pylist() for c in table.columns]
+    except UnicodeDecodeError as error:
+        raise SessionError(f"{path} has a text that is not UTF-8") from error
