@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
 from dexkit.cli import main
 from dexkit.conformance.audit import sessions
@@ -221,7 +222,7 @@ def test_a_journal_is_an_audits_own(tmp_path: Path) -> None:
 
 def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Judged as files are; one vanishes, one is refused, one is too large: rows."""
-    memory = pytest.importorskip("fsspec.implementations.memory").MemoryFileSystem()
+    memory = MemoryFileSystem()
     data = small(tmp_path / "local.mcap").read_bytes()
     names = ("good", "gone", "refused", "broken", "large")
     for name in names:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -82,7 +83,7 @@ def test_selection(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "DEX1-RATE-01" in out
     assert "DEX1-RATE-02" not in out
-    assert "(3 of 84 requirements: 3 pass)" in out
+    assert re.search(r"\(3 of \d\d requirements: 3 pass\)", out)
     assert check(sample_path("dex1_pick_place"), "--require", "DEX7") == 2
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-QOS-02", "--level", "must") == 2
 

@@ -99,6 +99,8 @@ def test_every_verdict() -> None:
     for name in ("DEX1-FIELD-06", "DEX1-FIELD-08"):  # ddq and temperature
         assert "not filled (0 throughout)" in reasons.pop(name)
     assert "does not say what was between the fingers" in reasons.pop("DEX1-FORCE-07")
+    # no client starts from rest here
+    assert "no step from rest" in reasons.pop("DEX1-FORCE-08")
     for name, reason in reasons.items():
         assert "only a live run" in reason or "does not apply to the dialect" in reason, name
 

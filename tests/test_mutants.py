@@ -25,7 +25,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
     ("dialect", "sides"),
     [
         ("unitree_go", BOTH),
-        ("unitree_go", LEFT),
+        pytest.param("unitree_go", LEFT, marks=pytest.mark.soak),
         ("unitree_hg", BOTH),
         ("unitree_actuator", BOTH),
         ("dex3", BOTH),

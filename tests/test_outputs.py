@@ -37,8 +37,12 @@ _INPUTS = {
     "--key",
     "--page",
     "--public-key",
+    "--wire",
+    "--beside-episodes",
 }
 _ELSEWHERE = {
+    ("audit", "--out"),  # a folder: tests/test_audit.py
+    ("export", "--out"),  # one, too: tests/test_sessions_export.py
     ("demo", "--out"),  # a folder, made before anything starts
     ("install-service", "--directory"),  # tests/test_install_service.py
     ("setup-dds", "--wheel"),  # tests/test_setup_dds.py

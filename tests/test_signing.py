@@ -140,7 +140,8 @@ def test_what_was_signed_is_verified(signed: Signed) -> None:
     results = json.loads(signed.result.read_text())
     count = len(results["results"]) + len(results["client"]["results"])
     assert f"all {count} verdicts are those of the result" in out
-    assert "its verdict: fail (84 requirements); drop-in fail, safety not judged" in out
+    judged = len({r["id"] for r in results["results"]})
+    assert f"its verdict: fail ({judged} requirements); drop-in fail, safety not judged" in out
     assert "not that the hand is good" in out
 
 

@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -52,65 +52,33 @@ def served(backend: str, side: str) -> Iterator[int]:
 
 
 @pytest.fixture(scope="module")
-def dex1() -> Iterator[int]:
-    with served("sim-dex1", "both") as domain:
-        yield domain
+def server() -> Iterator[Callable[[str], int]]:
+    """Serves both hands of a backend, one backend at a time; returns its domain."""
+    running: dict[str, int] = {}
+    with ExitStack() as stack:
+
+        def serve(backend: str) -> int:
+            if backend not in running:
+                stack.close()
+                running.clear()
+                running[backend] = stack.enter_context(served(backend, "both"))
+            return running[backend]
+
+        yield serve
 
 
-@pytest.fixture(scope="module")
-def dex3() -> Iterator[int]:
-    with served("sim-dex3", "both") as domain:
-        yield domain
+@pytest.fixture
+def dex1(server: Callable[[str], int]) -> int:
+    return server("sim-dex1")
+
+
+@pytest.fixture
+def dex3(server: Callable[[str], int]) -> int:
+    return server("sim-dex3")
 
 
 def teleop(*arguments: object) -> Result:
     return CliRunner().invoke(cli, ["teleop", *map(str, arguments)])
-
-
-def test_a_stroke_of_both_grippers_is_measured_and_recorded(dex1: int, tmp_path: Path) -> None:
-    path = tmp_path / "stroke.mcap"
-    result = teleop(
-        *("full-stroke", "--domain", dex1, "--duration", 4.0, "--record", path, "--json")
-    )
-    assert result.exit_code == 0, result.output
-    assert "ready: full-stroke on unitree_go" in result.stderr
-    data = json.loads(result.stdout)
-    for side in ("left", "right"):
-        found = data["sides"][side]
-        assert found["client_hz"] < 201  # what it is above 0 depends on the machine
-        assert found["joints"]["gripper"]["stroke_s"] > 0.5  # the lead of 0.18 rad limits it
-    recording = Recording.decode(open_trace(path))
-    for side in Side:
-        commands, states = recording.sides[side].commands, recording.sides[side].states
-        assert set(commands.kp[:, 0]) == {5.0}
-        assert set(commands.mode[:, 0]) == {0.0}
-        assert float(np.ptp(states.q[:, 0])) > 4.0
-        # each command is a short lead on a state, but for states that came meanwhile
-        at = np.clip(np.searchsorted(states.t, commands.t) - 1, 0, None)
-        assert np.median(np.abs(commands.q[:, 0] - states.q[at, 0])) < 0.3
-
-
-def test_fist_profile_moves_a_dex3(dex3: int) -> None:
-    result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
-    assert result.exit_code == 0, result.output
-    lines = result.stdout.splitlines()
-    assert any(line.startswith("left: the client ran at") for line in lines)
-    assert any("middle_0: " in line for line in lines)
-
-
-def test_other_publisher_is_refused_unless_forced(dex1: int) -> None:
-    topic = DIALECTS["unitree_go"].topics(LEFT)[0]
-    with DdsNode(domain=dex1, interface="lo") as other:
-        other.writer(topic, DIALECTS["unitree_go"].cmd_type)
-        script = [*TELEOP, "steps", "--domain", str(dex1)]
-        refused = subprocess.run(script, capture_output=True, text=True, timeout=60)
-        assert refused.returncode == 1
-        assert f"already commands {topic} on domain {dex1}" in refused.stderr
-        assert "--force" in refused.stderr
-        forced = subprocess.run(
-            [*script, "--force", "--duration", "0.5"], capture_output=True, text=True, timeout=60
-        )
-        assert forced.returncode == 0, forced.stderr
 
 
 def test_missing_side_is_named_with_a_hint() -> None:
@@ -141,37 +109,55 @@ def test_hint_is_printed_once_after_five_seconds(capsys: pytest.CaptureFixture[s
         assert said.count(f"'dexkit doctor --domain {node.domain}' reports what is wrong") == 1
 
 
-def test_hands_of_another_dialect_are_named(dex3: int) -> None:
-    result = teleop("full-stroke", "--domain", dex3, "--wait", 1.0)
-    assert isinstance(result.exception, DexkitError)
-    assert result.exception.exit_code == 1
-    assert result.exception.hint == "there are hands with the dialect dex3: --dialect dex3"
+def test_profiles_are_listed_without_a_hand() -> None:
+    result = teleop("--list")
+    assert result.exit_code == 0
+    for name in ("full-stroke", "pick-place", "startle", "pinch", "fist"):
+        assert f"  {name} " in result.stdout
+    unknown = teleop("juggle")
+    assert unknown.exit_code != 0
+    assert unknown.exception is not None
+    with pytest.raises(UsageError) as caught:
+        profile("pinch", "dex1-1")
+    assert str(caught.value.hint).startswith("--dialect dex3 has it; there are: full-stroke, ")
 
 
-def test_interrupt_locks_a_dex3_at_its_position(dex3: int) -> None:
-    spoken = DIALECTS["dex3"]
-    topic = spoken.topics(LEFT)[0]
-    with DdsNode(domain=dex3, interface="lo") as node:
-        reader = node.reader(topic, spoken.cmd_type)
-        with subprocess.Popen(
-            [*TELEOP, "sine", "--dialect", "dex3", "--domain", str(dex3), "--duration", "90"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        ) as process:
-            driven = take_until(reader, lambda samples: len(samples) > 3, 60)
-            modes = {m.mode for s in driven for m in s.message.motor_cmd}
-            assert modes == set(range(0x10, 0x17))
-            process.send_signal(signal.SIGINT)
-            locked = take_until(
-                reader,
-                lambda samples: any(s.message.motor_cmd[0].mode == 0 for s in samples),
-                10,
-            )
-            assert [m.mode for m in locked[-1].message.motor_cmd] == list(range(7))
-            assert process.wait(60) == 130
-            assert process.stderr is not None
-            assert "Traceback" not in process.stderr.read()
+def test_a_stroke_of_both_grippers_is_measured_and_recorded(dex1: int, tmp_path: Path) -> None:
+    path = tmp_path / "stroke.mcap"
+    result = teleop(
+        *("full-stroke", "--domain", dex1, "--duration", 4.0, "--record", path, "--json")
+    )
+    assert result.exit_code == 0, result.output
+    assert "ready: full-stroke on unitree_go" in result.stderr
+    data = json.loads(result.stdout)
+    for side in ("left", "right"):
+        found = data["sides"][side]
+        assert found["client_hz"] < 201  # what it is above 0 depends on the machine
+        assert found["joints"]["gripper"]["stroke_s"] > 0.5  # the lead of 0.18 rad limits it
+    recording = Recording.decode(open_trace(path))
+    for side in Side:
+        commands, states = recording.sides[side].commands, recording.sides[side].states
+        assert set(commands.kp[:, 0]) == {5.0}
+        assert set(commands.mode[:, 0]) == {0.0}
+        assert float(np.ptp(states.q[:, 0])) > 4.0
+        # each command is a short lead on a state, but for states that came meanwhile
+        at = np.clip(np.searchsorted(states.t, commands.t) - 1, 0, None)
+        assert np.median(np.abs(commands.q[:, 0] - states.q[at, 0])) < 0.3
+
+
+def test_other_publisher_is_refused_unless_forced(dex1: int) -> None:
+    topic = DIALECTS["unitree_go"].topics(LEFT)[0]
+    with DdsNode(domain=dex1, interface="lo") as other:
+        other.writer(topic, DIALECTS["unitree_go"].cmd_type)
+        script = [*TELEOP, "steps", "--domain", str(dex1)]
+        refused = subprocess.run(script, capture_output=True, text=True, timeout=60)
+        assert refused.returncode == 1
+        assert f"already commands {topic} on domain {dex1}" in refused.stderr
+        assert "--force" in refused.stderr
+        forced = subprocess.run(
+            [*script, "--force", "--duration", "0.5"], capture_output=True, text=True, timeout=60
+        )
+        assert forced.returncode == 0, forced.stderr
 
 
 def test_after_a_pause_teleoperation_starts_at_the_present_position(
@@ -224,22 +210,50 @@ def test_after_a_pause_teleoperation_starts_at_the_present_position(
             assert "was paused for" in said.read()
 
 
-def test_profiles_are_listed_without_a_hand() -> None:
-    result = teleop("--list")
-    assert result.exit_code == 0
-    for name in ("full-stroke", "pick-place", "startle", "pinch", "fist"):
-        assert f"  {name} " in result.stdout
-    unknown = teleop("juggle")
-    assert unknown.exit_code != 0
-    assert unknown.exception is not None
-    with pytest.raises(UsageError) as caught:
-        profile("pinch", "dex1-1")
-    assert str(caught.value.hint).startswith("--dialect dex3 has it; there are: full-stroke, ")
-
-
 def test_recording_can_be_played_as_operator_input(dex1: int) -> None:
     from dexkit.traces import sample_path
 
     result = teleop(sample_path("dex1_pick_place"), "--domain", dex1, "--duration", 1.0)
     assert result.exit_code == 0, result.output
     assert "ready: dex1_pick_place on unitree_go" in result.stderr
+
+
+def test_fist_profile_moves_a_dex3(dex3: int) -> None:
+    result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert any(line.startswith("left: the client ran at") for line in lines)
+    assert any("middle_0: " in line for line in lines)
+
+
+def test_hands_of_another_dialect_are_named(dex3: int) -> None:
+    result = teleop("full-stroke", "--domain", dex3, "--wait", 1.0)
+    assert isinstance(result.exception, DexkitError)
+    assert result.exception.exit_code == 1
+    assert result.exception.hint == "there are hands with the dialect dex3: --dialect dex3"
+
+
+def test_interrupt_locks_a_dex3_at_its_position(dex3: int) -> None:
+    spoken = DIALECTS["dex3"]
+    topic = spoken.topics(LEFT)[0]
+    with DdsNode(domain=dex3, interface="lo") as node:
+        reader = node.reader(topic, spoken.cmd_type)
+        with subprocess.Popen(
+            [*TELEOP, "sine", "--dialect", "dex3", "--domain", str(dex3), "--duration", "90"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
+            driven = take_until(reader, lambda samples: len(samples) > 3, 60)
+            modes = {m.mode for s in driven for m in s.message.motor_cmd}
+            assert modes == set(range(0x10, 0x17))
+            process.send_signal(signal.SIGINT)
+            locked = take_until(
+                reader,
+                lambda samples: any(s.message.motor_cmd[0].mode == 0 for s in samples),
+                10,
+            )
+            assert [m.mode for m in locked[-1].message.motor_cmd] == list(range(7))
+            assert process.wait(60) == 130
+            assert process.stderr is not None
+            assert "Traceback" not in process.stderr.read()
