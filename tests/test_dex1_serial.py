@@ -97,7 +97,7 @@ def test_driver_moves_measures_and_brakes_on_close() -> None:
         with opened(motors) as hand:
             assert isinstance(hand, Hand)
             assert motors.motor.mechanics.mode is JointMode.BRAKE
-            start = hand.exchange(BRAKE)
+            start = exchange(hand, BRAKE)
             assert float(start.q[0]) == pytest.approx(1.08, abs=1e-3)
             assert start.mode[0] == JointMode.BRAKE
             way = drive(hand, OPEN, moving)
@@ -124,7 +124,7 @@ def test_open_close_and_limp_do_not_move_the_hand() -> None:
         with opened(motors) as hand:
             hand.open()  # again: nothing happens
             for _ in range(50):
-                hand.exchange(LIMP)
+                exchange(hand, LIMP)
         assert motors.motor.mechanics.joint.q == before
 
 
@@ -135,7 +135,7 @@ def test_two_hands_share_one_line() -> None:
 
             def run(hand: Dex1Serial) -> None:
                 for _ in range(300):
-                    hand.exchange(HandCommand.position(targets[hand]))
+                    exchange(hand, HandCommand.position(targets[hand]))
                     time.sleep(0.001)
                 drive(
                     hand,
@@ -153,7 +153,7 @@ def test_two_hands_share_one_line() -> None:
             assert left.line_statistics is right.line_statistics
             assert left.line_statistics.foreign == 0
             left.close()
-            right.exchange(BRAKE)  # the line stays for the other one
+            exchange(right, BRAKE)  # the line stays for the other one
             with pytest.raises(HandRefused, match="6000000 baud already"):
                 acquire(motors.path, 4_000_000)
         assert line_module._lines == {}
@@ -205,7 +205,7 @@ def test_missing_motor_error_lists_what_was_tried(tmp_path: Path) -> None:
         motors.inject("stray:before=3")
         wait_for(lambda: motors.bus(Side.RIGHT).schedule.active)
         with Dex1Serial(Side.RIGHT, Dex1Settings(device=motors.path, timeout=TIMEOUT)) as hand:
-            hand.exchange(BRAKE)
+            exchange(hand, BRAKE)
             assert hand.line_statistics.stray >= 6
         motors.inject("corrupt")
         wait_for(lambda: len(motors.bus(Side.RIGHT).schedule.active) == 2)
@@ -260,7 +260,7 @@ def test_open_retries_three_times_like_the_vendor_service() -> None:
 
 def test_motor_that_answers_late_is_found() -> None:
     with Dex1Motors(faults=("silent:for=100ms",)) as motors, opened(motors, timeout=0.1) as hand:
-        hand.exchange(BRAKE)
+        exchange(hand, BRAKE)
 
 
 # --- what goes wrong on the line
@@ -288,7 +288,7 @@ def test_a_damaged_answer_costs_its_own_exchange_only(
     # the emulator is as late as a busy machine makes it, beyond its fault
     monkeypatch.setattr("dexkit.drivers.dex1_serial.line.LATE", 0.1)
     with Dex1Motors(start_pct=50.0) as motors, opened(motors) as hand:
-        hand.exchange(BRAKE)
+        exchange(hand, BRAKE)
         patient = hand.configuration
         if fails:
             hand.configuration = replace(patient, timeout=0.04)
@@ -331,7 +331,7 @@ def test_late_answer_is_not_taken_for_the_next_one() -> None:
         assert hand._line._port is not None
         port = hand._line._port
         wait_for(lambda: port.in_waiting)  # the driver itself waits for LATE only
-        assert hand.exchange(LIMP).mode[0] == JointMode.FOC  # and not that of the brake
+        assert exchange(hand, LIMP).mode[0] == JointMode.FOC  # and not that of the brake
 
 
 def test_an_exchange_is_bounded_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -373,9 +373,9 @@ def test_timeout_protection_trips_in_a_pause_and_is_cleared() -> None:
         drive(hand, OPEN, moving)
         wait_for(lambda: motors.motor.tripped)
         assert motors.motor.mechanics.mode is JointMode.BRAKE
-        found = hand.exchange(CLOSE)
+        found = exchange(hand, CLOSE)
         assert found.fault[0] & MotorError.MOTOR_SAW_HOST_TIMEOUT
-        cleared = hand.exchange(CLOSE)
+        cleared = exchange(hand, CLOSE)
         assert cleared.fault[0] == 0
         drive(hand, CLOSE, lambda s: float(s.q[0]) < 0.5)
         assert hand.statistics.trips >= 1
@@ -384,7 +384,7 @@ def test_timeout_protection_trips_in_a_pause_and_is_cleared() -> None:
 def test_protection_can_be_left_off() -> None:
     quick = Firmware(command_timeout=0.1)
     with Dex1Motors(firmware=quick) as motors, opened(motors, protect=False) as hand:
-        hand.exchange(OPEN)
+        exchange(hand, OPEN)
         time.sleep(0.3)
         assert not motors.motor.tripped
         assert motors.motor.mechanics.mode is JointMode.FOC
@@ -419,7 +419,7 @@ def test_motor_stops_after_the_driver_is_killed() -> None:
         "hand = Dex1Serial(Side.LEFT, Dex1Settings(device=sys.argv[1], timeout=0.3))\n"
         "hand.open()\n"
         "while True:\n"
-        "    hand.exchange(HandCommand.position(5.4, kp=0.0, kd=0.5, dq=0.5))\n"
+        "    exchange(hand, HandCommand.position(5.4, kp=0.0, kd=0.5, dq=0.5))\n"
         "    print(flush=True)\n"
         "    time.sleep(0.002)\n"
     )
@@ -476,7 +476,7 @@ def test_both_hands_recover_a_lost_shared_line() -> None:
         hands[1].open()
         assert hands[0].line_statistics is hands[1].line_statistics
         for hand in hands:
-            hand.exchange(BRAKE)
+            exchange(hand, BRAKE)
             hand.close()
     assert line_module._lines == {}
 
@@ -497,9 +497,9 @@ def test_close_of_a_lost_hand_reports_it(caplog: pytest.LogCaptureFixture) -> No
 
 def test_calibration_makes_closed_the_zero_once() -> None:
     with Dex1Motors(start_pct=0.0, zero_error=1.5) as motors, opened(motors) as hand:
-        assert float(hand.exchange(BRAKE).q[0]) == pytest.approx(1.5, abs=1e-3)
+        assert float(exchange(hand, BRAKE).q[0]) == pytest.approx(1.5, abs=1e-3)
         assert hand.calibrate() == pytest.approx(0.0, abs=1e-3)
-        assert float(hand.exchange(BRAKE).q[0]) == pytest.approx(0.0, abs=1e-3)
+        assert float(exchange(hand, BRAKE).q[0]) == pytest.approx(0.0, abs=1e-3)
         with pytest.raises(HandRefused, match="before since power-up"):
             hand.calibrate()
         hand.close()
