@@ -419,7 +419,7 @@ def test_motor_stops_after_the_driver_is_killed() -> None:
         "hand = Dex1Serial(Side.LEFT, Dex1Settings(device=sys.argv[1], timeout=0.3))\n"
         "hand.open()\n"
         "while True:\n"
-        "    exchange(hand, HandCommand.position(5.4, kp=0.0, kd=0.5, dq=0.5))\n"
+        "    hand.exchange(HandCommand.position(5.4, kp=0.0, kd=0.5, dq=0.5))\n"
         "    print(flush=True)\n"
         "    time.sleep(0.002)\n"
     )
