@@ -373,6 +373,7 @@ def test_without_fsspec_a_url_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
         list(sessions.find("s3://bucket"))
 
 
+@pytest.mark.soak
 def test_a_generated_archive_is_scored(tmp_path: Path) -> None:
     """Every fault is found in a short session of each sample, and nothing else is blamed."""
     from tools.generate_archive import FAULTS, generate
