@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from xml.etree import ElementTree
 import pytest
 
 from dexkit.cli import main
+from dexkit.conformance.requirements import catalogue
 from dexkit.traces import sample_path
 
 
@@ -83,7 +83,8 @@ def test_selection(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "DEX1-RATE-01" in out
     assert "DEX1-RATE-02" not in out
-    assert re.search(r"\(3 of \d\d requirements: 3 pass\)", out)
+    every = catalogue("dex1-1")
+    assert f"(3 of {len(every)} requirements: 3 pass)" in out
     assert check(sample_path("dex1_pick_place"), "--require", "DEX7") == 2
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-QOS-02", "--level", "must") == 2
 
