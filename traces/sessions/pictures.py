@@ -49,15 +49,16 @@ def read_picture(folder: Path, name: str) -> tuple[Picture | None, str]:
         return None, "are not below the session's folder"
     try:
         with open(path, "rb", opener=lambda p, f: os.open(p, f | os.O_NONBLOCK)) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
                 return None, "are not files"
-            data = file.read(_LARGEST + 1)
+            if found.st_size > _LARGEST:
+                return None, f"are larger than {_LARGEST >> 20} MB"
+            data = file.read(found.st_size)
     except FileNotFoundError:
         return None, "are missing"
     except OSError:
         return None, "cannot be read"
-    if len(data) > _LARGEST:
-        return None, f"are larger than {_LARGEST >> 20} MB"
     picture = parse_picture(data)
     return picture, "" if picture is not None else "are neither JPEG nor PNG"
 
