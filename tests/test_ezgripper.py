@@ -736,7 +736,9 @@ def test_driver_recovers_after_pause_trips_watchdog(tmp_path: Path) -> None:
         assert hand.servo_statistics.watchdog_trips == 1
 
 
-def test_servo_stopped_by_watchdog_is_opened_at_rest(tmp_path: Path) -> None:
+def test_servo_stopped_by_watchdog_is_opened_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # the least kind reading of the manual: once cleared, it goes on to its old goal
     firmware = Firmware(watchdog_resumes=True)
     with emulated(start=100.0, latency_timer=16e-3, firmware=firmware) as gripper:
@@ -754,10 +756,20 @@ def test_servo_stopped_by_watchdog_is_opened_at_rest(tmp_path: Path) -> None:
             time.sleep(0.01)
         stopped = travel(gripper)
         assert gripper.servo.torque
+        written: list[tuple[int, bytes]] = []
+        write_block = Servo.write_block
+
+        def noted(servo: Servo, address: int, data: bytes, **options: bool) -> int:
+            written.append((address, data))
+            return write_block(servo, address, data, **options)
+
+        monkeypatch.setattr(Servo, "write_block", noted)
         with gripper_on(gripper.path, configured(tmp_path)) as after:
             drive_for(after, BRAKE, 0.3)
-            # one answer's time at the speed it had just begun to take up
-            assert travel(gripper) == pytest.approx(stopped, abs=100)
+        # one answer's time at the speed that it begins to take up, and no longer
+        cleared = written.index((mx64.BUS_WATCHDOG.address, b"\0"))
+        goal = mx64.GOAL_POSITION.encode(ZERO + stopped)
+        assert written[cleared + 1] == (mx64.GOAL_POSITION.address, goal)
 
 
 def test_damaged_and_lost_answers_are_retried_and_counted(tmp_path: Path) -> None:

@@ -221,6 +221,20 @@ def test_free_motion_is_never_contact(
     assert found is None
 
 
+def test_pause_before_the_goal_is_written_is_not_contact() -> None:
+    """The sample that a goal is planned on is older than the goal by such a pause."""
+    for pause in (0.1, 0.15, 0.25):
+        detector = ContactDetector()
+        assert detector.update(0.0, 2000, 0) is None
+        # the goal was written a moment ago; the fingers begin to move
+        assert detector.update(pause, 2000, 0) is None
+        assert detector.update(pause + 0.02, 1999, 0) is None
+        assert detector.update(pause + 0.06, 1980, 0) is None
+        # the other way, and the same pause
+        assert detector.update(pause + 0.07, 1975, 2500) is None
+        assert detector.update(2 * pause + 0.07, 1975, 2500) is None
+
+
 @fewer
 @given(
     speed=st.floats(MIN_FREE_SPEED, 220.0),

@@ -87,10 +87,12 @@ class ContactDetector:
         direction = 0 if abs(ahead) <= self.outstanding else (1 if ahead > 0 else -1)
         if self._contact is not None:
             return self._update_contact(now, latest, position, direction)
-        if direction != self._direction or direction == 0:
-            # a new motion may take a whole window to begin
+        if direction != self._direction:
+            # a new motion may take a whole window to begin, and this sample does not count:
+            # the goal is written after it, after a pause of this program perhaps
             self._history.clear()
             self._direction = direction
+            return None
         if direction == 0:
             return None
         if self._is_still(now, latest, position):
@@ -107,9 +109,9 @@ class ContactDetector:
         if direction != contact.direction or moved_on > self.release:
             self._contact = None
             self._history.clear()
-            self._direction = direction
-            if direction:
+            if direction and direction == self._direction:
                 self._history.append((latest, position))
+            self._direction = direction
             return None
         # slow creep, or fingers pushed back when the current is lowered, keep the same contact;
         # the anchor moves only when the position is still
