@@ -84,6 +84,7 @@ def test_campaign_finds_planted_faults_and_repeats_them(tmp_path: Path) -> None:
         assert "again" in again.stdout
 
 
+@pytest.mark.soak
 def test_campaign_resumes_and_has_its_own_exit_code_for_its_own_failure(tmp_path: Path) -> None:
     two = ("--batches", "2", "--jobs", "1")
     code, _, errors = run(tmp_path, ["CLEAN"], *two, "--seed", "7")

@@ -166,7 +166,9 @@ class _Watches(What):
     def tick(self, dt: float, active: bool) -> None:
         self.count += 1
         for when in WHENS.values() if self.count % 8 == 0 else ():
-            self.seen.setdefault(when.title, set()).add(when.test(self.rig, self.side))
+            values = self.seen.setdefault(when.title, set())
+            if len(values) < 2:
+                values.add(when.test(self.rig, self.side))
 
 
 def test_every_condition_is_true_and_false_at_some_time() -> None:
@@ -192,7 +194,10 @@ def test_every_condition_is_true_and_false_at_some_time() -> None:
             *("dex1-1/unitree_go:q-mirror@left,joint0,always", "must-breaking", True),
             marks=pytest.mark.soak,
         ),
-        ("dex1-1/unitree_go:nan-is-zero@left,joint0,unled", "equivalent", False),
+        pytest.param(
+            *("dex1-1/unitree_go:nan-is-zero@left,joint0,unled", "equivalent", False),
+            marks=pytest.mark.soak,
+        ),
     ],
 )
 def test_a_generated_hand_is_graded_and_judged(name: str, severity: str, caught: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,11 @@ MAY_IMPORT = {
     "conformance": {"traces"},
 }
 
+_OF_INTEREST = re.compile(
+    rf"^\s*(from|import) +(\.|dexkit import|(dexkit\.)?({'|'.join(PACKAGES)}|cyclonedds)\b)",
+    re.MULTILINE,
+)
+
 
 def modules(folder: Path) -> Iterator[Path]:
     """Python files below ``folder``, not through the packages' links."""
@@ -30,12 +36,16 @@ def modules(folder: Path) -> Iterator[Path]:
 
 @cache
 def imported(path: Path) -> frozenset[str]:
-    """Every module that a file imports, at the top or inside a function, as absolute names.
+    """Modules that a file imports, at the top or inside a function, as absolute names.
 
-    What is imported for type checking only is left out: a program never loads it.
+    None if it imports neither a package nor CycloneDDS. What is imported for type checking only
+    is left out: a program never loads it.
     """
+    text = path.read_text()
+    if not _OF_INTEREST.search(text):  # parsing every file takes seconds
+        return frozenset()
     names = set()
-    tree = ast.parse(path.read_text(), str(path))
+    tree = ast.parse(text, str(path))
     for block in [n for n in ast.walk(tree) if isinstance(n, ast.If)]:
         if isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING":
             block.body = [ast.Pass()]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -45,6 +46,7 @@ sim-twofinger = twofinger_hand.simulated:sim_twofinger
 NAMES = {m.name for m in BUILT_IN} | {m.short_name for m in BUILT_IN} | set(ROBOTS)
 NAMES |= {d.name for m in BUILT_IN for d in m.dialects} | {"unitree_go", "unitree_hg"}
 CONSTANTS = {"DEX1_1", "DEX3_1", "DEX5_1", "H1", "G1"}
+NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
 HOMES = ("dexkit/models/", "dexkit/robots.py")
 # wrong hands are declared for the models on which they are tried
 WRONG_HANDS = "conformance/mutants/"
@@ -68,7 +70,9 @@ def names_a_model(node: ast.expr) -> bool:
 
 def by_name(source: str) -> list[int]:
     """Lines that compare with a name, or have a table with names as keys."""
-    lines = []
+    lines: list[int] = []
+    if not NAMED.search(source):  # parsing every file takes seconds
+        return lines
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Compare):
             hit = any(names_a_model(part) for part in (node.left, *node.comparators))

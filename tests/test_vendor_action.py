@@ -353,6 +353,7 @@ esac
     return runner
 
 
+@pytest.mark.soak
 def test_a_plug_in_is_judged_through_its_entry_point_outside_the_checkout(vendor: Runner) -> None:
     """Default options of a vendor's workflow, but for the requirements: it is one live run."""
     # a repository's own settings of pytest are not the suite's
