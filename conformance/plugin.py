@@ -215,7 +215,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     reported: list[Result] = config.stash[REPORTED_KEY]
     grade = config.getoption("dexkit_grade")
     if grade and len(_items(session)) == len(session.items):
-        session.exitstatus = Grade.of(Kind(grade), reported).overall.exit_code
+        session.exitstatus = Grade.from_results(Kind(grade), reported).overall.exit_code
         return
     if overall_of(reported) is Overall.INCONCLUSIVE:
         session.exitstatus = Overall.INCONCLUSIVE.exit_code

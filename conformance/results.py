@@ -216,7 +216,7 @@ class Result:
         """The result as the lines of a card; see :mod:`dexkit.conformance.report.card`."""
         from dexkit.conformance.report.card import Card
 
-        return Card.of([self]).as_text()
+        return Card.from_results([self]).as_text()
 
 
 def environment() -> dict[str, str]:
@@ -267,7 +267,7 @@ class Grade:
     counts: Mapping[Verdict, int]
 
     @classmethod
-    def of(cls, kind: Kind, results: Iterable[Result]) -> Grade:
+    def from_results(cls, kind: Kind, results: Iterable[Result]) -> Grade:
         """The grade of the results of that kind."""
         found = [r for r in results if r.requirement.kind is kind]
         return cls(kind, overall_of(found), counts_of(found))
@@ -354,7 +354,7 @@ class RunResult:
 
     def grade(self, kind: Kind) -> Grade:
         """The verdict on the requirements of that kind."""
-        return Grade.of(kind, self.results)
+        return Grade.from_results(kind, self.results)
 
     def exit_code(self, kind: Kind | None = None) -> int:
         """0 pass, 1 fail, 2 not usable: of one kind, or of the whole run."""

@@ -56,7 +56,7 @@ def with_beats(
     return Recording.decode(trace)
 
 
-def of(result: RunResult, requirement: str, side: str = "left") -> Result:
+def result_of(result: RunResult, requirement: str, side: str = "left") -> Result:
     return next(r for r in result.results if r.requirement.id == requirement and r.side == side)
 
 

@@ -12,7 +12,7 @@ from dexkit.conformance.recording import joints_of
 from dexkit.conformance.results import Verdict
 from dexkit.hand import Side
 from dexkit.models import dialect
-from tests.conformance_helpers import of
+from tests.conformance_helpers import result_of
 from tests.each import each
 
 GRIPPER = joints_of(dialect("unitree_go"), Side.LEFT)
@@ -93,4 +93,4 @@ def test_passed_result_has_no_cause() -> None:
     from dexkit.conformance.recording import Recording
     from tests.conformance_helpers import short_run
 
-    assert of(judge(Recording.decode(short_run())), "DEX1-RATE-01").cause == ""
+    assert result_of(judge(Recording.decode(short_run())), "DEX1-RATE-01").cause == ""

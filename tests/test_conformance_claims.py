@@ -19,7 +19,7 @@ from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from tests.conformance_helpers import of, short_run
+from tests.conformance_helpers import result_of, short_run
 from tests.each import each
 
 DOCS = Path(__file__).parent.parent / "docs" / "capabilities.md"
@@ -78,16 +78,16 @@ def test_without_claims_file_verdicts_are_unchanged() -> None:
 def test_claimed_units_are_must_and_others_not_claimed() -> None:
     recording = Recording.decode(short_run())
     silent = judge(recording)
-    assert of(silent, VELOCITY.id).requirement.level is Level.SHOULD
+    assert result_of(silent, VELOCITY.id).requirement.level is Level.SHOULD
     assert silent.claims is None
     claimed = judge(recording, claims=Claims.parse("[claims]\nvelocity = true"))
-    assert of(claimed, VELOCITY.id).requirement.level is Level.MUST
-    assert of(claimed, VELOCITY.id).verdict is Verdict.PASS
+    assert result_of(claimed, VELOCITY.id).requirement.level is Level.MUST
+    assert result_of(claimed, VELOCITY.id).verdict is Verdict.PASS
     assert claimed.claims is not None
     assert claimed.claims["velocity"]
     assert not claimed.claims["force"]
     nothing = judge(recording, claims=Claims.parse('[hand]\nname = "X"\nfirmware = "1"'))
-    assert of(nothing, VELOCITY.id).verdict is Verdict.NOT_CLAIMED
+    assert result_of(nothing, VELOCITY.id).verdict is Verdict.NOT_CLAIMED
     assert (nothing.subject["hand"], nothing.subject["firmware"]) == ("X", "1")
     assert hand_name(nothing) == "X 1"  # the reports show it under that name
 

@@ -40,7 +40,7 @@ from dexkit.hand import Floats, Side
 from dexkit.models import DIALECTS, dialect, model
 from dexkit.traces import Recorder, open_trace, sample_path
 from dexkit.traces.samples import SAMPLES
-from tests.conformance_helpers import failed, of, short_run
+from tests.conformance_helpers import failed, result_of, short_run
 from tests.each import each
 
 GOOD = {Verdict.PASS, Verdict.NOT_APPLICABLE}
@@ -101,7 +101,10 @@ def test_reference_client_and_hands_meet_every_requirement(name: str) -> None:
     assert not bad([*result.results, *result.client])
     applies = {i for i, r in BY_ID.items() if name in r.dialects}
     assert {r.requirement.id for r in result.client if r.verdict is Verdict.PASS} == applies
-    assert of(result, f"{next(iter(applies)).partition('-')[0]}-TRACK-01").verdict is Verdict.PASS
+    assert (
+        result_of(result, f"{next(iter(applies)).partition('-')[0]}-TRACK-01").verdict
+        is Verdict.PASS
+    )
 
 
 def test_run_of_the_kit_has_no_results_about_the_client() -> None:
@@ -183,14 +186,14 @@ def test_fault_of_the_client_fails_no_hand(change: Change, requirement: str, tol
     assert failed(result) == set()
     assert {name for name, side in bad(result.client)} == {requirement}
     assert {side for _, side in bad(result.client)} == {"left"}
-    track = of(result, "DEX1-TRACK-01")
+    track = result_of(result, "DEX1-TRACK-01")
     assert (track.verdict, track.blocked_by) == (Verdict.BLOCKED, requirement)
     assert track.reason.startswith(f"blocked by {requirement}, a fault of the client: ")
     (guilty,) = (r for r in result.client if r.verdict is Verdict.FAIL)
     assert re.search(told, guilty.observed)
     assert guilty.requirement.advice.startswith("In the client:")
     # the other hand is judged
-    assert of(result, "DEX1-TRACK-01", "right").verdict is Verdict.PASS
+    assert result_of(result, "DEX1-TRACK-01", "right").verdict is Verdict.PASS
     assert result.overall is Overall.INCONCLUSIVE
     assert f"because of the client ({requirement})" in result.sentence()
 

@@ -17,7 +17,7 @@ from dexkit.conformance.results import Load, Overall, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
-from tests.conformance_helpers import copy_of, of, short_run, with_beats
+from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 
 PHASES = frozenset(
     {"step", "ends", "nan", "out-of-range", "limp", "silence", "resume", "load", "burst"}
@@ -120,13 +120,13 @@ def test_hand_within_the_limits_never_fails(service: type[Service], warned: set[
 
 
 def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
-    fresh = of(judge(Recording.decode(listened(Hesitates))), "DEX1-FRESH-02")
+    fresh = result_of(judge(Recording.decode(listened(Hesitates))), "DEX1-FRESH-02")
     assert fresh.verdict is Verdict.PASS
     assert 0.08 < fresh.values["frozen_s"] < 0.15  # and not the second of rest before it
 
 
 def test_fast_gripper_is_not_judged_as_percent() -> None:
-    speed = of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-14")
+    speed = result_of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-14")
     assert speed.verdict is Verdict.PASS
     assert 30 < speed.values["speed_rad_s"] < 60
 
@@ -134,13 +134,13 @@ def test_fast_gripper_is_not_judged_as_percent() -> None:
 def test_units_that_are_not_claimed_do_not_fail() -> None:
     result = judged(Plain, Claims.parse('[hand]\nmodel = "dex1-1"'))
     assert blamed(result) == {"DEX1-QOS-02"}
-    assert of(result, "DEX1-FIELD-04").verdict is Verdict.NOT_CLAIMED
+    assert result_of(result, "DEX1-FIELD-04").verdict is Verdict.NOT_CLAIMED
 
 
 def test_restart_of_the_service_by_the_kit_is_not_a_gap() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"shutdown", "service-restart"}))
     found = judge(Recording.decode(run_virtual(plan, ReferenceService)))
-    gap = of(found, "DEX1-RATE-03")
+    gap = result_of(found, "DEX1-RATE-03")
     assert gap.verdict is Verdict.PASS
     assert gap.values["max_gap_s"] < 0.1  # nor is it reported as the longest
 
@@ -166,7 +166,7 @@ def test_busy_machine_explains_failures_up_to_its_lateness(
         copy_of(listened(service)), usual_us=int(usual_ms * 1e3), pressed=pressed
     )
     result = judge(recording)
-    found = of(result, "DEX1-RATE-01")
+    found = result_of(result, "DEX1-RATE-01")
     assert found.verdict is verdict
     if verdict is Verdict.BLOCKED:
         assert result.overall is Overall.INCONCLUSIVE
@@ -183,10 +183,10 @@ def test_motion_is_blocked_on_overloaded_machine(usual_ms: float, verdict: Verdi
     still = trace.rows[topic][0][2]
     trace.rows[topic] = [(t, s, still) for t, s, _ in trace.rows[topic]]
     result = judge(with_beats(trace, usual_us=int(usual_ms * 1e3)))
-    assert of(result, "DEX1-MOVE-01").verdict is verdict
-    assert of(result, "DEX1-FIELD-03").verdict is Verdict.PASS
+    assert result_of(result, "DEX1-MOVE-01").verdict is verdict
+    assert result_of(result, "DEX1-FIELD-03").verdict is Verdict.PASS
     percent = copy_of(listened(gripper.Percent))
-    found = of(judge(with_beats(percent, usual_us=int(usual_ms * 1e3))), "DEX1-FIELD-03")
+    found = result_of(judge(with_beats(percent, usual_us=int(usual_ms * 1e3))), "DEX1-FIELD-03")
     assert found.verdict is Verdict.FAIL
 
 
@@ -194,12 +194,12 @@ def test_motion_is_blocked_on_overloaded_machine(usual_ms: float, verdict: Verdi
     ("part", "late_ms"), [(0.02, 10.0), (0.05, 10.0), (0.05, 30.0), (0.2, 10.0)]
 )
 def test_late_timestamps_do_not_fail_acceleration_check(part: float, late_ms: float) -> None:
-    ratio = of(
+    ratio = result_of(
         judge(Recording.decode(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06"
     )
     assert ratio.verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE)
     turned = stamped_late(gripper.TurnedAcceleration, part, late_ms)
-    found = of(judge(Recording.decode(turned)), "DEX1-FIELD-06")
+    found = result_of(judge(Recording.decode(turned)), "DEX1-FIELD-06")
     assert found.verdict is (Verdict.WARN if ratio.verdict is Verdict.PASS else ratio.verdict)
 
 
@@ -230,7 +230,7 @@ def test_wrong_clock_of_the_hand_does_not_change_verdicts(off_s: float) -> None:
     trace.rows[topic] = [(t, s + round(off_s * 1e9), p) for t, s, p in trace.rows[topic]]
     found = judge(Recording.decode(trace))
     assert [r.verdict for r in found.results] == [r.verdict for r in right.results]
-    gap, was = of(found, "DEX1-WDOG-02"), of(right, "DEX1-WDOG-02")
+    gap, was = result_of(found, "DEX1-WDOG-02"), result_of(right, "DEX1-WDOG-02")
     assert gap.values["max_gap_s"] == pytest.approx(was.values["max_gap_s"], abs=1e-6)
 
 
@@ -246,4 +246,4 @@ def test_state_that_leads_the_first_command_by_less_than_the_kit_can_tell(
     )
     first = trace.rows[command][0][0]
     trace.rows[state] = [row for row in trace.rows[state] if row[0] > first - lead_s * 1e9]
-    assert of(judge(Recording.decode(trace)), "DEX1-START-01").verdict is verdict
+    assert result_of(judge(Recording.decode(trace)), "DEX1-START-01").verdict is verdict

@@ -23,7 +23,7 @@ from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import dialect
 from dexkit.traces import Recorder, open_trace, sample_labels, sample_path
-from tests.conformance_helpers import copy_of, failed, of, short_run
+from tests.conformance_helpers import copy_of, failed, result_of, short_run
 from tests.each import each
 
 STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
@@ -59,14 +59,14 @@ def test_genuine_recordings_pass(name: str) -> None:
     assert {v for v, n in result.counts().items() if n} == {Verdict.PASS, Verdict.NOT_APPLICABLE}
     for requirement in ("DEX1-START-01", "DEX1-RATE-03", "DEX1-FIELD-03", "DEX1-TRACK-01"):
         for side in Side:
-            assert of(result, requirement, side).verdict is Verdict.PASS
+            assert result_of(result, requirement, side).verdict is Verdict.PASS
 
 
 def test_dropout_is_found_at_its_time() -> None:
     result = judge(Recording.decode(open_trace(sample_path("dex1_hand_dropout"))))
     assert result.overall is Overall.FAIL
     assert failed(result) == {("DEX1-RATE-03", "left")}
-    gap = of(result, "DEX1-RATE-03").evidence[0]
+    gap = result_of(result, "DEX1-RATE-03").evidence[0]
     stops, resumes = (
         e.seconds_from_first_message for e in sample_labels("dex1_hand_dropout").events
     )
@@ -84,7 +84,7 @@ def test_legacy_recording_is_judged_in_legacy_dialect() -> None:
     assert recording.judged == (Side.LEFT, Side.RIGHT)
     # index 0 is the right hand, which holds the object at 2.4 rad (traces/samples/README.md)
     assert recording.sides[Side.RIGHT].states.tau.min() < -0.8
-    assert of(result, "DEX1-FIELD-01", "right").figure == "2"
+    assert result_of(result, "DEX1-FIELD-01", "right").figure == "2"
 
 
 def test_dex3_recording_is_not_judged_as_dex1() -> None:
@@ -98,7 +98,7 @@ def test_wrong_dialect_fails_topic_requirements() -> None:
     trace = open_trace(sample_path("dex1_pick_place"))
     result = judge(Recording.decode(trace, dialect_name="unitree_hg"))
     assert failed(result) == {("DEX1-TOPIC-01", "left"), ("DEX1-TOPIC-01", "right")}
-    assert of(result, "DEX1-RATE-01").verdict is Verdict.BLOCKED
+    assert result_of(result, "DEX1-RATE-01").verdict is Verdict.BLOCKED
     assert result.stage["left"] == "topic seen"
     with pytest.raises(ConformanceError, match="unitree_actuator"):
         Recording.decode(trace, dialect_name="unitree_actuator")
@@ -119,7 +119,7 @@ def test_endpoints_are_not_judged_without_discovery_data() -> None:
     trace.endpoints.clear()
     result = judged(trace)
     for requirement in ("DEX1-TOPIC-02", "DEX1-QOS-01", "DEX1-QOS-02"):
-        assert of(result, requirement).verdict is Verdict.NOT_APPLICABLE
+        assert result_of(result, requirement).verdict is Verdict.NOT_APPLICABLE
     assert result.overall is Overall.PASS
 
 
@@ -129,8 +129,8 @@ def test_recording_without_commands_is_judged_by_its_states() -> None:
     del trace.rows[CMD]
     result = judged(trace)
     assert result.overall is Overall.PASS
-    assert of(result, "DEX1-START-01").reason == "no commands to this hand in the recording"
-    assert of(result, "DEX1-MOVE-01").reason.startswith("needs the stimulus 'step'")
+    assert result_of(result, "DEX1-START-01").reason == "no commands to this hand in the recording"
+    assert result_of(result, "DEX1-MOVE-01").reason.startswith("needs the stimulus 'step'")
 
 
 def test_empty_topic_does_not_pass() -> None:
@@ -156,15 +156,15 @@ def test_start_up_is_not_judged_in_recording_that_begins_late() -> None:
     trace.metadata.clear()
     first_command = trace.rows[CMD][0][0]
     trace.rows[STATE] = [r for r in trace.rows[STATE] if r[0] > first_command]
-    assert of(judged(trace), "DEX1-START-01").verdict is Verdict.NOT_APPLICABLE
+    assert result_of(judged(trace), "DEX1-START-01").verdict is Verdict.NOT_APPLICABLE
 
 
 def test_reception_times_are_judged_without_source_timestamps() -> None:
     trace = copy_of(short_run())
     trace.rows[STATE] = [(log, 0, data) for log, _, data in trace.rows[STATE]]
     result = judged(trace)
-    assert of(result, "DEX1-ORDER-01").verdict is Verdict.NOT_APPLICABLE
-    assert of(result, "DEX1-RATE-01").verdict is Verdict.PASS
+    assert result_of(result, "DEX1-ORDER-01").verdict is Verdict.NOT_APPLICABLE
+    assert result_of(result, "DEX1-RATE-01").verdict is Verdict.PASS
 
 
 # ------------------------------------------------------------------------ whose fault is it
@@ -180,7 +180,7 @@ def with_gap(seconds: float, at: float = 2.5) -> MemoryTrace:
 
 def test_gap_in_state_fails_the_hand() -> None:
     assert ("DEX1-RATE-03", "left") in failed(judged(with_gap(0.2)))
-    assert of(judged(with_gap(0.05)), "DEX1-RATE-03").verdict is Verdict.PASS
+    assert result_of(judged(with_gap(0.05)), "DEX1-RATE-03").verdict is Verdict.PASS
 
 
 def test_state_that_never_returns_is_a_gap() -> None:
@@ -199,7 +199,7 @@ def test_end_of_state_blocks_later_requirements() -> None:
     assert all("fell silent for good" in r.cause for r in found), found
     early = copy_of(short_run())
     del early.rows[STATE][1000:1100]  # a gap, then state goes on
-    assert "silent for good" not in of(judged(early), "DEX1-RATE-03").cause
+    assert "silent for good" not in result_of(judged(early), "DEX1-RATE-03").cause
 
 
 def test_exception_in_check_is_verdict_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,9 +208,9 @@ def test_exception_in_check_is_verdict_error(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setitem(REGISTRY, "DEX1-RATE-01", broken)
     result = judged(short_run())
-    assert of(result, "DEX1-RATE-01").verdict is Verdict.ERROR
-    assert "ZeroDivisionError: 1/0" in of(result, "DEX1-RATE-01").reason
-    assert of(result, "DEX1-RATE-02").reason == "blocked by DEX1-RATE-01"
+    assert result_of(result, "DEX1-RATE-01").verdict is Verdict.ERROR
+    assert "ZeroDivisionError: 1/0" in result_of(result, "DEX1-RATE-01").reason
+    assert result_of(result, "DEX1-RATE-02").reason == "blocked by DEX1-RATE-01"
     assert result.overall is Overall.INCONCLUSIVE
 
 

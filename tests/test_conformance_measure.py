@@ -25,7 +25,7 @@ from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
-from tests.conformance_helpers import copy_of, of, short_run, with_beats
+from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 from tests.each import each
 
 BY_ID = {r.id: r for r in catalogue(None, None)}
@@ -103,13 +103,13 @@ def test_figure_without_end_is_not_hidden_by_one_near_the_limit() -> None:
 def test_should_within_the_kits_error_warns_all_the_same() -> None:
     found = judged(0.101, 0.002, JITTER.id)
     assert found.verdict is Verdict.WARN
-    assert "fails by less than the kit's measurement error" in Card.of([found]).as_text()
+    assert "fails by less than the kit's measurement error" in Card.from_results([found]).as_text()
 
 
 def test_pass_within_the_kits_error_is_shown_on_card_and_page() -> None:
     found = judged(0.099, 0.002)
     told = "passes by less than the kit's measurement error of 0.002 s"
-    assert told in Card.of([found]).as_text()
+    assert told in Card.from_results([found]).as_text()
     about = {"model": "dex1-1", "dialect": "unitree_go", "sides": "left"}
     result = RunResult(about, [found, judged(0.05, 0.002)])
     assert [told in text for text in near_limits(result)] == [True]
@@ -165,7 +165,7 @@ def with_gap(seconds: float) -> Recording:
 
 
 def test_error_is_that_of_the_beats_at_the_place() -> None:
-    found = of(judge(with_gap(0.2)), GAP.id)
+    found = result_of(judge(with_gap(0.2)), GAP.id)
     assert found.verdict is Verdict.FAIL
     assert found.measure is not None
     assert found.measure.error == pytest.approx(0.001)
@@ -174,11 +174,11 @@ def test_error_is_that_of_the_beats_at_the_place() -> None:
 
 def test_virtual_run_measures_without_error_and_others_do_not_know() -> None:
     trace = copy_of(short_run())
-    exact = of(judge(Recording.decode(trace)), GAP.id).measure
+    exact = result_of(judge(Recording.decode(trace)), GAP.id).measure
     assert exact is not None
     assert (exact.error, exact.in_errors) == (0.0, None)
     trace.metadata.clear()
-    unknown = of(judge(Recording.decode(trace)), GAP.id).measure
+    unknown = result_of(judge(Recording.decode(trace)), GAP.id).measure
     assert unknown is not None
     assert unknown.error is None
     assert unknown.sentence().endswith("the kit's measurement error is not known here")

@@ -27,7 +27,7 @@ from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
-from tests.conformance_helpers import copy_of, of, short_run
+from tests.conformance_helpers import copy_of, result_of, short_run
 from tests.each import each
 from tests.report_helpers import HOSTILE, result_of_every_kind
 
@@ -229,7 +229,7 @@ def test_failure_shows_plots_of_its_requirement(
         dialect_name="unitree_go",
         sides=(Side.LEFT,),
     )
-    found = of(judge(view), f"DEX1-{need}")
+    found = result_of(judge(view), f"DEX1-{need}")
     assert found.verdict in (Verdict.FAIL, Verdict.WARN)
     figures = plots_of(found, view)
     assert len(figures) == len(titles)

@@ -128,9 +128,9 @@ def test_damaged_packet_is_reported_and_others_are_read() -> None:
 @given(st.binary(max_size=100), st.integers(-200, 0), st.integers(0, 2**63))
 def test_transfer_is_decoded_unchanged(data: bytes, status: int, when: int) -> None:
     transfer = Transfer(when, when + 5, 0x81, status, 4096, data)
-    assert Transfer.of(transfer.payload(), when, when + 5) == transfer
+    assert Transfer.from_payload(transfer.payload(), when, when + 5) == transfer
     with pytest.raises(TraceUnsupported):
-        Transfer.of(transfer.payload()[:-1] if data else b"", when, when)
+        Transfer.from_payload(transfer.payload()[:-1] if data else b"", when, when)
 
 
 def test_recording_from_file_gives_same_verdicts(tmp_path: Path) -> None:

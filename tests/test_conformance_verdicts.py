@@ -26,7 +26,7 @@ from dexkit.conformance.stimulus_record import Beats, Lost
 from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
-from tests.conformance_helpers import copy_of, of, short_run, with_beats
+from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 from tests.dds_helpers import wait_until
 from tests.each import each
 
@@ -161,11 +161,11 @@ def test_places_beyond_the_shown_ones_count() -> None:
     trace.rows[key] = [
         row for row in trace.rows[key] if not any(a < row[0] < a + 150_000_000 for a in starts)
     ]
-    found = of(judge(with_beats(trace, stalls=starts[:5])), "DEX1-RATE-03")
+    found = result_of(judge(with_beats(trace, stalls=starts[:5])), "DEX1-RATE-03")
     assert found.verdict is Verdict.FAIL
     assert found.values["gaps"] == 6
     assert len(found.evidence) == MOST_PLACES
-    found = of(judge(with_beats(trace, stalls=starts)), "DEX1-RATE-03")
+    found = result_of(judge(with_beats(trace, stalls=starts)), "DEX1-RATE-03")
     assert found.verdict is Verdict.BLOCKED
 
 
@@ -180,9 +180,9 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
     begin = trace.rows[key][0][0] + round(2.5e9)
     trace.rows[key] = [r for r in trace.rows[key] if not begin <= r[0] < begin + 200_000_000]
-    assert of(judge(Recording.decode(trace)), GAP.id).verdict is Verdict.FAIL
+    assert result_of(judge(Recording.decode(trace)), GAP.id).verdict is Verdict.FAIL
     result = judge(with_beats(trace, [begin]))
-    found = of(result, GAP.id)
+    found = result_of(result, GAP.id)
     assert found.verdict is Verdict.BLOCKED
     assert "late by 149 ms in all" in found.reason
     assert (found.disturbance.load, found.retry) == (Load.TOO_BUSY, True)
@@ -190,7 +190,7 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
     assert result.disturbed
     assert result.harness["jitter_p50_ms"] == pytest.approx(0.1)
     result = judge(with_beats(trace, [begin], stall_s=0.02))
-    found = of(result, GAP.id)
+    found = result_of(result, GAP.id)
     assert found.verdict is Verdict.FAIL
     assert (found.disturbance.load, found.retry) == (Load.BUSY, True)
     assert result.disturbed  # one more run, to be sure
@@ -200,11 +200,11 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
 def test_slow_client_of_the_kit_does_not_fail_the_hand() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", OPERATOR}))
     trace = run_virtual(plan, LateState)
-    lag = of(judge(Recording.decode(trace)), "DEX1-OPER-02")
+    lag = result_of(judge(Recording.decode(trace)), "DEX1-OPER-02")
     assert lag.verdict is Verdict.WARN
     commands = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
     trace.rows[commands] = trace.rows[commands][::2]
-    starved = of(judge(Recording.decode(trace)), "DEX1-OPER-02")
+    starved = result_of(judge(Recording.decode(trace)), "DEX1-OPER-02")
     assert starved.verdict is Verdict.NOT_APPLICABLE
     assert "of 200 commands a second" in starved.reason
 
@@ -282,7 +282,7 @@ def test_beat_due_in_an_interval_counts_for_it() -> None:
 
 
 def test_missing_stimulus_has_a_hint() -> None:
-    touch = of(judge(Recording.decode(short_run())), "DEX1-FORCE-01")
+    touch = result_of(judge(Recording.decode(short_run())), "DEX1-FORCE-01")
     assert touch.verdict is Verdict.NOT_APPLICABLE
     assert touch.reason == (
         "the stimulus 'squeeze' was not applied in this run: put something between the fingers, "

@@ -209,7 +209,7 @@ CASES: dict[str, Observations] = {
     "DDS-CYCLONE-11": _seen(_pair(client=_who("client", version="11.0.1"))),
     "NET-LO-MULTICAST": Observations(domains=(GOOD,), interfaces=(DEAF,)),
     "NET-INTERFACE": _seen(_pair(client=_who("client", addresses=("192.168.123.5",)))),
-    "NET-MULTICAST": Observations(domains=(GOOD,), interfaces=(LO, ETH), looked_at=("lo", "eth0")),
+    "NET-MULTICAST": Observations(domains=(GOOD,), interfaces=(LO, ETH), examined=("lo", "eth0")),
     "DDS-NOBODY": _seen(_without(GOOD, "hand")),
     "DDS-UNPUBLISHED": _seen(_waiting()),
     "DDS-OTHER-DOMAIN": _seen(_without(GOOD, "hand"), _without(_pair(number=7), "client")),

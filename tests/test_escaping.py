@@ -224,7 +224,7 @@ def test_doctor_escapes_names_of_peers() -> None:
         for role in ("reader", "writer")
     )
     views = (DomainView(1, peers, ends), DomainView(2, peers))
-    seen = Observations(domains=views, looked_at=("lo",), seconds=1.0)
+    seen = Observations(domains=views, examined=("lo",), seconds=1.0)
     scope = Scope()
     findings = diagnose(seen, scope)
     assert findings

@@ -21,7 +21,7 @@ from dexkit.conformance.results import Overall, RunResult, Verdict
 from dexkit.hand import Side
 from dexkit.models import dialect
 from dexkit.traces import Recorder, open_trace, sample_path
-from tests.conformance_helpers import of
+from tests.conformance_helpers import result_of
 
 ACTUATOR = dialect("unitree_actuator")
 INDEX = {Side.RIGHT: 0, Side.LEFT: 1}  # docs/sources/unitree-dex.md#a1
@@ -110,7 +110,7 @@ def test_the_figures_are_those_of_the_bytes() -> None:
     gaps = np.diff(s.t)
 
     def figure(name: str, side: Side) -> float:
-        text = of(result, name, side).figure
+        text = result_of(result, name, side).figure
         return float(next(word for word in text.split() if word.replace(".", "").isdigit()))
 
     for side, index in INDEX.items():
@@ -123,7 +123,9 @@ def test_the_figures_are_those_of_the_bytes() -> None:
         assert figure("DEX1-RATE-04", side) == pytest.approx(
             1e3 * np.percentile(gaps, 99), abs=0.006
         )
-        assert of(result, "DEX1-FIELD-03", side).figure == f"{q.min():.2f} .. {q.max():.2f} rad"
+        assert (
+            result_of(result, "DEX1-FIELD-03", side).figure == f"{q.min():.2f} .. {q.max():.2f} rad"
+        )
         # nothing in the way, nothing moves: friction of the sensor's last bit
         rests = (np.abs(dq) < 0.02) & (np.abs(q - wanted) < 0.01)
         assert figure("DEX1-FORCE-02", side) == pytest.approx(
@@ -187,13 +189,13 @@ def test_absent_gripper_of_a_one_gripper_service_is_not_judged(
     assert any(f"says nothing of the {missing} hand" in note for note in recording.notes)
     result = judge(recording)
     assert result.overall is Overall.PASS
-    assert of(result, "DEX1-TRACK-01", there).verdict is Verdict.PASS
+    assert result_of(result, "DEX1-TRACK-01", there).verdict is Verdict.PASS
 
 
 def test_commanded_gripper_without_state_is_judged(tmp_path: Path) -> None:
     path = without(Side.LEFT, tmp_path / "dead.mcap", driven=True)
     result = judge(Recording.decode(open_trace(path)))
-    assert of(result, "DEX1-TRACK-01", Side.LEFT).verdict is Verdict.FAIL
+    assert result_of(result, "DEX1-TRACK-01", Side.LEFT).verdict is Verdict.FAIL
     assert result.overall is Overall.FAIL
     asked = Recording.decode(
         open_trace(without(Side.LEFT, tmp_path / "asked.mcap", driven=False)),

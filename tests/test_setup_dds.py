@@ -28,7 +28,7 @@ from dexkit.errors import (
     DexkitError,
     InterpreterRefused,
 )
-from dexkit.setup_dds import advice, execute, look, pinned_wheel, plan, probe
+from dexkit.setup_dds import advice, execute, inspect_machine, pinned_wheel, plan, probe
 from dexkit.setup_dds.facts import Distribution, Installed, Interpreter, Library, Machine
 from dexkit.setup_dds.running import Done, Interrupted, ProcessRunner
 from dexkit.stop_signals import StopRequest
@@ -129,7 +129,7 @@ def test_one_that_does_not_work_is_built_again(problem: str) -> None:
     installed = Installed("0.10.5", problem, libraries)
     found = plan.make_plan(dataclasses.replace(MACHINE, installed=installed))
     assert found.action == plan.Build(LIBRARY)
-    assert (problem or "two CycloneDDS libraries") in found.looked_at[0]
+    assert (problem or "two CycloneDDS libraries") in found.examined[0]
 
 
 def test_one_that_loads_the_library_11_is_built_again() -> None:
@@ -181,7 +181,7 @@ def test_libraries_that_cannot_be_used_are_passed_over_with_their_reason() -> No
     )
     found = plan.make_plan(dataclasses.replace(MACHINE, libraries=(*others, LIBRARY)))
     assert found.action == plan.Build(LIBRARY)
-    reasons = "\n".join(found.looked_at)
+    reasons = "\n".join(found.examined)
     for reason in (
         "11.0.1, not 0.10.x",
         "0.8.2, not 0.10.x",
@@ -316,7 +316,7 @@ def make_library(
 
 def found(root: Path, **environment: str) -> list[Library]:
     given = {"HOME": str(root / "home"), **environment}
-    return list(look.libraries(given, str(root / "env"), "x86_64", root))
+    return list(inspect_machine.libraries(given, str(root / "env"), "x86_64", root))
 
 
 def test_libraries_are_found_in_their_usual_places_and_in_order(tmp_path: Path) -> None:
@@ -356,8 +356,8 @@ def test_the_processor_of_a_library_is_read_from_the_file(tmp_path: Path) -> Non
     make_library(tmp_path / "usr", machine=183)
     (library,) = found(tmp_path)
     assert library.processor == "aarch64"
-    assert look.processor_of(Path(sys.executable)) == os.uname().machine
-    assert look.processor_of(Path(__file__)) == ""
+    assert inspect_machine.processor_of(Path(sys.executable)) == os.uname().machine
+    assert inspect_machine.processor_of(Path(__file__)) == ""
 
 
 def test_a_library_without_headers_is_found_as_such(tmp_path: Path) -> None:
@@ -383,27 +383,27 @@ def test_a_library_without_headers_is_found_as_such(tmp_path: Path) -> None:
 def test_the_distribution_is_read(tmp_path: Path, text: str, known: tuple[str, str]) -> None:
     (tmp_path / "etc").mkdir()
     (tmp_path / "etc/os-release").write_text(text)
-    distribution = look.distribution(tmp_path)
+    distribution = inspect_machine.distribution(tmp_path)
     assert (distribution.id, distribution.release) == known
 
 
 def test_libraries_that_the_loader_is_offered_are_found(tmp_path: Path) -> None:
     make_library(tmp_path / "ros")
-    offered = look.offered_elsewhere(
+    offered = inspect_machine.offered_elsewhere(
         {"LD_LIBRARY_PATH": f":/none:{tmp_path}/ros/lib", "LD_PRELOAD": "/a/libx.so /b/libddsc.so"}
     )
     assert offered == sorted(["/b/libddsc.so", f"{tmp_path}/ros/lib/libddsc.so.0.10.5"])
-    assert look.offered_elsewhere({}) == []
+    assert inspect_machine.offered_elsewhere({}) == []
 
 
 def test_the_version_of_a_source_is_read(tmp_path: Path) -> None:
-    assert look.source_version(tmp_path) == ""
+    assert inspect_machine.source_version(tmp_path) == ""
     (tmp_path / "CMakeLists.txt").write_text("project(CycloneDDS VERSION 0.10.5 LANGUAGES C)\n")
-    assert look.source_version(tmp_path) == "0.10.5"
+    assert inspect_machine.source_version(tmp_path) == "0.10.5"
 
 
 def test_this_interpreter_is_described_as_it_is() -> None:
-    here = look.interpreter()
+    here = inspect_machine.interpreter()
     assert here.version == sys.version_info[:3]
     assert here.kind == ("venv" if sys.prefix != sys.base_prefix else here.kind)
     assert not here.not_writable
@@ -784,7 +784,7 @@ def test_the_binding_is_built_and_works_in_a_new_environment(version: str, tmp_p
     python = optional.python(version)
     if python is None:
         pytest.skip(f"no Python {version} on this machine")
-    if not list(look.libraries(os.environ, sys.prefix, os.uname().machine)):
+    if not list(inspect_machine.libraries(os.environ, sys.prefix, os.uname().machine)):
         pytest.skip("no CycloneDDS library on this machine: apt install cyclonedds-dev")
     env, root = tmp_path / "env", Path(__file__).parent.parent
     for command in (

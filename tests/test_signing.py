@@ -324,7 +324,7 @@ def test_edited_verdict_is_found_though_well_signed(signed: Signed, tmp_path: Pa
     (tmp_path / "r.json").write_bytes(members["result.json"])
     found = read_json(tmp_path / "r.json")
     members["result.json"] = json.dumps(found.as_dict()).encode()
-    about = Judged.of(found)
+    about = Judged.from_result(found)
     archive = resigned(
         signed, tmp_path / "b.zip", members, overall=about.overall, grades=about.grades
     )

@@ -39,7 +39,7 @@ class Outcome:
     wrongly: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, mutant: Mutant, blamed: set[str]) -> Outcome:
+    def from_blame(cls, mutant: Mutant, blamed: set[str]) -> Outcome:
         """Compare the requirements that failed or warned with those that were declared."""
         due = {mutant.kills, *mutant.also}
         return cls(mutant, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
@@ -87,7 +87,7 @@ def try_one(mutant: Mutant, *, short: bool = False) -> Outcome:
 
     :param short: apply only the phases that show the fault, where that is fair.
     """
-    return Outcome.of(mutant, TRIALS[mutant.layer].blamed(mutant, short=short))
+    return Outcome.from_blame(mutant, TRIALS[mutant.layer].blamed(mutant, short=short))
 
 
 def _blamed(key: tuple[str, str, str]) -> set[str]:
@@ -123,7 +123,7 @@ class Score:
             waiting = {pool.submit(_blamed, mutant.key): mutant for mutant in ordered}
             while waiting and not stop:
                 for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
-                    self.outcomes.append(Outcome.of(waiting.pop(future), future.result()))
+                    self.outcomes.append(Outcome.from_blame(waiting.pop(future), future.result()))
                     yield self.outcomes[-1]
         finally:
             # not as a context manager, which would run the waiting trials

@@ -70,7 +70,7 @@ class Card:
     results: tuple[Result, ...]
 
     @classmethod
-    def of(cls, results: Sequence[Result]) -> Card:
+    def from_results(cls, results: Sequence[Result]) -> Card:
         """The card of these results of one requirement."""
         return cls(tuple(results))
 
@@ -165,7 +165,7 @@ def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
     """
     blocks = Counter(r.blocked_by for r in result.results)
     found = [
-        Card.of(group)
+        Card.from_results(group)
         for _, every in [*result.by_requirement(), *grouped(result.client)]
         if (group := [r for r in every if r.verdict in verdicts and not r.blocked_by])
     ]
@@ -204,6 +204,6 @@ def blocked_groups(results: Iterable[Result]) -> list[Blocked]:
             group = found.setdefault((result.reason, result.blocked_by), {})
             group.setdefault(result.requirement.id, []).append(result)
     return [
-        Blocked(reason, before, tuple(Card.of(group) for group in groups.values()))
+        Blocked(reason, before, tuple(Card.from_results(group) for group in groups.values()))
         for (reason, before), groups in found.items()
     ]

@@ -332,7 +332,7 @@ class _Plots:
         self._view = view
         self._left = _PLOT_BUDGET
 
-    def of(self, result: Result) -> str:
+    def figures_for(self, result: Result) -> str:
         if self._view is None:
             return ""
         if self._left <= 0:
@@ -350,7 +350,7 @@ def _card(card: Card, plots: _Plots, link: str) -> str:
         + "</dd>"
         for fact in card.facts()
     )
-    figures = "".join(plots.of(result) for result in card.results)
+    figures = "".join(plots.figures_for(result) for result in card.results)
     if figures and card.verdict is Verdict.BLOCKED:
         figures = f"<details><summary>What was seen</summary>{figures}</details>"
     whom = " of the client" if need.about_client else ""
@@ -475,7 +475,7 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         f"{cells}</summary>"
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
         f"<p>{escape(need.rationale)}</p>{original}"
-        f'<p class="dim">Source: {escape(Card.of(group).source)}</p>'
+        f'<p class="dim">Source: {escape(Card.from_results(group).source)}</p>'
         "</div></details>"
     )
 

@@ -86,7 +86,7 @@ class Judged:
     grades: Mapping[str, str]
 
     @classmethod
-    def of(cls, result: RunResult) -> Judged:
+    def from_result(cls, result: RunResult) -> Judged:
         """What a result says; long texts are cut."""
         count = sum(result.counts().values())
         known = {

@@ -77,7 +77,7 @@ def sign_result(
     shown = "" if page is None else _match_page(found, page)
     manifest = Manifest(
         files=[File(r, paths[r].name, d.size, d.sha256) for r, d in digests.items()],
-        judged=Judged.of(found),
+        judged=Judged.from_result(found),
         dexkit=__version__,
     )
     data = manifest.encode()

@@ -190,7 +190,7 @@ class _Verification:
         found = parse_result(document, name)
         differences = self._found.differences
         differences += [f"{file.name}: {line}" for line in claimed_differences(document, found)]
-        differences += _manifest_differences(manifest.judged, Judged.of(found))
+        differences += _manifest_differences(manifest.judged, Judged.from_result(found))
         recording, page = manifest.file("recording"), manifest.file("page")
         named = found.subject.get(RECORDING_DIGEST, "")
         if named and recording is not None and named != recording.sha256:

@@ -80,7 +80,7 @@ class Transfer:
         return head + self.data
 
     @classmethod
-    def of(cls, payload: bytes, submitted_ns: int, done_ns: int) -> Transfer:
+    def from_payload(cls, payload: bytes, submitted_ns: int, done_ns: int) -> Transfer:
         """Decode a message of the recording.
 
         :raises TraceUnsupported: the payload is damaged.

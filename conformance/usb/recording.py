@@ -246,7 +246,7 @@ class UsbRecording:
         transfers: dict[Side, list[Transfer]] = {}
         for side, names in topics.items():
             found = [
-                Transfer.of(payload, int(sent), int(done))
+                Transfer.from_payload(payload, int(sent), int(done))
                 for name in names
                 if name in samples
                 for payload, sent, done in zip(

@@ -231,7 +231,7 @@ def _observe(
     progress("")
     return Observations(
         domains=views,
-        looked_at=interfaces,
+        examined=interfaces,
         seconds=seconds,
         interfaces=known,
         sockets=network.dds_sockets(domains),

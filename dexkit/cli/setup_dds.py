@@ -81,7 +81,7 @@ def command(
     with _log_file(log) as (file, path), stop_on_signals() as stop:
         runner = ProcessRunner(file, stop)
         try:
-            machine, version = _look(runner, source)
+            machine, version = _inspect(runner, source)
             options = Options(
                 source=str(source.resolve()) if source else "",
                 source_version=version,
@@ -111,19 +111,19 @@ def command(
             _say_result(found, plan)
 
 
-def _look(runner: Runner, source: Path | None) -> tuple[Machine, str]:
+def _inspect(runner: Runner, source: Path | None) -> tuple[Machine, str]:
     """The facts, and the version of the source."""
-    from dexkit.setup_dds import look, probe
+    from dexkit.setup_dds import inspect_machine, probe
 
     def find(environment: dict[str, str] | None = None) -> Installed:
         done = runner.run(probe.command(sys.executable, send=False), environment)
         return probe.result_of(done.code, done.output)
 
     installed = find()
-    bare = {k: v for k, v in os.environ.items() if k not in look.VARIABLES}
+    bare = {k: v for k, v in os.environ.items() if k not in inspect_machine.VARIABLES}
     needed = installed.version and len(bare) < len(os.environ)
-    machine = look.look(installed, find(bare) if needed else None)
-    return machine, look.source_version(source) if source else ""
+    machine = inspect_machine.inspect_machine(installed, find(bare) if needed else None)
+    return machine, inspect_machine.source_version(source) if source else ""
 
 
 def _say_plan(machine: Machine, plan: Plan) -> None:
@@ -134,7 +134,7 @@ def _say_plan(machine: Machine, plan: Plan) -> None:
             f"{machine.distribution.name}"
         )
     )
-    for line in plan.looked_at:
+    for line in plan.examined:
         click.echo(f"  {one_line(line, REMARK)}")
     click.echo(f"to do: {one_line(plan.action, REMARK)}")
 

@@ -310,14 +310,14 @@ class Link:
 class Observations:
     """All that was seen.
 
-    :param looked_at: interfaces on which it was looked.
+    :param examined: interfaces on which it was looked.
     :param seconds: how long the samples were watched.
     :param usb_wanted: the user has asked about a hand on USB.
     :param link: the link to a machine that the user has asked about.
     """
 
     domains: tuple[DomainView, ...] = ()
-    looked_at: tuple[str, ...] = ("lo",)
+    examined: tuple[str, ...] = ("lo",)
     seconds: float = 0.0
     interfaces: tuple[Interface, ...] = ()
     sockets: tuple[DdsSocket, ...] = ()

@@ -111,7 +111,7 @@ def print_report(
         console.print(table)
     looked = ", ".join(str(view.number) for view in seen.domains)
     if looked:
-        console.print(f"\n[dim]looked at domains {looked} on {', '.join(seen.looked_at)}[/dim]")
+        console.print(f"\n[dim]looked at domains {looked} on {', '.join(seen.examined)}[/dim]")
 
 
 def _link_text(link: Link) -> str:

@@ -717,7 +717,7 @@ def _absent(
         yield _finding(
             "DDS-NOBODY",
             f"there {who} on domain {which}, and no hand on any domain looked at ({numbers}) "
-            f"on {', '.join(seen.looked_at)}",
+            f"on {', '.join(seen.examined)}",
             fix=_elsewhere(seen),
             severity=Severity.NOTE
             if scope.devices_only or (other_clients and not wanted)
@@ -743,7 +743,7 @@ def _elsewhere(seen: Observations) -> str:
     others = [
         f"{i.name} ({', '.join(i.addresses)})"
         for i in sorted(seen.interfaces, key=lambda i: not _robot(i.addresses))
-        if i.up and i.addresses and i.name not in seen.looked_at
+        if i.up and i.addresses and i.name not in seen.examined
     ]
     if others:
         text += f"; if it runs elsewhere: --interface NAME, this machine has {', '.join(others)}"
@@ -759,7 +759,7 @@ def _robot(addresses: Iterable[str]) -> bool:
 
 def _network(seen: Observations, scope: Scope) -> Iterator[Finding]:
     by_name = {i.name: i for i in seen.interfaces}
-    for name in seen.looked_at:
+    for name in seen.examined:
         known = by_name.get(name)
         if known and not known.loopback and not known.multicast:
             yield _finding(
@@ -840,13 +840,13 @@ def _hidden(seen: Observations, focus: list[DomainView]) -> Iterator[Finding]:
         ]
         if not hidden:
             continue
-        joined = [i.name for i in seen.interfaces if i.discovery and i.name not in seen.looked_at]
+        joined = [i.name for i in seen.interfaces if i.discovery and i.name not in seen.examined]
         on = f"; DDS discovery listens on {', '.join(joined)}" if joined else ""
         names = ", ".join(f"{s.command or 'a process'} (pid {s.pid})" for s in hidden)
         yield _finding(
             "NET-INTERFACE",
             f"{names} on this machine uses domain {view.number} but does not answer on "
-            f"{', '.join(seen.looked_at)}{on}",
+            f"{', '.join(seen.examined)}{on}",
             fix="start both sides with the same interface; look there with "
             f"--interface {joined[0] if joined else 'NAME'}",
             severity=Severity.WARNING,

@@ -5,7 +5,7 @@ binding is compiled against a CycloneDDS library of this machine.
 
 =========================  =====================================================================
 :mod:`.facts`              what is known of interpreter, environment, libraries, distribution
-:mod:`.look`               finds that out; changes nothing
+:mod:`.inspect_machine`               finds that out; changes nothing
 :mod:`.plan`               decides from the facts what is to be done; no input or output
 :mod:`.execute`            does it in a temporary folder; installing is its last step
 :mod:`.pinned_wheel`       writes into a built wheel which library it loads, or the library itself

@@ -16,7 +16,7 @@ from dexkit.errors import DdsBuildFailed, OutputError
 from dexkit.setup_dds import pinned_wheel, probe
 from dexkit.setup_dds.advice import Cause, cause_of
 from dexkit.setup_dds.facts import BINDING, Installed, Library, Machine
-from dexkit.setup_dds.look import library_at
+from dexkit.setup_dds.inspect_machine import library_at
 from dexkit.setup_dds.plan import Build, BuildSource, FromIndex, Keep, Plan
 from dexkit.setup_dds.running import Done, Runner
 from dexkit.temporary_folder import TemporaryFolder

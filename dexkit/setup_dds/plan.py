@@ -88,12 +88,12 @@ class BuildSource:
 class Plan:
     """What will be done.
 
-    :ivar looked_at: what was found on the way, one line each, with the reason why it is not used.
+    :ivar examined: what was found on the way, one line each, with the reason why it is not used.
     :ivar notes: what the user should know, such as a library that must not be moved.
     """
 
     action: Keep | FromIndex | Build | BuildSource
-    looked_at: tuple[str, ...] = ()
+    examined: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -106,14 +106,14 @@ def make_plan(machine: Machine, options: Options | None = None) -> Plan:
     options = options or Options()
     interpreter = machine.interpreter
     _check_interpreter(interpreter)
-    looked_at = []
+    examined = []
     installed = machine.installed
     if installed.version and options.install:
         problem = _installed_problem(machine, options)
         if not problem and not options.source and not options.keep_wheel:
-            looked_at.append(f"installed: cyclonedds {installed.version}")
-            return Plan(Keep(), tuple(looked_at), _notes(machine))
-        looked_at.append(f"installed: cyclonedds {installed.version}: {problem or 'it works'}")
+            examined.append(f"installed: cyclonedds {installed.version}")
+            return Plan(Keep(), tuple(examined), _notes(machine))
+        examined.append(f"installed: cyclonedds {installed.version}: {problem or 'it works'}")
     _check_environment(machine, options.install)
     if options.source:
         _check_source(options)
@@ -126,11 +126,11 @@ def make_plan(machine: Machine, options: Options | None = None) -> Plan:
                 hint=f"{system_packages(machine.distribution, 'cmake')}; or: pip install cmake",
             )
         _check_build(machine, _NEEDED["library"])
-        return Plan(action, tuple(looked_at), _notes(machine))
+        return Plan(action, tuple(examined), _notes(machine))
     if (interpreter.version[:2], interpreter.processor) in _WHEELS:
         _check_space(machine, _NEEDED["install"])
-        return Plan(FromIndex(), tuple(looked_at), _notes(machine))
-    looked_at.append(
+        return Plan(FromIndex(), tuple(examined), _notes(machine))
+    examined.append(
         f"package index: no wheel of cyclonedds 0.10 for Python {interpreter.short} on "
         f"{interpreter.processor}"
     )
@@ -138,14 +138,14 @@ def make_plan(machine: Machine, options: Options | None = None) -> Plan:
         problem = _library_problem(library, interpreter)
         where = f"{library.origin}: {library.folder}/{library.file}"
         if not problem:
-            looked_at.append(f"{where}: CycloneDDS {library.header_version}")
+            examined.append(f"{where}: CycloneDDS {library.header_version}")
             _check_build(machine, _NEEDED["binding"])
             notes = (*_endurance(library, machine), *_notes(machine, library))
-            return Plan(Build(library), tuple(looked_at), notes)
-        looked_at.append(f"{where}: {problem}")
+            return Plan(Build(library), tuple(examined), notes)
+        examined.append(f"{where}: {problem}")
     raise DdsLibraryMissing(
         "there is no CycloneDDS library 0.10.x to build against"
-        + "".join(f"; {line}" for line in looked_at),
+        + "".join(f"; {line}" for line in examined),
         hint=how_to_get_library(machine.distribution),
     )
 

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from dexkit.setup_dds import look
+from dexkit.setup_dds import inspect_machine
 from tools.platforms.interpreters import UV, find_python
 
 __all__ = ["build_all", "hiding_libraries"]
@@ -80,7 +80,7 @@ def hiding_libraries() -> tuple[list[str], list[str]]:
     """
     places = [Path("/usr/lib"), Path("/usr/local/lib"), *Path("/usr/lib").glob("*-linux-gnu")]
     found = {path.resolve() for place in places for path in place.glob("libddsc*.so*")}
-    machine = look.libraries(os.environ, sys.prefix, os.uname().machine)
+    machine = inspect_machine.libraries(os.environ, sys.prefix, os.uname().machine)
     found |= {Path(library.real) for library in machine}
     files = sorted(map(str, found))
     # an empty file in its place; dlopen refuses it

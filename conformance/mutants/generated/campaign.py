@@ -252,7 +252,7 @@ class Campaign:
 
     # -- the score ---------------------------------------------------------------------------
 
-    def of(self, severity: str, kind: str | None = None) -> list[Trial]:
+    def trials_of(self, severity: str, kind: str | None = None) -> list[Trial]:
         """The trials of a severity, and of a class."""
         return [t for t in self.trials if t.severity == severity and kind in (None, t.kind)]
 
@@ -266,7 +266,7 @@ class Campaign:
     @property
     def blamed(self) -> list[Trial]:
         """Good hands that were blamed."""
-        return [t for t in self.of(GOOD) if not t.caught]
+        return [t for t in self.trials_of(GOOD) if not t.caught]
 
     @property
     def perfect(self) -> bool:
@@ -275,7 +275,7 @@ class Campaign:
 
     def score(self, severity: str, kind: str | None = None) -> dict[str, object]:
         """Count, hits and confidence interval."""
-        those = self.of(severity, kind)
+        those = self.trials_of(severity, kind)
         hits = sum(t.caught for t in those)
         low, high = wilson(hits, len(those))
         return {
@@ -297,10 +297,10 @@ class Campaign:
                 **{g: self.score(g) for g in grades},
                 GOOD: {
                     **self.score(GOOD),
-                    "failed": sum(bool(t.failed) for t in self.of(GOOD)),
-                    "warned": sum(bool(t.warned) for t in self.of(GOOD)),
+                    "failed": sum(bool(t.failed) for t in self.trials_of(GOOD)),
+                    "warned": sum(bool(t.warned) for t in self.trials_of(GOOD)),
                 },
-                "equivalent": len(self.of(Severity.EQUIVALENT.value)),
+                "equivalent": len(self.trials_of(Severity.EQUIVALENT.value)),
             },
             "classes": {k: {g: self.score(g, k) for g in grades} for k in kinds},
             "hands": [
@@ -334,16 +334,16 @@ class Campaign:
         for kind in (*kinds, None):
             cells = []
             for grade in (Severity.BREAKING.value, Severity.LESSER.value):
-                those = self.of(grade, kind)
+                those = self.trials_of(grade, kind)
                 hits = sum(t.caught for t in those)
                 low, high = wilson(hits, len(those))
                 cells += [f"{hits}/{len(those)}", f"{100 * low:.0f} to {100 * high:.0f} %"]
             table.add_row(kind or "all", *(cells if self.survivors or kinds else []))
         if kinds:
             console.print(table)
-            count = len(self.of(Severity.EQUIVALENT.value))
+            count = len(self.trials_of(Severity.EQUIVALENT.value))
             console.print(f"{count} hands cannot be told from the reference, and are not counted")
-        if good := self.of(GOOD):
+        if good := self.trials_of(GOOD):
             console.print(
                 f"{len(good)} good hands: {sum(bool(t.failed) for t in good)} fail a MUST, "
                 f"{sum(bool(t.warned) for t in good)} are warned",

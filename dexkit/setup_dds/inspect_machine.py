@@ -23,10 +23,10 @@ from dexkit.setup_dds.facts import Distribution, Installed, Interpreter, Library
 __all__ = [
     "VARIABLES",
     "distribution",
+    "inspect_machine",
     "interpreter",
     "libraries",
     "library_at",
-    "look",
     "offered_elsewhere",
     "processor_of",
     "source_version",
@@ -48,7 +48,7 @@ VARIABLES = ("CYCLONEDDS_HOME", "LD_LIBRARY_PATH", "LD_PRELOAD")
 """Variables that decide which library a program loads."""
 
 
-def look(installed: Installed, without_variables: Installed | None = None) -> Machine:
+def inspect_machine(installed: Installed, without_variables: Installed | None = None) -> Machine:
     """Everything about this machine.
 
     :param installed: what a child process found of the installed package.
