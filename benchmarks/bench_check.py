@@ -111,9 +111,11 @@ def _peak_mb(pid: int) -> float:
 
 
 def _repeat(sample: str, path: Path, seconds: float) -> None:
-    """A long recording: a genuine session again and again."""
+    """A long recording: a genuine session again and again, while its client sends."""
     trace = open_trace(sample_path(sample))
     messages = list(trace.messages())
+    sent = [m.log_time_ns for m in messages if m.topic.endswith("/cmd")]
+    messages = [m for m in messages if sent[0] <= m.log_time_ns <= sent[-1]]
     length = messages[-1].log_time_ns - messages[0].log_time_ns + 2_000_000
     with Recorder(path, max_messages=10_000_000, max_bytes=2**33) as recorder:
         for turn in range(round(seconds * 1e9 / length)):
