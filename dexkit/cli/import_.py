@@ -78,7 +78,7 @@ def command(
     """
     from dexkit.models import model
     from dexkit.traces.sessions.episodes import Options
-    from dexkit.traces.sessions.sources import find
+    from dexkit.traces.sessions.sources import choose, find
 
     if hand not in (None, "none"):
         model(hand)  # refused before anything is read
@@ -86,15 +86,7 @@ def command(
     entries = find(source, form, options)
     if wire is not None:
         entries = _beside(source, entries, wire, options)
-    if chosen:
-        known = {e.name: e for e in entries} | {e.name.rpartition("/")[2]: e for e in entries}
-        if missing := [name for name in chosen if name not in known]:
-            raise UsageError(
-                f"{source} has no session {', '.join(missing)}",
-                hint=f"it has: {', '.join(e.name for e in entries[:20])}"
-                + (f" and {len(entries) - 20} more" if len(entries) > 20 else ""),
-            )
-        entries = list(dict.fromkeys(known[name] for name in chosen))
+    entries = choose(source, entries, chosen)
     one = out.suffix == ".mcap"
     if one and len(entries) > 1:
         raise UsageError(

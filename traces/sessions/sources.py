@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dexkit.errors import SessionError
+from dexkit.errors import SessionError, UsageError
 from dexkit.traces.reader import Trace
 from dexkit.traces.sessions import episodes, jsonl, lerobot_in, rosbag, tables
 from dexkit.traces.sessions.beside import write_beside
@@ -14,7 +14,7 @@ from dexkit.traces.sessions.episodes import DEFAULT, Options
 from dexkit.traces.sessions.imported import NOMINAL
 from dexkit.traces.sessions.model import Session, write
 
-__all__ = ["FORMATS", "Entry", "Report", "beside", "find"]
+__all__ = ["FORMATS", "Entry", "Report", "beside", "choose", "find"]
 
 FORMATS = ("episodes", "jsonl", "lerobot", "rosbag2", "tables")
 
@@ -99,6 +99,32 @@ def find(source: Path, form: str | None = None, options: Options = DEFAULT) -> l
         )
         for folder in folders
     ]
+
+
+def choose(
+    source: Path, entries: Sequence[Entry], names: Sequence[str], *, one: bool = False
+) -> list[Entry]:
+    """The sessions of these names, with or without their folders; without names, all.
+
+    :param one: there must be a single one.
+    :raises UsageError: a name is missing, or there are several.
+    """
+    chosen = list(entries)
+    if names:
+        known = {e.name: e for e in entries} | {e.name.rpartition("/")[2]: e for e in entries}
+        if missing := [name for name in names if name not in known]:
+            raise UsageError(
+                f"{source} has no session {', '.join(missing)}",
+                hint=f"it has: {', '.join(e.name for e in entries[:20])}"
+                + (f" and {len(entries) - 20} more" if len(entries) > 20 else ""),
+            )
+        chosen = list(dict.fromkeys(known[name] for name in names))
+    if one and len(chosen) > 1:
+        raise UsageError(
+            f"{source} has {len(chosen)} sessions",
+            hint=f"choose one: --episode {chosen[0].name}",
+        )
+    return chosen
 
 
 def _format(source: Path) -> str:

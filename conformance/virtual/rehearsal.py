@@ -1,0 +1,188 @@
+"""A replay rehearsed: the same machine and messages, with a reference hand on a virtual clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexkit.hand import Floats, Side
+from dexkit.models import Dialect, model
+from dexkit.teleop.client_codec import ClientWire
+from dexkit.traces.replay.machine import Guards, Phase, ReplayMachine
+from dexkit.traces.replay.prepare import Plan, joint_limits
+from dexkit.traces.replay.states import StateWire
+
+__all__ = ["JointFigures", "Rehearsal", "Rehearsed", "rehearse"]
+
+_SETTLED = 0.5
+"""Seconds of hand before the replay begins and after it ends."""
+_SATURATED = 0.98
+"""Part of its largest torque from which on a motor counts as at its limit."""
+
+
+@dataclass(frozen=True)
+class JointFigures:
+    """What a joint did while the session was played.
+
+    :param moved: rad that it was commanded over, and that it moved over.
+    :param rms: of the distance from its command, rad; ``worst`` the largest, ``at`` when.
+    :param speed: largest, rad/s; ``torque`` largest, N·m.
+    :param limit: part of the time that its motor gave its largest torque.
+    """
+
+    name: str
+    commanded: float
+    moved: float
+    rms: float
+    worst: float
+    at: float
+    speed: float
+    torque: float
+    limit: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsed:
+    """One hand: commands and states in seconds from the start, shape (n,) and (n, joints).
+
+    :param command: q as last sent, rad; NaN before the first one.
+    """
+
+    side: Side
+    names: tuple[str, ...]
+    t: Floats
+    command: Floats
+    q: Floats
+    tau: Floats
+    playing: Floats
+    """1 while the session is played, else 0."""
+
+    def figures(self, tau_max: Floats) -> list[JointFigures]:
+        """The figures of each joint; none if the session was not played."""
+        played = self.playing > 0
+        if played.sum() < 2:
+            return []
+        t, command, q, tau = self.t[played], self.command[played], self.q[played], self.tau[played]
+        away = np.abs(command - q)
+        speed = np.abs(np.diff(q, axis=0)) / np.diff(t)[:, None]
+        worst = np.argmax(away, axis=0)
+        return [
+            JointFigures(
+                name=name,
+                commanded=float(np.ptp(command[:, j])),
+                moved=float(np.ptp(q[:, j])),
+                rms=float(np.sqrt(np.mean(away[:, j] ** 2))),
+                worst=float(away[worst[j], j]),
+                at=float(t[worst[j]]),
+                speed=float(speed[:, j].max()),
+                torque=float(np.abs(tau[:, j]).max()),
+                limit=float((np.abs(tau[:, j]) >= _SATURATED * tau_max[j]).mean()),
+            )
+            for j, name in enumerate(self.names)
+        ]
+
+
+@dataclass(eq=False)
+class Rehearsal:
+    """What would happen.
+
+    :param machine: at its end: why it ended, and what it sent.
+    :param phases: (phase, begin, end) in seconds from the start.
+    """
+
+    plan: Plan
+    machine: ReplayMachine
+    hands: dict[Side, Rehearsed]
+    phases: list[tuple[Phase, float, float]] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return max((float(h.t[-1]) for h in self.hands.values() if len(h.t)), default=0.0)
+
+    def figures(self) -> Mapping[Side, list[JointFigures]]:
+        """By side, of each joint."""
+        return {
+            s: h.figures(joint_limits(self.plan.dialect, s).tau) for s, h in self.hands.items()
+        }
+
+
+class _Log:
+    """Rows of one hand."""
+
+    def __init__(self, joints: int) -> None:
+        self.t: list[float] = []
+        self.rows: list[tuple[tuple[float, ...], ...]] = []
+        self.playing: list[float] = []
+        self.command: tuple[float, ...] = (float("nan"),) * joints
+
+
+def rehearse(plan: Plan, guards: Guards = Guards()) -> Rehearsal:
+    """Play a plan to the reference hands of its model, which obey the law of their motors.
+
+    :param guards: as for the hand; a session that is looped is played once.
+    :raises UsageError: the model has no reference hand that speaks the dialect.
+    """
+    machine = ReplayMachine(plan, Guards(**{**vars(guards), "loop": False}))
+    spoken: Dialect = plan.dialect
+    service = model(spoken.model).reference.load()(spoken, plan.sides, {})
+    encode, states = ClientWire(spoken), StateWire(spoken)
+    topics = {states.topics[s] for s in plan.sides}
+    joints = len(model(spoken.model).joints[Side.LEFT])
+    logs = {s: _Log(joints) for s in plan.sides}
+    result = Rehearsal(plan, machine, {})
+    newest: dict[str, bytes] = {}
+    now, due, ended = 0.0, _SETTLED, 0.0
+    while not ended or now < ended + _SETTLED:
+        now += service.tick
+        for sample in service.advance(service.tick):
+            if sample.topic in topics:
+                newest[sample.topic] = sample.payload
+        if now + 1e-9 < due:
+            continue
+        for topic, payload in newest.items():
+            for side, seen in states.seen(topic, payload).items():
+                if side in logs:
+                    machine.receive(now, side, seen)
+                    log = logs[side]
+                    log.t.append(now)
+                    log.rows.append((log.command, seen.q, seen.tau))
+                    log.playing.append(float(machine.phase is Phase.PLAY))
+        if not ended:
+            _turn(result, now)
+            commands = machine.step(now)
+            for topic, payload in encode.encode(commands):
+                service.receive(topic, payload, 0)
+            for side, motors in commands.items():
+                logs[side].command = tuple(m.q for m in motors)
+            due = machine.wakes_at(now)
+            if machine.phase is Phase.END:
+                ended = now
+        else:
+            due = now + 0.01
+    _turn(result, now)
+    for side, log in logs.items():
+        table = np.array(log.rows, dtype=np.float64).reshape(len(log.rows), 3, joints)
+        result.hands[side] = Rehearsed(
+            side=side,
+            names=joint_limits(spoken, side).names,
+            t=np.array(log.t),
+            command=table[:, 0],
+            q=table[:, 1],
+            tau=table[:, 2],
+            playing=np.array(log.playing),
+        )
+    return result
+
+
+def _turn(result: Rehearsal, now: float) -> None:
+    """Note the phase."""
+    phase = result.machine.phase
+    if result.phases and result.phases[-1][0] is phase:
+        result.phases[-1] = (phase, result.phases[-1][1], now)
+    else:
+        if result.phases:
+            result.phases[-1] = (*result.phases[-1][:2], now)
+        result.phases.append((phase, now, now))

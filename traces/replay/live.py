@@ -1,0 +1,149 @@
+"""A replay on DDS: endpoints and the loop around a :class:`ReplayMachine`."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from dexkit.clock import RealClock, wait_until
+from dexkit.command_age import PAUSE, PauseWatch
+from dexkit.errors import TopicConflict, WireError
+from dexkit.models import DIALECTS
+from dexkit.single_publisher import NodeTopics, SolePublisher
+from dexkit.teleop.client_codec import ClientWire
+from dexkit.traces.player import SPIN
+from dexkit.traces.replay.machine import Commands, End, Phase, ReplayMachine
+from dexkit.traces.replay.states import StateWire
+
+if TYPE_CHECKING:
+    import threading
+
+    from dexkit.dds import DdsNode
+
+__all__ = ["LiveReplay"]
+
+_NAP = 0.05
+
+
+class LiveReplay:
+    """A machine's endpoints on a node, and its loop.
+
+    :param force: command beside others. By default this gives way to any other client of the hands.
+    :raises TopicConflict: another program commands one of the hands. So does :meth:`play`, when one
+        starts to.
+    """
+
+    def __init__(self, node: DdsNode, machine: ReplayMachine, *, force: bool = False) -> None:
+        from dexkit.dds import Qos
+
+        self._node, self.machine = node, machine
+        plan = machine.plan
+        self._encode = ClientWire(plan.dialect)
+        self._states = StateWire(plan.dialect)
+        self.command_topics = tuple(
+            dict.fromkeys(self._encode.command_topics[s] for s in plan.sides)
+        )
+        self._watch = PauseWatch(RealClock())
+        self._sole = SolePublisher(
+            [NodeTopics(node, self.command_topics)],
+            verb="commands",
+            hint="stop that client, choose another --domain, or go on with --force",
+            force=force,
+            yields=True,
+        )
+        self._sole.search()
+        claim = self._sole.announce()
+        self._writers = {
+            topic: node.writer(
+                topic, plan.dialect.cmd_type, qos=Qos.writer_default(), user_data=claim
+            )
+            for topic in self.command_topics
+        }
+        self._sole.settle()
+        self._readers = {
+            topic: node.reader(topic, plan.dialect.state_type, qos=Qos.reader_default())
+            for topic in dict.fromkeys(self._states.topics[s] for s in plan.sides)
+        }
+
+    @property
+    def unsubscribed(self) -> list[str]:
+        """Command topics that nobody reads."""
+        return [topic for topic, writer in self._writers.items() if not writer.matched]
+
+    def advice(self) -> str:
+        """What may be wrong where no hand is found."""
+        seen = {(e.topic, e.type_name) for e in self._node.endpoints() if e.kind == "writer"}
+        spoken = self.machine.plan.dialect
+        for d in DIALECTS.values():
+            sides = [s for s, topic in StateWire(d).topics.items() if (topic, d.state_type) in seen]
+            if sides and d == spoken:
+                return f"there is the {' and '.join(map(str, sides))} hand: --side, --swap-sides"
+            if sides:
+                same = d.model == spoken.model
+                return f"there is a hand of the dialect {d.name}" + (
+                    f": --dialect {d.name}" if same else f", which is a {d.model}"
+                )
+        return (
+            "start the hand first ('dexkit serve'), check --domain and --interface; "
+            "--as-recorded publishes without a hand"
+        )
+
+    def wait_ready(
+        self, stop: threading.Event, waiting: Callable[[float], object] = lambda seconds: None
+    ) -> bool:
+        """Wait until the hands listen and have published their state.
+
+        :param waiting: called every 50 ms with the seconds so far; may raise.
+        :returns: False when it was stopped.
+        """
+        begin = time.monotonic()
+        while not stop.is_set():
+            self._sole.poll()
+            self._read()
+            if not self.unsubscribed and not self.machine.missing:
+                return True
+            waiting(time.monotonic() - begin)
+            stop.wait(_NAP)
+        return False
+
+    def play(self, turn: Callable[[ReplayMachine], object] = lambda machine: None) -> None:
+        """Play until the machine's end.
+
+        :param turn: called in every turn; it may stop the machine, and must not block.
+        """
+        machine, clock = self.machine, RealClock()
+        self._watch.restart()
+        while machine.phase is not Phase.END:
+            away = self._watch.measure_pause()
+            if away:
+                for reader in self._readers.values():
+                    reader.take()
+                machine.pause(clock.now())
+            turn(machine)
+            try:
+                self._sole.poll()
+            except TopicConflict as conflict:
+                machine.abandon(End.ASKED, conflict.message)
+                raise
+            self._read()
+            commands = machine.step(clock.now())
+            if self._watch.away() <= PAUSE:  # else they were made before a pause
+                self._send(commands)
+            now = clock.now()
+            wait_until(clock, machine.wakes_at(now), spin=SPIN)
+
+    def _send(self, commands: Commands) -> None:
+        # stamped first: a command that a stop holds back here is old, and is seen to be
+        now_ns = time.time_ns()
+        for topic, payload in self._encode.encode(commands):
+            self._writers[topic].write_raw(payload, now_ns)
+
+    def _read(self) -> None:
+        now = time.monotonic()
+        for topic, reader in self._readers.items():
+            for sample in reader.take()[-1:]:
+                with contextlib.suppress(WireError):
+                    for side, seen in self._states.seen(topic, sample.data).items():
+                        self.machine.receive(now, side, seen)

@@ -1,0 +1,743 @@
+"""Check the commands of a session before they reach a hand, and cure what may be cured.
+
+Each thing that is wrong is a :class:`Finding` with a name. It is *refused*, unless an option cures
+it (:class:`Wishes`) or it is accepted by name. What is left is a :class:`Plan`.
+
+Rates, velocities and gaps are those at the chosen pace, and in the dialect of the hand that is to
+be driven.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.command_age import PAUSE
+from dexkit.errors import UsageError
+from dexkit.hand import Floats, Side
+from dexkit.models import Dialect, HandModel, dialect, model
+from dexkit.traces.replay.commands import Flags, HandCommands, RecordedCommands, counted
+from dexkit.traces.sessions.resample import gap_of
+
+__all__ = [
+    "ACCEPTABLE",
+    "GAINS",
+    "INVALID",
+    "JUMPS",
+    "LIMIT",
+    "Finding",
+    "JointLimits",
+    "Level",
+    "Plan",
+    "Prepared",
+    "Track",
+    "Wishes",
+    "joint_limits",
+    "prepare",
+]
+
+Ints = NDArray[np.intp]
+
+_TICK = 1e-6
+"""Seconds between commands of the same time."""
+_WINDOW = 0.05
+"""Seconds over which a velocity is taken: genuine clients step by 0.18 rad in 5 ms."""
+_FASTER = 1.1
+"""Times its speed limit that a joint may be commanded to turn: a hand lags behind."""
+_THIN = 0.4
+"""Part of the rate of the model's client below which commands are a staircase."""
+_HIGH_GAINS = 2.0
+"""Times the gains of the model's client from which on they are too high."""
+_BEYOND = 0.02
+"""Part of the stroke beyond a limit that is rounding or calibration."""
+_MOVES = 0.02
+"""Part of the stroke that a joint has to be commanded over to be meant to move."""
+_SHOWN = 0.01
+"""Share of commands outside the limits up to which the other hand's limits fit."""
+
+GAINS = ("recorded", "model")
+LIMIT = ("refuse", "clamp")
+JUMPS = ("refuse", "stretch")
+INVALID = ("refuse", "drop")
+ACCEPTABLE = (
+    "high-gains",
+    "jumps",
+    "limits",
+    "locked",
+    "pace",
+    "side",
+    "stale",
+    "thin-rate",
+    "zero-gains",
+)
+"""Findings that may be accepted as they are."""
+
+
+class Level(str, Enum):
+    """What a finding means for the replay."""
+
+    NOTE = "note"
+    CURED = "cured"
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about a session that matters to a hand.
+
+    :param name: e.g. ``thin-rate``.
+    :param where: side and joint, or empty.
+    :param text: what was found.
+    :param cure: the option that cures it, or what to do; empty where nothing has to be done.
+    """
+
+    name: str
+    level: Level
+    text: str
+    where: str = ""
+    cure: str = ""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """How a session is to be played.
+
+    :param sides: hands to drive; None for all that it commands.
+    :param dialect: of the hands to be driven; None for that of the session.
+    :param pace: 0.5 plays in twice the time.
+    :param gains: those of the session, or those of the model's client with its mode.
+    :param resample: commands a second, interpolated; None to send the recorded ones.
+    :param limit: whether commands outside the limits are moved to them.
+    :param jumps: whether time is stretched where joints would have to turn too fast.
+    :param invalid: whether commands that cannot be sent are left out.
+    :param states: play the recorded positions instead of the commands.
+    :param swap_sides: play the left hand's commands on the right one, and the other way round.
+    :param max_gap: longest pause, seconds of recorded time; None keeps all.
+    :param accept: names of findings to accept.
+    """
+
+    sides: tuple[Side, ...] | None = None
+    dialect: str | None = None
+    pace: float = 1.0
+    gains: str = "recorded"
+    resample: float | None = None
+    limit: str = "refuse"
+    jumps: str = "refuse"
+    invalid: str = "refuse"
+    states: bool = False
+    swap_sides: bool = False
+    max_gap: float | None = None
+    accept: Collection[str] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Limits of a hand's joints in a dialect's radians, arrays of shape (joints,)."""
+
+    names: tuple[str, ...]
+    low: Floats
+    high: Floats
+    dq: Floats
+    tau: Floats
+
+    @property
+    def stroke(self) -> Floats:
+        """Widths of the ranges."""
+        return self.high - self.low
+
+
+def joint_limits(spoken: Dialect, side: Side) -> JointLimits:
+    """The limits of a side's joints."""
+    joints = model(spoken.model).joints[side]
+    scale = spoken.q_open / joints[0].q_max if spoken.is_gripper else 1.0
+    return JointLimits(
+        tuple(j.name for j in joints),
+        *(
+            np.array([getattr(j, f) for j in joints]) * by
+            for f, by in (("q_min", scale), ("q_max", scale), ("dq_max", scale), ("tau_max", 1.0))
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The commands to one hand as they will be sent; fields as in :class:`HandCommands`."""
+
+    t: Floats
+    q: Floats
+    dq: Floats
+    tau: Floats
+    kp: Floats
+    kd: Floats
+    driven: Flags
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def period(self) -> float:
+        """The usual time between commands, seconds; 0 for a single one."""
+        return float(np.median(np.diff(self.t))) if len(self) > 1 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be sent to the hands of a dialect, in seconds from the first command."""
+
+    name: str
+    dialect: Dialect
+    tracks: Mapping[Side, Track]
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """The hands that are driven."""
+        return tuple(self.tracks)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first command to the last."""
+        return max(float(t.t[-1]) for t in self.tracks.values())
+
+    @property
+    def commands(self) -> int:
+        """Number of commands, all hands together."""
+        return sum(map(len, self.tracks.values()))
+
+
+@dataclass(eq=False)
+class Prepared:
+    """The findings, in the order of the checks, and what would be sent.
+
+    :ivar plan: without any command: None.
+    """
+
+    findings: list[Finding] = field(default_factory=list)
+    plan: Plan | None = None
+
+    @property
+    def refused(self) -> list[Finding]:
+        """The findings that keep the session from being played."""
+        return [f for f in self.findings if f.level is Level.REFUSED]
+
+    @property
+    def cures(self) -> list[str]:
+        """The options that cure what is refused, each once."""
+        given = [f.cure for f in self.refused if f.cure.startswith("--")]
+        return list(dict.fromkeys(given))
+
+
+def prepare(session: RecordedCommands, wishes: Wishes = Wishes()) -> Prepared:
+    """Check a session, cure it as wished, and make the plan.
+
+    :raises SessionError: it has no hand that dexkit knows.
+    :raises UsageError: the wishes contradict the session: another model's dialect, a side that it
+        does not have.
+    """
+    return _Preparation(session, wishes).run()
+
+
+class _Preparation:
+    def __init__(self, session: RecordedCommands, wishes: Wishes) -> None:
+        self.session, self.wishes = session, wishes
+        self.model: HandModel = session.model
+        assert session.dialect is not None
+        self.recorded = session.dialect
+        self.spoken = dialect(wishes.dialect) if wishes.dialect else self.recorded
+        self.found = Prepared()
+
+    # -- findings
+
+    def note(self, name: str, text: str, where: str = "", cure: str = "") -> None:
+        self.found.findings.append(Finding(name, Level.NOTE, text, where, cure))
+
+    def judge(self, name: str, text: str, cure: str, *, cured: bool, where: str = "") -> None:
+        """A finding that is cured, accepted, or refused."""
+        level = Level.REFUSED
+        if cured:
+            level = Level.CURED
+        elif name in self.wishes.accept and name in ACCEPTABLE:
+            level = Level.ACCEPTED
+        shown = cure if level is Level.REFUSED else ""
+        self.found.findings.append(Finding(name, level, text, where, shown))
+
+    def refuse(self, name: str, text: str, cure: str = "", where: str = "") -> None:
+        """A finding that no option accepts."""
+        self.found.findings.append(Finding(name, Level.REFUSED, text, where, cure))
+
+    # -- the steps
+
+    def run(self) -> Prepared:
+        self._origin()
+        if self.spoken.model != self.recorded.model:
+            self.refuse(
+                "model",
+                f"the session is of a {self.model.title}, the dialect {self.spoken.name} of a "
+                f"{model(self.spoken.model).title}",
+                f"choose {' or '.join(d.name for d in self.model.dialects)}",
+            )
+            return self.found
+        chosen = self._chosen()
+        usable = {s: u for s, c in chosen.items() if (u := self._usable(s, c)) is not None}
+        tracks = {s: self._translated(c) for s, c in usable.items()}
+        if not tracks:
+            if not self.found.refused:
+                self.refuse("empty", "there is no command in it")
+            return self.found
+        for side, track in tracks.items():
+            self._side(side, track)
+            tracks[side] = self._gains(side, track)
+        tracks = {s: self._limits(s, t) for s, t in tracks.items()}
+        tracks = self._timed(tracks)
+        if self.wishes.resample:
+            tracks = {s: _resampled(t, self.wishes.resample) for s, t in tracks.items()}
+        self.found.plan = Plan(self.session.name, self.spoken, tracks)
+        return self.found
+
+    def _origin(self) -> None:
+        session = self.session
+        for text in session.damage:
+            self.note("damage", text)
+        for text in session.corrections:
+            self.note("corrected", text)
+        if session.problems:
+            more = f", and {len(session.problems) - 1} more" if len(session.problems) > 1 else ""
+            self.note("left-out", session.problems[0] + more, cure="dexkit import lists all")
+        if session.nominal_rate:
+            self.note(
+                "nominal-time",
+                f"the source has no times: frames are played at {session.nominal_rate:g} a second, "
+                "which is what was asked for when it was recorded, not what was measured",
+                cure="--rate HZ states another rate, --pace 0.5 plays it slower",
+            )
+        if session.others and session.dialect is not None:
+            self.note("not-played", ", ".join(session.others))
+
+    def _chosen(self) -> dict[Side, HandCommands]:
+        """The commands of the chosen hands, on the sides where they are to be played."""
+        session, wishes = self.session, self.wishes
+        commands = dict(session.commands)
+        if wishes.states or not commands:
+            self.judge(
+                "only-states" if not commands else "states",
+                "the session has positions of hands and no commands"
+                if not commands
+                else "its positions are played instead of its commands",
+                "--play states",
+                cured=wishes.states,
+            )
+            commands = {s: _from_states(t, q, self.model) for s, (t, q) in session.states.items()}
+        if wishes.swap_sides:
+            other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT}
+            commands = {other[s]: commands[s] for s in reversed(list(commands))}
+            self.note("swapped", "each hand's commands are played on the other hand")
+        sides = wishes.sides or tuple(commands)
+        if missing := [str(s) for s in sides if s not in commands]:
+            raise UsageError(
+                f"{session.name} has nothing to play on the {' and '.join(missing)} hand",
+                hint=f"it has the {' and '.join(map(str, commands)) or 'no'} hand: --side, or "
+                "--swap-sides to play it on the other one",
+            )
+        return {s: commands[s] for s in Side if s in sides}
+
+    def _usable(self, side: Side, given: HandCommands) -> HandCommands | None:
+        """Without what cannot be sent; None if nothing is left."""
+        n = len(self.model.joints[side])
+        shared = self.recorded.length > n
+        odd = (given.counts < n) | ((given.counts > n) & (not shared))
+        tables = np.concatenate([given.q, given.dq, given.tau, given.kp, given.kd], axis=1)
+        broken = ~odd & ~np.isfinite(tables).all(axis=1)
+        stale = ~odd & ~broken & (given.late > PAUSE)
+        drop = self.wishes.invalid == "drop"
+        out = odd | broken | given.backwards
+        cure = "--invalid drop"
+        if odd.all() and len(given):
+            self.refuse(
+                "joints",
+                f"{counted(given.counts)}, and a {self.model.title} has {n}: these are commands "
+                "to another hand",
+                where=str(side),
+            )
+            return None
+        texts = {
+            "joints": (odd, f"{int(odd.sum())} of {len(odd)} commands have not {n} motors"),
+            "not-finite": (
+                broken,
+                f"{int(broken.sum())} of {len(odd)} commands hold NaN or infinity"
+                + _at(given.t, broken),
+            ),
+            "backwards": (
+                given.backwards,
+                f"{int(given.backwards.sum())} of {len(odd)} commands were sent before one that "
+                "was received earlier: time runs backwards" + _at(given.t, given.backwards),
+            ),
+        }
+        for name, (rows, text) in texts.items():
+            if rows.any():
+                self.judge(name, text, cure, cured=drop, where=str(side))
+        if stale.any():
+            self.judge(
+                "stale",
+                f"{int(stale.sum())} of {len(odd)} commands were received up to "
+                f"{given.late[stale].max():.2f} s late, which no hand obeys" + _at(given.t, stale),
+                cure,
+                cured=drop,
+                where=str(side),
+            )
+            out |= stale & drop
+        kept = given.rows(~out)
+        return kept if len(kept) else None
+
+    def _translated(self, given: HandCommands) -> Track:
+        """In the radians of the dialect, and at the pace."""
+        scale = 1.0
+        if self.spoken.name != self.recorded.name and self.spoken.is_gripper:
+            scale = self.spoken.q_open / self.recorded.q_open
+        return Track(
+            t=given.t / self.wishes.pace,
+            q=given.q * scale,
+            dq=given.dq * scale * self.wishes.pace,
+            tau=given.tau,
+            kp=given.kp,
+            kd=given.kd,
+            driven=given.driven,
+        )
+
+    def _side(self, side: Side, track: Track) -> None:
+        """Whether the commands fit the other hand, and not this one."""
+        other = Side.RIGHT if side is Side.LEFT else Side.LEFT
+        mine, its = (self._outside(track, s) for s in (side, other))
+        if mine > 0.5 and its <= _SHOWN:
+            self.judge(
+                "side",
+                f"{mine:.0%} of the commands are outside the limits of the {side} hand, and "
+                f"within those of the {other} one",
+                "--swap-sides",
+                cured=False,
+                where=str(side),
+            )
+
+    def _outside(self, track: Track, side: Side) -> float:
+        limits = joint_limits(self.spoken, side)
+        margin = _BEYOND * limits.stroke
+        outside = (track.q < limits.low - margin) | (track.q > limits.high + margin)
+        return float(outside.any(axis=1).mean())
+
+    def _gains(self, side: Side, track: Track) -> Track:
+        """Check kp, kd and mode; with ``--gains model`` replace them."""
+        if not self.spoken.gains_are_used:
+            return track
+        limits = joint_limits(self.spoken, side)
+        kp, kd = np.array(self.model.gains).T
+        cured = self.wishes.gains == "model"
+        moves = np.ptp(track.q, axis=0) > _MOVES * limits.stroke
+        cure = "--gains model"
+        locked = ~track.driven
+        if locked.any():
+            self.judge(
+                "locked",
+                f"no motion: the mode byte locks {_joints(limits, locked)} in "
+                f"{locked.any(axis=1).mean():.0%} of the commands",
+                cure,
+                cured=cured,
+                where=str(side),
+            )
+        pushed = (track.tau != 0) | ((track.dq != 0) & (track.kd > 0))
+        limp = track.driven & (track.kp <= 0) & ~pushed
+        if limp.any():
+            still = "" if moves.any() else ", though nothing is commanded to move"
+            self.judge(
+                "zero-gains",
+                f"no motion: kp is 0 for {_joints(limits, limp)} in "
+                f"{limp.any(axis=1).mean():.0%} of the commands{still}",
+                cure,
+                cured=cured,
+                where=str(side),
+            )
+        high = track.driven & ((track.kp > _HIGH_GAINS * kp) | (track.kd > _HIGH_GAINS * kd))
+        if high.any():
+            j = int(np.argmax((track.kp / kp).max(axis=0)))
+            self.judge(
+                "high-gains",
+                f"loud motors: kp up to {track.kp[:, j].max():g} and kd up to "
+                f"{track.kd[:, j].max():g} for {limits.names[j]}, where the model's client sends "
+                f"{kp[j]:g} and {kd[j]:g}",
+                cure,
+                cured=cured,
+                where=str(side),
+            )
+        if not moves.any():
+            self.note("still", "its commands move no joint", str(side))
+        if not cured:
+            return track
+        shape = track.q.shape
+        return replace(
+            track,
+            kp=np.broadcast_to(kp, shape),
+            kd=np.broadcast_to(kd, shape),
+            driven=np.ones(shape, dtype=np.bool_),
+        )
+
+    def _limits(self, side: Side, track: Track) -> Track:
+        """Check position, feed-forward velocity and torque."""
+        limits = joint_limits(self.spoken, side)
+        margin = _BEYOND * limits.stroke
+        clamp = self.wishes.limit == "clamp"
+        clamped = replace(
+            track,
+            q=np.clip(track.q, limits.low, limits.high),
+            dq=np.clip(track.dq, -limits.dq, limits.dq),
+            tau=np.clip(track.tau, -limits.tau, limits.tau),
+        )
+        bounds = (
+            ("q", "rad", limits.low - margin, limits.high + margin),
+            ("dq", "rad/s", -limits.dq, limits.dq),
+            ("tau", "N·m", -limits.tau, limits.tau),
+        )
+        for name, unit, low, high in bounds:
+            table = getattr(track, name)
+            beyond = np.maximum(low - table, table - high)
+            if not (beyond > 0).any():
+                continue
+            j = int(np.argmax(beyond.max(axis=0)))
+            worst = table[int(np.argmax(beyond[:, j])), j]
+            self.judge(
+                "limits",
+                f"{name} of {_joints(limits, beyond > 0)} is outside the limits in "
+                f"{(beyond > 0).any(axis=1).mean():.1%} of the commands: {limits.names[j]} "
+                f"{worst:.3g} {unit}, limits "
+                + (
+                    f"{limits.low[j]:.3g} to {limits.high[j]:.3g}"
+                    if name == "q"
+                    else f"{high[j]:.3g}"
+                ),
+                "--limit clamp",
+                cured=clamp,
+                where=str(side),
+            )
+        # a little beyond is rounding, and always put right
+        return (
+            clamped
+            if clamp
+            else replace(
+                track, q=np.where(np.abs(clamped.q - track.q) <= margin, clamped.q, track.q)
+            )
+        )
+
+    def _timed(self, tracks: dict[Side, Track]) -> dict[Side, Track]:
+        """Check pace, gaps, jumps and rate; shorten gaps and stretch jumps."""
+        wishes = self.wishes
+        if wishes.pace > 1:
+            self.judge(
+                "pace",
+                f"{wishes.pace:g} times as fast as it was recorded",
+                "--accept pace",
+                cured=False,
+            )
+        begin = min(float(t.t[0]) for t in tracks.values())
+        tracks = {s: replace(t, t=_apart(t.t - begin)) for s, t in tracks.items()}
+        if wishes.max_gap is not None:
+            longest = wishes.max_gap / wishes.pace
+            tracks = _warped(tracks, lambda middle, dt: np.minimum(dt, longest))
+        tracks = {s: self._gaps(s, t) for s, t in tracks.items()}
+        stretch = wishes.jumps == "stretch"
+        jumping = [s for s, t in tracks.items() if self._jumps(s, t)]
+        if jumping and stretch:
+            tracks = self._stretched(tracks)
+        for side, track in tracks.items():
+            self._rate(side, track)
+        return tracks
+
+    def _gaps(self, side: Side, track: Track) -> Track:
+        """Note pauses; the pose is held in them until a period before their end."""
+        dt = np.diff(track.t)
+        gaps = np.flatnonzero(dt > gap_of((track.t * 1e9).astype(np.int64)))
+        if not len(gaps):
+            return track
+        self.note(
+            "gaps",
+            f"{len(gaps)} pauses of up to {dt[gaps].max():.2f} s; the pose is held in them",
+            str(side),
+            cure="--max-gap S shortens them",
+        )
+        return _inserted(track, gaps + 1, track.t[gaps + 1] - track.period, gaps)
+
+    def _jumps(self, side: Side, track: Track) -> bool:
+        """Whether a joint would have to turn faster than it can."""
+        if len(track) < 2:
+            return False
+        limits = joint_limits(self.spoken, side)
+        window = max(_WINDOW, track.period)
+        before = np.searchsorted(track.t, track.t - window, side="right") - 1
+        before = np.clip(before, 0, np.maximum(np.arange(len(track)) - 1, 0))
+        speed = np.abs(track.q - track.q[before]) / window
+        over = (speed > _FASTER * limits.dq) & track.driven
+        if not over.any():
+            return False
+        i, j = np.unravel_index(int(np.argmax(np.where(over, speed / limits.dq, 0))), over.shape)
+        way = abs(track.q[i, j] - track.q[before[i], j])
+        self.judge(
+            "jumps",
+            f"{_joints(limits, over)} would have to turn faster than they can at "
+            f"{_places(over)}: {limits.names[j]} by {way:.2f} rad in {window * 1e3:.0f} ms at "
+            f"{track.t[i]:.2f} s, at most {limits.dq[j]:.3g} rad/s",
+            "--jumps stretch",
+            cured=self.wishes.jumps == "stretch",
+            where=str(side),
+        )
+        return True
+
+    def _stretched(self, tracks: dict[Side, Track]) -> dict[Side, Track]:
+        """Give every joint the time that it needs, and commands on its way."""
+        needed = {
+            s: (np.abs(np.diff(t.q, axis=0)) / joint_limits(self.spoken, s).dq).max(axis=1)
+            for s, t in tracks.items()
+            if len(t) > 1
+        }
+
+        def slower(middle: Floats, dt: Floats) -> Floats:
+            factor = np.ones_like(dt)
+            for side, need in needed.items():
+                t = tracks[side].t
+                i = np.searchsorted(t, middle, side="right") - 1
+                inside = (i >= 0) & (i < len(need))
+                own = np.maximum(need / np.diff(t), 1.0)
+                factor[inside] = np.maximum(factor[inside], own[i[inside]])
+            return dt * factor
+
+        warped = _warped(tracks, slower)
+        return {
+            s: _filled(t, needed[s] > np.diff(tracks[s].t), 1.0 / self.model.command_rate)
+            if s in needed
+            else t
+            for s, t in warped.items()
+        }
+
+    def _rate(self, side: Side, track: Track) -> None:
+        """Check that the commands are no staircase."""
+        if len(track) < 2:
+            self.note("single", "there is a single command", str(side))
+            return
+        rate, least = 1.0 / track.period, _THIN * self.model.command_rate
+        steps = np.abs(np.diff(track.q, axis=0))
+        if rate >= least or not (steps > 0).any():
+            return
+        torque = steps * track.kp[1:]
+        i, j = np.unravel_index(int(np.argmax(torque)), torque.shape)
+        wished = self.wishes.resample or 0.0
+        self.judge(
+            "thin-rate",
+            f"loud motors: {rate:.3g} commands a second, where the model's client sends "
+            f"{self.model.command_rate:g}; steps of up to {steps[i, j]:.3f} rad at kp "
+            f"{track.kp[i + 1, j]:g} are torque steps of {torque[i, j]:.2f} N·m",
+            f"--resample {self.model.command_rate:g}",
+            cured=wished >= least,
+            where=str(side),
+        )
+
+
+def _from_states(t: Floats, q: Floats, hand: HandModel) -> HandCommands:
+    """Positions as commands, with the gains of the model's client."""
+    kp, kd = np.array(hand.gains).T
+    zero = np.zeros_like(q)
+    n = len(t)
+    return HandCommands(
+        t=t,
+        q=q,
+        dq=zero,
+        tau=zero,
+        kp=np.broadcast_to(kp, q.shape),
+        kd=np.broadcast_to(kd, q.shape),
+        driven=np.ones(q.shape, dtype=np.bool_),
+        counts=np.full(n, q.shape[1]),
+        late=np.zeros(n),
+        backwards=np.zeros(n, dtype=np.bool_),
+    )
+
+
+def _apart(t: Floats) -> Floats:
+    """Times that ascend strictly: of equal ones each later one by a microsecond."""
+    return np.asarray(
+        np.maximum.accumulate(t - _TICK * np.arange(len(t))) + _TICK * np.arange(len(t))
+    )
+
+
+def _warped(
+    tracks: Mapping[Side, Track], change: Callable[[Floats, Floats], Floats]
+) -> dict[Side, Track]:
+    """All tracks with the same change of time.
+
+    :param change: takes the middles and the lengths of the pieces between any two commands, and
+        returns their new lengths.
+    """
+    grid = np.unique(np.concatenate([t.t for t in tracks.values()]))
+    lengths = change((grid[1:] + grid[:-1]) / 2, np.diff(grid))
+    new = np.concatenate([grid[:1], grid[0] + np.cumsum(lengths)])
+    return {s: replace(t, t=np.interp(t.t, grid, new)) for s, t in tracks.items()}
+
+
+def _inserted(track: Track, at: Ints, times: Floats, rows: Ints) -> Track:
+    """With further commands, equal to ``rows``, at places and times."""
+    tables = {name: np.insert(v, at, v[rows], axis=0) for name, v in vars(track).items()}
+    return Track(**{**tables, "t": np.insert(track.t, at, times)})
+
+
+def _at_times(track: Track, times: Floats) -> Track:
+    """The commands at other times: on a straight line between two, gains and mode held."""
+    before = np.clip(np.searchsorted(track.t, times, side="right") - 1, 0, len(track) - 1)
+
+    def line(table: Floats) -> Floats:
+        columns = [np.interp(times, track.t, column) for column in table.T]
+        return np.stack(columns, axis=1)
+
+    return Track(
+        t=times,
+        q=line(track.q),
+        dq=line(track.dq),
+        tau=line(track.tau),
+        kp=track.kp[before],
+        kd=track.kd[before],
+        driven=track.driven[before],
+    )
+
+
+def _filled(track: Track, where: Flags, period: float) -> Track:
+    """With commands on a straight line in some of the intervals."""
+    times = [track.t]
+    for i in np.flatnonzero(where):
+        a, b = track.t[i], track.t[i + 1]
+        pieces = int(np.ceil((b - a) / period))
+        times.append(np.linspace(a, b, pieces + 1)[1:-1])
+    return _at_times(track, np.unique(np.concatenate(times)))
+
+
+def _resampled(track: Track, rate: float) -> Track:
+    if len(track) < 2:
+        return track
+    count = int((track.t[-1] - track.t[0]) * rate)
+    times = np.append(track.t[0] + np.arange(count + 1) / rate, track.t[-1])
+    return _at_times(track, np.unique(times))
+
+
+def _joints(limits: JointLimits, which: Flags) -> str:
+    """The joints with a mark in any row."""
+    marks = np.asarray(which.any(axis=0)).tolist()
+    names = [n for n, marked in zip(limits.names, marks, strict=True) if marked]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _places(which: Flags) -> str:
+    rows = which.any(axis=1)
+    begins = int((np.diff(rows.astype(np.int8), prepend=0) == 1).sum())
+    return f"{begins} place{'' if begins == 1 else 's'}"
+
+
+def _at(t: Floats, rows: Flags) -> str:
+    return f", first {t[int(np.argmax(rows))]:.2f} s after the first" if rows.any() else ""
