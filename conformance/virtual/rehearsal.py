@@ -16,6 +16,7 @@ from dexkit.traces.replay.states import StateWire
 
 __all__ = ["JointFigures", "Rehearsal", "Rehearsed", "rehearse"]
 
+_DEFAULT = Guards()
 _SETTLED = 0.5
 """Seconds of hand before the replay begins and after it ends."""
 _SATURATED = 0.98
@@ -104,9 +105,7 @@ class Rehearsal:
 
     def figures(self) -> Mapping[Side, list[JointFigures]]:
         """By side, of each joint."""
-        return {
-            s: h.figures(joint_limits(self.plan.dialect, s).tau) for s, h in self.hands.items()
-        }
+        return {s: h.figures(joint_limits(self.plan.dialect, s).tau) for s, h in self.hands.items()}
 
 
 class _Log:
@@ -119,7 +118,7 @@ class _Log:
         self.command: tuple[float, ...] = (float("nan"),) * joints
 
 
-def rehearse(plan: Plan, guards: Guards = Guards()) -> Rehearsal:
+def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     """Play a plan to the reference hands of its model, which obey the law of their motors.
 
     :param guards: as for the hand; a session that is looped is played once.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import FILE, Number
+from dexkit.cli.options import FILE, session_options
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
 
@@ -22,30 +22,7 @@ __all__ = ["command"]
 @click.command("import")
 @click.argument("source", type=FILE)
 @click.argument("out", type=FILE)
-@click.option(
-    "--from",
-    "form",
-    type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
-    help="The format of SOURCE.  [default: told by its files]",
-)
-@click.option(
-    "--episode",
-    "chosen",
-    multiple=True,
-    metavar="NAME",
-    help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
-)
-@click.option(
-    "--rate",
-    type=Number(min=0.1, max=2000),
-    metavar="HZ",
-    help="Frames a second, where the source has no times.  [default: what it says]",
-)
-@click.option(
-    "--hand",
-    metavar="MODEL",
-    help="Model of the hands, e.g. dex3-1, or none.  [default: told by joints and limits]",
-)
+@session_options()
 @click.option(
     "--wire",
     type=FILE,
@@ -53,7 +30,6 @@ __all__ = ["command"]
     help="A recording made while the episodes were: it gives their frames true times.",
 )
 @click.option("--embed-pictures", is_flag=True, help="Put single pictures into the recording.")
-@click.option("--keep-sides", is_flag=True, help="Do not exchange hands that look swapped.")
 @click.option("--force", is_flag=True, help="Overwrite existing recordings.")
 def command(
     source: Path,

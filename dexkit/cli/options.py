@@ -44,6 +44,7 @@ __all__ = [
     "real_time_option",
     "require_option",
     "seed_option",
+    "session_options",
     "set_option",
     "side_option",
     "start_option",
@@ -238,6 +239,49 @@ def force_option() -> Callable[[F], F]:
         is_flag=True,
         help="Publish even if another program publishes the same topics.",
     )
+
+
+# ------------------------------------------------------------------------------ sessions
+
+
+def session_options() -> Callable[[F], F]:
+    """``--from`` (``form``), ``--episode`` (``chosen``), ``--rate``, ``--hand`` and
+    ``--keep-sides``: what a session of another format is, and how it is read.
+    """
+    options = (
+        click.option(
+            "--from",
+            "form",
+            type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
+            help="The format of SOURCE.  [default: told by its files]",
+        ),
+        click.option(
+            "--episode",
+            "chosen",
+            multiple=True,
+            metavar="NAME",
+            help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
+        ),
+        click.option(
+            "--rate",
+            type=Number(min=0.1, max=2000),
+            metavar="HZ",
+            help="Frames a second, where the source has no times.  [default: what it says]",
+        ),
+        click.option(
+            "--hand",
+            metavar="MODEL",
+            help="Model of the hands, e.g. dex3-1, or none.  [default: told by joints and limits]",
+        ),
+        click.option("--keep-sides", is_flag=True, help="Do not exchange hands that look swapped."),
+    )
+
+    def decorate(function: F) -> F:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
 
 
 # ------------------------------------------------------------------------------ conformance

@@ -1,55 +1,176 @@
-"""``dexkit replay``: publish the commands of a recording with their timing."""
+"""``dexkit replay``: play a session on hands with care, or a recording as it is."""
 
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from dexkit.cli.options import Number, dds_options, force_option, topic_option
-from dexkit.errors import DdsError, TraceUnsupported
+from dexkit.cli.options import (
+    DIALECT,
+    FILE,
+    Number,
+    dds_options,
+    force_option,
+    html_option,
+    session_options,
+    side_option,
+    topic_option,
+)
+from dexkit.errors import DdsError, UsageError
 from dexkit.escaping import REMARK, one_line
-from dexkit.single_publisher import NodeTopics, SolePublisher
-from dexkit.stop_signals import StopRequest, stop_on_signals
-from dexkit.threads import Worker
 
 if TYPE_CHECKING:
-    from dexkit.dds import DdsNode, Writer
-    from dexkit.traces import Player, Trace, TraceMessage
+    from dexkit.conformance.virtual.rehearsal import Rehearsal
+    from dexkit.traces.replay.commands import RecordedCommands
+    from dexkit.traces.replay.live import LiveReplay
+    from dexkit.traces.replay.machine import Guards, ReplayMachine
+    from dexkit.traces.replay.prepare import Prepared
 
 __all__ = ["command"]
 
-# Seconds from a match seen here to the first message, for the other side to see it too: what comes
-# before is lost to it. Unitree's SDK sleeps as long after making a writer
-# (docs/sources/unitree-dex.md#a6).
-_SETTLE = 0.2
-# Seconds for the other side's readers after the last message, before the writers vanish.
-_LINGER = 0.1
+# literal, because the package is imported only when a command runs; tests/test_replay.py compares
+_ACCEPTABLE = (
+    "high-gains",
+    "jumps",
+    "limits",
+    "locked",
+    "pace",
+    "side",
+    "stale",
+    "thin-rate",
+    "zero-gains",
+)
+# parameters that mean something without a hand's state
+_AS_RECORDED = {
+    "source",
+    "as_recorded",
+    "pace",
+    "loop",
+    "topics",
+    "max_gap",
+    "domain",
+    "interface",
+    "peers",
+    "wait_for_interface",
+    "wait",
+    "no_wait",
+    "force",
+}
+_STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bold red"}
 
 
 @click.command("replay")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("source", type=FILE)
+@click.option("--check", "check_only", is_flag=True, help="Only check the session.")
 @click.option(
+    "--rehearse",
+    is_flag=True,
+    help="Only play it on the model's emulated hand, in virtual time, and write a page of what "
+    "would happen.",
+)
+@html_option()
+@side_option("Hands to drive.  [default: all that the session commands]")
+@click.option(
+    "--dialect",
+    "dialect_name",
+    type=DIALECT,
+    help="Dialect of the hands to drive.  [default: the session's]",
+)
+@click.option(
+    "--pace",
     "--speed",
+    "pace",
     type=Number(1e-3, 1e3),
     default=1.0,
     show_default=True,
-    help="Factor of the speed: 2 plays in half the time.",
+    help="0.5 plays in twice the time. More than 1 needs --accept pace.",
 )
-@click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
-@topic_option("Play", "the command topics, those that end in /cmd")
+@click.option(
+    "--ramp-speed",
+    type=Number(min=0.01, max=10.0),
+    default=0.5,
+    show_default=True,
+    metavar="RAD/S",
+    help="Speed of the way to the first pose.",
+)
+@click.option(
+    "--gains",
+    type=click.Choice(["recorded", "model"]),
+    default="recorded",
+    show_default=True,
+    help="kp, kd and mode of the session, or those that the model's client sends.",
+)
+@click.option(
+    "--resample",
+    type=Number(min=1.0, max=1000.0),
+    metavar="HZ",
+    help="Commands a second, interpolated.  [default: the recorded ones]",
+)
+@click.option(
+    "--limit",
+    type=click.Choice(["refuse", "clamp"]),
+    default="refuse",
+    show_default=True,
+    help="Commands outside the joints' limits: refuse the session, or move them to the limit.",
+)
+@click.option(
+    "--jumps",
+    type=click.Choice(["refuse", "stretch"]),
+    default="refuse",
+    show_default=True,
+    help="Where joints would have to turn too fast: refuse, or give them the time that they need.",
+)
+@click.option(
+    "--invalid",
+    type=click.Choice(["refuse", "drop"]),
+    default="refuse",
+    show_default=True,
+    help="Commands that cannot be sent (NaN, too few motors, stale, time running backwards): "
+    "refuse, or leave them out.",
+)
+@click.option(
+    "--play",
+    type=click.Choice(["commands", "states"]),
+    default="commands",
+    show_default=True,
+    help="The commands, or the hands' recorded positions as commands.",
+)
+@click.option("--swap-sides", is_flag=True, help="Play each hand's commands on the other hand.")
 @click.option(
     "--max-gap",
     type=Number(min=0, min_open=True),
     metavar="S",
     help="Shorten longer pauses to S seconds.  [default: keep them]",
 )
+@click.option(
+    "--accept",
+    multiple=True,
+    type=click.Choice(_ACCEPTABLE),
+    help="Play in spite of this finding; may be repeated.",
+)
+@click.option(
+    "--max-distance",
+    type=Number(min=0, min_open=True),
+    metavar="RAD",
+    help="Stop if a joint is further away from its command ...  [default: a quarter of its stroke]",
+)
+@click.option(
+    "--distance-time",
+    type=Number(min=0),
+    default=1.0,
+    show_default=True,
+    metavar="S",
+    help="... for longer than this.",
+)
+@click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
+@session_options()
 @dds_options()
 @click.option(
     "--wait",
@@ -57,163 +178,331 @@ _LINGER = 0.1
     default=10.0,
     show_default=True,
     metavar="S",
-    help="Wait up to S seconds until each topic is subscribed.",
+    help="Wait up to S seconds for the hands.",
 )
-@click.option("--no-wait", is_flag=True, help="Start at once, subscribed or not.")
 @force_option()
-def command(
-    file: Path,
-    speed: float,
-    loop: bool,
-    topics: tuple[str, ...],
-    max_gap: float | None,
-    domain: int,
-    interface: str,
-    wait: float,
-    no_wait: bool,
-    force: bool,
-) -> int:
-    """Publish the commands in a recording on DDS, with their recorded timing.
+@click.option(
+    "--as-recorded",
+    is_flag=True,
+    help="Publish the payloads of a recording as they are: no checks, no ramp, no supervision.",
+)
+@topic_option("With --as-recorded, which it implies: play", "those that end in /cmd")
+@click.option(
+    "--no-wait", is_flag=True, help="With --as-recorded, which it implies: start at once."
+)
+@click.pass_context
+def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
+    """Play a session on hands, with care.
 
-    Waits until each topic is subscribed, then plays. Refuses to play while another program
-    publishes on the same topics, and ends when one starts to. After a pause of its own
-    (Ctrl-Z, suspend) it goes on where it was left. The default domain is 1, the simulation's:
-    --domain 0 with a robot's interface moves real hands.
+    SOURCE is a recording, or a session of any format that 'dexkit import' reads. It is checked
+    first; what is found is printed, and refused unless an option cures it. The hands are led from
+    where they are to the first pose, the session is played, and they are left at rest: at its end,
+    on a fault, without states, too far from the commands, on Ctrl-C, space or q.
 
-    Exit code: 0 all is sent (or a loop was stopped), 1 the recording is damaged (what can be read
-    of it is sent) or the topics are not free, 2 it cannot be read, 130 stopped.
+    The default domain is 1, the simulation's: --domain 0 with a robot's interface moves real hands.
+
+    Exit code: 0 played (or a loop was stopped, or nothing is refused with --check and --rehearse),
+    1 refused, stopped by the supervision, damaged, or not free, 2 it cannot be read, 130 stopped.
     """
-    from dexkit.dds import DdsNode
-    from dexkit.traces import Player, open_trace
+    if given["as_recorded"] or given["no_wait"] or given["topics"]:
+        return _as_recorded(ctx, source, given)
+    from dexkit.models import model
+    from dexkit.traces.replay.commands import read_session
+    from dexkit.traces.replay.machine import Guards
+    from dexkit.traces.replay.prepare import Wishes, prepare
+    from dexkit.traces.sessions.episodes import Options
 
-    trace = open_trace(file)
-    try:
-        player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
-    finally:  # more may be found while the messages are read
-        for warning in trace.warnings:
-            click.echo(one_line(f"warning: {warning}", REMARK), err=True)
-    _check_types(trace, player)
-    click.echo(
-        f"{file}: {len(player)} messages of {', '.join(map(one_line, player.topics))}, "
-        f"{player.duration:.1f} s" + (", looped" if loop else "")
+    if given["hand"] not in (None, "none"):
+        model(given["hand"])  # refused before anything is read
+    options = Options(rate=given["rate"], hand=given["hand"], correct=not given["keep_sides"])
+    wishes = Wishes(
+        sides=given["sides"],
+        dialect=given["dialect_name"],
+        pace=given["pace"],
+        gains=given["gains"],
+        resample=given["resample"],
+        limit=given["limit"],
+        jumps=given["jumps"],
+        invalid=given["invalid"],
+        states=given["play"] == "states",
+        swap_sides=given["swap_sides"],
+        max_gap=given["max_gap"],
+        accept=given["accept"],
     )
-    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        # a hand must have one source of commands: a recording gives way to any other
-        sole = SolePublisher(
-            [NodeTopics(node, player.topics)],
-            hint="stop that publisher, choose another --domain, or play anyway with --force",
-            force=force,
-            yields=True,
-        )
-        sole.search()
-        claim = sole.announce()
-        writers = {
-            topic: node.writer(topic, name, user_data=claim)
-            for topic, name in player.topics.items()
-        }
-        sole.settle()
-        if not no_wait:
-            _wait_for_readers(node, writers, wait, stop)
-            stop.wait(_SETTLE)
-        if stop:
-            return 130
-        click.echo(f"ready: playing on domain {domain}, {interface}")
-        with _short_switch_interval(), _status(player):
-
-            def send(message: TraceMessage) -> object:
-                # stamped first: a command that a stop holds back here is old, and is seen to be
-                now_ns = time.time_ns()
-                sole.poll()
-                return writers[message.topic].write_raw(message.data, now_ns)
-
-            def paused(seconds: float) -> None:
-                click.echo(
-                    f"this program was paused for {seconds:.2f} s; the recording goes on where it "
-                    "was left",
-                    err=True,
-                )
-                stop.wait(_SETTLE)  # publishers that started meanwhile are discovered first
-
-            stats = player.play(send, stop=stop.event, paused=paused)
-        time.sleep(_LINGER)
-    click.echo(
-        f"sent {stats.sent} messages in {stats.duration:.1f} s"
-        + (f", {stats.passes} passes" if loop else "")
-        + f"; late by {stats.error_p50 * 1e3:.3f} ms (p50), {stats.error_p99 * 1e3:.3f} ms (p99), "
-        f"{stats.error_max * 1e3:.3f} ms (max)"
-        + (f"; paused {stats.pauses} times" if stats.pauses else "")
+    guards = Guards(
+        ramp_speed=given["ramp_speed"],
+        max_distance=given["max_distance"],
+        distance_time=given["distance_time"],
+        loop=given["loop"],
     )
-    # for a loop, being stopped is the ordinary end
-    if stats.stopped and not loop:
-        return 130
-    return 1 if trace.damage else 0
+    session = read_session(source, given["form"], given["chosen"], options)
+    prepared = prepare(session, wishes)
+    _print_session(session, prepared)
+    code = 1 if session.damage else 0
+    if given["rehearse"]:
+        code = _rehearse(prepared, guards, source, session.name, given["html_path"], ctx) or code
+    elif given["html_path"] is not None:
+        raise UsageError("--report is the page of a rehearsal", hint="add --rehearse")
+    if prepared.refused:
+        _print_refusal(source, prepared)
+        return 1
+    if given["check_only"] or given["rehearse"]:
+        return code
+    assert prepared.plan is not None
+    return _play(prepared, guards, given) or code
 
 
-def _check_types(trace: Trace, player: Player) -> None:
-    for channel in trace.channels:
-        chosen = player.topics.get(channel.topic) == channel.type_name
-        if chosen and channel.problem and channel.message_count:
-            raise TraceUnsupported(
-                f"{channel.topic} cannot be played: {channel.problem}",
-                hint="choose other topics with --topic",
+def _as_recorded(ctx: click.Context, source: Path, given: dict[str, Any]) -> int:
+    from dexkit.cli.replay_as_recorded import play_as_recorded
+
+    stated = click.core.ParameterSource.COMMANDLINE
+    for parameter in ctx.command.params:
+        name = str(parameter.name)
+        if name not in _AS_RECORDED and ctx.get_parameter_source(name) is stated:
+            raise UsageError(
+                f"{parameter.opts[0]} is not for a recording that is published as it is",
+                hint="leave out --as-recorded, --topic and --no-wait to play it with care",
             )
+    return play_as_recorded(
+        source,
+        speed=given["pace"],
+        **{
+            name: given[name]
+            for name in (
+                *("loop", "topics", "max_gap", "domain", "interface"),
+                *("wait", "no_wait", "force"),
+            )
+        },
+    )
 
 
-def _wait_for_readers(
-    node: DdsNode, writers: dict[str, Writer], patience: float, stop: StopRequest
-) -> None:
-    """Return when each topic is subscribed, or the user gives up.
+# ------------------------------------------------------------------------------ what was found
 
-    :raises DdsError: a topic is still not subscribed after ``patience`` seconds.
-    """
-    end = time.monotonic() + patience
-    missing = [t for t, w in writers.items() if not w.matched]
-    if missing:
-        names = ", ".join(map(one_line, missing))
-        click.echo(f"waiting for a subscriber of {names} ...", err=True)
-    while missing and not stop and time.monotonic() < end:
-        writers[missing[0]].wait_matched(timeout=0.1)
-        missing = [t for t, w in writers.items() if not w.matched]
-    if missing and not stop:
-        raise DdsError(
-            f"no process subscribes {', '.join(missing)} on domain {node.domain}, {node.interface} "
-            f"(waited {patience:g} s)",
-            hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
-            "anyway with --no-wait",
-        )
+
+def _print_session(session: RecordedCommands, prepared: Prepared) -> None:
+    from rich.table import Table
+
+    from dexkit.console import Console, markup
+
+    spoken = session.dialect
+    assert spoken is not None
+    hands = session.commands or session.states
+    about = [f"{session.model.title}, {', '.join(map(str, hands))} ({spoken.name})"]
+    if plan := prepared.plan:
+        rates = [1 / t.period for t in plan.tracks.values() if t.period]
+        about.append(f"{plan.commands:,} commands in {plan.duration:.2f} s")
+        about += [f"{max(rates):.3g} Hz"] if rates else []
+    about.append(session.form if session.form != "recording" else _age(session.first_ns))
+    click.echo(one_line(f"{session.name}: {'; '.join(filter(None, about))}", REMARK))
+    if not prepared.findings:
+        click.echo("nothing was found against it")
+        return
+    console = Console(width=max(Console().width, 100))
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in ("finding", "", "hand"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("what, and its cure", overflow="fold")
+    for f in prepared.findings:
+        cure = f"\n[bold]{markup(f.cure)}[/]" if f.cure else ""
+        level = f"[{_STYLES[str(f.level)]}]{f.level}[/]"
+        table.add_row(markup(f.name), level, markup(f.where), markup(f.text) + cure)
+    console.print(table)
+
+
+def _age(first_ns: int) -> str:
+    """When it was recorded."""
+    seconds = time.time() - first_ns / 1e9
+    if first_ns <= 0 or seconds < 0:
+        return ""
+    when = datetime.fromtimestamp(first_ns / 1e9, timezone.utc)
+    days = int(seconds // 86400)
+    ago = f"{days} day{'' if days == 1 else 's'} ago" if days else "today"
+    return f"recorded {when:%Y-%m-%d %H:%M} UTC, {ago}"
+
+
+def _print_refusal(source: Path, prepared: Prepared) -> None:
+    names = ", ".join(dict.fromkeys(f.name for f in prepared.refused))
+    click.echo(f"refused: {names}", err=True)
+    hard = [f for f in prepared.refused if not f.cure.startswith("--")]
+    if prepared.cures and not hard:
+        click.echo(f"  cured by: {' '.join(prepared.cures)}", err=True)
+        click.echo("  see what that does: the same with --rehearse", err=True)
+
+
+# ------------------------------------------------------------------------------ rehearsal
+
+
+def _rehearse(
+    prepared: Prepared,
+    guards: Guards,
+    source: Path,
+    name: str,
+    page: Path | None,
+    ctx: click.Context,
+) -> int:
+    """Rehearse, print a summary, write the page; the exit code."""
+    from dexkit.conformance.report.rehearsal import render
+    from dexkit.conformance.virtual.rehearsal import rehearse
+    from dexkit.documents import check_output_paths, write_file
+    from dexkit.traces.replay.machine import End
+
+    if prepared.plan is None:
+        return 1
+    if page is None:
+        page = Path(f"{Path(name).name.removesuffix('.mcap')}-rehearsal.html")
+    check_output_paths([source], [page])
+    rehearsal = rehearse(prepared.plan, guards)
+    _print_rehearsal(rehearsal)
+    write_file(page, render(prepared, rehearsal, source=str(source), options=_options(ctx)))
+    click.echo(f"page: {page}")
+    return 0 if rehearsal.machine.end is End.DONE else 1
+
+
+def _options(ctx: click.Context) -> str:
+    """The options that were given, for the page."""
+    stated = click.core.ParameterSource.COMMANDLINE
+    words = []
+    for parameter in ctx.command.params:
+        name = str(parameter.name)
+        if isinstance(parameter, click.Option) and ctx.get_parameter_source(name) is stated:
+            value = ctx.params.get(name)
+            shown = [] if parameter.is_flag else value if isinstance(value, tuple) else [value]
+            words += [parameter.opts[0], *map(str, shown)]
+    return " ".join(words)
+
+
+def _print_rehearsal(rehearsal: Rehearsal) -> None:
+    from rich.table import Table
+
+    from dexkit.console import Console, markup
+
+    machine = rehearsal.machine
+    click.echo(
+        f"rehearsed on emulated hands, {rehearsal.seconds:.1f} s: "
+        + one_line(machine.reason, REMARK)
+    )
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("joint", no_wrap=True)
+    for heading in (
+        *("commanded rad", "moved rad", "rms away", "worst away", "at s"),
+        *("max rad/s", "max N·m", "at limit"),
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for side, figures in rehearsal.figures().items():
+        for f in figures:
+            table.add_row(
+                markup(f"{side} {f.name}"),
+                *(f"{x:.3f}" for x in (f.commanded, f.moved, f.rms, f.worst)),
+                f"{f.at:.2f}",
+                f"{f.speed:.1f}",
+                f"{f.torque:.2f}",
+                f"{f.limit:.0%}",
+            )
+    Console(width=max(Console().width, 110)).print(table)
+
+
+# ------------------------------------------------------------------------------ the hands
+
+
+def _play(prepared: Prepared, guards: Guards, given: dict[str, Any]) -> int:
+    from dexkit.cli.replay_as_recorded import short_switch_interval
+    from dexkit.cli.stop_keys import stop_keys
+    from dexkit.dds import DdsNode
+    from dexkit.stop_signals import stop_on_signals
+    from dexkit.traces.replay.live import LiveReplay
+    from dexkit.traces.replay.machine import End, ReplayMachine
+
+    assert prepared.plan is not None
+    machine = ReplayMachine(prepared.plan, guards)
+    domain, interface = given["domain"], given["interface"]
+    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
+        live = LiveReplay(node, machine, force=given["force"])
+        waiting = _Waiting(live, given["wait"])
+        if not live.wait_ready(stop.event, waiting):
+            return 130
+        click.echo(f"ready: playing on domain {domain}, {interface}; space, q or Ctrl-C stops")
+        with short_switch_interval(), _status() as show, stop_keys() as pressed:
+
+            def turn(machine: ReplayMachine) -> None:
+                show(machine)
+                if stop or pressed():
+                    machine.stop(End.ASKED, "stopped")
+
+            live.play(turn)
+    return _print_end(machine)
+
+
+def _print_end(machine: ReplayMachine) -> int:
+    from dexkit.traces.replay.machine import End
+
+    done = machine.progress
+    text = f"played {machine.at:.1f} s, sent {done.sent} commands"
+    if machine.guards.loop:
+        text += f", {done.passes} passes"
+    for side, (away, joint, at) in done.farthest.items():
+        name = machine.names(side)[joint]
+        text += f"; {side} at most {away:.2f} rad from its command ({name}, {at:.1f} s)"
+    if done.held > 0.1:
+        text += f"; held for {done.held:.1f} s by this machine"
+    if done.pauses:
+        text += f"; paused {done.pauses} times, and ramped again"
+    click.echo(one_line(text, REMARK))
+    if machine.end is End.DONE:
+        return 0
+    if machine.end is End.ASKED:
+        return 0 if machine.guards.loop else 130
+    click.echo(one_line(f"stopped: {machine.reason}", REMARK), err=True)
+    return 1
+
+
+class _Waiting:
+    """Says what is waited for, and gives up."""
+
+    def __init__(self, live: LiveReplay, patience: float) -> None:
+        self._live, self._patience = live, patience
+        self._told = False
+
+    def __call__(self, seconds: float) -> None:
+        """Still waiting.
+
+        :raises DdsError: for longer than the user wants to.
+        """
+        live = self._live
+        node, missing = live.node, live.machine.missing
+        if live.unsubscribed:
+            topics = ", ".join(map(one_line, live.unsubscribed))
+            waits, lacks = f"a subscriber of {topics}", f"no process subscribes {topics}"
+        else:
+            sides = " and ".join(map(str, missing))
+            waits = f"state of the {sides} hand"
+            lacks = f"no usable state of the {sides} hand"
+        if seconds >= self._patience:
+            raise DdsError(
+                f"{lacks} on domain {node.domain}, {node.interface} (waited {self._patience:g} s)",
+                hint=live.advice(),
+            )
+        if not self._told and seconds > 0.2:
+            self._told = True
+            click.echo(f"waiting for {waits} ...", err=True)
 
 
 @contextmanager
-def _short_switch_interval() -> Iterator[None]:
-    """Let the playing thread have the interpreter within 0.5 ms instead of 5."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
-
-
-@contextmanager
-def _status(player: Player) -> Iterator[None]:
+def _status() -> Iterator[Any]:
     """Show the progress in one line, on a terminal."""
     if not sys.stderr.isatty():
-        yield
+        yield lambda machine: None
         return
-    done = threading.Event()
+    shown = 0.0
 
-    def show() -> None:
-        while not done.wait(0.5):
-            passes, within = divmod(player.sent, len(player))
-            part = f"{100 * within / len(player):3.0f} %"
-            text = f"{part}  {player.sent:,} messages" + (f"  pass {passes + 1}" if passes else "")
+    def show(machine: ReplayMachine) -> None:
+        nonlocal shown
+        now = time.monotonic()
+        if now - shown >= 0.5:
+            shown = now
+            text = f"{machine.phase}  {machine.at:.1f} of {machine.plan.duration:.1f} s"
             click.echo(f"\r\033[K{text}", nl=False, err=True)
 
-    thread = Worker("status", show)
-    thread.start()
     try:
-        yield
+        yield show
     finally:
-        done.set()
-        thread.join()
         click.echo("\r\033[K", nl=False, err=True)

@@ -38,7 +38,7 @@ class LiveReplay:
     def __init__(self, node: DdsNode, machine: ReplayMachine, *, force: bool = False) -> None:
         from dexkit.dds import Qos
 
-        self._node, self.machine = node, machine
+        self.node, self.machine = node, machine
         plan = machine.plan
         self._encode = ClientWire(plan.dialect)
         self._states = StateWire(plan.dialect)
@@ -74,7 +74,7 @@ class LiveReplay:
 
     def advice(self) -> str:
         """What may be wrong where no hand is found."""
-        seen = {(e.topic, e.type_name) for e in self._node.endpoints() if e.kind == "writer"}
+        seen = {(e.topic, e.type_name) for e in self.node.endpoints() if e.kind == "writer"}
         spoken = self.machine.plan.dialect
         for d in DIALECTS.values():
             sides = [s for s, topic in StateWire(d).topics.items() if (topic, d.state_type) in seen]

@@ -165,6 +165,14 @@ class ReplayMachine:
         self._from: dict[Side, Values] = {}
         self._ramp = 0.0
 
+    def names(self, side: Side) -> tuple[str, ...]:
+        """The joints of a hand."""
+        return self._limits[side].names
+
+    def farthest_allowed(self, side: Side) -> Values:
+        """Rad that each joint may be away from its command."""
+        return self._far[side]
+
     # -- what happens
 
     def receive(self, now: float, side: Side, seen: HandSeen) -> None:
@@ -258,8 +266,7 @@ class ReplayMachine:
 
     def _wait(self, now: float) -> None:
         fresh = all(
-            self._usable(s) and now - self._seen[s][0] <= self.guards.stale
-            for s in self.plan.sides
+            self._usable(s) and now - self._seen[s][0] <= self.guards.stale for s in self.plan.sides
         )
         if not fresh:
             if self._sent and self._since > _PATIENCE:

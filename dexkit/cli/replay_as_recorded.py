@@ -1,0 +1,185 @@
+"""``dexkit replay --as-recorded``: publish the payloads of a recording with their timing."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.errors import DdsError, TraceUnsupported
+from dexkit.escaping import REMARK, one_line
+from dexkit.single_publisher import NodeTopics, SolePublisher
+from dexkit.stop_signals import StopRequest, stop_on_signals
+from dexkit.threads import Worker
+
+if TYPE_CHECKING:
+    from dexkit.dds import DdsNode, Writer
+    from dexkit.traces import Player, Trace, TraceMessage
+
+__all__ = ["play_as_recorded", "short_switch_interval"]
+
+# Seconds from a match seen here to the first message, for the other side to see it too: what comes
+# before is lost to it. Unitree's SDK sleeps as long after making a writer
+# (docs/sources/unitree-dex.md#a6).
+_SETTLE = 0.2
+# Seconds for the other side's readers after the last message, before the writers vanish.
+_LINGER = 0.1
+
+
+def play_as_recorded(
+    file: Path,
+    *,
+    speed: float,
+    loop: bool,
+    topics: tuple[str, ...],
+    max_gap: float | None,
+    domain: int,
+    interface: str,
+    wait: float,
+    no_wait: bool,
+    force: bool,
+) -> int:
+    """Publish the payloads of a recording as they are, with their timing; the exit code.
+
+    :raises DexkitError: it cannot be read or published.
+    """
+    from dexkit.dds import DdsNode
+    from dexkit.traces import Player, open_trace
+
+    trace = open_trace(file)
+    try:
+        player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
+    finally:  # more may be found while the messages are read
+        for warning in trace.warnings:
+            click.echo(one_line(f"warning: {warning}", REMARK), err=True)
+    _check_types(trace, player)
+    click.echo(
+        f"{file}: {len(player)} messages of {', '.join(map(one_line, player.topics))}, "
+        f"{player.duration:.1f} s" + (", looped" if loop else "")
+    )
+    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
+        # a hand must have one source of commands: a recording gives way to any other
+        sole = SolePublisher(
+            [NodeTopics(node, player.topics)],
+            hint="stop that publisher, choose another --domain, or play anyway with --force",
+            force=force,
+            yields=True,
+        )
+        sole.search()
+        claim = sole.announce()
+        writers = {
+            topic: node.writer(topic, name, user_data=claim)
+            for topic, name in player.topics.items()
+        }
+        sole.settle()
+        if not no_wait:
+            _wait_for_readers(node, writers, wait, stop)
+            stop.wait(_SETTLE)
+        if stop:
+            return 130
+        click.echo(f"ready: playing on domain {domain}, {interface}")
+        with short_switch_interval(), _status(player):
+
+            def send(message: TraceMessage) -> object:
+                # stamped first: a command that a stop holds back here is old, and is seen to be
+                now_ns = time.time_ns()
+                sole.poll()
+                return writers[message.topic].write_raw(message.data, now_ns)
+
+            def paused(seconds: float) -> None:
+                click.echo(
+                    f"this program was paused for {seconds:.2f} s; the recording goes on where it "
+                    "was left",
+                    err=True,
+                )
+                stop.wait(_SETTLE)  # publishers that started meanwhile are discovered first
+
+            stats = player.play(send, stop=stop.event, paused=paused)
+        time.sleep(_LINGER)
+    click.echo(
+        f"sent {stats.sent} messages in {stats.duration:.1f} s"
+        + (f", {stats.passes} passes" if loop else "")
+        + f"; late by {stats.error_p50 * 1e3:.3f} ms (p50), {stats.error_p99 * 1e3:.3f} ms (p99), "
+        f"{stats.error_max * 1e3:.3f} ms (max)"
+        + (f"; paused {stats.pauses} times" if stats.pauses else "")
+    )
+    # for a loop, being stopped is the ordinary end
+    if stats.stopped and not loop:
+        return 130
+    return 1 if trace.damage else 0
+
+
+def _check_types(trace: Trace, player: Player) -> None:
+    for channel in trace.channels:
+        chosen = player.topics.get(channel.topic) == channel.type_name
+        if chosen and channel.problem and channel.message_count:
+            raise TraceUnsupported(
+                f"{channel.topic} cannot be played: {channel.problem}",
+                hint="choose other topics with --topic",
+            )
+
+
+def _wait_for_readers(
+    node: DdsNode, writers: dict[str, Writer], patience: float, stop: StopRequest
+) -> None:
+    """Return when each topic is subscribed, or the user gives up.
+
+    :raises DdsError: a topic is still not subscribed after ``patience`` seconds.
+    """
+    end = time.monotonic() + patience
+    missing = [t for t, w in writers.items() if not w.matched]
+    if missing:
+        names = ", ".join(map(one_line, missing))
+        click.echo(f"waiting for a subscriber of {names} ...", err=True)
+    while missing and not stop and time.monotonic() < end:
+        writers[missing[0]].wait_matched(timeout=0.1)
+        missing = [t for t, w in writers.items() if not w.matched]
+    if missing and not stop:
+        raise DdsError(
+            f"no process subscribes {', '.join(missing)} on domain {node.domain}, {node.interface} "
+            f"(waited {patience:g} s)",
+            hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
+            "anyway with --no-wait",
+        )
+
+
+@contextmanager
+def short_switch_interval() -> Iterator[None]:
+    """Let the playing thread have the interpreter within 0.5 ms instead of 5."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextmanager
+def _status(player: Player) -> Iterator[None]:
+    """Show the progress in one line, on a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    done = threading.Event()
+
+    def show() -> None:
+        while not done.wait(0.5):
+            passes, within = divmod(player.sent, len(player))
+            part = f"{100 * within / len(player):3.0f} %"
+            text = f"{part}  {player.sent:,} messages" + (f"  pass {passes + 1}" if passes else "")
+            click.echo(f"\r\033[K{text}", nl=False, err=True)
+
+    thread = Worker("status", show)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        click.echo("\r\033[K", nl=False, err=True)
