@@ -24,6 +24,7 @@ _WRITERS: dict[tuple[str, ...], list[str]] = {
     ("badge",): ["<result>"],
     ("check",): [_SAMPLE, "--require", "DEX1-RATE-03"],
     ("compare",): ["<result>", "<result>"],
+    ("replay",): [_SAMPLE, "--rehearse"],
     ("report",): ["<result>"],
     ("mutants",): [],
 }
@@ -89,7 +90,7 @@ def test_unwritable_output_file_of_any_option_is_an_error(
             (str(there), "No space left on device"),
             (str(tmp_path / "out"), "Is a directory"),
             (str(tmp_path / "none" / "x"), "No such file or directory"),
-        )[: 2 if name == ("check",) else 4]:  # which judges each time
+        )[: 2 if name in (("check",), ("replay",)) else 4]:  # which work each time
             with monkeypatch.context() as patch:
                 if place == str(there):
                     patch.setattr(os, "replace", full)

@@ -130,7 +130,7 @@ def test_a_replayed_session_is_recorded_as_it_was(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     options = ("--domain", domain)
     with running("record", out, "--topic", "/dex1/left/cmd", "--topic", RIGHT, *options) as rec:
-        done = run("replay", clip, *options)
+        done = run("replay", clip, "--as-recorded", *options)
         assert done.returncode == 0, done.stderr
         stdout, stderr = interrupt(rec)
         assert rec.returncode == 0, stderr

@@ -14,7 +14,7 @@ from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehear
 from dexkit.escaping import html as escape
 from dexkit.hand import Side
 from dexkit.models import model
-from dexkit.traces.replay.machine import End
+from dexkit.traces.replay.machine import End, Phase
 from dexkit.traces.replay.prepare import Level as Grade
 from dexkit.traces.replay.prepare import Prepared, joint_limits
 
@@ -122,7 +122,9 @@ def _hand(rehearsal: Rehearsal, side: Side) -> str:
     limits = joint_limits(rehearsal.plan.dialect, side)
     figures = hand.figures(limits.tau)
     bands = [
-        Band(str(phase), begin, end) for phase, begin, end in rehearsal.phases if end - begin > 0.05
+        Band(str(phase), begin, end)
+        for phase, begin, end in rehearsal.phases
+        if phase is not Phase.PLAY and end - begin > 0.05
     ]
     parts = [f"<h2>{str(side).capitalize()} hand</h2>"]
     if figures:
@@ -168,23 +170,18 @@ def _overview(
 ) -> str:
     """The largest distance from a command, and the largest torque, over time."""
     limits = joint_limits(rehearsal.plan.dialect, hand.side)
+    machine = rehearsal.machine
     away = np.abs(hand.command - hand.q)
-    levels = []
-    stated = rehearsal.machine.guards.max_distance
-    title = "distance from the command, of the farthest joint"
-    if stated is not None:
-        levels = [Level(stated, f"stopped beyond {stated:g} rad")]
-    elif len(hand.names) == 1:
-        far = rehearsal.machine.farthest_allowed(hand.side)[0]
-        levels = [Level(far, f"stopped beyond {far:.2f} rad")]
+    part = 100 * (away / np.array(machine.farthest_allowed(hand.side))).max(axis=1)
+    stopped = Level(100.0, f"stopped beyond, for {machine.guards.distance_time:g} s")
     torque = 100 * (np.abs(hand.tau) / limits.tau).max(axis=1)
     return chart(
-        f"{hand.side} hand: {title}",
-        [Line("distance", "bad", hand.t, away.max(axis=1))],
-        y_unit="rad",
+        f"{hand.side} hand: distance from the command, of the farthest joint",
+        [Line("distance", "state", hand.t, part)],
+        y_unit="% of allowed",
         span=span,
         bands=bands,
-        levels=levels,
+        levels=[stopped],
         height=140,
         include=(0.0,),
     ) + chart(
@@ -201,7 +198,7 @@ def _overview(
 def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
     rows = [
         (
-            escape(f.name),
+            f'<span style="white-space:nowrap">{escape(f.name)}</span>',
             f"{f.commanded:.2f}",
             f"{f.moved:.2f}",
             f"{f.rms:.3f}",

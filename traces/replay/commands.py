@@ -150,7 +150,8 @@ def read_trace(trace: Trace, name: str) -> RecordedCommands:
     """
     topics = [c.topic for c in trace.channels if c.message_count and _wanted(c.topic, c.type_name)]
     for channel in trace.channels:
-        if channel.problem and channel.message_count and channel.topic in topics:
+        hand = roles(channel.topic, channel.type_name)
+        if channel.problem and channel.message_count and hand:
             raise TraceUnsupported(f"{channel.topic} cannot be played: {channel.problem}")
     streams = streams_of(trace, list(dict.fromkeys(topics))) if topics else []
     hands = [s for s in streams if s.model and s.part.endswith(HAND) and s.samples is not None]
@@ -180,7 +181,8 @@ def read_trace(trace: Trace, name: str) -> RecordedCommands:
 
 
 def _wanted(topic: str, type_name: str) -> bool:
-    return topic.startswith(SESSION) or any(r.kind != "low" for r in roles(topic, type_name))
+    group = topic.startswith(SESSION) and topic.endswith(("/cmd", "/state"))
+    return group or any(r.kind != "low" for r in roles(topic, type_name))
 
 
 def _role(stream: Stream) -> Role | None:

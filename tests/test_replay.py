@@ -1,0 +1,749 @@
+"""Sessions are checked, cured and played on hands with care: ``dexkit replay``, without DDS."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.cli import cli
+from dexkit.cli.replay import command
+from dexkit.command_age import PAUSE, SETTLE
+from dexkit.conformance.virtual.rehearsal import rehearse
+from dexkit.errors import DexkitError, SessionError, UsageError
+from dexkit.hand import JointMode, MotorError, Side
+from dexkit.messages import message_type
+from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
+from dexkit.messages.unitree_hg import HandCmd_, HandState_
+from dexkit.messages.unitree_hg import MotorCmd_ as HgCmd
+from dexkit.messages.unitree_hg import MotorState_ as HgState
+from dexkit.models import DEX3_1, dialect
+from dexkit.models import model as model_by_name
+from dexkit.teleop.client import JointCommand
+from dexkit.traces import open_trace, sample_path
+from dexkit.traces.replay import prepare as preparation
+from dexkit.traces.replay.commands import RecordedCommands, read_session, read_trace
+from dexkit.traces.replay.machine import HOLD, End, Guards, Phase, ReplayMachine
+from dexkit.traces.replay.prepare import Finding, Level, Plan, Prepared, Track, Wishes, prepare
+from dexkit.traces.replay.states import HandSeen, StateWire
+from tests.each import each
+from tests.session_helpers import document, episode, hand_waves, whole
+from tests.test_sessions_import import NAMES, dataset
+from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, Row, mcap_bytes, write
+
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+GO, DEX3 = dialect("unitree_go"), dialect("dex3")
+HAND_CMD, HAND_STATE = DEX3.cmd_type, DEX3.state_type
+DEX3_LEFT, DEX3_STATE = DEX3.topics(LEFT)
+
+
+def dexkit(*arguments: object) -> tuple[int, str]:
+    """Exit code and everything printed; of an error, its message and hint."""
+    result = CliRunner().invoke(cli, [str(a) for a in arguments], standalone_mode=False)
+    if isinstance(result.exception, DexkitError):
+        error = result.exception
+        return error.exit_code, f"{result.output}{error.message} {error.hint}"
+    assert result.exception is None, result.exception
+    return int(result.return_value or 0), result.output
+
+
+# -- small sessions
+
+
+def gripper(
+    q: Any, *, hz: float = 200.0, kp: float = 5.0, sent: Any = None, topic: str = CMD
+) -> list[Row]:
+    """Commands to a gripper at a rate; ``sent`` are the source timestamps, ns."""
+    kind = message_type(CMD_TYPE)
+    return [
+        (
+            topic,
+            T0 + round(i * 1e9 / hz),
+            T0 + round(i * 1e9 / hz) if sent is None else int(sent[i]),
+            kind.encode(MotorCmds_([MotorCmd_(q=float(x), kp=kp, kd=0.05)])),
+        )
+        for i, x in enumerate(q)
+    ]
+
+
+def fingers(
+    q: np.ndarray, *, hz: float = 100.0, kp: float = 1.5, mode: int | None = None,
+    topic: str = DEX3_LEFT,
+) -> list[Row]:  # fmt: skip
+    """Commands to a hand of several joints."""
+    kind = message_type(HAND_CMD)
+    rows = []
+    for i, pose in enumerate(q.tolist()):
+        motors = [
+            HgCmd(mode=0x10 | j if mode is None else mode, q=x, kp=kp, kd=0.2)
+            for j, x in enumerate(pose)
+        ]
+        at = T0 + round(i * 1e9 / hz)
+        rows.append((topic, at, at, kind.encode(HandCmd_(motors))))
+    return rows
+
+
+def session(tmp_path: Path, rows: list[Row], **settings: Any) -> RecordedCommands:
+    types = {CMD: CMD_TYPE, STATE: STATE_TYPE, "rt/dex1/right/cmd": CMD_TYPE}
+    types |= {DEX3.topics(s)[0]: HAND_CMD for s in Side} | {DEX3_STATE: HAND_STATE}
+    used = {row[0] for row in rows}
+    data = mcap_bytes(rows, types={t: k for t, k in types.items() if t in used}, **settings)
+    path = write(tmp_path / "session.mcap", data)
+    return read_trace(open_trace(path), path.name)
+
+
+def slow_wave(n: int = 400) -> np.ndarray:
+    return 2.7 + 1.5 * np.sin(np.arange(n) / 60)
+
+
+def named(found: Prepared) -> dict[str, Finding]:
+    return {f.name: f for f in found.findings}
+
+
+def levels(found: Prepared) -> dict[str, str]:
+    return {f.name: str(f.level) for f in found.findings}
+
+
+# -- findings and cures
+
+
+def test_genuine_sessions_are_found_fit_to_be_played() -> None:
+    for name in ("dex1_pick_place", "dex1_legacy_v1_1", "dex3_pinch"):
+        found = prepare(read_session(sample_path(name)))
+        assert found.findings == []
+        assert found.plan is not None
+        assert found.plan.sides == (LEFT, RIGHT)
+
+
+def test_data_without_motion_is_named_and_cured(tmp_path: Path) -> None:
+    """No motion (unitree_lerobot 79): without gains, or with motors locked by their mode."""
+    (tmp_path / "a").mkdir()
+    limp = session(tmp_path / "a", gripper(slow_wave(), kp=0.0))
+    found = prepare(limp)
+    assert levels(found) == {"zero-gains": "refused"}
+    assert "no motion" in found.findings[0].text
+    assert found.cures == ["--gains model"]
+    assert found.plan is not None
+    moved = rehearse(found.plan).figures()[LEFT]
+    assert moved[0].commanded > 2
+    assert moved[0].moved < 0.1
+    cured = prepare(limp, Wishes(gains="model"))
+    assert levels(cured) == {"zero-gains": "cured"}
+    assert cured.plan is not None
+    assert rehearse(cured.plan).figures()[LEFT][0].moved > 2
+
+    locked = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 300, 0.0), mode=0))
+    found = prepare(locked)
+    assert levels(found) == {"locked": "refused"}
+    assert found.plan is not None
+    assert not found.plan.tracks[LEFT].driven.any()
+    assert max(f.moved for f in rehearse(found.plan).figures()[LEFT]) < 0.1
+    cured = prepare(locked, Wishes(gains="model"))
+    assert cured.plan is not None
+    assert cured.plan.tracks[LEFT].driven.all()
+    assert max(f.moved for f in rehearse(cured.plan).figures()[LEFT]) > 0.5
+
+
+def test_data_with_loud_motors_is_named_and_cured(tmp_path: Path) -> None:
+    """Loud motors (unitree_lerobot 79): steps of a thin rate, made strong by high gains."""
+    waves = hand_waves("dex3-1", LEFT, 90, 0.0)
+    loud = session(tmp_path, fingers(waves, hz=30.0, kp=20.0))
+    found = prepare(loud)
+    assert levels(found) == {"high-gains": "refused", "thin-rate": "refused"}
+    assert found.cures == ["--gains model", "--resample 100"]
+    assert all("loud motors" in f.text for f in found.findings)
+    half = prepare(loud, Wishes(gains="model"))
+    assert levels(half) == {"high-gains": "cured", "thin-rate": "refused"}
+    cured = prepare(loud, Wishes(gains="model", resample=100.0))
+    assert not cured.refused
+    assert found.plan is not None
+    assert cured.plan is not None
+    before, after = found.plan.tracks[LEFT], cured.plan.tracks[LEFT]
+    torque = [float((np.abs(np.diff(t.q, axis=0)) * t.kp[1:]).max()) for t in (before, after)]
+    assert torque[1] < torque[0] / 30
+    # on a straight line between the frames, and with both ends
+    at = np.array([np.interp(after.t, before.t, c) for c in before.q.T]).T
+    assert after.q == pytest.approx(at, abs=1e-6)
+    assert (after.t[0], after.t[-1]) == (before.t[0], before.t[-1])
+
+
+def test_a_thin_rate_by_a_slow_pace_is_found(tmp_path: Path) -> None:
+    calm = session(tmp_path, gripper(slow_wave()))
+    assert prepare(calm, Wishes(pace=0.5)).findings == []
+    assert levels(prepare(calm, Wishes(pace=0.25))) == {"thin-rate": "refused"}
+    played = prepare(calm, Wishes(pace=0.25, resample=200.0)).plan
+    assert played is not None
+    assert played.duration == pytest.approx(399 / 200 / 0.25)
+
+
+def test_faster_than_recorded_is_refused_unless_it_is_accepted(tmp_path: Path) -> None:
+    calm = session(tmp_path, gripper(slow_wave()))
+    assert levels(prepare(calm, Wishes(pace=2.0))) == {"pace": "refused"}
+    assert levels(prepare(calm, Wishes(pace=2.0, accept=["pace"]))) == {"pace": "accepted"}
+
+
+def test_positions_outside_the_limits_are_refused_or_clamped(tmp_path: Path) -> None:
+    wide = session(tmp_path, gripper(2.7 + 3.2 * np.sin(np.arange(800) / 150)))
+    found = prepare(wide)
+    assert levels(found) == {"limits": "refused"}
+    assert "gripper" in found.findings[0].text
+    assert "limits 0 to 5.4" in found.findings[0].text
+    plan = prepare(wide, Wishes(limit="clamp")).plan
+    assert plan is not None
+    q = plan.tracks[LEFT].q
+    assert (q.min(), q.max()) == (0.0, 5.4)
+
+
+def test_jumps_are_refused_or_given_time(tmp_path: Path) -> None:
+    q = np.where(np.arange(400) < 200, 0.5, 5.0)
+    jumping = session(tmp_path, gripper(q))
+    found = prepare(jumping)
+    assert levels(found) == {"jumps": "refused"}
+    assert "1 place" in found.findings[0].text
+    plan = prepare(jumping, Wishes(jumps="stretch")).plan
+    assert plan is not None
+    track = plan.tracks[LEFT]
+    assert plan.duration == pytest.approx(399 / 200 - 0.005 + 4.5 / 24.0, abs=1e-3)
+    assert _fastest(track) <= 24.0 * (1 + 1e-6)
+    assert np.diff(track.q[:, 0]).max() < 0.2
+
+
+def test_hands_stay_together_when_one_is_given_time(tmp_path: Path) -> None:
+    q = np.where(np.arange(400) < 200, 0.5, 5.0)
+    both = gripper(q) + gripper(slow_wave(), topic="rt/dex1/right/cmd")
+    plan = prepare(session(tmp_path, both), Wishes(jumps="stretch")).plan
+    assert plan is not None
+    left, right = plan.tracks[LEFT], plan.tracks[RIGHT]
+    assert left.t[-1] == pytest.approx(right.t[-1], abs=1e-4)
+    after = right.t[np.argmin(np.abs(right.q[:, 0] - slow_wave()[300]))]
+    assert left.t[-1] - after == pytest.approx(99 / 200, abs=1e-3)
+
+
+def _fastest(track: Track) -> float:
+    return float((np.abs(np.diff(track.q, axis=0)) / np.diff(track.t)[:, None]).max())
+
+
+def test_the_pose_is_held_in_pauses(tmp_path: Path) -> None:
+    rows = gripper(slow_wave())
+    moved = [(t, log + (3_000_000_000 if i >= 200 else 0), 0, d) for i, (t, log, _, d) in
+             enumerate(rows)]  # fmt: skip
+    paused = session(tmp_path, moved)
+    found = prepare(paused, Wishes(resample=200.0))
+    assert levels(found) == {"gaps": "note"}
+    assert found.plan is not None
+    track = found.plan.tracks[LEFT]
+    held = (track.t > 1.0) & (track.t < 3.9)
+    assert np.ptp(track.q[held]) < 1e-6
+    shorter = prepare(paused, Wishes(max_gap=0.5)).plan
+    assert shorter is not None
+    assert shorter.duration == pytest.approx(399 / 200 - 0.005 + 0.5, abs=1e-3)
+
+
+def test_a_session_of_the_other_hand_is_recognised(tmp_path: Path) -> None:
+    """A mirrored hand: what closes one is out of reach of the other."""
+    wrong = session(tmp_path, fingers(hand_waves("dex3-1", RIGHT, 300, 0.0)))
+    found = prepare(wrong)
+    assert named(found)["side"].level is Level.REFUSED
+    assert named(found)["side"].cure == "--swap-sides"
+    swapped = prepare(wrong, Wishes(swap_sides=True))
+    assert not swapped.refused
+    assert swapped.plan is not None
+    assert swapped.plan.sides == (RIGHT,)
+
+
+def test_what_cannot_be_sent_is_refused_or_left_out(tmp_path: Path) -> None:
+    q = slow_wave()
+    good = gripper(q)
+    nan = list(good)
+    nan[7] = gripper(np.where(np.arange(8) == 7, np.nan, 2.7))[7]
+    late = [(t, log, sent - (400_000_000 if 100 <= i < 110 else 0), d)
+            for i, (t, log, sent, d) in enumerate(good)]  # fmt: skip
+    back = [(t, log, sent - (6_000_000 if i == 50 else 0), d)
+            for i, (t, log, sent, d) in enumerate(good)]  # fmt: skip
+    empty = list(good)
+    empty[9] = (CMD, good[9][1], good[9][2], message_type(CMD_TYPE).encode(MotorCmds_([])))
+    for name, rows, dropped in (
+        ("not-finite", nan, 1),
+        ("stale", late, 10),
+        ("backwards", back, 1),
+        ("joints", empty, 1),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        broken = session(folder, rows)
+        found = prepare(broken)
+        assert found.cures == ["--invalid drop"], (name, found.findings)
+        assert name in levels(found)
+        cured = prepare(broken, Wishes(invalid="drop"))
+        assert not cured.refused, name
+        assert cured.plan is not None
+        assert len(cured.plan.tracks[LEFT]) == len(q) - dropped, name
+        assert np.isfinite(cured.plan.tracks[LEFT].q).all()
+
+
+def test_commands_to_a_hand_with_other_joints_are_refused(tmp_path: Path) -> None:
+    six = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 50, 0.0)[:, :6]))
+    found = prepare(six)
+    assert levels(found) == {"joints": "refused"}
+    assert "6 motors in 50 messages, and a Dex3-1 hand has 7" in found.findings[0].text
+    assert found.plan is None
+    assert found.cures == []
+
+
+def test_another_model_is_refused(tmp_path: Path) -> None:
+    found = prepare(session(tmp_path, gripper(slow_wave())), Wishes(dialect="dex3"))
+    assert levels(found) == {"model": "refused"}
+    assert found.plan is None
+
+
+def test_a_gripper_of_another_dialect_gets_its_radians(tmp_path: Path) -> None:
+    plan = prepare(
+        session(tmp_path, gripper([0.0, 2.7, 5.4], hz=2.0)), Wishes(dialect="unitree_hg")
+    )
+    assert plan.plan is not None
+    assert plan.plan.tracks[LEFT].q[:, 0] == pytest.approx([0, math.pi, 2 * math.pi], abs=1e-5)
+
+
+def test_a_session_of_states_is_refused_or_played(tmp_path: Path) -> None:
+    kind = message_type(STATE_TYPE)
+    rows = [
+        (STATE, T0 + i * 5_000_000, 0, kind.encode(MotorStates_([MotorState_(q=float(x))])))
+        for i, x in enumerate(slow_wave())
+    ]
+    states = session(tmp_path, rows)
+    found = prepare(states)
+    assert levels(found) == {"only-states": "refused"}
+    assert found.cures == ["--play states"]
+    played = prepare(states, Wishes(states=True))
+    assert not played.refused
+    assert played.plan is not None
+    assert played.plan.tracks[LEFT].q[:, 0] == pytest.approx(slow_wave(), abs=1e-6)
+    assert played.plan.tracks[LEFT].kp == pytest.approx(5.0)
+
+
+def test_sessions_without_a_hand_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match="no commands to a hand"):
+        prepare(session(tmp_path, []))
+    inspire = episode(tmp_path / "e", whole(document(20, 6)))
+    with pytest.raises(SessionError, match=r"left_hand \(6 joints\)"):
+        prepare(read_session(inspire))
+    left = session(tmp_path, gripper(slow_wave()))
+    with pytest.raises(UsageError, match="nothing to play on the right hand"):
+        prepare(left, Wishes(sides=(RIGHT,)))
+
+
+def test_a_session_that_moves_nothing_is_noted(tmp_path: Path) -> None:
+    assert levels(prepare(session(tmp_path, gripper(np.full(50, 2.0))))) == {"still": "note"}
+    assert levels(prepare(session(tmp_path, gripper([2.0])))) == {"still": "note", "single": "note"}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    steps=st.lists(
+        st.tuples(st.sampled_from([0, 1, 5, 33, 400, 3000]), st.floats(-0.5, 6.0)),
+        min_size=1,
+        max_size=40,
+    ),
+    pace=st.sampled_from([0.3, 1.0]),
+    resample=st.sampled_from([None, 100.0]),
+)
+def test_a_cured_plan_asks_for_nothing_that_a_hand_cannot_do(
+    steps: list[tuple[int, float]], pace: float, resample: float | None
+) -> None:
+    t = np.cumsum([ms / 1000 for ms, _ in steps])
+    q = np.array([[x] for _, x in steps])
+    found = prepare(
+        _recorded(t - t[0], q),
+        Wishes(pace=pace, resample=resample, limit="clamp", jumps="stretch", gains="model"),
+    )
+    assert {f.name for f in found.refused} <= {"thin-rate"}
+    assert found.plan is not None
+    track = found.plan.tracks[LEFT]
+    assert (np.diff(track.t) > 0).all()
+    assert track.q.min() >= 0
+    assert track.q.max() <= 5.4
+    assert track.q[[0, -1]] == pytest.approx(np.clip(q[[0, -1]], 0, 5.4))
+    if any(f.name == "jumps" for f in found.findings):
+        assert _fastest(track) <= 24.0 * (1 + 1e-3)
+    assert found.plan.duration >= (t[-1] - t[0]) / pace - 1e-9
+
+
+def _recorded(t: np.ndarray, q: np.ndarray) -> RecordedCommands:
+    commands = preparation._from_states(t, q, model_by_name("dex1-1"))
+    return RecordedCommands("test", "recording", GO, {LEFT: commands}, {})
+
+
+# -- the machine
+
+
+def plan_of(q: Any, hz: float = 200.0, kp: float = 5.0) -> Plan:
+    table = np.array([[float(x)] for x in q])
+    shape = table.shape
+    track = Track(
+        t=np.arange(len(table)) / hz,
+        q=table,
+        dq=np.zeros(shape),
+        tau=np.zeros(shape),
+        kp=np.full(shape, kp),
+        kd=np.full(shape, 0.05),
+        driven=np.ones(shape, dtype=np.bool_),
+    )
+    return Plan("test", GO, {LEFT: track})
+
+
+class Drive:
+    """Steps a machine; the hand is where it was last commanded, if it follows."""
+
+    def __init__(self, plan: Plan, guards: Guards = Guards(), q: float = 1.0) -> None:  # noqa: B008
+        self.machine = ReplayMachine(plan, guards)
+        self.now, self.q = 100.0, q
+        self.follows = self.answers = True
+        self.seen = HandSeen((q,), (0.0,), (0,))
+        self.sent: list[tuple[float, Phase, JointCommand]] = []
+
+    def turn(self, delay: float = 0.0) -> list[JointCommand]:
+        machine = self.machine
+        self.now = machine.wakes_at(self.now) + delay
+        if self.answers:
+            machine.receive(self.now, LEFT, HandSeen((self.q,), (0.0,), self.seen.fault))
+        phase = machine.phase
+        found = [motors[0] for motors in machine.step(self.now).values()]
+        for sent in found:
+            self.sent.append((self.now, phase, sent))
+            if self.follows and sent.kp > 0:
+                self.q = sent.q
+        return found
+
+    def until(self, *phases: Phase) -> None:
+        for _ in range(20_000):
+            if self.machine.phase in phases:
+                return
+            self.turn()
+        raise AssertionError(f"never {phases}")
+
+    def in_phase(self, phase: Phase) -> Iterator[JointCommand]:
+        return (c for _, p, c in self.sent if p is phase)
+
+
+def test_the_hand_is_led_to_the_first_pose_and_left_at_rest() -> None:
+    drive = Drive(plan_of(slow_wave()), Guards(ramp_speed=0.5), q=0.5)
+    drive.until(Phase.END)
+    machine = drive.machine
+    assert (machine.end, machine.progress.passes) == (End.DONE, 1)
+    ramp = [c.q for c in drive.in_phase(Phase.RAMP)]
+    assert ramp[0] == pytest.approx(0.5, abs=0.01)
+    assert ramp[-1] == pytest.approx(2.7)
+    assert max(np.abs(np.diff(ramp))) <= 0.5 * HOLD + 1e-9
+    times = [t for t, p, _ in drive.sent if p is Phase.RAMP]
+    assert times[-1] - times[0] == pytest.approx(2.2 / 0.5 + 0.3, abs=0.02)
+    played = list(dict.fromkeys(c.q for c in drive.in_phase(Phase.PLAY)))
+    assert played == list(dict.fromkeys(slow_wave().tolist()))
+    parting = list(drive.in_phase(Phase.LEAVE))
+    assert {c.q for c in parting} == {drive.q}
+    assert (parting[0].kp, parting[0].mode) == (5.0, 0)
+
+
+def test_fingers_are_locked_at_the_end() -> None:
+    q = np.repeat([DEX3_1.rest_q[LEFT]], 20, axis=0)
+    shape = q.shape
+    track = Track(np.arange(20) / 100, q, np.zeros(shape), np.zeros(shape), np.full(shape, 1.5),
+                  np.full(shape, 0.2), np.ones(shape, dtype=np.bool_))  # fmt: skip
+    machine = ReplayMachine(Plan("test", DEX3, {LEFT: track}))
+    now, modes = 0.0, []
+    while machine.phase is not Phase.END:
+        now = machine.wakes_at(now)
+        machine.receive(now, LEFT, HandSeen(DEX3_1.rest_q[LEFT], (0.0,) * 7, (0,) * 7))
+        phase = machine.phase
+        modes += [(phase, [m.mode for m in x]) for x in machine.step(now).values()]
+    assert (Phase.PLAY, [0x10 | i for i in range(7)]) in modes
+    assert modes[-1] == (Phase.LEAVE, list(range(7)))
+
+
+def test_nothing_is_sent_before_a_state_and_none_that_is_no_state() -> None:
+    machine = ReplayMachine(plan_of(slow_wave()))
+    assert machine.step(0.0) == {}
+    machine.receive(0.1, LEFT, HandSeen((math.nan,), (0.0,)))
+    assert (machine.step(0.1), machine.missing) == ({}, (LEFT,))
+    fingers_machine = ReplayMachine(
+        Plan("test", DEX3, {LEFT: Track(*(np.zeros((1, 7)) for _ in range(7)))})  # type: ignore[arg-type]
+    )
+    fingers_machine.receive(0.0, LEFT, HandSeen((0.0,) * 7, (0.0,) * 7))
+    assert fingers_machine.missing == (LEFT,)  # clients take all 0 for no state
+    machine.stop(End.ASKED, "stopped")
+    assert machine.phase is Phase.END
+
+
+def test_each_danger_stops_it() -> None:
+    def fault(drive: Drive) -> None:
+        drive.seen = HandSeen((drive.q,), (0.0,), (int(MotorError.OVERCURRENT),))
+
+    def silence(drive: Drive) -> None:
+        drive.answers = False
+
+    def stuck(drive: Drive) -> None:
+        drive.follows = False
+
+    for hurt, end, text, within in (
+        (fault, End.FAULT, "gripper reports overcurrent", 0.02),
+        (silence, End.SILENT, "no state for 0.2", PAUSE + 0.03),
+        (stuck, End.DISTANCE, "more than 0.30 rad from its command", 2.5),
+    ):
+        drive = Drive(plan_of(2.7 + 2 * np.sin(np.arange(2000) / 100)), Guards(max_distance=0.3))
+        drive.until(Phase.PLAY)
+        for _ in range(20):
+            drive.turn()
+        begin = drive.now
+        hurt(drive)
+        drive.until(Phase.LEAVE)
+        assert drive.machine.end is end
+        assert text in drive.machine.reason, drive.machine.reason
+        assert drive.now - begin < within
+        drive.until(Phase.END)
+        last = drive.sent[-1]
+        assert last[1] is Phase.LEAVE
+        # of a hand that is silent the pose is not known: no command draws it anywhere
+        assert last[2].kp == (0.0 if end is End.SILENT else 5.0)
+        if end is not End.SILENT:
+            assert last[2].q == drive.q
+
+
+def test_a_hand_with_a_fault_is_not_moved_at_all() -> None:
+    drive = Drive(plan_of(slow_wave()))
+    drive.seen = HandSeen((1.0,), (0.0,), (int(MotorError.MOS_TEMPERATURE),))
+    drive.until(Phase.END)
+    assert drive.sent == []
+    assert drive.machine.end is End.FAULT
+
+
+def test_a_distance_that_passes_stops_nothing() -> None:
+    drive = Drive(plan_of(np.full(2000, 2.7)), Guards(max_distance=0.3, distance_time=1.0))
+    drive.until(Phase.PLAY)
+    drive.follows = False
+    for i in range(600):
+        drive.q = 1.0 if i % 60 < 40 else 2.7  # blocked for 0.2 s, again and again
+        drive.turn()
+    assert drive.machine.phase is Phase.PLAY
+    assert drive.machine.progress.farthest[LEFT][0] == pytest.approx(1.7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    delays=st.lists(
+        st.sampled_from([0.0, 0.0, 0.0, 0.001, 0.03, 0.2, 0.24, 0.6, 5.0]), min_size=5, max_size=80
+    ),
+    q=st.floats(0.0, 5.4),
+)
+def test_no_delay_of_the_program_makes_a_hand_leap(delays: list[float], q: float) -> None:
+    """Whatever holds the program up: commands follow each other as in the session or the ramp.
+
+    After a pause the first command is where the hand is now, and no state from before counts.
+    """
+    wave = slow_wave(100)
+    drive = Drive(plan_of(wave), Guards(ramp_speed=0.5, max_distance=10.0), q=q)
+    step = max(0.5 * HOLD, float(np.abs(np.diff(wave)).max()) * HOLD * 200)
+    before: float | None = None
+    at = drive.now
+    for i in range(3000):
+        if drive.machine.phase is Phase.END:
+            break
+        delay = delays[i % len(delays)]
+        if delay > PAUSE:
+            drive.q += 0.5 if drive.q < 3 else -0.5  # the hand is moved meanwhile
+        sent = drive.turn(delay)
+        if drive.now - at > PAUSE:
+            assert sent == []  # made before the pause
+            paused = drive.now
+            before = None
+        at = drive.now
+        for motor in sent:
+            if before is None and drive.sent[:-1]:
+                assert drive.now >= paused + SETTLE - 1e-9 or drive.machine.phase is Phase.LEAVE
+            if before is not None and drive.sent[-1][1] is not Phase.LEAVE:
+                assert abs(motor.q - before) <= step + 1e-9
+            before = motor.q
+    else:
+        assert any(d > HOLD for d in delays)  # it may take long
+    played = list(dict.fromkeys(c.q for c in drive.in_phase(Phase.PLAY)))
+    positions = {x: i for i, x in enumerate(wave.tolist())}
+    order = [positions[x] for x in played]
+    assert order == sorted(order)
+    assert all(b - a <= HOLD * 200 + 1 for a, b in itertools.pairwise(order))
+
+
+def test_after_a_pause_the_session_goes_on_where_it_was() -> None:
+    drive = Drive(plan_of(slow_wave()), q=2.0)
+    drive.until(Phase.PLAY)
+    for _ in range(100):
+        drive.turn()
+    at = drive.machine.at
+    drive.q = 0.3
+    drive.turn(delay=3.0)
+    assert drive.machine.phase is Phase.WAIT
+    first = len(drive.sent)
+    drive.until(Phase.PLAY)
+    assert drive.machine.at == pytest.approx(at, abs=1e-9)
+    assert drive.sent[first][2].q == pytest.approx(0.3, abs=0.02)
+    assert drive.machine.progress.pauses == 1
+    drive.until(Phase.END)
+    assert drive.machine.end is End.DONE
+
+
+def test_a_loop_ramps_back_to_the_first_pose() -> None:
+    drive = Drive(plan_of(np.linspace(1.0, 4.0, 200)), Guards(loop=True, max_distance=9.0))
+    while drive.machine.progress.passes < 2:
+        drive.turn()
+    assert max(np.abs(np.diff([c.q for _, _, c in drive.sent]))) < 0.5 * HOLD + 0.31
+    drive.machine.stop(End.ASKED, "stopped")
+    drive.until(Phase.END)
+    assert drive.sent[-1][1] is Phase.LEAVE
+
+
+def test_states_of_each_dialect_are_read() -> None:
+    wire = StateWire(DEX3)
+    motors = [HgState(mode=0x10 | i, q=0.1 * i, tau_est=0.2) for i in range(7)]
+    motors[2].motorstate = int(MotorError.WINDING_OVERTEMPERATURE)
+    motors[4].mode |= 0x80
+    data = message_type(HAND_STATE).encode(HandState_(motors))
+    seen = wire.seen(DEX3_STATE, data)[LEFT]
+    names = [j.name for j in DEX3_1.joints[LEFT]]
+    assert seen.q[1] == pytest.approx(0.1)
+    assert seen.problem(names) == "thumb_2 reports winding_overtemperature"
+    assert HandSeen(seen.q, seen.tau, (), seen.tripped).problem(names).endswith("stopped middle_1")
+    short = message_type(HAND_STATE).encode(HandState_(motors[:6]))
+    assert wire.seen(DEX3_STATE, short) == {}
+    actuator = StateWire(dialect("unitree_actuator"))
+    both = MotorStates_([MotorState_(q=1.0), MotorState_(q=2.0, reserve=(4, 0))])
+    found = actuator.seen("rt/unitree_actuator/state", message_type(STATE_TYPE).encode(both))
+    assert (found[RIGHT].q, found[LEFT].q) == ((1.0,), (2.0,))
+    assert found[LEFT].problem(["gripper"]) == "gripper reports overvoltage"
+
+
+def test_both_hands_of_a_shared_message_are_always_in_it() -> None:
+    plan = prepare(read_session(sample_path("dex1_legacy_v1_1"))).plan
+    assert plan is not None
+    machine, now = ReplayMachine(plan, Guards(max_distance=9.0)), 0.0
+    for _ in range(900):
+        now = machine.wakes_at(now)
+        for side in Side:
+            machine.receive(now, side, HandSeen((0.5,), (0.0,)))
+        commands = machine.step(now)
+        assert set(commands) in (set(), set(Side))
+    assert machine.phase is Phase.PLAY
+
+
+# -- the command
+
+
+def test_every_source_that_import_knows_is_rehearsed(tmp_path: Path) -> None:
+    """An episode, JSON lines, LeRobot, a bag, tables, and a recording of it."""
+    made = episode(tmp_path / "episode_0001", whole(document(40, "dex3-1")))
+    recording = tmp_path / "imported.mcap"
+    assert dexkit("import", made, recording)[0] in (0, 1)
+    lines = tmp_path / "lines.jsonl"
+    items = document(40, "dex3-1")["data"]
+    lines.write_text("".join(json.dumps(x | {"timestamp_ns": T0 + i * 33_333_333}) + "\n"
+                             for i, x in enumerate(items)))  # fmt: skip
+    matrix = np.concatenate(
+        [np.zeros((40, 14)), *(hand_waves("dex3-1", s, 40, 1.0 * i) for i, s in enumerate(Side))],
+        axis=1,
+    )
+    lerobot = dataset(tmp_path / "lerobot", "v2.1", NAMES, matrix)
+    for form in ("rosbag2", "parquet"):
+        assert dexkit("export", recording, "--to", form, "--out", tmp_path / form)[0] in (0, 1)
+    for source, more in (
+        (made, ()),
+        (tmp_path / "episode_0001" / "data.json", ()),
+        (lines, ()),
+        (lerobot, ("--episode", "episode_000000")),
+        (tmp_path / "rosbag2", ()),
+        (tmp_path / "parquet", ()),
+        (recording, ()),
+    ):
+        page = tmp_path / "page.html"
+        code, output = dexkit("replay", source, *more, "--check")
+        assert code == 1, output
+        assert "thin-rate" in output
+        assert "--resample 100" in output
+        code, output = dexkit(
+            "replay", source, *more, "--rehearse", "--resample", 100, "--report", page
+        )
+        assert code == 0, output
+        assert "played to the end" in output
+        text = page.read_text()
+        assert "It can be played" in text
+        assert "left thumb_1: command and emulated position" in text
+        assert "http" not in text.replace("http-equiv", "")
+
+
+def test_nominal_times_are_said(tmp_path: Path) -> None:
+    made = episode(tmp_path / "e", whole(document(30, "dex3-1")))
+    code, output = dexkit("replay", made, "--check", "--resample", 100)
+    assert (code, "nominal-time" in output) == (0, True)
+    assert "30 a second" in output
+
+
+def test_a_refused_session_is_rehearsed_nevertheless(tmp_path: Path) -> None:
+    session(tmp_path, gripper(slow_wave(), kp=0.0))
+    page = tmp_path / "page.html"
+    code, output = dexkit("replay", tmp_path / "session.mcap", "--rehearse", "--report", page)
+    assert code == 1
+    assert "refused: zero-gains" in output
+    assert "cured by: --gains model" in output
+    assert "It is refused" in page.read_text()
+
+
+def test_options_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    session(tmp_path, gripper(slow_wave()))
+    source = tmp_path / "session.mcap"
+    for arguments, text in (
+        ((source, "--report", tmp_path / "x.html"), "add --rehearse"),
+        ((source, "--as-recorded", "--gains", "model"), "--gains is not for"),
+        ((source, "--no-wait", "--resample", 100), "--resample is not for"),
+        ((source, "--check", "--side", "right"), "nothing to play on the right hand"),
+        ((source, "--hand", "dex9"), "no hand model"),
+        ((tmp_path, "--check"), "holds no session"),
+        ((source, "--rehearse", "--report", source), "is also an"),
+    ):
+        code, output = dexkit("replay", *arguments)
+        assert (code, text in output) == (2, True), output
+
+
+def test_several_sessions_need_a_choice(tmp_path: Path) -> None:
+    for i in range(2):
+        episode(tmp_path / "task" / f"episode_000{i}", whole(document(20, "dex3-1")))
+    code, output = dexkit("replay", tmp_path / "task", "--check")
+    assert (code, "--episode episode_0000" in output) == (2, True)
+    code, output = dexkit("replay", tmp_path / "task", "--check", "--episode", "episode_0001")
+    assert (code, "thin-rate" in output) == (1, True)
+
+
+def test_the_command_names_all_findings_that_can_be_accepted() -> None:
+    accept = next(p for p in command.params if p.name == "accept")
+    assert tuple(accept.type.choices) == preparation.ACCEPTABLE  # type: ignore[attr-defined]
+
+
+@each("name", ["dex1-1", "dex3-1", "dex5-1"])
+def test_every_model_is_rehearsed(name: str) -> None:
+    """The rehearsal drives the reference of each model through a ramp and a session."""
+    hand = model_by_name(name)
+    spoken = hand.dialects[0]
+    q = np.array([hand.rest_q[LEFT]]).repeat(30, axis=0) * np.linspace(1.0, 0.6, 30)[:, None]
+    commands = preparation._from_states(np.arange(30) / hand.command_rate, q, hand)
+    found = prepare(RecordedCommands("test", "recording", spoken, {LEFT: commands}, {}))
+    assert not found.refused, found.findings
+    assert found.plan is not None
+    done = rehearse(found.plan)
+    assert done.machine.end is End.DONE
+    last = done.hands[LEFT].q[-1]
+    assert last == pytest.approx(q[-1], abs=0.25)
+    assert [p for p, _, _ in done.phases] == list(Phase)
+    assert JointMode.BRAKE == 0
