@@ -23,6 +23,7 @@ from dexkit.cli.options import (
     side_option,
     topic_option,
 )
+from dexkit.command_age import PAUSE
 from dexkit.errors import DdsError, UsageError
 from dexkit.escaping import REMARK, one_line
 
@@ -169,6 +170,14 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     metavar="S",
     help="... for longer than this.",
 )
+@click.option(
+    "--max-silence",
+    type=Number(min=0.05),
+    default=PAUSE,
+    show_default=True,
+    metavar="S",
+    help="Stop if no state of a hand comes for longer.",
+)
 @click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
 @session_options()
 @dds_options()
@@ -233,6 +242,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
         ramp_speed=given["ramp_speed"],
         max_distance=given["max_distance"],
         distance_time=given["distance_time"],
+        stale=given["max_silence"],
         loop=given["loop"],
     )
     session = read_session(source, given["form"], given["chosen"], options)

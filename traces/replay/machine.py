@@ -36,6 +36,7 @@ from dexkit.traces.replay.states import HandSeen
 __all__ = [
     "HOLD",
     "RAMP_SPEED",
+    "Commands",
     "End",
     "Guards",
     "Phase",
