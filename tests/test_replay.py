@@ -253,7 +253,10 @@ def test_a_session_of_the_other_hand_is_recognised(tmp_path: Path) -> None:
     wrong = session(tmp_path, fingers(hand_waves("dex3-1", RIGHT, 300, 0.0)))
     found = prepare(wrong)
     assert named(found)["side"].level is Level.REFUSED
-    assert named(found)["side"].cure == "--swap-sides"
+    assert levels(found) == {"side": "refused"}
+    assert found.cures == ["--swap-sides"]
+    again = prepare(wrong, Wishes(accept=["side"], swap_sides=False))
+    assert levels(again) == {"side": "accepted"}
     swapped = prepare(wrong, Wishes(swap_sides=True))
     assert not swapped.refused
     assert swapped.plan is not None

@@ -97,7 +97,9 @@ class RecordedCommands:
             has = f"; it has: {', '.join(self.others)}" if self.others else ""
             raise SessionError(
                 f"{self.name} has no commands to a hand that dexkit knows{has}",
-                hint="--as-recorded publishes the command topics of a recording as they are",
+                hint="--as-recorded publishes the command topics of a recording as they are"
+                if self.form == "recording"
+                else "--hand states the hands' model",
             )
         return model(self.dialect.model)
 

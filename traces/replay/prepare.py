@@ -56,7 +56,9 @@ _BEYOND = 0.02
 """Part of the stroke beyond a limit that is rounding or calibration."""
 _MOVES = 0.02
 """Part of the stroke that a joint has to be commanded over to be meant to move."""
-_SHOWN = 0.01
+_TOLD = 5
+"""Things that an import has left out that are told one by one."""
+_FITS = 0.01
 """Share of commands outside the limits up to which the other hand's limits fit."""
 
 GAINS = ("recorded", "model")
@@ -291,10 +293,9 @@ class _Preparation:
             if not self.found.refused:
                 self.refuse("empty", "there is no command in it")
             return self.found
-        for side, track in tracks.items():
-            self._side(side, track)
-            tracks[side] = self._gains(side, track)
-        tracks = {s: self._limits(s, t) for s, t in tracks.items()}
+        exchanged = [s for s, t in tracks.items() if self._side(s, t)]
+        tracks = {s: self._gains(s, t) for s, t in tracks.items()}
+        tracks = {s: t if s in exchanged else self._limits(s, t) for s, t in tracks.items()}
         tracks = self._timed(tracks)
         if self.wishes.resample:
             tracks = {s: _resampled(t, self.wishes.resample) for s, t in tracks.items()}
@@ -307,14 +308,15 @@ class _Preparation:
             self.note("damage", text)
         for text in session.corrections:
             self.note("corrected", text)
-        if session.problems:
-            more = f", and {len(session.problems) - 1} more" if len(session.problems) > 1 else ""
-            self.note("left-out", session.problems[0] + more, cure="dexkit import lists all")
+        for text in session.problems[:_TOLD]:
+            self.note("left-out", text)
+        if len(session.problems) > _TOLD:
+            self.note("left-out", f"and {len(session.problems) - _TOLD} more things")
         if session.nominal_rate:
             self.note(
                 "nominal-time",
-                f"the source has no times: frames are played at {session.nominal_rate:g} a second, "
-                "which is what was asked for when it was recorded, not what was measured",
+                f"the source has no usable times: frames are played at {session.nominal_rate:g} a "
+                "second, which is what was asked for when it was recorded, not what was measured",
                 cure="--rate HZ states another rate, --pace 0.5 plays it slower",
             )
         if session.others and session.dialect is not None:
@@ -410,19 +412,21 @@ class _Preparation:
             driven=given.driven,
         )
 
-    def _side(self, side: Side, track: Track) -> None:
+    def _side(self, side: Side, track: Track) -> bool:
         """Whether the commands fit the other hand, and not this one."""
         other = Side.RIGHT if side is Side.LEFT else Side.LEFT
         mine, its = (self._outside(track, s) for s in (side, other))
-        if mine > 0.5 and its <= _SHOWN:
-            self.judge(
-                "side",
-                f"{mine:.0%} of the commands are outside the limits of the {side} hand, and "
-                f"within those of the {other} one",
-                "--swap-sides",
-                cured=False,
-                where=str(side),
-            )
+        if mine <= 0.5 or its > _FITS:
+            return False
+        self.judge(
+            "side",
+            f"{mine:.0%} of the commands are outside the limits of the {side} hand, and "
+            f"within those of the {other} one",
+            "leave out --swap-sides" if self.wishes.swap_sides else "--swap-sides",
+            cured=False,
+            where=str(side),
+        )
+        return True
 
     def _outside(self, track: Track, side: Side) -> float:
         limits = joint_limits(self.spoken, side)
