@@ -20,7 +20,7 @@ from dexkit.cli.replay import command
 from dexkit.command_age import PAUSE, SETTLE
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.errors import DexkitError, SessionError, UsageError
-from dexkit.hand import JointMode, MotorError, Side
+from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
 from dexkit.messages.unitree_hg import HandCmd_, HandState_
@@ -174,6 +174,12 @@ def test_data_with_loud_motors_is_named_and_cured(tmp_path: Path) -> None:
     at = np.array([np.interp(after.t, before.t, c) for c in before.q.T]).T
     assert after.q == pytest.approx(at, abs=1e-6)
     assert (after.t[0], after.t[-1]) == (before.t[0], before.t[-1])
+
+
+def test_gains_that_are_negative_are_refused(tmp_path: Path) -> None:
+    found = prepare(session(tmp_path, gripper(slow_wave(), kp=-5.0)))
+    assert levels(found) == {"zero-gains": "refused", "high-gains": "refused"}
+    assert "kp -5 and kd 0.05" in found.findings[1].text
 
 
 def test_a_thin_rate_by_a_slow_pace_is_found(tmp_path: Path) -> None:
@@ -749,4 +755,3 @@ def test_every_model_is_rehearsed(name: str) -> None:
     last = done.hands[LEFT].q[-1]
     assert last == pytest.approx(q[-1], abs=0.25)
     assert [p for p, _, _ in done.phases] == list(Phase)
-    assert JointMode.BRAKE == 0

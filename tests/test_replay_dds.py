@@ -22,7 +22,7 @@ from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import dialect
 from dexkit.service import HandService
 from dexkit.traces.replay.live import LiveReplay
-from dexkit.traces.replay.machine import Commands, End, Guards, ReplayMachine
+from dexkit.traces.replay.machine import Commands, End, Guards, Phase, ReplayMachine
 from tests.dds_helpers import free_domain, wait_until
 from tests.patience import PATIENCE
 from tests.service_helpers import ScriptedHand
@@ -147,6 +147,31 @@ def test_it_gives_way_to_another_client_without_a_last_command() -> None:
         sent = machine.progress.sent
         assert machine.step(time.monotonic()) == {}
         assert machine.progress.sent == sent
+
+
+def test_a_failure_of_the_program_leaves_the_hand_at_rest() -> None:
+    hand = Watched(q=2.0)
+    with served(hand) as domain, DdsNode(domain) as node:
+        machine = ReplayMachine(plan_of(np.full(100_000, 2.0)), Guards(stale=PATIENCE))
+        live = LiveReplay(node, machine)
+        assert live.wait_ready(threading.Event())
+        phases: list[Phase] = []
+        send = live._send
+
+        def noted(commands: Commands) -> None:
+            phases.extend(machine.phase for _ in commands)
+            send(commands)
+
+        live._send = noted  # type: ignore[method-assign]
+
+        def turn(machine: ReplayMachine) -> None:
+            if machine.progress.sent > 20:
+                raise OSError("the terminal is gone")
+
+        with pytest.raises(OSError, match="terminal"):
+            live.play(turn)
+    assert (machine.phase, machine.end) == (Phase.END, End.ASKED)
+    assert phases[-1] is Phase.LEAVE
 
 
 def test_after_a_pause_the_hand_is_led_from_where_it_is() -> None:

@@ -111,22 +111,29 @@ class LiveReplay:
     def play(self, turn: Callable[[ReplayMachine], object] = lambda machine: None) -> None:
         """Play until the machine's end.
 
-        :param turn: called in every turn; it may stop the machine, and must not block.
+        :param turn: called in every turn; it may stop the machine, and must not block. If it
+            raises, the hands are left at rest first.
         """
-        machine, clock = self.machine, RealClock()
         self._watch.restart()
+        try:
+            self._run(turn)
+        except TopicConflict as conflict:
+            self.machine.abandon(End.ASKED, conflict.message)
+            raise
+        except BaseException:
+            self.machine.stop(End.ASKED, "this program failed")
+            self._run(lambda machine: None)
+            raise
+
+    def _run(self, turn: Callable[[ReplayMachine], object]) -> None:
+        machine, clock = self.machine, RealClock()
         while machine.phase is not Phase.END:
-            away = self._watch.measure_pause()
-            if away:
+            if self._watch.measure_pause():
                 for reader in self._readers.values():
                     reader.take()
                 machine.pause(clock.now())
             turn(machine)
-            try:
-                self._sole.poll()
-            except TopicConflict as conflict:
-                machine.abandon(End.ASKED, conflict.message)
-                raise
+            self._sole.poll()
             self._read()
             commands = machine.step(clock.now())
             if self._watch.away() <= PAUSE:  # else they were made before a pause

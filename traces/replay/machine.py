@@ -26,6 +26,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from dexkit.command_age import PAUSE, SETTLE
 from dexkit.hand import JointMode, Side
 from dexkit.models import ModeByte, model
@@ -152,7 +154,7 @@ class ReplayMachine:
             )
             for s, limits in self._limits.items()
         }
-        self._rows = {s: _rows(plan, t) for s, t in plan.tracks.items()}
+        self._rows = {s: _Rows(plan, t) for s, t in plan.tracks.items()}
         self._times: dict[Side, list[float]] = {s: t.t.tolist() for s, t in plan.tracks.items()}
         self._next = dict.fromkeys(plan.sides, 0)
         """Place of the first command of each hand that is not yet due."""
@@ -400,20 +402,22 @@ def _mode(plan: Plan, index: int, status: int) -> int:
     return status if byte is ModeByte.STATUS else 0
 
 
-def _rows(plan: Plan, track: Track) -> list[tuple[JointCommand, ...]]:
-    """The commands of a track as they are sent; torques in the dialect's units."""
-    n = track.q.shape[1]
-    units = plan.dialect.torque_units or (1.0,) * n
-    columns = [
-        zip(
-            [_mode(plan, j, int(is_driven)) for is_driven in track.driven[:, j].tolist()],
-            track.q[:, j].tolist(),
-            track.dq[:, j].tolist(),
-            (track.tau[:, j] / units[j]).tolist(),
-            track.kp[:, j].tolist(),
-            track.kd[:, j].tolist(),
-            strict=True,
-        )
-        for j in range(n)
-    ]
-    return [tuple(JointCommand(*c) for c in row) for row in zip(*columns, strict=True)]
+class _Rows:
+    """The commands of a track as they are sent, each made when it is asked for; torques in the
+    dialect's units.
+    """
+
+    def __init__(self, plan: Plan, track: Track) -> None:
+        n = track.q.shape[1]
+        units = np.array(plan.dialect.torque_units or (1.0,) * n)
+        self._tables = (track.q, track.dq, track.tau / units, track.kp, track.kd)
+        self._driven = track.driven
+        self._modes = [
+            [_mode(plan, j, status) for status in (JointMode.BRAKE, JointMode.FOC)]
+            for j in range(n)
+        ]
+
+    def __getitem__(self, k: int) -> tuple[JointCommand, ...]:
+        modes = [m[d] for m, d in zip(self._modes, self._driven[k].tolist(), strict=True)]
+        columns = [table[k].tolist() for table in self._tables]
+        return tuple(map(JointCommand, modes, *columns))

@@ -465,14 +465,20 @@ class _Preparation:
                 cured=cured,
                 where=str(side),
             )
-        high = track.driven & ((track.kp > _HIGH_GAINS * kp) | (track.kd > _HIGH_GAINS * kd))
+        wrong = (track.kp > _HIGH_GAINS * kp) | (track.kd > _HIGH_GAINS * kd)
+        wrong |= (track.kp < 0) | (track.kd < 0)
+        high = track.driven & wrong
         if high.any():
-            j = int(np.argmax((track.kp / kp).max(axis=0)))
+            j = int(np.argmax(high.sum(axis=0)))
+            ranges = [
+                f"{name} {table[:, j].min():g}"
+                + (f" to {table[:, j].max():g}" if np.ptp(table[:, j]) else "")
+                for name, table in (("kp", track.kp), ("kd", track.kd))
+            ]
             self.judge(
                 "high-gains",
-                f"loud motors: kp up to {track.kp[:, j].max():g} and kd up to "
-                f"{track.kd[:, j].max():g} for {limits.names[j]}, where the model's client sends "
-                f"{kp[j]:g} and {kd[j]:g}",
+                f"loud motors: {' and '.join(ranges)} for {limits.names[j]}, where the model's "
+                f"client sends {kp[j]:g} and {kd[j]:g}",
                 cure,
                 cured=cured,
                 where=str(side),
