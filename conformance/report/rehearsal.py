@@ -89,20 +89,25 @@ def _findings(prepared: Prepared) -> str:
         return "<h2>Findings</h2><p>Nothing was found.</p>"
     rows = [
         (
-            f"<code>{escape(f.name)}</code>",
-            f'<b class="{_CSS[f.level]}">{f.level}</b>',
-            escape(f.where),
+            _whole(f"<code>{escape(f.name)}</code>"),
+            _whole(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
+            _whole(escape(f.where)),
             escape(f.text),
-            f"<code>{escape(f.cure)}</code>" if f.cure.startswith("--") else escape(f.cure),
+            _whole(f"<code>{escape(f.cure)}</code>") if f.cure.startswith("--") else escape(f.cure),
         )
         for f in prepared.findings
     ]
-    return "<h2>Findings</h2>" + _table(("finding", "", "hand", "what", "cure"), rows)
+    return "<h2>Findings</h2>" + _table(("finding", "verdict", "hand", "what", "cure"), rows)
+
+
+def _whole(text: str) -> str:
+    """A cell that is not broken."""
+    return f'<bdi style="white-space:nowrap">{text}</bdi>'
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table; the cells are HTML, the first of each row is its heading."""
-    head = "".join(f'<th scope="col">{h}</th>' for h in heads)
+    head = "".join(f'<th scope="col">{h if " " in h else _whole(h)}</th>' for h in heads)
     body = "".join(
         f'<tr><th scope="row">{row[0]}</th>'
         + "".join(
@@ -198,13 +203,14 @@ def _overview(
 def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
     rows = [
         (
-            f'<span style="white-space:nowrap">{escape(f.name)}</span>',
+            _whole(escape(f.name)),
             f"{f.commanded:.2f}",
             f"{f.moved:.2f}",
             f"{f.rms:.3f}",
             f"{f.worst:.3f} at {f.at:.2f} s",
             f"{f.speed:.1f}",
             f"{f.torque:.2f} of {most:.2f}",
+            f"{f.ripple:.3f}",
             f"{f.limit:.1%}",
         )
         for f, most in zip(figures, tau_max, strict=True)
@@ -217,6 +223,7 @@ def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
         "largest distance, rad",
         "fastest, rad/s",
         "largest torque, N·m",
+        "torque ripple rms, N·m",
         "time at largest torque",
     )
     return _table(heads, rows)

@@ -12,13 +12,15 @@ from dexkit.models import Dialect, model
 from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces.replay.machine import Guards, Phase, ReplayMachine
 from dexkit.traces.replay.prepare import Plan, joint_limits
-from dexkit.traces.replay.states import StateWire
+from dexkit.traces.replay.states import HandSeen, StateWire
 
 __all__ = ["JointFigures", "Rehearsal", "Rehearsed", "rehearse"]
 
 _DEFAULT = Guards()
 _SETTLED = 0.5
 """Seconds of hand before the replay begins and after it ends."""
+_RIPPLE = 0.1
+"""Seconds of the mean that a ripple is about: three steps of 30 Hz."""
 _SATURATED = 0.98
 """Part of its largest torque from which on a motor counts as at its limit."""
 
@@ -30,6 +32,8 @@ class JointFigures:
     :param moved: rad that it was commanded over, and that it moved over.
     :param rms: of the distance from its command, rad; ``worst`` the largest, ``at`` when.
     :param speed: largest, rad/s; ``torque`` largest, N·m.
+    :param ripple: rms of the torque's difference from its mean over 0.1 s, N·m: what makes motors
+        loud.
     :param limit: part of the time that its motor gave its largest torque.
     """
 
@@ -41,6 +45,7 @@ class JointFigures:
     at: float
     speed: float
     torque: float
+    ripple: float
     limit: float
 
 
@@ -79,10 +84,21 @@ class Rehearsed:
                 at=float(t[worst[j]]),
                 speed=float(speed[:, j].max()),
                 torque=float(np.abs(tau[:, j]).max()),
+                ripple=_ripple(t, tau[:, j]),
                 limit=float((np.abs(tau[:, j]) >= _SATURATED * tau_max[j]).mean()),
             )
             for j, name in enumerate(self.names)
         ]
+
+
+def _ripple(t: Floats, tau: Floats) -> float:
+    """Rms of the difference from the mean over a window."""
+    width = max(3, round(_RIPPLE / float(np.median(np.diff(t)))))
+    if len(tau) <= width:
+        return 0.0
+    mean = np.convolve(tau, np.full(width, 1.0 / width), mode="valid")
+    begin = width // 2
+    return float(np.sqrt(np.mean((tau[begin : begin + len(mean)] - mean) ** 2)))
 
 
 @dataclass(eq=False)
@@ -117,6 +133,12 @@ class _Log:
         self.playing: list[float] = []
         self.command: tuple[float, ...] = (float("nan"),) * joints
 
+    def note(self, now: float, seen: HandSeen, *, playing: bool) -> None:
+        """A state came."""
+        self.t.append(now)
+        self.rows.append((self.command, seen.q, seen.tau))
+        self.playing.append(float(playing))
+
 
 def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     """Play a plan to the reference hands of its model, which obey the law of their motors.
@@ -132,23 +154,18 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     joints = len(model(spoken.model).joints[Side.LEFT])
     logs = {s: _Log(joints) for s in plan.sides}
     result = Rehearsal(plan, machine, {})
-    newest: dict[str, bytes] = {}
     now, due, ended = 0.0, _SETTLED, 0.0
     while not ended or now < ended + _SETTLED:
         now += service.tick
         for sample in service.advance(service.tick):
-            if sample.topic in topics:
-                newest[sample.topic] = sample.payload
-        if now + 1e-9 < due:
-            continue
-        for topic, payload in newest.items():
-            for side, seen in states.seen(topic, payload).items():
+            if sample.topic not in topics:
+                continue
+            for side, seen in states.seen(sample.topic, sample.payload).items():
                 if side in logs:
                     machine.receive(now, side, seen)
-                    log = logs[side]
-                    log.t.append(now)
-                    log.rows.append((log.command, seen.q, seen.tau))
-                    log.playing.append(float(machine.phase is Phase.PLAY))
+                    logs[side].note(now, seen, playing=machine.phase is Phase.PLAY)
+        if now + 1e-9 < due:
+            continue
         if not ended:
             _turn(result, now)
             commands = machine.step(now)

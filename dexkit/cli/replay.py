@@ -296,9 +296,11 @@ def _print_session(session: RecordedCommands, prepared: Prepared) -> None:
 
     spoken = session.dialect
     assert spoken is not None
-    hands = session.commands or session.states
-    about = [f"{session.model.title}, {', '.join(map(str, hands))} ({spoken.name})"]
-    if plan := prepared.plan:
+    plan = prepared.plan
+    hands = plan.sides if plan else tuple(session.commands or session.states)
+    speaks = f"{spoken.name}, to {plan.dialect.name}" if plan and plan.dialect != spoken else ""
+    about = [f"{session.model.title}, {', '.join(map(str, hands))} ({speaks or spoken.name})"]
+    if plan:
         rates = [1 / t.period for t in plan.tracks.values() if t.period]
         about.append(f"{plan.commands:,} commands in {plan.duration:.2f} s")
         about += [f"{max(rates):.3g} Hz"] if rates else []
@@ -395,7 +397,7 @@ def _print_rehearsal(rehearsal: Rehearsal) -> None:
     table.add_column("joint", no_wrap=True)
     for heading in (
         *("commanded rad", "moved rad", "rms away", "worst away", "at s"),
-        *("max rad/s", "max N·m", "at limit"),
+        *("max rad/s", "max N·m", "ripple", "at limit"),
     ):
         table.add_column(heading, justify="right", no_wrap=True)
     for side, figures in rehearsal.figures().items():
@@ -406,6 +408,7 @@ def _print_rehearsal(rehearsal: Rehearsal) -> None:
                 f"{f.at:.2f}",
                 f"{f.speed:.1f}",
                 f"{f.torque:.2f}",
+                f"{f.ripple:.3f}",
                 f"{f.limit:.0%}",
             )
     Console(width=max(Console().width, 110)).print(table)
