@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -295,6 +296,9 @@ def test_only_the_requested_dialect_is_judged(looked: _Looked) -> None:
     assert "DDS-ONE-SIDE" in looked.findings("one side", "unitree_go")
 
 
+_DOMAIN_ID = b"\x0f\0\4\0"  # the parameter's number and length
+
+
 @contextlib.contextmanager
 def _played(*answers: bytes) -> Iterator[int]:
     """A domain on which announcements get what a real participant answered; yields its number."""
@@ -312,10 +316,13 @@ def _played(*answers: bytes) -> Iterator[int]:
             for packet in answers:
                 # those of two captured participants; here they are one
                 prefix = packet[8:20]
-                sock.sendto(
-                    packet[:24].replace(prefix, owner) + asker + packet[36:].replace(prefix, owner),
-                    source,
+                told = (
+                    packet[:24].replace(prefix, owner) + asker + packet[36:].replace(prefix, owner)
                 )
+                at = told.find(_DOMAIN_ID) + len(_DOMAIN_ID)
+                if at >= len(_DOMAIN_ID):
+                    told = told[:at] + struct.pack("<I", domain) + told[at + 4 :]
+                sock.sendto(told, source)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", unicast_port(domain, 3)))

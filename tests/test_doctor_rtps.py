@@ -116,6 +116,20 @@ def test_submessages_for_other_participants_are_ignored() -> None:
     assert not observer.participants
 
 
+def test_participants_of_other_domains_are_left_out() -> None:
+    """The ports of a high domain are also those that sockets of other domains get."""
+    packet = _addressed(packets.CYCLONE_0_10_PARTICIPANT)
+    assert rtps.parse_participant(_only(packet, Data).payload).domain == 160
+    for domain, known in ((160, 1), (None, 1), (7, 0)):
+        observer = Observer(ME, PLACE, domain=domain)
+        observer.receive(packet, 0.0)
+        assert len(observer.participants) == known
+        # and so can others
+        (announced,) = (i for _, i in rtps.parse_message(observer.announcement())[1])
+        assert isinstance(announced, Data)
+        assert rtps.parse_participant(announced.payload).domain == domain
+
+
 def test_final_heartbeat_is_not_answered() -> None:
     """Two that acknowledge each other's acknowledgements never stop."""
     observer = Observer(ME, PLACE)

@@ -176,6 +176,7 @@ class _Window:
                 "__Pid": str(os.getpid()),
                 "__Hostname": socket.gethostname(),
             },
+            domain=domain,
             wanted=_is_watched,
             on_sample=self.sample,
         )

@@ -72,6 +72,9 @@ class Observer:
     :param prefix: GUID prefix of its own, 12 bytes, unique.
     :param place: where it receives.
     :param properties: properties of its process to announce.
+    :param domain: number of the domain; participants that announce another one are left out, for
+        the ports of domains from 101 on are also handed out to sockets of other domains. None
+        takes all.
     :param wanted: whether to read a topic of a type.
     :param on_sample: takes each sample of the topics that are read.
 
@@ -86,6 +89,7 @@ class Observer:
         place: Locator,
         *,
         properties: dict[str, str] | None = None,
+        domain: int | None = None,
         wanted: Callable[[str, str], bool] = lambda topic, type_name: False,
         on_sample: SampleHandler = lambda writer, sequence, data, now, written: None,
     ) -> None:
@@ -94,8 +98,9 @@ class Observer:
         self.endpoints: dict[bytes, tuple[rtps.EndpointData, bool]] = {}
         self.damaged = 0
         self._announcement = rtps.build_participant(
-            prefix, place, lease=_LEASE, properties=properties
+            prefix, place, lease=_LEASE, properties=properties, domain=domain
         )
+        self._domain = domain
         self._wanted = wanted
         self._on_sample = on_sample
         self._peers: dict[bytes, _Peer] = {}
@@ -185,6 +190,8 @@ class Observer:
         data = rtps.parse_participant(item.payload)
         known = self._peers.get(data.prefix)
         if known is not None or data.prefix == self.prefix:
+            return
+        if None not in (data.domain, self._domain) and data.domain != self._domain:
             return
         self.participants[data.prefix] = data
         places = [p for p in data.discovery if p.address == address] or data.discovery[:1]

@@ -76,6 +76,7 @@ _PID_SENTINEL = 0x0001
 _PID_LEASE = 0x0002
 _PID_TOPIC = 0x0005
 _PID_TYPE = 0x0007
+_PID_DOMAIN = 0x000F
 _PID_PROTOCOL = 0x0015
 _PID_VENDOR = 0x0016
 _PID_RELIABILITY = 0x001A
@@ -216,6 +217,7 @@ class ParticipantData:
     :param discovery: where it takes discovery messages.
     :param data: where it takes samples.
     :param multicast: it listens to multicast.
+    :param domain: number of its domain; None where it does not say.
     """
 
     prefix: bytes
@@ -225,6 +227,7 @@ class ParticipantData:
     discovery: tuple[Locator, ...]
     data: tuple[Locator, ...]
     multicast: bool
+    domain: int | None = None
 
 
 @dataclass(frozen=True)
@@ -429,6 +432,7 @@ def parse_participant(payload: bytes) -> ParticipantData:
     """
     order, pairs = _parameters(payload)
     prefix, vendor, version = b"", 0, ""
+    domain: int | None = None
     properties: dict[str, str] = {}
     places: dict[int, list[Locator]] = {
         pid: [] for pid in (_PID_UNICAST, _PID_META_UNICAST, _PID_MULTICAST, _PID_META_MULTICAST)
@@ -439,6 +443,8 @@ def parse_participant(payload: bytes) -> ParticipantData:
                 prefix = value[:12]
             elif pid == _PID_VENDOR and len(value) >= 2:
                 vendor = value[0] << 8 | value[1]
+            elif pid == _PID_DOMAIN:
+                domain = _word(value, order)
             elif pid in places:
                 place = _locator(value, order)
                 if place is not None:
@@ -465,6 +471,7 @@ def parse_participant(payload: bytes) -> ParticipantData:
         discovery=tuple(places[_PID_META_UNICAST]),
         data=tuple(places[_PID_UNICAST]),
         multicast=bool(places[_PID_MULTICAST] or places[_PID_META_MULTICAST]),
+        domain=domain,
     )
 
 
@@ -628,16 +635,24 @@ class _Announcement:
 
 
 def build_participant(
-    prefix: bytes, place: Locator, *, lease: int, properties: dict[str, str] | None = None
+    prefix: bytes,
+    place: Locator,
+    *,
+    lease: int,
+    properties: dict[str, str] | None = None,
+    domain: int | None = None,
 ) -> bytes:
     """The announcement of a participant that takes everything at one place.
 
     :param lease: seconds after which others forget it.
+    :param domain: number of its domain; None does not say it.
     """
     out = _Announcement()
     out.add(_PID_PROTOCOL, b"\x02\x01")
     out.add(_PID_VENDOR, b"\0\0")
     out.add(_PID_PARTICIPANT_GUID, prefix + _PARTICIPANT)
+    if domain is not None:
+        out.add(_PID_DOMAIN, struct.pack("<I", domain))
     out.add(_PID_BUILTIN_SET, struct.pack("<I", BUILTIN_ENDPOINTS))
     out.add(_PID_LEASE, struct.pack("<iI", lease, 0))
     out.add(_PID_UNICAST, _pack_locator(place))
