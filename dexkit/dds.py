@@ -58,6 +58,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 from dexkit import interface_filter
 from dexkit.child_processes import process_id
+from dexkit.dds_library import loaded_here
 from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
 from dexkit.interface_names import find_interface, resolve_peers
@@ -294,6 +295,13 @@ class _Cyclone:
                 f"CycloneDDS {version} is installed, dexkit needs 0.10.x",
                 hint="an 11.x participant with Unitree's types crashes every 0.10.x peer, the "
                 "robot included: dexkit setup-dds --replace",
+            )
+        if len(loaded := loaded_here()) > 1:
+            raise DdsUnavailable(
+                f"this process has loaded two CycloneDDS libraries: {' and '.join(loaded)}",
+                hint="a program that uses both crashes or hangs. Unset LD_LIBRARY_PATH and "
+                "LD_PRELOAD, and run ROS 2 (rclpy) as another process; 'dexkit setup-dds' examines "
+                "what is installed",
             )
         self.version = version
         self.layer: Any = _clayer

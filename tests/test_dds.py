@@ -277,10 +277,9 @@ def test_invalid_payload_is_delivered_and_raises_on_decoding(dds_node: DdsNode) 
         _ = sample.message
 
 
-def _run(script: str, *, quiet: bool = True) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
-    )
+def _run(script: str, *arguments: str, quiet: bool = True) -> str:
+    command = [sys.executable, "-c", script, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr if quiet else "") == (0, "")
     return done.stdout
 
@@ -371,6 +370,24 @@ except DdsUnavailable as error:
 """
     assert _run(script) == "True True\n"
     assert _run("import sys, dexkit.dds; print('cyclonedds' in sys.modules)") == "False\n"
+
+
+def test_two_libraries_in_one_process_are_refused(tmp_path: Path) -> None:
+    """As where ROS 2's library is preloaded, or came with rclpy; it hung."""
+    script = """
+import ctypes, shutil, sys
+import cyclonedds.core
+from dexkit.dds_library import loaded_here
+(own,) = loaded_here()
+other = shutil.copy(own, sys.argv[1])
+ctypes.CDLL(other)
+from dexkit.dds import DdsNode
+try:
+    DdsNode(1)
+except ImportError as error:
+    print(own in str(error), other in str(error), "rclpy" in error.hint)
+"""
+    assert _run(script, str(tmp_path / "libddsc.so.0")) == "True True True\n"
 
 
 def test_cyclonedds_11_is_refused() -> None:

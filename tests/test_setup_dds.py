@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 
 from dexkit.cli import main
+from dexkit.dds_library import loaded_libraries
 from dexkit.errors import (
     DdsBuildFailed,
     DdsInstallError,
@@ -415,9 +416,10 @@ def test_loaded_libraries_are_read_from_the_map_of_a_process() -> None:
         "7f01-7f02 r-xp 00001000 fe:00 123   /opt/ros/humble/lib/libddsc.so.0.10.5\n"
         "7f03-7f04 r--p 00000000 fe:00 124   /home/a b/cyclonedds.libs/libddsc-9.so.0.10.5\n"
         "7f05-7f06 r--p 00000000 fe:00 125   /usr/lib/libc.so.6\n"
+        "7f06-7f07 r--p 00000000 fe:00 126   /usr/lib/libddscxx.so.0.10.5\n"
         "7f07-7f08 rw-p 00000000 00:00 0 \n"
     )
-    assert probe.loaded_libraries(maps) == (
+    assert loaded_libraries(maps) == (
         "/home/a b/cyclonedds.libs/libddsc-9.so.0.10.5",
         "/opt/ros/humble/lib/libddsc.so.0.10.5",
     )

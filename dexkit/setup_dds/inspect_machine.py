@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from dexkit.dds_library import is_library
 from dexkit.setup_dds.facts import Distribution, Installed, Interpreter, Library, Machine
 
 __all__ = [
@@ -277,7 +278,7 @@ def offered_elsewhere(environment: Mapping[str, str]) -> list[str]:
     for folder in filter(None, environment.get("LD_LIBRARY_PATH", "").split(":")):
         found += list(Path(folder).glob("libddsc.so*"))
     preloaded = re.split(r"[: ]", environment.get("LD_PRELOAD", ""))
-    found += [Path(p) for p in preloaded if os.path.basename(p).startswith("libddsc")]
+    found += [Path(p) for p in preloaded if is_library(p)]
     return sorted({os.path.realpath(p) for p in found})
 
 

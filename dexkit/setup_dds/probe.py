@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
-import os
 import select
 import subprocess
 import sys
@@ -17,9 +16,10 @@ import time
 from importlib import metadata
 from pathlib import Path
 
+from dexkit.dds_library import loaded_here
 from dexkit.setup_dds.facts import Installed
 
-__all__ = ["command", "loaded_libraries", "result_of"]
+__all__ = ["command", "result_of"]
 
 _ROOT = str(Path(__file__).resolve().parents[2])
 _TYPE = "unitree_go::msg::dds_::MotorCmds_"
@@ -63,12 +63,6 @@ def result_of(code: int, output: str) -> Installed:
     return Installed("?", f"the process that tries it ends with code {code}: {last}")
 
 
-def loaded_libraries(maps: str) -> tuple[str, ...]:
-    """Files of libddsc in the text of ``/proc/PID/maps``."""
-    paths = [line.split(maxsplit=5)[5].strip() for line in maps.splitlines() if "/" in line]
-    return tuple(sorted({p for p in paths if os.path.basename(p).startswith("libddsc")}))
-
-
 def main(send: bool) -> None:
     """Find out, and print it."""
     print(json.dumps(dataclasses.asdict(_look(send))))
@@ -85,18 +79,14 @@ def _look(send: bool) -> Installed:
         importlib.import_module("cyclonedds.core")
     except Exception as error:  # the loader of the binding has classes of its own
         return Installed(version, " ".join(str(error).split()) or type(error).__name__)
-    libraries = _loaded()
+    libraries = loaded_here()
     if len(libraries) > 1 or not send:
         return Installed(version, "", libraries)
     try:
         _send_and_receive()
     except Exception as error:
         return Installed(version, "", libraries, " ".join(str(error).split()))
-    return Installed(version, "", _loaded())
-
-
-def _loaded() -> tuple[str, ...]:
-    return loaded_libraries(Path("/proc/self/maps").read_text(errors="replace"))
+    return Installed(version, "", loaded_here())
 
 
 def _send_and_receive() -> None:
