@@ -16,6 +16,10 @@ PYTHON_VERSION ?= $(or $(LAST_VERSION),$(shell cat .python-version))
 # uv does not look into pyenv's folder, and pyenv's shims run only what is switched on
 FOUND_BY_PYENV := $(lastword $(sort $(wildcard \
 	$(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions/$(PYTHON_VERSION).*/bin/python)))
+# with DDS; without it, newer ones may work
+SUPPORTED := $(foreach v,3.10 3.11 3.12 3.13,$(v) $(v).%)
+UNSUPPORTED = $(if $(filter no,$(DDS)),,$(if $(filter $(SUPPORTED),$(PYTHON_VERSION)),,$(error \
+	Python $(PYTHON_VERSION) cannot be used: dexkit needs 3.10 to 3.13 (docs/install.md))))
 FOR_PYTHON := --python $(or $(FOUND_BY_PYENV),$(PYTHON_VERSION))
 RUN := $(UV) run --frozen $(FOR_PYTHON)
 
@@ -30,6 +34,7 @@ $(UV):
 	@$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check "uv==$(UV_VERSION)"
 
 $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
+	$(UNSUPPORTED)
 	@$(UV) sync --frozen --quiet $(FOR_PYTHON)
 ifneq ($(DDS),no)
 	@.venv/bin/python -c 'import cyclonedds.core' 2>/dev/null || .venv/bin/dexkit setup-dds || { \
