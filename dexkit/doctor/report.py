@@ -83,7 +83,9 @@ def print_report(
         console.print(f"  why:  {escape(finding.diagnosis.why)}", highlight=False)
         console.print(f"  do:   [bold]{escape(finding.fix)}[/]", highlight=False)
     if seen.link is not None:
-        console.print(f"\n{escape(_link_text(seen.link))}", highlight=False)
+        console.print()
+        for line in _link_text(seen.link).splitlines():
+            console.print(escape(line), highlight=False)
     for state in states:
         text = "a client gets past its wait" if state.ready else f"a client waits: {state.missing}"
         console.print(f"\ndomain {state.domain}, {state.dialect}: {escape(text)}", highlight=False)
