@@ -454,7 +454,7 @@ def test_link_figures_follow_from_samples_and_round_trips() -> None:
     text = io.StringIO()
     seen = Observations(link=found)
     print_report(Console(file=text, width=200), seen, [], verdict(seen, [], Scope()), [])
-    assert "round trip     120.0 ms median, 100.0 ms least" in text.getvalue()
+    assert "\n  round trip     120.0 ms median, 100.0 ms least" in text.getvalue()
     assert "clock there    +2.050 s" in text.getvalue()
     assert "multicast      does not work" in text.getvalue()
     json.dumps(as_data(seen, [], verdict(seen, [], Scope()), []), allow_nan=False)
