@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,12 +139,16 @@ class Commands:
 
 @dataclass(frozen=True, eq=False)
 class SideView:
-    """One hand, or a robot, in the recording."""
+    """One hand, or a robot, in the recording.
+
+    :param known: what several checks need and one of them has worked out, by a name.
+    """
 
     side: Subject
     states: States
     commands: Commands
     joints: tuple[JointSpec, ...]
+    known: dict[object, Any] = field(default_factory=dict, repr=False)
 
 
 @dataclass(frozen=True, eq=False)

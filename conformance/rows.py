@@ -1,15 +1,17 @@
-"""Select rows of columns without copying them where all are wanted."""
+"""Rows of columns: select them without copies, find those of a time, look at ranges of them."""
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 
-__all__ = ["Selected", "finite_rows"]
+__all__ = ["Rows", "Selected", "Times", "extremes", "finite_rows"]
+
+Rows: TypeAlias = NDArray[np.intp]
 
 Selected: TypeAlias = "slice | NDArray[np.bool_]"
 """An index of rows; a slice gives views."""
@@ -21,3 +23,97 @@ def finite_rows(*columns: Floats) -> Selected:
     for column in columns[1:]:
         good &= np.isfinite(column)
     return slice(None) if good.all() else good
+
+
+class Times:
+    """Times of rows, and which rows lie a while after or before each of them.
+
+    The results are those of ``np.searchsorted``. They are kept, for all joints of a hand have the
+    same times.
+
+    :param t: seconds, shape (n,).
+    """
+
+    def __init__(self, t: Floats) -> None:
+        self.t = t
+        self.rising = bool((t[1:] >= t[:-1]).all()) and bool(np.isfinite(t).all())
+        """Whether they are in order; a part of them can be looked up by :meth:`within` then."""
+        self._known: dict[tuple[float, str], Rows] = {}
+
+    def shifted(self, seconds: float, side: Literal["left", "right"] = "left") -> Rows:
+        """For each time, the first row that is not before it by that much.
+
+        :param seconds: what is added to each time.
+        :param side: ``right`` for the first row that is behind it by that much.
+        """
+        key = (seconds, side)
+        if key not in self._known:
+            times = self.t + seconds
+            found = _looked_up(self.t, times, side) if self.rising else None
+            if found is None:
+                found = np.searchsorted(self.t, times, side)
+            self._known[key] = found
+        return self._known[key]
+
+    def within(self, rows: Rows, seconds: float, side: Literal["left", "right"] = "left") -> Rows:
+        """The same as :meth:`shifted` of ``t[rows]`` alone, where ``rows`` rise.
+
+        As many of them are before a time as there are among all rows before it.
+        """
+        if not self.rising:
+            t = self.t[rows]
+            return np.searchsorted(t, t + seconds, side)
+        if len(rows) == len(self.t):
+            return self.shifted(seconds, side)
+        before = np.zeros(len(self.t) + 1, dtype=np.intp)
+        before[rows + 1] = 1
+        return np.cumsum(before)[self.shifted(seconds, side)[rows]]
+
+
+def _looked_up(t: Floats, times: Floats, side: Literal["left", "right"]) -> Rows | None:
+    """``np.searchsorted`` for rising times, several times as fast; None where it is not certain."""
+    n = len(t)
+    if n < 2:
+        return None
+    # interpolation goes through both columns once; its rounding is corrected by one row
+    rows = np.interp(times, t, np.arange(float(n))).astype(np.intp)
+    padded = np.concatenate(([-np.inf], t, [np.inf]))
+    behind = np.less if side == "left" else np.less_equal
+    rows += behind(t[rows], times)
+    # row k is right if t[k - 1] is before the time, and t[k] is not
+    ahead = ~behind(padded[rows], times)
+    rows -= ahead
+    right = behind(padded[rows], times) & ~behind(padded[rows + 1], times)
+    return rows if right.all() else None
+
+
+def extremes(values: Floats, first: Rows, last: Rows) -> tuple[Floats, Floats]:
+    """The least and the greatest of ``values[first[i] : last[i]]``, for each i; NaN passes on.
+
+    :param first: rows, each before the one in ``last``.
+    """
+    lengths = last - first
+    n = len(lengths)
+    if not n:
+        return np.empty(0), np.empty(0)
+    # two ranges of one length, which is a power of two, cover a range up to twice as long
+    step = 1 << (int(np.partition(lengths, n // 50)[n // 50]).bit_length() - 1)
+    low = high = values
+    width = 1
+    while width < step:
+        low = np.minimum(low[:-width], low[width:])
+        high = np.maximum(high[:-width], high[width:])
+        width *= 2
+    fits = (lengths >= step) & (lengths <= 2 * step)
+    if fits.all():
+        begin, end, odd = first, last - step, np.empty(0, np.intp)
+    else:
+        odd = np.flatnonzero(~fits)
+        begin, end = np.where(fits, first, 0), np.where(fits, last - step, 0)
+    least, most = np.minimum(low[begin], low[end]), np.maximum(high[begin], high[end])
+    if len(odd):
+        ranges = np.column_stack((first[odd], last[odd])).ravel()
+        longer = np.append(values, values[-1])  # an end may be one past the last row
+        least[odd] = np.minimum.reduceat(longer, ranges)[::2]
+        most[odd] = np.maximum.reduceat(longer, ranges)[::2]
+    return least, most

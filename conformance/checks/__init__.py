@@ -197,6 +197,7 @@ class Located(Protocol):
 
 RecordingT = TypeVar("RecordingT", bound=Located, covariant=True)
 ViewT = TypeVar("ViewT", covariant=True)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -269,6 +270,17 @@ class Context(BaseContext[Recording, SideView]):
     def joints(self) -> tuple[JointSpec, ...]:
         """The hand's joints, in the dialect's radians."""
         return self.hand.joints
+
+    def once(self, name: object, work_out: Callable[[], T]) -> T:
+        """What another check of this hand has worked out under that name, else do it now.
+
+        :param name: with all that the result depends on, except for the recording.
+        """
+        known = self.hand.known
+        if name not in known:
+            known[name] = work_out()
+        found: T = known[name]
+        return found
 
     def tolerance(self, name: str, joint: int = 0) -> float:
         """A tolerance of the requirement; ``NAME_stroke`` in radians of that joint."""

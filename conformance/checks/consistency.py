@@ -13,21 +13,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
-from dexkit.conformance.rows import finite_rows
+from dexkit.conformance.rows import Rows, Times, extremes, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
 
 __all__ = ["contacts"]
-
-Rows: TypeAlias = NDArray[np.intp]
 
 _FEW = 10
 """Measurements that are needed to say anything."""
@@ -38,68 +34,84 @@ _OWN = 1.2
 """By how much a hand may exceed that speed."""
 
 
-@dataclass(frozen=True)
 class _Joint:
     """What a joint reported, without repetitions.
 
-    :param t: seconds; ``q``, rad, and ``dq``, rad/s, have the same length.
+    :ivar t: seconds; ``q``, rad, and ``dq``, rad/s, have the same length.
     """
 
-    t: Floats
-    q: Floats
-    dq: Floats
+    def __init__(self, ctx: Context, joint: int) -> None:
+        self._clock = ctx.once("clock", lambda: Times(ctx.states.clock))
+        self._rows = ctx.once(("measurements", joint), lambda: _measurements(ctx, joint))
+        whole = len(self._rows) == len(ctx.states)
+        rows = slice(None) if whole else self._rows
+        self.t: Floats = ctx.states.clock[rows]
+        self.q: Floats = ctx.states.q[rows, joint]
+        self.dq: Floats = ctx.states.dq[rows, joint]
+        self._steps: Floats = np.diff(self.t)
 
-    @classmethod
-    def from_context(cls, ctx: Context, joint: int) -> _Joint:
-        """The measurements of a joint: states that repeat q and a dq that is not 0 are none."""
-        states = ctx.states
-        q, dq = states.q[:, joint], states.dq[:, joint]
-        good = finite_rows(q, dq)
-        t, q, dq = states.clock[good], q[good], dq[good]
-        if len(t):
-            same = (np.diff(q) == 0) & (np.diff(dq) == 0) & (dq[1:] != 0)
-            rises = np.maximum.accumulate(t)[:-1] < t[1:]
-            new = ~same & rises
-            if not new.all():
-                new = np.concatenate(([True], new))
-                t, q, dq = t[new], q[new], dq[new]
-        return cls(t, q, dq)
-
-    def windows(self, seconds: float, longest: float) -> tuple[Rows, Rows]:
+    def windows(self, seconds: float, longest: float) -> tuple[Rows | slice, Rows]:
         """First and last rows of all windows of that length without a gap above ``longest``."""
-        ends = np.searchsorted(self.t, self.t + seconds)
+        ends = self._clock.within(self._rows, seconds)
+        gap = self._steps > longest
+        if self._clock.rising and 2 * longest <= seconds and not gap.any():
+            # every window that ends before the last row is whole, and not too long
+            ends = ends[: int(np.searchsorted(ends, len(self.t)))]
+            return slice(0, len(ends)), ends
         starts = np.flatnonzero(ends < len(self.t))
         ends = ends[starts]
-        gaps = np.concatenate(([0], np.cumsum(np.diff(self.t) > longest)))
+        gaps = np.concatenate(([0], np.cumsum(gap)))
         whole = (gaps[ends] == gaps[starts]) & (self.t[ends] - self.t[starts] < 2 * seconds)
         return starts[whole], ends[whole]
 
     def integral(self, speeds: Floats) -> Floats:
         """The integral of speeds up to each measurement, rad."""
-        steps = (speeds[1:] + speeds[:-1]) / 2 * np.diff(self.t)
-        return np.concatenate(([0.0], np.cumsum(steps)))
+        found = np.zeros(len(speeds))
+        steps = speeds[1:] + speeds[:-1]
+        steps /= 2
+        steps *= self._steps
+        np.cumsum(steps, out=found[1:])
+        return found
 
     def reach(self, values: Floats, seconds: float) -> tuple[Floats, Floats]:
         """The least and greatest of values within that time of each measurement."""
-        first = np.searchsorted(self.t, self.t - seconds)
-        last = np.searchsorted(self.t, self.t + seconds, "right")
-        ranges = np.column_stack((first, last)).ravel()
-        longer = np.append(values, values[-1])
-        return (
-            np.minimum.reduceat(longer, ranges)[::2],
-            np.maximum.reduceat(longer, ranges)[::2],
-        )
+        first = self._clock.within(self._rows, -seconds)
+        last = self._clock.within(self._rows, seconds, "right")
+        return extremes(values, first, last)
+
+
+def _measurements(ctx: Context, joint: int) -> Rows:
+    """The states with a new measurement: those that repeat q and a dq that is not 0 have none."""
+    states = ctx.states
+    q, dq = states.q[:, joint], states.dq[:, joint]
+    good = finite_rows(q, dq)
+    t, q, dq = states.clock[good], q[good], dq[good]
+    rows = np.arange(len(states))[good]
+    if len(t):
+        same = (q[1:] == q[:-1]) & (dq[1:] == dq[:-1]) & (dq[1:] != 0)
+        rises = np.maximum.accumulate(t)[:-1] < t[1:]
+        new = ~same & rises
+        if not new.all():
+            rows = rows[np.concatenate(([True], new))]
+    return rows
 
 
 def _fastest(ctx: Context, joint: int) -> float:
     """The joint's fastest speed, rad/s: as reported, or its profile's where dq is not filled."""
+    fast = ctx.once(("fast", joint), lambda: _reported_speed(ctx, joint))
+    return (
+        ctx.joints[joint].dq_max if fast is None else max(_OWN * fast, ctx.tolerance("min_speed"))
+    )
+
+
+def _reported_speed(ctx: Context, joint: int) -> float | None:
+    """The speed that :data:`_FAST` of the states do not exceed; None if dq is not filled."""
     dq = np.abs(ctx.states.dq[:, joint])
     dq = dq[finite_rows(dq)]
     if not len(dq) or not dq.any():
-        return ctx.joints[joint].dq_max
+        return None
     row = int(_FAST * (len(dq) - 1))
-    fast = float(np.partition(dq, row)[row])
-    return max(_OWN * fast, ctx.tolerance("min_speed"))
+    return float(np.partition(dq, row)[row])
 
 
 @check("DEX1-FIELD-15", "DEX3-FIELD-15")
@@ -212,7 +224,7 @@ def slope(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        found = _window_error(ctx, _Joint.from_context(ctx, joint), spec.stroke)
+        found = _window_error(ctx, _Joint(ctx, joint), spec.stroke)
         if found is not None and (worst is None or found[0] > worst[0]):
             worst = (*found[:2], joint, found[2])
     if worst is None:
@@ -273,7 +285,7 @@ def keeps_up(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float, float, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        x = _Joint.from_context(ctx, joint)
+        x = _Joint(ctx, joint)
         if len(x.t) < _FEW:
             continue
         for excess, begin, end, speed in _excesses(ctx, x):
@@ -302,12 +314,14 @@ def keeps_up(ctx: Context) -> Outcome:
 def _excesses(ctx: Context, x: _Joint) -> Iterator[tuple[float, float, float, float]]:
     """For each length of window: the largest excess, begin, end, and fastest speed around."""
     lag, part = ctx.tolerance("max_lag_s"), ctx.tolerance("max_part")
-    dq = _factor(x, lag) * x.dq
-    low, high = x.reach(x.integral(dq), lag)
+    said = x.integral(x.dq)
+    factor = _factor(x, said, lag)
+    dq = factor * x.dq
+    low, high = x.reach(said if factor == 1.0 else x.integral(dq), lag)
     path = x.integral(np.abs(dq))
     for seconds in (1.25 * lag, 4 * lag, 10 * lag):
         starts, ends = x.windows(seconds, 0.5 * lag)
-        if not len(starts):
+        if not len(ends):
             continue
         moved = x.q[ends] - x.q[starts]
         most, least = high[ends] - low[starts], low[ends] - high[starts]
@@ -315,9 +329,9 @@ def _excesses(ctx: Context, x: _Joint) -> Iterator[tuple[float, float, float, fl
         for begin, end in _unstable(ctx):
             beyond[(x.t[starts] < end) & (x.t[ends] > begin)] = -np.inf
         i = int(np.argmax(beyond))
-        inside = slice(starts[i], ends[i] + 1)
-        speed = float(np.abs(dq[inside]).max())
-        yield float(beyond[i]), float(x.t[starts[i]]), float(x.t[ends[i]]), speed
+        start = i if isinstance(starts, slice) else int(starts[i])
+        speed = float(np.abs(dq[start : ends[i] + 1]).max())
+        yield float(beyond[i]), float(x.t[start]), float(x.t[ends[i]]), speed
 
 
 def _unstable(ctx: Context) -> list[tuple[float, float]]:
@@ -327,10 +341,12 @@ def _unstable(ctx: Context) -> list[tuple[float, float]]:
     return [ctx.span(p) for p in ctx.recording.phases("negative", ctx.side)]
 
 
-def _factor(x: _Joint, lag: float) -> float:
-    """The constant factor between the slope of q and dq; 1 unless most windows agree on one."""
+def _factor(x: _Joint, c: Floats, lag: float) -> float:
+    """The constant factor between the slope of q and dq; 1 unless most windows agree on one.
+
+    :param c: the integral of dq.
+    """
     starts, ends = x.windows(4 * lag, 0.5 * lag)
-    c = x.integral(x.dq)
     said, moved = c[ends] - c[starts], x.q[ends] - x.q[starts]
     reach = float(np.ptp(x.q))
     moving = np.abs(said) > 0.05 * reach

@@ -15,6 +15,11 @@ from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
 
 _GRID = 0.005  # seconds; clients send commands at 200 Hz
+_TOLERANCES = (
+    *("min_session_s", "min_travel_stroke", "blocked_tau_nm", "blocked_speed_rad_s"),
+    *("min_speed_rad_s", "min_step_stroke"),
+)
+"""Tolerances that the figures depend on."""
 _SAME = 1e-12
 """Part of a sum of squares by which sums in another order differ at most."""
 
@@ -52,6 +57,12 @@ def _session(ctx: Context) -> tuple[float, float] | str:
 
 def measure(ctx: Context, search: float) -> list[Tracking] | str:
     """Error figures of the joints that the session moves, or why there are none."""
+    tolerances = ctx.requirement.tolerances
+    used = tuple(tolerances.get(name) for name in _TOLERANCES)
+    return ctx.once(("tracking", search, *used), lambda: _measured(ctx, search))
+
+
+def _measured(ctx: Context, search: float) -> list[Tracking] | str:
     span = _session(ctx)
     if isinstance(span, str):
         return span
@@ -114,13 +125,17 @@ def _measure(
     if top_speed is not None:
         asked = _within_reach(commanded, top_speed * _GRID)
     # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
-    weight = free.astype(np.float64)
     middle = mean(q[free])
     seen, asked, commanded = np.where(free, q - middle, 0.0), asked - middle, commanded - middle
     n = len(grid)
     late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, asked**2))  # by delay
+    if free.all():
+        sums = np.concatenate(([0.0], np.cumsum(asked**2)))
+        squares = (sums[n:] - sums[:-n])[::-1]
+    else:
+        squares = np.einsum("ki,i->k", late2, free.astype(np.float64))
     # einsum, for BLAS would start threads for this
-    errors = np.einsum("i,i", seen, seen) + np.einsum("ki,i->k", late2, weight)
+    errors = np.einsum("i,i", seen, seen) + squares
     errors -= 2.0 * np.einsum("ki,i->k", late, seen)
     # the shortest of delays that differ by less than sums of two machines do
     same = _SAME * float(np.einsum("i,i", seen, seen))
