@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 
-__all__ = ["Rows", "Selected", "Times", "extremes", "finite_rows"]
+__all__ = ["Rows", "Selected", "SomeTimes", "Times", "extremes", "finite_rows"]
 
 Rows: TypeAlias = NDArray[np.intp]
 
@@ -37,7 +37,7 @@ class Times:
     def __init__(self, t: Floats) -> None:
         self.t = t
         self.rising = bool((t[1:] >= t[:-1]).all()) and bool(np.isfinite(t).all())
-        """Whether they are in order; a part of them can be looked up by :meth:`within` then."""
+        """Whether they are in order."""
         self._known: dict[tuple[float, str], Rows] = {}
 
     def shifted(self, seconds: float, side: Literal["left", "right"] = "left") -> Rows:
@@ -55,19 +55,30 @@ class Times:
             self._known[key] = found
         return self._known[key]
 
-    def within(self, rows: Rows, seconds: float, side: Literal["left", "right"] = "left") -> Rows:
-        """The same as :meth:`shifted` of ``t[rows]`` alone, where ``rows`` rise.
 
-        As many of them are before a time as there are among all rows before it.
-        """
-        if not self.rising:
-            t = self.t[rows]
-            return np.searchsorted(t, t + seconds, side)
-        if len(rows) == len(self.t):
-            return self.shifted(seconds, side)
-        before = np.zeros(len(self.t) + 1, dtype=np.intp)
-        before[rows + 1] = 1
-        return np.cumsum(before)[self.shifted(seconds, side)[rows]]
+class SomeTimes:
+    """The times of some of the rows; lookups are those of these times alone.
+
+    :param rows: which of all rows; rising.
+    """
+
+    def __init__(self, every: Times, rows: Rows) -> None:
+        self.t: Floats = every.t if len(rows) == len(every.t) else every.t[rows]
+        self._every, self._rows = every, rows
+        self._before: Rows | None = None
+
+    def shifted(self, seconds: float, side: Literal["left", "right"] = "left") -> Rows:
+        """As :meth:`Times.shifted`."""
+        if len(self.t) == len(self._every.t):
+            return self._every.shifted(seconds, side)
+        if not self._every.rising:
+            return np.searchsorted(self.t, self.t + seconds, side)
+        if self._before is None:
+            # as many of these are before a time as there are among all rows before it
+            chosen = np.zeros(len(self._every.t) + 1, dtype=np.intp)
+            chosen[self._rows + 1] = 1
+            self._before = np.cumsum(chosen)
+        return self._before[self._every.shifted(seconds, side)[self._rows]]
 
 
 def _looked_up(t: Floats, times: Floats, side: Literal["left", "right"]) -> Rows | None:
@@ -76,7 +87,7 @@ def _looked_up(t: Floats, times: Floats, side: Literal["left", "right"]) -> Rows
     if n < 2:
         return None
     # interpolation goes through both columns once; its rounding is corrected by one row
-    rows = np.interp(times, t, np.arange(float(n))).astype(np.intp)
+    rows: Rows = np.interp(times, t, np.arange(float(n))).astype(np.intp)
     padded = np.concatenate(([-np.inf], t, [np.inf]))
     behind = np.less if side == "left" else np.less_equal
     rows += behind(t[rows], times)
@@ -98,18 +109,17 @@ def extremes(values: Floats, first: Rows, last: Rows) -> tuple[Floats, Floats]:
         return np.empty(0), np.empty(0)
     # two ranges of one length, which is a power of two, cover a range up to twice as long
     step = 1 << (int(np.partition(lengths, n // 50)[n // 50]).bit_length() - 1)
-    low = high = values
+    low: Floats = values
+    high: Floats = values
     width = 1
     while width < step:
         low = np.minimum(low[:-width], low[width:])
         high = np.maximum(high[:-width], high[width:])
         width *= 2
     fits = (lengths >= step) & (lengths <= 2 * step)
-    if fits.all():
-        begin, end, odd = first, last - step, np.empty(0, np.intp)
-    else:
-        odd = np.flatnonzero(~fits)
-        begin, end = np.where(fits, first, 0), np.where(fits, last - step, 0)
+    odd = np.flatnonzero(~fits)
+    begin: Rows = np.where(fits, first, 0) if len(odd) else first
+    end: Rows = np.where(fits, last - step, 0) if len(odd) else last - step
     least, most = np.minimum(low[begin], low[end]), np.maximum(high[begin], high[end])
     if len(odd):
         ranges = np.column_stack((first[odd], last[odd])).ravel()

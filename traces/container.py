@@ -849,6 +849,12 @@ def _decompress_zstd(packed: bytes, size: int, cut: bool) -> tuple[bytes, bool]:
         except zstandard.ZstdError:
             pass
         return bytes(out[:size]), False
+    if size and zstandard.frame_content_size(packed) == size:
+        try:  # at once, into memory of that size
+            whole = zstandard.ZstdDecompressor().decompress(packed, allow_extra_data=False)
+            return whole, False
+        except zstandard.ZstdError:
+            pass  # damaged, or with something behind it: what can be had is read below
     with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
         return reader.read(size), bool(reader.read(1))
 

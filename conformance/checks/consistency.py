@@ -18,7 +18,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.median import median
-from dexkit.conformance.rows import Rows, Times, extremes, finite_rows
+from dexkit.conformance.rows import Rows, SomeTimes, Times, extremes, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
@@ -41,20 +41,21 @@ class _Joint:
     """
 
     def __init__(self, ctx: Context, joint: int) -> None:
-        self._clock = ctx.once("clock", lambda: Times(ctx.states.clock))
-        self._rows = ctx.once(("measurements", joint), lambda: _measurements(ctx, joint))
-        whole = len(self._rows) == len(ctx.states)
-        rows = slice(None) if whole else self._rows
-        self.t: Floats = ctx.states.clock[rows]
-        self.q: Floats = ctx.states.q[rows, joint]
-        self.dq: Floats = ctx.states.dq[rows, joint]
+        clock = ctx.once("clock", lambda: Times(ctx.states.clock))
+        found = ctx.once(("measurements", joint), lambda: _measurements(ctx, joint))
+        self._times = SomeTimes(clock, found)
+        self._rising = clock.rising
+        rows = slice(None) if len(found) == len(ctx.states) else found
+        self.t = self._times.t
+        self.q: Floats = ctx.states.q[:, joint][rows]
+        self.dq: Floats = ctx.states.dq[:, joint][rows]
         self._steps: Floats = np.diff(self.t)
 
     def windows(self, seconds: float, longest: float) -> tuple[Rows | slice, Rows]:
         """First and last rows of all windows of that length without a gap above ``longest``."""
-        ends = self._clock.within(self._rows, seconds)
+        ends = self._times.shifted(seconds)
         gap = self._steps > longest
-        if self._clock.rising and 2 * longest <= seconds and not gap.any():
+        if self._rising and 2 * longest <= seconds and not gap.any():
             # every window that ends before the last row is whole, and not too long
             ends = ends[: int(np.searchsorted(ends, len(self.t)))]
             return slice(0, len(ends)), ends
@@ -75,8 +76,8 @@ class _Joint:
 
     def reach(self, values: Floats, seconds: float) -> tuple[Floats, Floats]:
         """The least and greatest of values within that time of each measurement."""
-        first = self._clock.within(self._rows, -seconds)
-        last = self._clock.within(self._rows, seconds, "right")
+        first = self._times.shifted(-seconds)
+        last = self._times.shifted(seconds, "right")
         return extremes(values, first, last)
 
 
@@ -88,11 +89,12 @@ def _measurements(ctx: Context, joint: int) -> Rows:
     t, q, dq = states.clock[good], q[good], dq[good]
     rows = np.arange(len(states))[good]
     if len(t):
-        same = (q[1:] == q[:-1]) & (dq[1:] == dq[:-1]) & (dq[1:] != 0)
-        rises = np.maximum.accumulate(t)[:-1] < t[1:]
-        new = ~same & rises
+        again = np.flatnonzero(q[1:] == q[:-1])
+        again = again[(dq[again + 1] == dq[again]) & (dq[again + 1] != 0)]
+        new = np.concatenate(([True], np.maximum.accumulate(t)[:-1] < t[1:]))
+        new[again + 1] = False
         if not new.all():
-            rows = rows[np.concatenate(([True], new))]
+            rows = rows[new]
     return rows
 
 

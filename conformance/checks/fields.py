@@ -215,13 +215,13 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     if not len(starts):
         return ctx.skipped("the states are too far apart to derive a velocity")
     slope = (q[ends] - q[starts]) / span
-    moving = np.abs(slope) > 0.5
-    if moving.sum() < 50:
+    moving = np.flatnonzero(np.abs(slope) > 0.5)
+    if len(moving) < 50:
         return ctx.skipped("the hand hardly moves in this recording")
     cumulated = np.concatenate(([0.0], np.cumsum((dq[1:] + dq[:-1]) / 2 * np.diff(t))))
     mean = (cumulated[ends] - cumulated[starts]) / span
     size = math.sqrt(sums.mean(slope[moving] ** 2))
-    error = math.sqrt(sums.mean((mean - slope)[moving] ** 2)) / size
+    error = math.sqrt(sums.mean((mean[moving] - slope[moving]) ** 2)) / size
     text = ctx.named(
         f"dq differs from the slope of q by {error:.0%} of its size ({size:.2f} rad/s RMS)", joint
     )

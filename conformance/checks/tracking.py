@@ -125,11 +125,13 @@ def _measure(
     if top_speed is not None:
         asked = _within_reach(commanded, top_speed * _GRID)
     # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
-    middle = mean(q[free])
+    every = bool(free.all())
+    at_work = slice(None) if every else np.flatnonzero(free)
+    middle = mean(q[at_work])
     seen, asked, commanded = np.where(free, q - middle, 0.0), asked - middle, commanded - middle
     n = len(grid)
     late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, asked**2))  # by delay
-    if free.all():
+    if every:
         sums = np.concatenate(([0.0], np.cumsum(asked**2)))
         squares = (sums[n:] - sums[:-n])[::-1]
     else:
@@ -141,19 +143,19 @@ def _measure(
     same = _SAME * float(np.einsum("i,i", seen, seen))
     best = int(np.argmax(errors <= max(float(errors.min()), 0.0) + same))
     # a hand that is faster at times than it showed lies between what it reaches and the command
-    reached, wanted = late[best][free], commanded[most - best : most - best + n][free]
+    reached, wanted = late[best][at_work], commanded[most - best : most - best + n][at_work]
     low, high = np.minimum(reached, wanted), np.maximum(reached, wanted)
-    error = np.abs(seen[free] - np.clip(seen[free], low, high))
+    error = np.abs(seen[at_work] - np.clip(seen[at_work], low, high))
     worst = int(np.argmax(error))
     return Tracking(
         joint=joint,
         begin=begin,
         end=end,
         delay=best * _GRID,
-        rms=math.sqrt(mean((seen - late[best])[free] ** 2 if top_speed is None else error**2)),
+        rms=math.sqrt(mean((seen - late[best])[at_work] ** 2 if top_speed is None else error**2)),
         peak=float(error[worst]),
-        peak_at=float(grid[free][worst]),
-        raw=math.sqrt(mean((seen - late[0])[free] ** 2)),
+        peak_at=float(grid[at_work][worst]),
+        raw=math.sqrt(mean((seen - late[0])[at_work] ** 2)),
         blocked=float((~free).mean()),
     )
 

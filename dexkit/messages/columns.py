@@ -49,6 +49,7 @@ class Columns:
         self._groups: dict[_Shape, _Group] = {}
         self._usual: dict[int, _Group] = {}  # by length of the samples
         self._paths: dict[str, _Steps] = {}
+        self._extremes: dict[str, tuple[float, float]] = {}
         for piece in pieces(payloads):
             self.append(*piece)
 
@@ -59,6 +60,7 @@ class Columns:
         sizes: NDArray[np.int64],
     ) -> None:
         """Add the payloads that begin at ``starts`` in ``data``; their bytes are not kept."""
+        self._extremes.clear()
         rows = np.arange(self._n, self._n + len(starts))
         self._n += len(starts)
         if len(sizes) and (sizes == sizes[0]).all():
@@ -185,6 +187,11 @@ class Columns:
 
         :raises UsageError: the type has no such member.
         """
+        if path not in self._extremes:
+            self._extremes[path] = self._find_extremes(path)
+        return self._extremes[path]
+
+    def _find_extremes(self, path: str) -> tuple[float, float]:
         steps = self._steps(path)
         shape = self._shape(steps)
         low, high = [], []

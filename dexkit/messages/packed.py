@@ -14,6 +14,8 @@ _BLOCK = 512
 """Payloads that are looked at at once: few enough to stay in the processor's cache."""
 _SEGMENT = 1 << 16
 """Most samples whose changing words are kept in one table."""
+_FIRST = 1 << 18
+"""Words of the first table; those that are not filled cost no memory."""
 
 Piece: TypeAlias = "tuple[bytes | NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]"
 """A buffer, where some payloads begin in it, and how long each of them is."""
@@ -120,7 +122,7 @@ class Words:
         self._changing: list[int] = []
         self._place: dict[int, int] = {}
         # tables of columns, each as long as all before it: no more is allocated than twice the
-        # samples take, and memory that is not touched costs nothing
+        # samples take, beyond a first table, and memory that is not touched costs nothing
         self._tables: list[NDArray[np.uint32]] = []
         self._begins: list[int] = []  # the first sample of each table
         self._known: list[int] = []  # how many words changed when a table was full
@@ -152,7 +154,8 @@ class Words:
             if not self._tables or self._n - self._begins[-1] == self._tables[-1].shape[1]:
                 if self._tables:
                     self._known.append(len(self._changing))
-                length = min(max(kept.shape[1], self._n), _SEGMENT)
+                first = _FIRST // len(self._row)
+                length = min(max(kept.shape[1], self._n, first), _SEGMENT)
                 self._tables.append(np.empty((len(self._row), length), dtype=np.uint32))
                 self._begins.append(self._n)
             at = self._n - self._begins[-1]
