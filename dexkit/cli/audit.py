@@ -62,6 +62,14 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
 )
 @click.option(
+    "--ray",
+    is_flag=False,
+    flag_value="auto",
+    metavar="[ADDRESS]",
+    help="Judge on a Ray cluster (extra [ray]): at HOST:PORT, at the one of this machine (auto, "
+    "which is meant without ADDRESS), or at one that is started for this audit (local).",
+)
+@click.option(
     "--timeout",
     type=Number(min=1),
     default=600.0,
@@ -94,6 +102,7 @@ def command(
     table_format: str,
     labels: tuple[str, ...],
     jobs: int | None,
+    ray: str | None,
     timeout: float,
     memory: int,
     max_size: int,
@@ -113,6 +122,8 @@ def command(
     from dexkit.conformance.audit.sessions import is_url
 
     assert _FAIL_ON == FAIL_ON
+    if ray is not None and jobs is not None:
+        raise click.UsageError("--jobs is for this machine's processes; a cluster has its own")
     limits = Limits(seconds=timeout, memory=memory * 2**20, max_size=max_size * 2**20)
     audit = Audit(
         locations,
@@ -125,6 +136,7 @@ def command(
     )
     # Python's worker processes begin with the working folder in front of their import path
     os.chdir("/")
+    runner = limits.pool(jobs) if ray is None else limits.cluster(ray)
     status = StatusLine(quiet)
     last = 0.0
 
@@ -135,7 +147,7 @@ def command(
             status.show(_status(outcome))
 
     with stop_on_signals() as stop:
-        outcome = audit.run(limits.pool(jobs), stop, progress)
+        outcome = audit.run(runner, stop, progress)
     status.clear()
     _print(Console(), outcome)
     if stop:

@@ -1,0 +1,160 @@
+"""Do the tasks of an audit on a Ray cluster: the same function, one file a task.
+
+The nodes need dexkit in the same version, and reach the files under the same paths or URLs. A task
+whose process or node dies is done again on another one; its record is taken once, by this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import signal
+import socket
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from dexkit.conformance.audit.examine import Task, examine, settings_key
+from dexkit.conformance.audit.records import FileRecord
+from dexkit.conformance.audit.workers import Lost
+from dexkit.errors import ConformanceError, UsageError
+from dexkit.escaping import one_line
+
+if TYPE_CHECKING:
+    from dexkit.conformance.audit.audit import Limits
+
+__all__ = ["THIS_MACHINE", "Cluster"]
+
+THIS_MACHINE = "local"
+"""The address of a cluster of this machine alone, which ends with the audit."""
+_PATIENCE = 10.0  # seconds for the head node to answer
+_LOOK = 0.2  # seconds between looks at the stop request
+_AGAIN = 3  # times that a task is done again whose process or node died
+_AHEAD = 3  # tasks that are handed to the cluster, for each of its processors
+_FEWEST = 16  # likewise, in all
+
+
+class Cluster:
+    """A connection to a Ray cluster; ends with :meth:`close`, or when tasks have been run.
+
+    :param address: ``host:port`` of its head node, ``auto`` for the one that runs on this machine,
+        ``local`` for a new one on this machine.
+    :param limits: what one file may take. Time is taken by the task's own process, so that a task
+        that waits for a processor does not lose any.
+    :raises UsageError: Ray is not installed.
+    :raises ConformanceError: there is no such cluster.
+    """
+
+    def __init__(self, address: str, limits: Limits) -> None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to anybody
+        try:
+            import ray
+        except ImportError:
+            raise UsageError("--ray needs Ray", hint="pip install 'dexkit[ray]'") from None
+        self._ray: Any = ray
+        try:
+            _check_address(address)  # Ray itself would try for minutes
+            ray.init(address, log_to_driver=False, logging_level="ERROR", include_dashboard=None)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ConformanceError(
+                f"no Ray cluster at {address}: {one_line(str(error), 300)}",
+                hint="'ray start --head' starts one; --ray local has one for this audit alone",
+            ) from error
+        self._examine = ray.remote(num_cpus=1, max_retries=_AGAIN)(_examine)
+        self._limits = limits
+
+    def run(self, tasks: Iterable[Task], stop: object) -> Iterator[tuple[Task, FileRecord | Lost]]:
+        """Examine files until a stop request is true; yields each once, in any order."""
+        ray, waiting = self._ray, iter(tasks)
+        pending: dict[Any, Task] = {}
+        exhausted = False
+        try:
+            while not stop:
+                # the number of processors changes as nodes come and go
+                room = max(_FEWEST, _AHEAD * int(ray.cluster_resources().get("CPU", 1)))
+                while not exhausted and len(pending) < room:
+                    task = next(waiting, None)
+                    if task is None:
+                        exhausted = True
+                        break
+                    settings = settings_key(task.labels)
+                    reference = self._examine.remote(
+                        task, settings, self._limits.seconds, self._limits.memory
+                    )
+                    pending[reference] = task
+                if not pending:
+                    return
+                done, _ = ray.wait(list(pending), num_returns=1, timeout=_LOOK)
+                for reference in done:
+                    yield pending.pop(reference), self._result(reference)
+        finally:
+            for reference in pending:
+                with contextlib.suppress(Exception):  # a cluster that has gone needs no cancelling
+                    ray.cancel(reference, force=True)
+            self.close()
+
+    def _result(self, reference: Any) -> FileRecord | Lost:
+        ray = self._ray
+        try:
+            found: FileRecord | Lost = ray.get(reference)
+        except ray.exceptions.RayTaskError as error:
+            return Lost(f"a node of the cluster cannot do it: {one_line(str(error.cause), 500)}")
+        except ray.exceptions.RayError as error:
+            # its process or node died, and did again each time
+            return Lost(f"its process died ({type(error).__name__})")
+        return found
+
+    def close(self) -> None:
+        """Leave the cluster; one that was made for this audit ends."""
+        self._ray.shutdown()
+
+
+def _check_address(address: str) -> None:
+    """Raise OSError if nothing answers at a ``host:port``."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), _PATIENCE).close()
+
+
+class _TooLong(BaseException):
+    """Ends a task; no handler of errors catches it."""
+
+
+def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileRecord | Lost:
+    """Examine a file in a process of the cluster.
+
+    :param settings: those of the audit; a node with another dexkit would judge differently.
+    """
+    mine = settings_key(task.labels)
+    if mine != settings:
+        raise RuntimeError(
+            f"its dexkit or catalogue is another one than the audit's ({mine}, not {settings})"
+        )
+
+    def too_long(signum: int, frame: FrameType | None) -> None:
+        raise _TooLong
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = _data() + memory  # Ray itself has reserved some
+    before = signal.signal(signal.SIGALRM, too_long)
+    try:
+        if hard == resource.RLIM_INFINITY or limit < hard:
+            resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        return examine(task)
+    except _TooLong:
+        return Lost(f"it took longer than {seconds:g} s")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _data() -> int:
+    """Bytes of memory that count for the limit, of this process."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmData:"):
+            return int(line.split()[1]) * 1024
+    return 0

@@ -1,0 +1,133 @@
+"""An audit on a Ray cluster of two nodes gives what one process gives, also if a node dies.
+
+Ray is no part of ``make setup``: ``.tools/bin/uv pip install 'ray>=2.40'`` lets these tests run.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from dexkit.conformance.audit.audit import Audit, Limits, Outcome, in_this_process
+from dexkit.conformance.audit.journal import Journal
+from dexkit.conformance.audit.records import FileRecord
+from dexkit.errors import ConformanceError, UsageError
+from dexkit.traces import sample_path
+
+FILES = 12
+
+
+def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UsageError, match="needs Ray"):
+        Limits().cluster("auto")
+
+
+@pytest.fixture
+def two_nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
+    """A cluster of two raylets on the loopback interface, and its second node."""
+    pytest.importorskip("ray", reason="install it: .tools/bin/uv pip install 'ray>=2.40'")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    from ray.cluster_utils import Cluster
+
+    about = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": 80 * 2**20}
+    cluster = Cluster(initialize_head=True, head_node_args={**about, "include_dashboard": False})
+    try:
+        second = cluster.add_node(**about)
+        cluster.wait_for_nodes()
+        yield cluster, second
+    finally:
+        cluster.shutdown()
+
+
+def archive(folder: Path) -> Path:
+    for number in range(FILES):
+        sample = ("dex1_pick_place", "dex1_hand_dropout", "dex3_pinch")[number % 3]
+        path = folder / f"{number:02}.mcap"
+        path.parent.mkdir(exist_ok=True)
+        shutil.copyfile(sample_path(sample), path)
+    (folder / "99.mcap").write_text("no recording")
+    return folder
+
+
+def records(out: Path) -> dict[str, FileRecord]:
+    """The records, and that no file has two."""
+    lines = (out / "journal.jsonl").read_text().splitlines()[1:]
+    with Journal(out / "journal.jsonl") as journal:
+        found = {name: journal.read(entry) for name, entry in journal.entries.items()}
+    assert len(lines) == len(found)
+    return {
+        name: replace(r, facts={k: v for k, v in r.facts.items() if k != "cpu_s"})
+        for name, r in found.items()
+    }
+
+
+@pytest.mark.soak
+def test_a_node_is_killed_and_nothing_is_lost_or_done_twice(
+    tmp_path: Path, two_nodes: tuple[Any, Any]
+) -> None:
+    cluster, second = two_nodes
+    files = archive(tmp_path / "archive")
+    killed: list[int] = []
+
+    def kill_a_node(outcome: Outcome) -> None:
+        if outcome.done == 3:
+            cluster.remove_node(second, allow_graceful=False)
+            killed.append(outcome.done)
+
+    audit = Audit([str(files)], tmp_path / "ray", parquet=False)
+    outcome = audit.run(Limits().cluster(cluster.address), progress=kill_a_node)
+    assert killed == [3]
+    assert (outcome.done, outcome.total, outcome.stopped) == (FILES + 1, FILES + 1, False)
+    Audit([str(files)], tmp_path / "one", parquet=False).run(in_this_process)
+    assert records(tmp_path / "ray") == records(tmp_path / "one")
+
+
+@pytest.mark.soak
+def test_a_stop_leaves_what_is_done_and_the_next_audit_goes_on(
+    tmp_path: Path, two_nodes: tuple[Any, Any]
+) -> None:
+    files = archive(tmp_path / "archive")
+    stop: list[bool] = []
+
+    def after_four(outcome: Outcome) -> None:
+        if outcome.done == 4:
+            stop.append(True)
+
+    audit = Audit([str(files)], tmp_path / "ray", parquet=False)
+    outcome = audit.run(Limits().cluster(two_nodes[0].address), stop, after_four)
+    assert (outcome.done, outcome.stopped) == (4, True)
+    assert len((tmp_path / "ray/files.jsonl").read_text().splitlines()) == 4
+    outcome = audit.run(Limits().cluster(two_nodes[0].address))
+    assert (outcome.done, outcome.reused, outcome.stopped) == (FILES + 1, 4, False)
+    assert len(records(tmp_path / "ray")) == FILES + 1
+
+
+@pytest.mark.soak
+def test_a_file_that_takes_too_long_is_a_row(tmp_path: Path, two_nodes: tuple[Any, Any]) -> None:
+    files = archive(tmp_path / "archive")
+    for path in sorted(files.iterdir())[2:]:
+        path.unlink()
+    audit = Audit([str(files)], tmp_path / "ray", parquet=False)
+    outcome = audit.run(Limits(seconds=1e-3).cluster(two_nodes[0].address))
+    found = records(tmp_path / "ray").values()
+    assert outcome.done == 2
+    assert {(str(r.state), r.error) for r in found} == {
+        ("too large", "it took longer than 0.001 s")
+    }
+
+
+def test_no_cluster_at_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", ModuleType("ray"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(ConformanceError, match="no Ray cluster"):
+        Limits().cluster(f"127.0.0.1:{port}")
