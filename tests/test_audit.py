@@ -12,7 +12,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from dexkit.cli import main
-from dexkit.conformance.audit import sessions
+from dexkit.conformance.audit import objects, sessions
 from dexkit.conformance.audit.audit import Audit, Outcome, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.journal import Journal
@@ -221,24 +221,30 @@ def test_a_journal_is_an_audits_own(tmp_path: Path) -> None:
 
 
 def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Judged as files are; one vanishes, one is refused, one is too large: rows."""
+    """Judged as files are; one vanishes, one is refused, one is replaced meanwhile: rows."""
+    monkeypatch.setattr(objects, "_PAUSE", 0.0)
     memory = MemoryFileSystem()
     data = small(tmp_path / "local.mcap").read_bytes()
-    names = ("good", "gone", "refused", "broken", "large")
+    names = ("good", "gone", "refused", "broken", "large", "flaky", "replaced")
+    faults = iter((True, True))
     for name in names:
         memory.pipe(f"/archive/{name}.mcap", data + b"\0" * (name == "large"))
     memory.pipe("/archive/notes.txt", b"")
-    genuine = type(memory)._open
+    genuine = type(memory).cat_file
     errors = {"gone": FileNotFoundError(2, "gone"), "refused": PermissionError(13, "refused")}
 
-    def opened(self: Any, path: str, *rest: Any, **more: Any) -> Any:
+    def given(self: Any, path: str, *rest: Any, **more: Any) -> Any:
         if (name := Path(path).stem) in errors:
             raise errors[name]
         if name == "broken":
             raise RuntimeError("the storage has a fault")
+        if name == "flaky" and next(faults, False):
+            raise RuntimeError("for a moment")
+        if name == "replaced":
+            memory.pipe_file(path, data)
         return genuine(self, path, *rest, **more)
 
-    monkeypatch.setattr(type(memory), "_open", opened)
+    monkeypatch.setattr(type(memory), "cat_file", given)
     try:
         found = list(find("memory://archive"))
         records = {
@@ -254,7 +260,9 @@ def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         "gone": "gone",
         "refused": "no permission",
         "broken": "unavailable",
-        "large": "too large",
+        "large": "judged",
+        "flaky": "judged",
+        "replaced": "unavailable",
     }
     local = examine(Task(Session("x", str(tmp_path / "local.mcap"), len(data), "")))
     assert records["good"].findings == local.findings

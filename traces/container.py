@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -31,7 +31,7 @@ from dexkit.traces import records
 from dexkit.traces.records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema, walk
 from dexkit.traces.summary import Found, Summary, contradictions
 
-__all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "Segment"]
+__all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "OpenFile", "Segment"]
 
 MAX_CHUNK = 256 * 2**20
 """Largest chunk that is unpacked, bytes. Writers default to 1 to 4 MiB."""
@@ -63,6 +63,8 @@ HEADS = np.dtype(
 )
 """A message record up to its payload; ``length`` counts from ``channel`` on."""
 Heads = NDArray[np.void]
+OpenFile = Callable[[], BinaryIO]
+"""Opens a recording that is not a file of this machine; it can be read and sought in."""
 
 _IN_SUMMARY = frozenset(
     {
@@ -132,8 +134,9 @@ class Container:
     :ivar notes: facts that limit what can be verified.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, open_file: OpenFile | None = None) -> None:
         self.path = path
+        self.open_file = open_file or partial(_open_ordinary, path)
         self.truncated = False
         self.damage: list[str] = []
         self.warnings: list[str] = []
@@ -176,21 +179,16 @@ class Container:
         :raises TraceUnreadable: it is missing, not an mcap file, or ends within its header.
         """
         try:
-            with open(self.path, "rb", opener=_open_nonblocking) as file:
-                status = os.fstat(file.fileno())
-                if not stat.S_ISREG(status.st_mode):
-                    raise TraceUnreadable(
-                        f"cannot read {self.path}: it is not an ordinary file",
-                        hint="a recording that comes through a pipe must be stored first",
-                    )
-                self._size = status.st_size
+            with self.open_file() as file:
+                self._size = file.seek(0, os.SEEK_END)
+                file.seek(0)
                 snapshot = cast(BinaryIO, _Snapshot(file, self._size))
                 self._walk(snapshot, self._read_start(snapshot))
                 sound = self._check_sums(snapshot)
                 self._apply_summary_definitions(sound)
                 self._complete(snapshot, sound)
         except OSError as error:
-            raise TraceUnreadable(f"cannot read {self.path}: {error.strerror}") from error
+            raise TraceUnreadable(f"cannot read {self.path}: {error.strerror or error}") from error
         for text in contradictions(self._summary, self._found, complete=self._complete_definitions):
             self.report_damage(text)
 
@@ -893,6 +891,21 @@ def _heads_at(data: bytes, starts: NDArray[np.int64]) -> Heads | None:
     if (heads["opcode"] != Opcode.MESSAGE).any() or (lengths < LEAST[Opcode.MESSAGE]).any():
         return None
     return None if (lengths > len(data)).any() else heads
+
+
+def _open_ordinary(path: Path) -> BinaryIO:
+    """Open a file that is not a pipe or device.
+
+    :raises TraceUnreadable: it is one.
+    """
+    file = open(path, "rb", opener=_open_nonblocking)  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise TraceUnreadable(
+            f"cannot read {path}: it is not an ordinary file",
+            hint="a recording that comes through a pipe must be stored first",
+        )
+    return file
 
 
 def _open_nonblocking(path: str, flags: int) -> int:

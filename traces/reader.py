@@ -24,7 +24,7 @@ from dexkit.messages import Columns, MessageType, message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
 from dexkit.messages.schemas import omgidl
-from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, by_channel
+from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, OpenFile, by_channel
 from dexkit.traces.names import SESSION, USB, dds_topic, dds_type, select_topics
 from dexkit.traces.records import Schema
 
@@ -240,9 +240,9 @@ class Trace:
     :ivar profile: mcap profile, ``"ros2"`` in ROS 2 bags and in dexkit's own recordings.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, open_file: OpenFile | None = None) -> None:
         self.path = path
-        self._file = Container(path)
+        self._file = Container(path, open_file)
         self._file.open()
         self.truncated = self._file.truncated
         self.damage = self._file.damage
@@ -355,7 +355,7 @@ class Trace:
         # (next log time, number, messages) of the segments that are being given
         held: list[tuple[int, int, _Held]] = []
         size = 0
-        with self.path.open("rb") as file:
+        with self._file.open_file() as file:
             for number, segment in enumerate(segments):
                 found = _Held(*self._file.read(file, segment), names)
                 if found:
@@ -415,7 +415,7 @@ class Trace:
                 )
                 by_topic[topic].append(sinks[i])
         bytearray(_MALLOC_KEEP)
-        with self.path.open("rb") as file:
+        with self._file.open_file() as file:
             for segment in self._file.segments:
                 if segment.counts is None or not sinks.keys().isdisjoint(segment.counts):
                     self._collect(*self._file.read(file, segment), sinks)
@@ -536,12 +536,16 @@ class Trace:
                 self._file.warn(f"{topic} carries {len(names)} types: {some}")
 
 
-def open_trace(path: str | os.PathLike[str]) -> Trace:
+def open_trace(path: str | os.PathLike[str], open_file: OpenFile | None = None) -> Trace:
     """Open a recording: an mcap file, or the directory of a ROS 2 bag with one in it.
 
+    :param open_file: opens it where it is no file of this machine, again for each pass over it;
+        ``path`` is only its name then.
     :raises TraceUnreadable: it is missing, not an mcap file, or ends within its header.
     """
     found = Path(path)
+    if open_file is not None:
+        return Trace(found, open_file)
     if found.is_dir():
         files = sorted(found.glob("*.mcap"))
         if len(files) != 1:

@@ -31,7 +31,7 @@ class Limits:
     """What one file may take.
 
     :param memory: bytes of the process that examines it.
-    :param max_size: bytes of an object that are copied.
+    :param max_size: bytes of an object that are copied; larger ones are read by ranges.
     """
 
     seconds: float = 600.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from dexkit import __version__
 from dexkit.conformance.audit.records import FileRecord, State, finding_of
-from dexkit.conformance.audit.sessions import Session, local_file, problem_of
+from dexkit.conformance.audit.sessions import Session, opened, problem_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
@@ -24,6 +24,7 @@ from dexkit.errors import DexkitError
 from dexkit.escaping import one_line
 from dexkit.hand import Floats
 from dexkit.traces import Trace, open_trace
+from dexkit.traces.container import OpenFile
 
 __all__ = ["LABELS", "Task", "examine", "settings_key"]
 
@@ -39,7 +40,7 @@ class Task:
 
     :param known: the SHA-256 that it had when it was examined the last time, or empty.
     :param labels: keys of its metadata that are kept.
-    :param max_size: bytes of an object that are copied.
+    :param max_size: bytes of an object that are copied; larger ones are read by ranges.
     """
 
     session: Session
@@ -63,9 +64,9 @@ def examine(task: Task) -> FileRecord:
     session = task.session
     digest = ""
     try:
-        with local_file(session, task.max_size) as (path, digest):
+        with opened(session, task.max_size) as (path, open_file, digest):
             if digest != task.known:
-                record = _judged(path, session.name, task.labels)
+                record = _judged(path, open_file, session.name, task.labels)
             else:
                 record = FileRecord(session.name, state=State.JUDGED)
     except (DexkitError, OSError, MemoryError) as error:
@@ -93,10 +94,10 @@ def _where() -> str:
     return "?" if trace is None else f"{trace.tb_frame.f_code.co_name}:{trace.tb_lineno}"
 
 
-def _judged(path: Path, name: str, labels: Sequence[str]) -> FileRecord:
+def _judged(path: Path, open_file: OpenFile | None, name: str, labels: Sequence[str]) -> FileRecord:
     facts: dict[str, Any] = {}
     try:
-        trace = open_trace(path)
+        trace = open_trace(path, open_file)
         facts = _facts_of_trace(trace, labels)
         view = recording_of(trace, None, ())
         facts |= _facts_of_recording(view)

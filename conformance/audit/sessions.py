@@ -5,30 +5,28 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.audit.objects import Object, file_system, tag_of
 from dexkit.conformance.audit.records import FileRecord, State
 from dexkit.digests import file_pieces
-from dexkit.errors import DexkitError, TraceUnreadable, UsageError
+from dexkit.errors import DexkitError, TraceUnreadable
 from dexkit.escaping import one_line
 from dexkit.temporary_folder import TemporaryFolder
+from dexkit.traces.container import OpenFile
 
-__all__ = ["Session", "TooLarge", "find", "is_url", "local_file", "problem_of"]
+__all__ = ["Session", "TooLarge", "find", "is_url", "opened", "problem_of"]
 
 _SUFFIX = ".mcap"
-_PIECE = 1 << 20
-_TAGS = (
-    *("ETag", "etag", "md5Hash", "md5", "sha256", "blob_id", "generation", "versionId"),
-    *("mtime", "LastModified", "last_modified", "updated", "created"),
-)
-"""What file systems of fsspec call that which changes with an object, best first."""
+_SPARE = 1 << 28  # bytes that a copy leaves free in the temporary folder
 
 
 class TooLarge(DexkitError):
-    """A file is larger than an audit may copy."""
+    """A file is larger than an audit may copy, and cannot be read otherwise."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +85,8 @@ def _session_of(name: Path, path: Path) -> Session | FileRecord:
     return Session(text, str(path), status.st_size, str(status.st_mtime_ns))
 
 
-def _file_system(url: str) -> tuple[Any, str]:
-    try:
-        import fsspec
-    except ImportError:
-        raise UsageError(
-            f"{url} is a URL, which needs fsspec", hint="pip install 'dexkit[audit]'"
-        ) from None
-    try:
-        return fsspec.core.url_to_fs(url)  # type: ignore[no-any-return]
-    except (ImportError, ValueError) as error:
-        raise UsageError(f"{url}: {error}", hint="pip install s3fs, gcsfs, ... for it") from None
-
-
 def _find_objects(url: str) -> Iterator[Session | FileRecord]:
-    files, root = _file_system(url)
+    files, root = file_system(url)
     try:
         found: dict[str, dict[str, Any]] = files.find(root, detail=True)
         if not found and not files.exists(root):
@@ -113,8 +98,13 @@ def _find_objects(url: str) -> Iterator[Session | FileRecord]:
         if not path.lower().endswith(_SUFFIX) and path != root:
             continue
         place = files.unstrip_protocol(path)
-        tag = next((str(info[key]) for key in _TAGS if info.get(key)), "")
-        yield Session(one_line(place, 4096), place, int(info.get("size") or 0), tag)
+        try:
+            if not tag_of(info) or not info.get("size"):  # a web server's list has only names
+                info = files.info(path)
+        except Exception as error:
+            yield problem_of(place, error)
+            continue
+        yield Session(one_line(place, 4096), place, int(info.get("size") or 0), tag_of(info))
 
 
 def problem_of(name: str, error: BaseException) -> FileRecord:
@@ -124,10 +114,12 @@ def problem_of(name: str, error: BaseException) -> FileRecord:
     while cause is not None:
         if isinstance(cause, FileNotFoundError | NotADirectoryError):
             state = State.GONE
-        elif isinstance(cause, PermissionError):
+        elif isinstance(cause, PermissionError) or getattr(cause, "status", 0) in (401, 403):
             state = State.REFUSED
         elif isinstance(cause, TooLarge | MemoryError):
             state = State.TOO_LARGE
+        elif isinstance(cause, OSError) and state is State.UNREADABLE:
+            state = State.UNAVAILABLE
         cause = cause.__cause__
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     if state is State.UNAVAILABLE and not isinstance(error, OSError):
@@ -139,30 +131,44 @@ def problem_of(name: str, error: BaseException) -> FileRecord:
 
 
 @contextlib.contextmanager
-def local_file(session: Session, most: int) -> Iterator[tuple[Path, str]]:
-    """The file's path and its SHA-256; of an object, of a copy that is removed behind it.
+def opened(session: Session, most: int) -> Iterator[tuple[Path, OpenFile | None, str]]:
+    """The file's path, what opens it if it is not there, and its SHA-256.
 
-    :param most: bytes of an object that are copied.
-    :raises TooLarge: it has more.
+    An object is copied to the temporary folder, block by block; the copy is removed behind it. One
+    that is larger than ``most``, or than what is free there, is read where it is, by ranges, which
+    transfers it several times.
+
+    :raises TooLarge: it can neither be copied nor be read by ranges.
+    :raises OSError: an object was replaced meanwhile.
     """
     digest = hashlib.sha256()
     if not is_url(session.place):
         path = Path(session.place)
         for piece in file_pieces(path, error=TraceUnreadable):
             digest.update(piece)
-        yield path, digest.hexdigest()
+        yield path, None, digest.hexdigest()
         return
-    if session.size > most:
-        raise TooLarge(f"it has {session.size} bytes, more than {most}", hint="--max-size")
-    files, where = _file_system(session.place)
+    source = Object(session.place)
     with TemporaryFolder("audit") as folder:
+        if source.size > min(most, shutil.disk_usage(folder).free - _SPARE):
+            if not source.ranges:
+                raise TooLarge(
+                    f"it has {source.size} bytes, more than can be copied, and its server does "
+                    "not give parts of it",
+                    hint="--max-size",
+                )
+            for piece in source.pieces():
+                digest.update(piece)
+            yield Path(session.place), source.open, digest.hexdigest()
+            source.check()
+            return
         path = folder / "session.mcap"
         size = 0
-        with files.open(where, "rb") as source, path.open("wb") as copy:
-            while piece := source.read(_PIECE):
+        with path.open("wb") as copy:
+            for piece in source.pieces():
                 size += len(piece)
                 if size > most:
                     raise TooLarge(f"it has more than {most} bytes", hint="--max-size")
                 digest.update(piece)
                 copy.write(piece)
-        yield path, digest.hexdigest()
+        yield path, None, digest.hexdigest()

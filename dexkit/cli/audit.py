@@ -91,7 +91,8 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     default=8192,
     show_default=True,
     metavar="MIB",
-    help="Largest object of a URL that is copied to this machine's temporary folder.",
+    help="Largest object of a URL that is copied to the temporary folder; larger ones are read "
+    "where they are, by ranges, several times.",
 )
 @quiet_option()
 def command(
