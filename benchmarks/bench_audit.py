@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
 
 from benchmarks import Result
 from dexkit.conformance.audit.audit import Audit, Limits, Outcome, in_this_process
@@ -42,8 +43,11 @@ def _audits(title: str, archive: Path, folder: Path) -> list[Result]:
     cores = len(os.sched_getaffinity(0))
     one, steady = _audit(archive, folder / "one", 1)
     many, _ = _audit(archive, folder / "many", cores)
-    peer = _read_with_mcap(archive.rglob("*.mcap"))
-    target, reading = _TARGETS[title], one.examined_s / peer
+    peers = {
+        "mcap library, iter_messages": _read_with_mcap,
+        "rosbags, Reader.messages": _read_with_rosbags,
+    }
+    target = _TARGETS[title]
     about = f"{one.total} files of {_SECONDS:g} s"
     return [
         Result(
@@ -57,14 +61,17 @@ def _audits(title: str, archive: Path, folder: Path) -> list[Result]:
             steady >= target,
             about,
         ),
-        Result(
-            f"dexkit audit, {title}, a core in steady state",
-            steady,
-            "times real time",
-            "mcap library, iter_messages",
-            reading,
-            steady / reading,
-            note="the library reads the same messages, and decodes none",
+        *(
+            Result(
+                f"dexkit audit, {title}, a core in steady state",
+                steady,
+                "times real time",
+                peer,
+                reading := one.examined_s / read(archive.rglob("*.mcap")),
+                steady / reading,
+                note="it reads the same messages, and decodes none",
+            )
+            for peer, read in peers.items()
         ),
         Result(
             f"dexkit audit, {title}, {cores} processes",
@@ -100,5 +107,14 @@ def _read_with_mcap(paths: Iterable[Path]) -> float:
     for path in paths:
         with path.open("rb") as file:
             for _ in make_reader(file).iter_messages():
+                pass
+    return time.process_time() - begin
+
+
+def _read_with_rosbags(paths: Iterable[Path]) -> float:
+    begin = time.process_time()
+    for path in paths:
+        with Reader(path) as reader:
+            for _ in reader.messages():
                 pass
     return time.process_time() - begin

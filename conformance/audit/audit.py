@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
 from dexkit.conformance.audit.journal import Entry, Journal
@@ -59,13 +58,6 @@ def in_this_process(tasks: Iterable[Task], stop: object) -> Iterator[tuple[Task,
         if stop:
             return
         yield task, examine(task)
-
-
-class Progress(Protocol):
-    """Is told how far an audit is."""
-
-    def __call__(self, outcome: Outcome) -> None:
-        """Called after each file."""
 
 
 @dataclass
@@ -126,6 +118,10 @@ class Outcome:
         if level >= 2 and self.unusable:
             return 2
         return 1 if level >= 3 and self.warned else 0
+
+
+Progress = Callable[[Outcome], None]
+"""Is called after each file with how far the audit is; it must not change what it gets."""
 
 
 class Audit:

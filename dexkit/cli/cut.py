@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import FILE, Number, topic_option
+from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
-from dexkit.escaping import REMARK, one_line
 
 if TYPE_CHECKING:
     from dexkit.traces import Trace
@@ -66,8 +66,7 @@ def command(
     written = cut(
         trace, out, spans=spans, topics=topics or None, metadata=metadata, overwrite=force
     )
-    for warning in trace.warnings:
-        click.echo(one_line(f"warning: {warning}", REMARK), err=True)
+    remarks("warning", trace.warnings)
     if trace.attachments:
         click.echo(f"warning: {trace.attachments} attachments are left out", err=True)
     click.echo(f"{out}: {written} of {trace.message_count} messages")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.options import FILE, Number, json_option, topic_option
-from dexkit.escaping import REMARK, one_line
+from dexkit.cli.remarks import remarks
 
 if TYPE_CHECKING:
     from dexkit.traces.sessions.compare import Comparison
@@ -60,8 +60,7 @@ def command(
     traces = [open_trace(a), open_trace(b)]
     found = compare(*traces, topics=topics or None, offset=offset, tolerance=tolerance)
     for trace in traces:
-        for warning in trace.warnings:
-            click.echo(one_line(f"warning: {trace.path}: {warning}", REMARK), err=True)
+        remarks("warning", trace.warnings, trace.path)
     if as_json:
         click.echo(json.dumps(_finite({"equal": found.equal, **asdict(found)}), indent=1))
     else:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from dexkit.cli.options import FILE
+from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
 
@@ -77,14 +78,12 @@ def command(
             if not several:
                 raise
             trouble = True
-            click.echo(one_line(f"warning: {path}: refused: {error}", REMARK), err=True)
+            remark("warning", f"refused: {error}", path)
             continue
         done += 1
         trouble |= bool(trace.damage)
-        for text in trace.warnings:
-            click.echo(one_line(f"warning: {path}: {text}", REMARK), err=True)
-        for text in lost:
-            click.echo(one_line(f"not in {form}: {text}", REMARK), err=True)
+        remarks("warning", trace.warnings, path)
+        remarks(f"not in {form}", lost)
         click.echo(one_line(f"{target}: {trace.message_count} messages", REMARK))
     if not done:
         raise SessionError("none of the recordings could be exported")
@@ -112,11 +111,8 @@ def _frames(
     else:
         result = episodes_out.export_episodes(traces, out, fps=fps, task=task)
     for trace in traces:
-        for text in trace.warnings:
-            click.echo(one_line(f"warning: {trace.path}: {text}", REMARK), err=True)
-    for text in (*refused, *result.problems):
-        click.echo(one_line(f"warning: {text}", REMARK), err=True)
-    for text in result.lost:
-        click.echo(one_line(f"not in {form}: {text}", REMARK), err=True)
+        remarks("warning", trace.warnings, trace.path)
+    remarks("warning", (*refused, *result.problems))
+    remarks(f"not in {form}", result.lost)
     click.echo(f"{out}: {lerobot_out.describe(result)}")
     return 1 if refused or result.problems or any(t.damage for t in traces) else 0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import FILE, session_options
+from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
 
@@ -79,14 +80,12 @@ def command(
             if len(entries) == 1:
                 raise
             trouble = True
-            click.echo(one_line(f"warning: {entry.name}: refused: {error}", REMARK), err=True)
+            remark("warning", f"refused: {error}", entry.name)
             continue
         done += 1
         trouble |= bool(report.problems)
-        for text in report.corrections:
-            click.echo(one_line(f"corrected: {entry.name}: {text}", REMARK), err=True)
-        for text in report.problems:
-            click.echo(one_line(f"warning: {entry.name}: {text}", REMARK), err=True)
+        remarks("corrected", report.corrections, entry.name)
+        remarks("warning", report.problems, entry.name)
         click.echo(one_line(f"{target}: {report.messages} messages ({report.form})", REMARK))
     if not done:
         raise SessionError(f"none of the {len(entries)} sessions of {source} can be imported")

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from dexkit.cli.options import FILE
+from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
-from dexkit.escaping import REMARK, one_line
 
 __all__ = ["command"]
 
@@ -62,8 +62,7 @@ def command(
             click.echo(f"{path}: shifted by {moved[-1]:+.6f} s")
     result = merge(traces, out, shifts=moved, keep_duplicates=keep_duplicates, overwrite=force)
     for trace in traces:
-        for warning in trace.warnings:
-            click.echo(one_line(f"warning: {trace.path}: {warning}", REMARK), err=True)
+        remarks("warning", trace.warnings, trace.path)
         if trace.attachments:
             click.echo(
                 f"warning: {trace.path}: {trace.attachments} attachments are left out", err=True

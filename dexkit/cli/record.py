@@ -13,6 +13,7 @@ import click
 
 from dexkit import threads
 from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
+from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, TraceError, UsageError
 from dexkit.escaping import REMARK, one_line
 from dexkit.stop_signals import stop_on_signals
@@ -98,10 +99,8 @@ def command(
             threads.check()  # why nothing came is known then
             _refuse_empty(node, recording, time.monotonic() - started)
     for topic, why in recording.unknown.items():
-        click.echo(one_line(f"warning: {topic} was not recorded: {why}", REMARK), err=True)
-    for text in (*recording.losses.describe(), recorder.displaced):
-        if text:
-            click.echo(one_line(f"warning: {text}", REMARK), err=True)
+        remark("warning", f"{topic} was not recorded: {why}")
+    remarks("warning", filter(None, (*recording.losses.describe(), recorder.displaced)))
     dropped = recorder.dropped
     per_topic = ", ".join(
         f"{one_line(topic)} {count}" for topic, count in sorted(recorder.offered.items())
@@ -141,7 +140,7 @@ def _merge_episodes(
 
     new = [e for e, status in _episodes(folder).items() if before.get(e) != status]
     if not new:
-        click.echo(one_line(f"warning: no episode was written to {folder}", REMARK), err=True)
+        remark("warning", f"no episode was written to {folder}")
         return False
     trace, whole = open_trace(out), True
     for episode in new:
@@ -151,10 +150,9 @@ def _merge_episodes(
             report = beside(episode, trace).convert(target, False, force)
         except DexkitError as error:
             whole = False
-            click.echo(one_line(f"warning: {episode}: not merged: {error}", REMARK), err=True)
+            remark("warning", f"not merged: {error}", episode)
             continue
-        for text in (*report.corrections, *report.problems):
-            click.echo(one_line(f"warning: {episode}: {text}", REMARK), err=True)
+        remarks("warning", (*report.corrections, *report.problems), episode)
         click.echo(one_line(f"{target}: {report.messages} messages ({report.form})", REMARK))
     return whole
 
