@@ -301,6 +301,24 @@ def test_what_cannot_be_sent_is_refused_or_left_out(tmp_path: Path) -> None:
         assert np.isfinite(cured.plan.tracks[LEFT].q).all()
 
 
+def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> None:
+    q = slow_wave(20)
+    q[10:] = 1e38
+    found = prepare(session(tmp_path, gripper(q)), Wishes(jumps="stretch", resample=200.0))
+    assert {f.name for f in found.refused} == {"limits"}
+    assert found.plan is not None
+    assert found.plan.duration < 1.0
+    rows = gripper(slow_wave(4))
+    rows[3] = (CMD, T0 + 10**14, T0 + 10**14, rows[3][3])
+    paused = session(tmp_path, rows)
+    with pytest.raises(UsageError, match="more than 5,000,000"):
+        prepare(paused, Wishes(resample=200.0))
+    plan = prepare(paused).plan
+    assert plan is not None
+    with pytest.raises(UsageError, match="too long to be rehearsed"):
+        rehearse(plan)
+
+
 def test_commands_to_a_hand_with_other_joints_are_refused(tmp_path: Path) -> None:
     six = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 50, 0.0)[:, :6]))
     found = prepare(six)

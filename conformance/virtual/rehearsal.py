@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, model
 from dexkit.teleop.client_codec import ClientWire
@@ -19,6 +20,7 @@ __all__ = ["JointFigures", "Rehearsal", "Rehearsed", "rehearse"]
 _DEFAULT = Guards()
 _SETTLED = 0.5
 """Seconds of hand before the replay begins and after it ends."""
+_LONGEST = 3600.0
 _RIPPLE = 0.1
 """Seconds of the mean that a ripple is about: three steps of 30 Hz."""
 _SATURATED = 0.98
@@ -144,8 +146,13 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     """Play a plan to the reference hands of its model, which obey the law of their motors.
 
     :param guards: as for the hand; a session that is looped is played once.
-    :raises UsageError: the model has no reference hand that speaks the dialect.
+    :raises UsageError: it takes more than an hour.
     """
+    if plan.duration > _LONGEST:
+        raise UsageError(
+            f"the session takes {plan.duration:,.0f} s, too long to be rehearsed",
+            hint="shorten pauses with --max-gap S, or cut the session: dexkit cut",
+        )
     machine = ReplayMachine(plan, Guards(**{**vars(guards), "loop": False}))
     spoken: Dialect = plan.dialect
     service = model(spoken.model).reference.load()(spoken, plan.sides, {})

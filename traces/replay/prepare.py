@@ -56,6 +56,8 @@ _BEYOND = 0.02
 """Part of the stroke beyond a limit that is rounding or calibration."""
 _MOVES = 0.02
 """Part of the stroke that a joint has to be commanded over to be meant to move."""
+_MOST = 5_000_000
+"""Commands of a hand that is resampled: an hour at the highest rate, and more."""
 _TOLD = 5
 """Things that an import has left out that are told one by one."""
 _FITS = 0.01
@@ -606,11 +608,7 @@ class _Preparation:
 
     def _stretched(self, tracks: dict[Side, Track]) -> dict[Side, Track]:
         """Give every joint the time that it needs, and commands on its way."""
-        needed = {
-            s: (np.abs(np.diff(t.q, axis=0)) / joint_limits(self.spoken, s).dq).max(axis=1)
-            for s, t in tracks.items()
-            if len(t) > 1
-        }
+        needed = {s: self._needed(s, t) for s, t in tracks.items() if len(t) > 1}
 
         def slower(middle: Floats, dt: Floats) -> Floats:
             factor = np.ones_like(dt)
@@ -629,6 +627,12 @@ class _Preparation:
             else t
             for s, t in warped.items()
         }
+
+    def _needed(self, side: Side, track: Track) -> Floats:
+        """Seconds that the hand needs from each command to the next, within its limits."""
+        limits = joint_limits(self.spoken, side)
+        q = np.clip(track.q, limits.low, limits.high)
+        return np.asarray((np.abs(np.diff(q, axis=0)) / limits.dq).max(axis=1))
 
     def _rate(self, side: Side, track: Track) -> None:
         """Check that the commands are no staircase."""
@@ -732,6 +736,11 @@ def _resampled(track: Track, rate: float) -> Track:
     if len(track) < 2:
         return track
     count = int((track.t[-1] - track.t[0]) * rate)
+    if count > _MOST:
+        raise UsageError(
+            f"{rate:g} commands a second are {count:,} in all, more than {_MOST:,}",
+            hint="shorten pauses with --max-gap S, or cut the session: dexkit cut",
+        )
     times = np.append(track.t[0] + np.arange(count + 1) / rate, track.t[-1])
     return _at_times(track, np.unique(times))
 
