@@ -311,7 +311,7 @@ def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> Non
     rows = gripper(slow_wave(4))
     rows[3] = (CMD, T0 + 10**14, T0 + 10**14, rows[3][3])
     paused = session(tmp_path, rows)
-    with pytest.raises(UsageError, match="more than 5,000,000"):
+    with pytest.raises(UsageError, match="more than 1,000,000"):
         prepare(paused, Wishes(resample=200.0))
     plan = prepare(paused).plan
     assert plan is not None

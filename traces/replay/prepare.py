@@ -56,8 +56,8 @@ _BEYOND = 0.02
 """Part of the stroke beyond a limit that is rounding or calibration."""
 _MOVES = 0.02
 """Part of the stroke that a joint has to be commanded over to be meant to move."""
-_MOST = 5_000_000
-"""Commands of a hand that is resampled: an hour at the highest rate, and more."""
+_MOST = 1_000_000
+"""Commands of a hand that is resampled: more than an hour at 200 Hz."""
 _TOLD = 5
 """Things that an import has left out that are told one by one."""
 _FITS = 0.01
