@@ -180,8 +180,7 @@ class Container:
         """
         try:
             with self.open_file() as file:
-                self._size = file.seek(0, os.SEEK_END)
-                file.seek(0)
+                self._size = _size_of(file)
                 snapshot = cast(BinaryIO, _Snapshot(file, self._size))
                 self._walk(snapshot, self._read_start(snapshot))
                 sound = self._check_sums(snapshot)
@@ -906,6 +905,16 @@ def _open_ordinary(path: Path) -> BinaryIO:
             hint="a recording that comes through a pipe must be stored first",
         )
     return file
+
+
+def _size_of(file: BinaryIO) -> int:
+    """The bytes of an open file, or of an object that is read as one."""
+    try:
+        return os.fstat(file.fileno()).st_size
+    except OSError:  # no file of this machine
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        return size
 
 
 def _open_nonblocking(path: str, flags: int) -> int:
