@@ -293,13 +293,14 @@ class HandCodec:
         """A state frame; on each bus the motors, then the sensors.
 
         The time-out bit of a motor is its ``MotorError.MOTOR_SAW_HOST_TIMEOUT``, which goes into
-        ``MError`` too. A supply or IMU that is not measured is sent as 0.
+        ``MError`` too. A temperature, voltage, supply or IMU that is not measured (NaN or None) is
+        sent as 0: the wire has no code for "not known" except in ``pressure``.
 
         :param motors: indices of the motors that answer; all by default.
         :param sensors: likewise of the sensors.
         :param model: ``mode[0]`` of the frame; ``timeout``: ``mode[1]``.
-        :raises EncodeError: NaN or infinity in what is sent (but NaN in ``pressure`` is "no
-            value").
+        :raises EncodeError: NaN in q, dq or tau_est of a motor that answers (leave it out of
+            ``motors`` instead), or infinity anywhere.
         """
         buses: list[list[MotorState | SensorState]] = [[] for _ in range(N_BUSES)]
         for i in range(len(self.joints)) if motors is None else motors:
@@ -318,15 +319,15 @@ class HandCodec:
                         number,
                         0,
                         tuple(units.encode_pressure(p) for p in state.pressure[i].tolist()),
-                        tuple(units.TEMPERATURE.encode(t) for t in heat),
+                        tuple(_encode_or_zero(units.TEMPERATURE, t) for t in heat),
                     )
                 )
         supply = state.supply or SupplyState()
         imu: tuple[int, ...] = (0,) * 6
         if state.imu is not None:
             imu = (
-                *(units.ACCELERATION.encode(a) for a in state.imu.accelerometer),
-                *(units.ROTATION.encode(w) for w in state.imu.gyroscope),
+                *(_encode_or_zero(units.ACCELERATION, a) for a in state.imu.accelerometer),
+                *(_encode_or_zero(units.ROTATION, w) for w in state.imu.gyroscope),
             )
         return pack_state(
             StateFrame(
@@ -353,9 +354,9 @@ class HandCodec:
             id=number,
             status=int(state.mode[i]),
             timeout=bool(fault & MotorError.MOTOR_SAW_HOST_TIMEOUT),
-            temp=units.TEMPERATURE.encode(float(state.temperature[i])),
-            sensor=units.WINDING_TEMPERATURE.encode(float(winding[i])),
-            vol=units.MOTOR_VOLTAGE.encode(float(state.voltage[i])),
+            temp=_encode_or_zero(units.TEMPERATURE, float(state.temperature[i])),
+            sensor=_encode_or_zero(units.WINDING_TEMPERATURE, float(winding[i])),
+            vol=_encode_or_zero(units.MOTOR_VOLTAGE, float(state.voltage[i])),
             torque=units.TORQUE.encode(float(state.tau_est[i]), ratio),
             speed=units.VELOCITY.encode(float(state.dq[i]), ratio),
             pos=units.POSITION.encode(float(state.q[i]), ratio),

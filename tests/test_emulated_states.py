@@ -1,0 +1,189 @@
+"""What a simulated hand measures survives every encoding it has: DDS messages and USB frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.clock import Clock, ManualClock
+from dexkit.emulators.sim_dex3 import SimDex3
+from dexkit.emulators.sim_dex5 import SimDex5
+from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.simulated import SimulatedHand
+from dexkit.errors import EncodeError
+from dexkit.hand import HandCommand, HandState, Side
+from dexkit.messages import message_type
+from dexkit.models import DEX3_1, Dialect, model
+from dexkit.service.dialects import StateView, dialect_map
+from dexkit.wire.dex3_usb import HandCodec, units
+from tests.each import each
+
+CODECS = {side: HandCodec(DEX3_1.joints[side]) for side in Side}
+# with an object between the fingers, so that touch and force are not 0
+HANDS: tuple[Callable[[Side, Clock], SimulatedHand], ...] = (
+    lambda side, clock: SimHand(side, object_pct=30.0, clock=clock),
+    lambda side, clock: SimDex3(side, object_at=30.0, clock=clock),
+    lambda side, clock: SimDex5(side, object_at=30.0, clock=clock),
+)
+
+# a goal as a fraction of the range, whether the drive is stiff, seconds until the next
+motions = st.lists(
+    st.tuples(st.floats(0.0, 1.0), st.booleans(), st.floats(0.0, 0.2)), min_size=1, max_size=3
+)
+sides = st.sampled_from(list(Side))
+
+
+def states(
+    make: Callable[[Side, Clock], SimulatedHand],
+    side: Side,
+    plan: Sequence[tuple[float, bool, float]],
+) -> list[HandState]:
+    """The states of a hand that moves by ``plan``, the first before any command."""
+    clock = ManualClock()
+    hand = make(side, clock)
+    hand.open()
+    spec = hand.spec
+    found = [hand.exchange(HandCommand.brake(spec.n_joints))]
+    for part, stiff, seconds in plan:
+        q = spec.q_min + part * (spec.q_max - spec.q_min)
+        command = HandCommand.position(q, kp=1.5 if stiff else 0.2, kd=0.1)
+        hand.exchange(command)
+        clock.advance(seconds)
+        found.append(hand.exchange(command))
+    return found
+
+
+def close(got: object, wanted: object, step: object, what: str) -> None:
+    """Assert that no value is further than ``step`` from what was measured; unknown is 0."""
+    expected = np.nan_to_num(np.asarray(wanted, dtype=np.float64))
+    error = np.abs(np.asarray(got, dtype=np.float64) - expected)
+    assert (error <= np.asarray(step) * (1 + 1e-6)).all(), what
+
+
+@settings(max_examples=15, deadline=None)
+@given(sides, motions)
+def test_a_dex3_state_survives_a_usb_frame(
+    side: Side, plan: list[tuple[float, bool, float]]
+) -> None:
+    codec = CODECS[side]
+    for state in states(HANDS[1], side, plan):
+        decoded = codec.decode(codec.encode_state(state), state.stamp)
+        assert codec.problems == []
+        for name, scale in (
+            ("q", units.POSITION),
+            ("dq", units.VELOCITY),
+            ("tau_est", units.TORQUE),
+            ("temperature", units.TEMPERATURE),
+            ("winding_temperature", units.WINDING_TEMPERATURE),
+            ("voltage", units.MOTOR_VOLTAGE),
+        ):
+            step = [1 / scale.factor(ratio) for ratio in codec.ratios]
+            close(getattr(decoded, name), getattr(state, name), step, name)
+        for name in ("mode", "fault"):
+            np.testing.assert_array_equal(getattr(decoded, name), getattr(state, name))
+        assert state.pressure is not None
+        assert decoded.pressure is not None
+        np.testing.assert_array_equal(np.isnan(decoded.pressure), np.isnan(state.pressure))
+        close(np.nan_to_num(decoded.pressure), state.pressure, 8.0, "pressure")
+        close(decoded.sensor_temperature, state.sensor_temperature, 1.0, "sensor_temperature")
+        # and once more: the encoded state is a fixed point
+        assert codec.encode_state(decoded) == codec.encode_state(
+            codec.decode(codec.encode_state(decoded), 0.0)
+        )
+
+
+@settings(max_examples=10, deadline=None)
+@given(sides, motions)
+def test_every_state_survives_its_dds_messages(
+    side: Side, plan: list[tuple[float, bool, float]]
+) -> None:
+    for make in HANDS:
+        spec = make(side, ManualClock()).spec
+        for dialect in model(spec.model).dialects:
+            for state in states(make, side, plan):
+                check_message(dialect, side, make, state)
+
+
+def check_message(
+    dialect: Dialect,
+    side: Side,
+    make: Callable[[Side, Clock], SimulatedHand],
+    state: HandState,
+) -> None:
+    spec = make(side, ManualClock()).spec
+    fault = tuple(int(bits) for bits in state.fault)
+    mapping = dialect_map(dialect, {side: spec})
+    kind = message_type(dialect.state_type)
+    message = kind.decode(mapping.encode({side: StateView(state, fault)}))
+    first = dialect.index[side] if spec.n_joints == 1 else 0
+    motors = getattr(message, kind.motor_sequence)[first : first + spec.n_joints]
+    scale = dialect.q_open / spec.joints[0].q_max if dialect.name == "unitree_hg" else 1.0
+    units_of_tau = np.array(dialect.torque_units or 1.0)
+    tau = state.tau_est / units_of_tau
+    float32 = 1e-5
+    close([m.q for m in motors], state.q * scale, float32, "q")
+    close([m.dq for m in motors], state.dq * scale, 1e-3, "dq")
+    close(
+        [m.tau_est for m in motors],
+        np.abs(tau) if dialect.name == "unitree_hg" else tau,
+        1e-4 * (1 + np.abs(tau)),
+        "tau_est",
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.sets(st.sampled_from(["temperature", "winding_temperature", "voltage"])),
+    st.booleans(),
+    st.booleans(),
+    st.lists(st.integers(0, 6), max_size=7),
+)
+def test_what_a_backend_does_not_know_is_sent_as_0(
+    unknown: set[str], no_heat: bool, no_imu: bool, joints: list[int]
+) -> None:
+    (state,) = states(HANDS[1], Side.LEFT, [])
+    changed = {}
+    for name in unknown:
+        values = np.array(getattr(state, name))
+        values[joints] = math.nan
+        changed[name] = values
+    assert state.imu is not None
+    assert state.sensor_temperature is not None
+    state = dataclasses.replace(
+        state,
+        **changed,  # type: ignore[arg-type]
+        sensor_temperature=np.full((9, 12), math.nan) if no_heat else state.sensor_temperature,
+        imu=dataclasses.replace(state.imu, gyroscope=(math.nan,) * 3) if no_imu else state.imu,
+    )
+    decoded = CODECS[Side.LEFT].decode(CODECS[Side.LEFT].encode_state(state), 0.0)
+    for name in unknown:
+        assert not getattr(decoded, name)[joints].any()
+    assert decoded.imu is not None
+    assert decoded.imu.gyroscope == (0.0, 0.0, 0.0)
+
+
+@each("name", ["q", "dq", "tau_est"])
+def test_an_unknown_position_speed_or_torque_is_not_made_up(name: str) -> None:
+    (state,) = states(HANDS[1], Side.LEFT, [])
+    values = np.array(getattr(state, name))
+    values[3] = math.nan
+    state = dataclasses.replace(state, **{name: values})  # type: ignore[arg-type]
+    codec = CODECS[Side.LEFT]
+    with pytest.raises(EncodeError):
+        codec.encode_state(state)
+    decoded = codec.decode(codec.encode_state(state, motors=[0, 1, 2, 4, 5, 6]), 0.0)
+    assert np.isnan(decoded.q[3])
+
+
+def test_infinity_is_refused() -> None:
+    (state,) = states(HANDS[1], Side.LEFT, [])
+    for name in ("temperature", "voltage"):
+        hot = dataclasses.replace(state, **{name: np.full(7, math.inf)})  # type: ignore[arg-type]
+        with pytest.raises(EncodeError, match="cannot be sent"):
+            CODECS[Side.LEFT].encode_state(hot)
