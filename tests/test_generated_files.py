@@ -25,6 +25,7 @@ def test_every_generator_contributes() -> None:
         "docs/conformance.md",
         "docs/conformance-robots.md",
         "docs/conformance-usb.md",
+        "docs/conformity.md",
         "docs/dex3-protocol.md",
         "docs/doctor.md",
         "docs/images/model-dex3-1.svg",

@@ -6,6 +6,7 @@
 :mod:`~.requirement_pages`     the catalogues in docs/conformance*.md, from the requirement files
 :mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
 :mod:`~.doctor_page`           the table of docs/doctor.md, from the doctor's diagnoses
+:mod:`~.conformity_page`       docs/conformity.md, from conformity.toml
 =============================  ==================================================================
 
 Each has a function ``files()``: the content of its files by path.
@@ -26,6 +27,7 @@ def generated_files() -> dict[Path, str]:
     """Content of every generated file, by path."""
     # the generators import ROOT and DOCS from here
     from tools.generate import (
+        conformity_page,
         dex3_protocol_page,
         doctor_page,
         message_modules,
@@ -39,6 +41,7 @@ def generated_files() -> dict[Path, str]:
         **requirement_pages.files(),
         **dex3_protocol_page.files(),
         **doctor_page.files(),
+        **conformity_page.files(),
     }
 
 
