@@ -257,6 +257,13 @@ class HandCommand:
         """Whether every joint brakes."""
         return not self.mode.any()
 
+    @property
+    def is_limp(self) -> bool:
+        """Whether it drives no joint: kp, kd, dq and tau are 0 throughout, and no joint brakes."""
+        return bool(self.mode.all()) and not any(
+            values.any() for values in (self.kp, self.kd, self.dq, self.tau)
+        )
+
     def same_as(self, other: HandCommand) -> bool:
         """Whether all fields are equal."""
         return all(

@@ -272,6 +272,7 @@ def test_hand_that_is_commanded_without_gains_is_not_frozen(looked: _Looked) -> 
     }
     assert command == (2.0, 0.0)
     assert "DDS-FROZEN" not in looked.findings("limp")
+    assert "DDS-NO-GAINS" in looked.findings("limp")
 
 
 def test_root_cause_suppresses_its_consequences(looked: _Looked) -> None:

@@ -175,6 +175,12 @@ def _frozen() -> DomainView:
     return dataclasses.replace(GOOD, streams=states + flows)
 
 
+def _limp_client() -> DomainView:
+    commands = [e for e in GOOD.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
+    flows = tuple(_flow(e, q_span=1.0, limp_span=1.0) for e in commands)
+    return dataclasses.replace(GOOD, streams=GOOD.streams + flows)
+
+
 def _legacy() -> DomainView:
     """A hand of another generation beside a client of this one."""
     hand = _end("hand", "writer", "rt/unitree_actuator/state", STATES)
@@ -229,6 +235,7 @@ CASES: dict[str, Observations] = {
         _pair(model="dex3", hand=_who("hand", started=9.0), client=_who("client", started=5.0))
     ),
     "DDS-FROZEN": _seen(_frozen()),
+    "DDS-NO-GAINS": _seen(_limp_client()),
     "DDS-RATE": _seen(_pair(rate=50.0)),
     "DDS-NO-CLIENT": _seen(_without(GOOD, "client")),
     "LINK-NO-ANSWER": _linked(received=0, samples=0),

@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -36,6 +37,7 @@ from dexkit.drivers.ezgripper.discovery import (
     latency_timer,
     latency_warning,
 )
+from dexkit.drivers.ezgripper.gripper import ZeroGains
 from dexkit.drivers.ezgripper.servo import line_time
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.mx64 import (
@@ -453,6 +455,17 @@ def test_zero_gains_apply_no_torque_and_brake_holds(tmp_path: Path) -> None:
         later = drive_for(hand, BRAKE, 0.3)
         assert float(later.q[0]) == pytest.approx(float(held.q[0]), abs=0.02)
         assert hand.phase is Phase.BRAKE
+
+
+def test_zero_gains_can_mean_a_position(tmp_path: Path) -> None:
+    configuration = configured(tmp_path, zero_gains=ZeroGains.POSITION)
+    with emulated() as gripper, gripper_on(gripper.path, configuration) as hand:
+        q_only = replace(OPEN, kp=np.zeros(1), kd=np.zeros(1))
+        drive(hand, q_only, lambda s: float(s.q[0]) > 5.0)
+        damped = replace(q_only, kd=np.ones(1))
+        drive(hand, damped, lambda s: abs(float(s.dq[0])) < 0.01)
+        assert gripper.servo.get(mx64.GOAL_CURRENT) == 0, "kd alone is still limp"
+        assert hand.adapt_command(BRAKE) is BRAKE
 
 
 def test_object_is_detected_and_held_with_hold_effort(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from dexkit.errors import (
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go, unitree_hg
 from dexkit.models import dialect
-from dexkit.service import HandService, diagnose
+from dexkit.service import HandService, diagnose, limp
 from tests.service_helpers import FakeEndpoint, FakeNode, FakeWriter, ScriptedHand, wait_until
 
 CMD, STATE = dialect("unitree_go").topics(Side.LEFT)
@@ -119,6 +119,50 @@ def test_invalid_commands_are_counted_and_ignored() -> None:
         count, core = service.counters, service.cores[Side.LEFT].counters
     assert (count.short, count.overlong, count.undecodable) == (1, 1, 2)
     assert (core.accepted, core.rejected, core.clamped) == (2, 3, 1)
+
+
+def test_a_client_without_gains_is_counted_and_told_the_setting(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(limp, "PERSISTENCE", 0.0)
+    hand, node = ScriptedHand(), FakeNode()
+    hand.zero_gains_hint = ", or set it"  # type: ignore[attr-defined]
+    with caplog.at_level(logging.WARNING), serve(hand, node) as service:
+        for number, q in enumerate((1.0, 2.0, 2.0)):
+            node.deliver(CMD, encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q)])))
+            wait_until(lambda n=number: service.counters.received > n)  # type: ignore[misc]
+        hands = service.snapshot()["hands"]["left"]
+    assert (hands["accepted"], hands["zero_gains"]) == (3, 2)
+    (said,) = [r.getMessage() for r in caplog.records if "stays limp" in r.getMessage()]
+    assert "kp 5, kd 0.05), or set it" in said
+
+
+def test_a_hand_may_adapt_the_commands_of_its_clients() -> None:
+    hand, node = ScriptedHand(), FakeNode()
+    hand.adapt_command = lambda c: HandCommand.position(c.q)  # type: ignore[attr-defined]
+    with serve(hand, node) as service:
+        node.deliver(CMD, encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=2.0)])))
+        wait_until(lambda: newest(node).q == pytest.approx(2.0))
+        assert service.snapshot()["hands"]["left"]["zero_gains"] == 0
+
+
+def test_commands_without_gains_count_from_a_second_after_q_changed() -> None:
+    watch = limp.LimpCommands(ScriptedHand().spec)
+
+    def command(q: float, **gains: float) -> HandCommand:
+        return HandCommand.position(q, **{"kp": 0.0, "kd": 0.0, **gains})
+
+    def seen(*times_and_qs: tuple[float, float]) -> list[bool]:
+        return [watch.update(command(q), now) for now, q in times_and_qs]
+
+    assert seen((0.0, 1.0), (5.0, 1.0), (6.0, 1.05)) == [False] * 3, "q stays the same"
+    assert seen((7.0, 2.0), (7.9, 3.0), (8.0, 2.0), (9.0, 2.0)) == [False, False, True, True]
+    for gain in ("kp", "kd", "tau", "dq"):
+        assert not watch.update(command(2.0, **{gain: 0.1}), 10.0)
+        assert seen((11.0, 3.0), (11.5, 2.0), (12.4, 3.0)) == [False] * 3
+        assert seen((12.5, 1.0)) == [True]
+    assert not watch.update(HandCommand.brake(1), 13.0)
+    assert not HandCommand.brake(1).is_limp
 
 
 class TestLink:

@@ -321,6 +321,15 @@ _ALL = (
         "checks a serial port",
     ),
     Diagnosis(
+        "DDS-NO-GAINS",
+        _W,
+        "a client changes q in commands without gains",
+        "the client runs, the hand stays limp",
+        "kp = kd = dq = tau = 0 is the command to be limp; a service counts it as accepted",
+        "send gains with q (xr_teleoperate: kp 5.0, kd 0.05); an EZGripper obeys q alone with "
+        "'dexkit serve ezgripper --set zero_gains=position'",
+    ),
+    Diagnosis(
         "DDS-RATE",
         _W,
         "the rate of states is too low",

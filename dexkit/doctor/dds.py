@@ -22,7 +22,7 @@ from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
 from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
-from dexkit.doctor.topics import is_driven, is_hand_topic
+from dexkit.doctor.topics import is_driven, is_hand_topic, is_limp
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
 from dexkit.topics import roles
@@ -64,6 +64,7 @@ class _Watch:
     high: list[float] = field(default_factory=list)
     q: tuple[float, ...] = ()
     driven: dict[int, tuple[float, float]] = field(default_factory=dict)
+    limp: dict[int, tuple[float, float]] = field(default_factory=dict)
     nonzero: bool = False
     undecodable: int = 0
     decoded_at: float = float("-inf")
@@ -102,9 +103,10 @@ class _Watch:
         self.nonzero = self.nonzero or any(q)
         self.q = tuple(q)
         for i, motor in enumerate(motors if self.dialects else ()):
-            if any(is_driven(motor, dialect) for dialect in self.dialects):
-                low, high = self.driven.get(i, (q[i], q[i]))
-                self.driven[i] = min(low, q[i]), max(high, q[i])
+            for seen, matches in ((self.driven, is_driven), (self.limp, is_limp)):
+                if any(matches(motor, dialect) for dialect in self.dialects):
+                    low, high = seen.get(i, (q[i], q[i]))
+                    seen[i] = min(low, q[i]), max(high, q[i])
         if len(q) != len(self.low):
             self.low, self.high = list(q), list(q)
         self.low = [min(pair) for pair in zip(self.low, q, strict=True)]
@@ -128,6 +130,7 @@ class _Watch:
             q=self.q,
             q_span=max((h - low for low, h in zip(self.low, self.high, strict=True)), default=0.0),
             driven_span=max((high - low for low, high in self.driven.values()), default=0.0),
+            limp_span=max((high - low for low, high in self.limp.values()), default=0.0),
             nonzero=self.nonzero,
             undecodable=self.undecodable,
             lost=gaps + 1 - self.samples if self.samples else 0,

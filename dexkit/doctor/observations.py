@@ -98,6 +98,7 @@ class Stream:
     :param q_span: the furthest that any joint moved, rad.
     :param driven_span: of commands: the furthest that the target of any joint moved, rad, over
         the commands that drive it (with a position gain, and a mode that obeys).
+    :param limp_span: of commands: the same over the commands without gains, which leave it limp.
     :param nonzero: some position of some sample was not exactly 0.
     :param undecodable: samples that do not decode as their type.
     :param lost: sequence numbers that are missing between the first and the last sample.
@@ -115,6 +116,7 @@ class Stream:
     q: tuple[float, ...] = ()
     q_span: float = 0.0
     driven_span: float = 0.0
+    limp_span: float = 0.0
     nonzero: bool = False
     undecodable: int = 0
     lost: int = 0

@@ -254,6 +254,7 @@ def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
         yield from _matches(view)
         yield from _listeners(view, scope)
         yield from _streams(view, scope)
+        yield from _limp_clients(view, scope)
         if not scope.dialects:
             yield from _waiting(seen, view)
     yield from _absent(seen, focus, scope, explained=bool(found))
@@ -528,6 +529,21 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
                 domain=view.number,
                 topic=topic,
             )
+
+
+def _limp_clients(view: DomainView, scope: Scope) -> Iterator[Finding]:
+    for part in _parts(view, "writer", "cmd", scope):
+        stream = view.stream(part.endpoint)
+        # what is driven at times is let go on purpose
+        if stream is None or stream.driven_span or stream.limp_span < _FROZEN_COMMANDS:
+            continue
+        yield _finding(
+            "DDS-NO-GAINS",
+            f"{part.endpoint.topic} of {part.who} on domain {view.number}: q changed by "
+            f"{stream.limp_span:.2f} rad, with kp = kd = dq = tau = 0",
+            domain=view.number,
+            topic=part.endpoint.topic,
+        )
 
 
 def _waiting(seen: Observations, view: DomainView) -> Iterator[Finding]:

@@ -11,7 +11,7 @@ from dexkit.messages import message_types
 from dexkit.models import Dialect, ModeByte
 from dexkit.topics import HAND_TOPICS, roles
 
-__all__ = ["is_driven", "is_hand_topic", "nearly", "short"]
+__all__ = ["is_driven", "is_hand_topic", "is_limp", "nearly", "short"]
 
 _KNOWN_TYPES = frozenset(kind.name for kind in message_types())
 _ALIKE = 0.86  # ratio of difflib above which a name is a slip of the pen
@@ -32,6 +32,15 @@ def is_driven(motor: Any, dialect: Dialect) -> bool:
     if dialect.mode_byte is ModeByte.RIS and (motor.mode >> 4) & 7 != _FOC:
         return False
     return bool(motor.kp) or not dialect.gains_are_used
+
+
+def is_limp(motor: Any, dialect: Dialect) -> bool:
+    """Whether a motor's command is to be limp: nothing brakes or locks it, and it has no gains."""
+    if not dialect.gains_are_used or any((motor.kp, motor.kd, motor.dq, motor.tau)):
+        return False
+    if dialect.mode_byte is ModeByte.STATUS:
+        return bool(motor.mode)
+    return dialect.mode_byte is not ModeByte.RIS or (motor.mode >> 4) & 7 == _FOC
 
 
 def _plain(topic: str) -> str:

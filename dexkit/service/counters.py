@@ -47,6 +47,8 @@ class HandCounters:
     :ivar clamped: accepted commands that had to be brought within the limits.
     :ivar wrong_ids: accepted commands with a mode byte whose id is not the motor's index.
     :ivar unknown_status: accepted commands with a mode byte whose status is neither lock nor FOC.
+    :ivar zero_gains: accepted commands of a client that has changed q for a second or more without
+        gains, so that the hand stays limp (:mod:`dexkit.service.limp`).
     :ivar brakes: times that driving stopped because no fresh command was there.
     :ivar holds: times that a position was held for want of a fresh command, the client having
         switched the time-out protection off.
@@ -63,6 +65,7 @@ class HandCounters:
     clamped: int = 0
     wrong_ids: int = 0
     unknown_status: int = 0
+    zero_gains: int = 0
     brakes: int = 0
     holds: int = 0
     exchanges: int = 0

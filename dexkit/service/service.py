@@ -45,6 +45,7 @@ from dexkit.models import dialect as dialect_by_name
 from dexkit.service.core import Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
+from dexkit.service.limp import LimpCommands
 from dexkit.service.publisher import Publisher, align
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.threads import Worker
@@ -97,6 +98,10 @@ class _ServedHand:
         self.side: Side = hand.spec.side
         self.thread: threading.Thread | None = None
         self.problem = ""  # the last error logged, to log each only once
+        self.limp = LimpCommands(hand.spec)
+        self.adapt: Callable[[HandCommand], HandCommand] | None = getattr(
+            hand, "adapt_command", None
+        )
 
 
 class HandService:
@@ -115,6 +120,10 @@ class HandService:
 
     A service that is to give way to another one after its start (:mod:`dexkit.single_publisher`)
     brakes and releases its hands; :attr:`failure` then is a :class:`~dexkit.errors.TopicConflict`.
+
+    A hand may have a method ``adapt_command``, which takes each command as it was received and
+    returns the one that this hand is set to make of it, and a text ``zero_gains_hint``, which is
+    added to the warning of a client without gains.
 
     A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
     and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.
@@ -393,6 +402,8 @@ class HandService:
     def _submit(self, unit: _ServedHand, command: HandCommand, message: Any, sent: float) -> None:
         counters = unit.core.counters
         clamped, rejected = counters.clamped, counters.rejected
+        if unit.adapt is not None:
+            command = unit.adapt(command)
         if not unit.core.submit(command, sent):
             if counters.rejected != rejected:
                 self._log_once("rejected", "rejected, it is not finite")
@@ -408,6 +419,15 @@ class HandService:
                 "tripped",
                 f"{names} stay braked, because their time-out protection has tripped and the mode "
                 "byte asks for it again; send it once with bit 7 = 0",
+            )
+        if unit.limp.update(command, self._clock.now()):
+            counters.zero_gains += 1
+            hint = getattr(unit.hand, "zero_gains_hint", "")
+            self._log_once(
+                "zero_gains",
+                "q changes, but kp, kd, dq and tau are all 0, so the hand stays limp; send gains "
+                f"(Unitree's client: kp {self.model.client_gains[0]:g}, kd "
+                f"{self.model.client_gains[1]:g}){hint}",
             )
         for remark in self._map.remarks(message, unit.side):
             setattr(counters, remark.counter, getattr(counters, remark.counter) + 1)

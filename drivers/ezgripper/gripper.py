@@ -42,9 +42,26 @@ from dexkit.models import DEX1_1
 from dexkit.wire import mx64
 from dexkit.wire.mx64 import HardwareError
 
-__all__ = ["Calibrate", "EZGripper", "GripperSettings", "GripperStatistics", "backend"]
+__all__ = [
+    "Calibrate",
+    "EZGripper",
+    "GripperSettings",
+    "GripperStatistics",
+    "ZeroGains",
+    "backend",
+]
 
 log = logging.getLogger(__name__)
+
+
+class ZeroGains(str, Enum):
+    """What a command without gains (kp = kd = dq = tau = 0) does."""
+
+    LIMP = "limp"
+    POSITION = "position"
+
+    def __str__(self) -> str:
+        return self.value
 
 
 class Calibrate(str, Enum):
@@ -71,6 +88,8 @@ class GripperSettings:
     :param zero: zero in ticks, instead of the stored one.
     :param config: file of the stored calibration; None for the user's file.
     :param force_table: table instead of the stored one.
+    :param zero_gains: LIMP: a command whose kp, kd, dq and tau are 0 lets go, as the vendor's
+        gripper does. POSITION: it is a position command, for clients that send q alone (SAKE's).
     :param timeout: seconds to wait for a status packet.
     :param retries: how often an unanswered transaction is sent again within an exchange.
     """
@@ -82,6 +101,7 @@ class GripperSettings:
     zero: int | None = None
     config: Path | None = None
     force_table: ForceTable | None = None
+    zero_gains: ZeroGains = ZeroGains.LIMP
     timeout: float = 0.03
     retries: int = 2
 
@@ -121,6 +141,8 @@ _SETUP_TIMEOUT = 0.25
 _TURNAROUND = 0.5e-3
 """Seconds allowed from a status packet to the next request. An exchange takes CPython 0.1 ms of
 processor time (benchmarks/bench_serial.py); the rest is for other load on the processor."""
+
+_CLIENT_GAINS = DEX1_1.client_gains
 
 _MAX_RESTART_WAIT = 2.0
 """Seconds that ``open`` waits at most for a reboot to be due; otherwise it raises."""
@@ -230,6 +252,18 @@ class EZGripper:
             for measured in (self.record.opening, self.record.closing)
         )
         return ((opening * per_percent, closing * per_percent),)
+
+    def adapt_command(self, command: HandCommand) -> HandCommand:
+        """Give a command without gains those of Unitree's client, if ``zero_gains`` is POSITION."""
+        if self.configuration.zero_gains is ZeroGains.LIMP or not command.is_limp:
+            return command
+        kp, kd = _CLIENT_GAINS
+        return replace(command, kp=np.full(1, kp), kd=np.full(1, kd))
+
+    @property
+    def zero_gains_hint(self) -> str:
+        """Advice for a client that sends q without gains."""
+        return ", or serve this gripper with --set zero_gains=position"
 
     # --- opening and closing
 
@@ -375,6 +409,7 @@ class EZGripper:
             goal was written.
         """
         deadline = WriteDeadline(self._clock)
+        command = self.adapt_command(command)
         servo, control, last = self._servo, self._control, self._last
         if servo is None or control is None or last is None:
             raise HandLost("the gripper is not open", hint="call open() first")
@@ -600,6 +635,10 @@ _SETTINGS: dict[str, tuple[Callable[[str], object], str]] = {
     "force_table": (
         _read_force_table,
         "JSON file {current units: force}, or default (default: as stored)",
+    ),
+    "zero_gains": (
+        ZeroGains,
+        "limp: kp = kd = 0 lets go; position: with dq = tau = 0, too, it goes to q (default limp)",
     ),
     "effort": (_in_range(0, 100), "force limit while moving, % (default 50)"),
     "hold_effort": (_in_range(0, 100), "force limit while holding and braking, % (default 15)"),

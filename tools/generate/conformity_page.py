@@ -119,9 +119,11 @@ def _link(reference: str) -> str:
     if page.startswith("docs/"):
         short = page.removeprefix("docs/").removesuffix(".md")
         text = f"{short}, {anchor.replace('-', ' ')}" if anchor else short
-        if short.startswith("sources/"):
-            text = f"{short.removeprefix('sources/')} {anchor[:1].upper()}.{anchor[1:]}"
-        return f"[{text}]({target.removeprefix('docs/')})"
+        link = target.removeprefix("docs/")
+        if short.startswith("sources/") and short != "sources/README":
+            number = f"{anchor[:1].upper()}.{anchor[1:]}".removesuffix(".")
+            return f"{short.removeprefix('sources/')} [{number}]({link})"
+        return f"[{text}]({link})"
     return f"[{f'`{name}`' if name else f'`{target}`'}](../{target})"
 
 
