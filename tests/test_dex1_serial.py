@@ -637,7 +637,10 @@ def test_calibration_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> Non
     [
         (["dex1-serial"], "no hand is given"),
         (["dex1-serial", "--side", "left", "--speed"], "--speed means nothing for dex1-serial"),
-        (["ezgripper", "--side", "left"], "--side means nothing for ezgripper"),
+        (
+            ["ezgripper", "--side", "left", "--device", "x"],
+            "--side means nothing beside --device",
+        ),
     ],
 )
 def test_options_of_the_other_gripper_are_refused(arguments: list[str], expected: str) -> None:

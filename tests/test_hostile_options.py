@@ -210,7 +210,7 @@ def test_backend_settings_are_parsed_or_refused() -> None:
         for key in row.backend.settings:
             for value in values:
                 tried += 1
-                device = "/dev/null" if row.backend.needs_device else None
+                device = "/dev/null" if row.backend.needs else None
                 options = BackendOptions(Side.LEFT, device, {key: value})
                 try:
                     row.backend.create(options)

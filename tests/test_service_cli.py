@@ -220,9 +220,12 @@ class TestArguments:
             (["sim-dex1", "--side", "left", "--dialect", "dex3"], "does not speak dex3"),
             (["sim-dex3", "--side", "left", "--dialect", "unitree_go"], "it speaks dex3"),
             (["sim-dex1", "--side", "left", "--usb", "usbip://x:1"], "no setting 'usb'"),
-            (["ezgripper", "--side", "left"], "needs a device"),
+            (["ezgripper", "--side", "left"], "names none for the left hand"),
             (["ezgripper", "--side", "both", "--device", "/dev/x"], "which hand is /dev/x"),
-            (["ezgripper", "--side", "both", "--device", "left=/dev/x"], "needs a device"),
+            (
+                ["ezgripper", "--side", "both", "--device", "left=/dev/x"],
+                "names none for the right",
+            ),
             (["ezgripper", "--side", "left", "--device", "right=/dev/x"], "only the left"),
             (
                 ["ezgripper", "--side", "left", "--device", "a", "--device", "left=b"],

@@ -17,10 +17,12 @@ from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, di
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.config import GripperRecord, Store
 from dexkit.drivers.ezgripper.force import ForceTable
+from dexkit.drivers.ezgripper.gripper import stored_device
 from dexkit.drivers.ezgripper.scaling import amperes
 from dexkit.drivers.ezgripper.servo import Servo
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
+from dexkit.hand import Side
 from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.wire import mx64
 
@@ -56,7 +58,8 @@ class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--side",
     type=click.Choice(["left", "right"]),
-    help="Whose motor; only for dex1-serial, and needed there.",
+    help="Whose motor, needed for dex1-serial; of an EZGripper, to take the adapter that the "
+    "file names for that side.",
 )
 @click.option(
     "--id",
@@ -140,13 +143,19 @@ def command(
         _refuse_foreign(ctx, {"gripper", "device", "side", "dry_run", "yes"}, gripper)
         calibrate_dex1(device, side, dry_run=dry_run, yes=yes)
         return
-    _refuse_foreign(ctx, set(ctx.params) - {"side"}, gripper)
     store = Store(config)
     if show:
         _print_store(store)
         return
+    if device is not None and side is not None:
+        raise UsageError("--side means nothing beside --device for an ezgripper")
+    if device is None and side is None:
+        raise UsageError(
+            "no gripper is given",
+            hint="--device PATH or USB serial number, or --side left|right of the file",
+        )
     if device is None:
-        raise UsageError("no gripper is given", hint="--device PATH or USB serial number")
+        device = stored_device(store, Side(side))
     console = Console()
     configuration = GripperSettings(
         id=servo_id if isinstance(servo_id, int) else None,
@@ -231,7 +240,7 @@ def _force(hand: EZGripper, servo: Servo, console: Console, stop: StopRequest) -
             servo, zero, effort, asked.holding, cancelled=lambda: bool(stop)
         )
         console.print(f"{effort:g} %: {current:.0f} units ({amperes(current):.2f} A)")
-        points.append((round(current, 1), asked.answer))
+        points.append((float(round(current)), asked.answer))  # SAKE's driver reads whole numbers
     return ForceTable(tuple(points))
 
 
@@ -300,6 +309,13 @@ def _print_dim(console: Console) -> Callable[[str], None]:
     return lambda text: console.print(f"[dim]{text}[/dim]")
 
 
+def _describe_table(record: GripperRecord) -> str:
+    if record.force_table is None:
+        return "default"
+    points = f"{len(record.force_table.points)} points"
+    return points if record.force_unit_known else f"{points}, no unit"
+
+
 def _print_store(store: Store) -> None:
     console = Console()
     keys = store.keys()
@@ -317,6 +333,6 @@ def _print_store(store: Store) -> None:
                 "-" if v is None else f"{v:g}"
                 for v in (record.zero, record.opening, record.closing)
             ),
-            f"{len(record.force_table.points)} points" if record.force_table else "default",
+            _describe_table(record),
         )
     console.print(table)

@@ -1,16 +1,21 @@
 """Store the calibration of each gripper (zero, speeds, force table) in the user's JSON file.
 
 The layout is that of the note on predictive state, so a file of SAKE's driver can be used
-unchanged::
+unchanged, and what is written has the types that such a driver reads::
 
-    {"calibration":    {"DA1Z9T40": 3010},
-     "movement_speed": {"DA1Z9T40": {"opening": 131.0, "closing": 127.5}},
-     "force_lookup":   {"DA1Z9T40": {"0": 0.0, "100": 0.5}}}
+    {"left": "/dev/ttyUSB0", "left_serial": "DA1Z9T40",
+     "calibration":          {"DA1Z9T40": 3010},
+     "movement_speed":       {"DA1Z9T40": 127.5},
+     "direction_speeds":     {"DA1Z9T40": {"opening": 131.0, "closing": 127.5}},
+     "force_lookup":         {"DA1Z9T40": {"0": 0.0, "100": 0.5}},
+     "force_lookup_unit":    {"DA1Z9T40": "3.36 mA"}}
 
 Keys are the USB serial number of the adapter, or the device path where there is none (a
 pseudo-terminal); ``#2`` is appended for servo id 2. Zero in ticks within the turn, speed in
-percent of stroke a second (one number serves for both directions), force over current units.
-Unknown entries are kept.
+percent of stroke a second, force over current units. ``movement_speed`` is the slower of the two
+``direction_speeds``; if another program has changed it, that number holds for both directions.
+(Earlier files hold the two in ``movement_speed``; they are read.) ``left``, ``right``,
+``left_serial`` and ``right_serial`` name the adapter of a side. Unknown entries are kept.
 """
 
 from __future__ import annotations
@@ -27,16 +32,20 @@ import platformdirs
 from dexkit import documents
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.errors import UsageError
+from dexkit.hand import Side
 from dexkit.wire import mx64
 
 _HINT = "correct it, or remove it and calibrate again"
 
-__all__ = ["ENVIRONMENT", "GripperRecord", "Store", "default_path", "record_key"]
+__all__ = ["CURRENT_UNIT", "ENVIRONMENT", "GripperRecord", "Store", "default_path", "record_key"]
 
 ENVIRONMENT = "DEXKIT_EZGRIPPER_CONFIG"
 """Environment variable with the path of another file."""
 
 _ZERO, _SPEED, _FORCE = "calibration", "movement_speed", "force_lookup"
+_DIRECTIONS, _UNIT = "direction_speeds", "force_lookup_unit"
+CURRENT_UNIT = "3.36 mA"
+"""Unit of the currents of a force table: one count of Present Current(126)."""
 
 
 def default_path() -> Path:
@@ -60,12 +69,15 @@ class GripperRecord:
     :param zero: position of the closed gripper, ticks within the turn.
     :param opening: percent of stroke a second.
     :param closing: percent of stroke a second.
+    :param force_unit_known: the file says that the table is in units of 3.36 mA. A table of SAKE's
+        driver, which says nothing, may be of register 40 (docs/sources/mx64-ezgripper.md#d10-1).
     """
 
     zero: int | None = None
     opening: float | None = None
     closing: float | None = None
     force_table: ForceTable | None = None
+    force_unit_known: bool = True
 
 
 class Store:
@@ -105,6 +117,20 @@ class Store:
             names.update(self._get_section(content, section))
         return sorted(names)
 
+    def device(self, side: Side) -> str | None:
+        """USB serial number, else path, of the adapter of a side; None if the file names none.
+
+        :raises UsageError: the file cannot be read, or an entry is no text.
+        """
+        content = self._load()
+        for name in (f"{side}_serial", str(side)):
+            value = content.get(name)
+            if value is not None and not isinstance(value, str):
+                raise UsageError(f"{self.path}: {name} must be text, not {value!r}")
+            if value:
+                return value
+        return None
+
     def read(self, key: str) -> GripperRecord:
         """Read a gripper's calibration; an empty record if there is none.
 
@@ -118,6 +144,18 @@ class Store:
         ):
             raise UsageError(f"{where}: zero {zero!r} is not a position in ticks")
         opening, closing = self._parse_speeds(where, self._get_section(content, _SPEED).get(key))
+        pair = self._get_section(content, _DIRECTIONS).get(key)
+        if pair is not None:
+            directions = self._parse_speeds(where, pair)
+            known = [speed for speed in directions if speed is not None]
+            if opening == closing and known and min(known) == opening:
+                opening, closing = directions
+        unit = self._get_section(content, _UNIT).get(key)
+        if unit not in (None, CURRENT_UNIT):
+            raise UsageError(
+                f"{where}: the force table is in {unit!r}, not in {CURRENT_UNIT!r}",
+                hint="measure it: dexkit calibrate ezgripper --force",
+            )
         table = self._get_section(content, _FORCE).get(key)
         if table is not None and not isinstance(table, dict):
             raise UsageError(f"{where}: the force table must be an object")
@@ -126,6 +164,7 @@ class Store:
             opening=opening,
             closing=closing,
             force_table=None if table is None else ForceTable.from_mapping(table),
+            force_unit_known=table is None or unit is not None,
         )
 
     @staticmethod
@@ -171,8 +210,10 @@ class Store:
             if value is not None
         }
         if speeds:
-            content[_SPEED] = self._get_section(content, _SPEED) | {key: speeds}
+            content[_SPEED] = self._get_section(content, _SPEED) | {key: min(speeds.values())}
+            content[_DIRECTIONS] = self._get_section(content, _DIRECTIONS) | {key: speeds}
         if record.force_table is not None:
             content[_FORCE] = self._get_section(content, _FORCE) | {
                 key: record.force_table.to_mapping()
             }
+            content[_UNIT] = self._get_section(content, _UNIT) | {key: CURRENT_UNIT}

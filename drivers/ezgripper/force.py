@@ -1,8 +1,9 @@
 """Estimate grip force from motor current with a calibrated table (the note on predictive state).
 
 The table maps Present Current (absolute value, units of 3.36 mA) to grip force, by linear
-interpolation; outside its range it keeps the end values. The state's ``tau_est`` is the force
-divided by ten, as in the note on predictive state and the interface specification.
+interpolation; beyond its last point it goes on with the slope of the last two. The state's
+``tau_est`` is the force divided by ten, as in the note on predictive state and the interface
+specification.
 
 Present Current of an MX-64 is a noisy estimate (docs/sources/mx64-ezgripper.md#d10-11), so no
 decision of the driver uses it.
@@ -70,14 +71,23 @@ class ForceTable:
         """Return the table in the note's JSON form."""
         return {f"{current:g}": force for current, force in self.points}
 
+    def covers(self, current: float) -> bool:
+        """Whether ``current`` units lie within the table, so that no force is extrapolated."""
+        return abs(current) <= self.points[-1][0]
+
     def force(self, current: float) -> float:
-        """Return the force at ``current`` units; the sign of the current has no effect."""
+        """Return the force at ``current`` units; the sign of the current has no effect.
+
+        Beyond the last point the force goes on rising as between the last two; a table of one
+        point has one force.
+        """
         current = abs(current)
         index = bisect_right(self.points, current, key=lambda p: p[0])
         if index == 0:
             return self.points[0][1]
-        if index == len(self.points):
-            return self.points[-1][1]
+        if len(self.points) == 1:
+            return self.points[0][1]
+        index = min(index, len(self.points) - 1)
         (c0, f0), (c1, f1) = self.points[index - 1], self.points[index]
         return f0 + (f1 - f0) * (current - c0) / (c1 - c0)
 

@@ -18,7 +18,7 @@ from dexkit.command_age import PAUSE, WriteDeadline
 from dexkit.drivers.ezgripper import calibration, settings
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BusStatistics, Ping, ServoBus
-from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
+from dexkit.drivers.ezgripper.config import CURRENT_UNIT, GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
 from dexkit.drivers.ezgripper.discovery import (
     Device,
@@ -49,6 +49,7 @@ __all__ = [
     "GripperStatistics",
     "ZeroGains",
     "backend",
+    "stored_device",
 ]
 
 log = logging.getLogger(__name__)
@@ -203,6 +204,7 @@ class EZGripper:
         self._commanded: HandCommand | None = None
         self._overload_at: float | None = None
         self._was_warm = False
+        self._extrapolated = False
         self._spec = self._make_spec(side, self.configuration.baudrate or 1_000_000)
 
     def _make_spec(self, side: Side, baudrate: int, timer: float = _LATENCY_TIMER) -> HandSpec:
@@ -332,6 +334,15 @@ class EZGripper:
         self._recovery_state = _Recovery.NONE
         self.record = Store(configuration.config).read(self.key)
         self._force = configuration.force_table or self.record.force_table or DEFAULT_FORCE_TABLE
+        if configuration.force_table is None and not self.record.force_unit_known:
+            log.warning(
+                "the force_lookup of %s has no unit and is read in units of %s; a table of SAKE's "
+                "driver may be in units of register 40. tau_est is wrong then: measure it with "
+                "'dexkit calibrate ezgripper --force', or set force_lookup_unit to %r",
+                self.key,
+                CURRENT_UNIT,
+                CURRENT_UNIT,
+            )
         return servo
 
     @property
@@ -481,6 +492,14 @@ class EZGripper:
         # sign of the joint: closing is toward smaller q, so gripping torque is negative, as in the
         # vendor's gripper (docs/sources/unitree-dex.md#b7)
         tau = contact.direction * self._force.tau(sample.current) if contact else 0.0
+        if contact and not self._extrapolated and not self._force.covers(sample.current):
+            self._extrapolated = True
+            log.warning(
+                "a current of %d units is beyond the force table, which ends at %g: tau_est is "
+                "extrapolated (logged once)",
+                abs(sample.current),
+                self._force.points[-1][0],
+            )
         mode = JointMode.BRAKE if control.phase is Phase.BRAKE else JointMode.FOC
         return HandState(
             q=np.array([joint_of_ticks(control.position(sample))]),
@@ -665,16 +684,32 @@ def _parse_settings(options: BackendOptions) -> GripperSettings:
     return GripperSettings(control=control, **rest)  # type: ignore[arg-type]
 
 
+def stored_device(store: Store, side: Side) -> str:
+    """USB serial number or path of the adapter that the calibration file names for a side.
+
+    :raises UsageError: it names none.
+    """
+    device = store.device(side)
+    if device is None:
+        raise UsageError(
+            f"no gripper is given, and {store.path} names none for the {side} hand",
+            hint=f"give --device PATH or USB serial number, or {side}_serial in that file",
+        )
+    log.info("the %s gripper is on %s (%s)", side, device, store.path)
+    return device
+
+
 def _create_hand(options: BackendOptions) -> EZGripper:
-    assert options.device is not None  # Backend.create has checked it
-    return EZGripper(options.device, options.side, _parse_settings(options))
+    configuration = _parse_settings(options)
+    device = options.device or stored_device(Store(configuration.config), options.side)
+    return EZGripper(device, options.side, configuration)
 
 
 backend = Backend(
     summary="SAKE EZGripper with an MX-64 servo (Protocol 2.0) on a serial port",
     model=DEX1_1.name,
     make=_create_hand,
-    needs="--device PATH or USB serial number",
-    needs_device=True,
+    needs="--device PATH or USB serial number, or left_serial, right_serial, left or right in the "
+    "calibration file",
     settings={name: meaning for name, (_, meaning) in _SETTINGS.items()},
 )
