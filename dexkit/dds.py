@@ -410,7 +410,7 @@ def cyclone_type(name: str) -> Any:
     :raises DdsUnavailable: CycloneDDS 0.10.x is not installed.
     """
     cyclone = _cyclone()
-    struct = layout.STRUCTS[name]
+    struct = layout.ALL[name]
     numbers = {
         "uint8": cyclone.types.uint8,
         "int16": cyclone.types.int16,
@@ -418,6 +418,9 @@ def cyclone_type(name: str) -> Any:
         "int32": cyclone.types.int32,
         "uint32": cyclone.types.uint32,
         "float": cyclone.types.float32,
+        "int64": cyclone.types.int64,
+        "boolean": bool,
+        "string": str,
     }
     fields = {}
     for member in struct.fields:
@@ -426,7 +429,7 @@ def cyclone_type(name: str) -> Any:
             if isinstance(member.type, layout.Primitive)
             else cyclone_type(member.type.dds_name)
         )
-        if member.sequence:
+        if member.sequence and not member.is_text:
             kind = cyclone.types.sequence[kind]
         elif member.array is not None:
             kind = cyclone.types.array[kind, member.array]
@@ -1291,7 +1294,7 @@ def _endpoint(data: Any, kind: str, owner: Participant | None, own_key: str) -> 
     hashed = _announced_hash(data)
     if not hashed and owner is not None and owner.pid == os.getpid():
         # CycloneDDS does not describe the types of its own process
-        hashed = type_hash(type_name) if type_name in layout.STRUCTS else ""
+        hashed = type_hash(type_name) if type_name in layout.ALL else ""
     return Endpoint(
         topic=_text(data.topic_name),
         type_name=type_name,

@@ -10,11 +10,12 @@ import numpy as np
 from hypothesis import strategies as st
 
 from dexkit.messages import message_type
-from dexkit.messages.layout import STRUCTS, Primitive, Struct
+from dexkit.messages.layout import ALL, STRUCTS, Primitive, Struct
 
-__all__ = ["NAMES", "messages"]
+__all__ = ["NAMES", "SERVICE_NAMES", "messages"]
 
 NAMES = list(STRUCTS)
+SERVICE_NAMES = ["unitree_api::msg::dds_::Request_", "unitree_api::msg::dds_::Response_"]
 
 _RANGES = {
     "uint8": (0, 255),
@@ -22,12 +23,15 @@ _RANGES = {
     "uint16": (0, 2**16 - 1),
     "int32": (-(2**31), 2**31 - 1),
     "uint32": (0, 2**32 - 1),
+    "int64": (-(2**63), 2**63 - 1),
 }
 
 
 def _numbers(kind: Primitive) -> st.SearchStrategy[Any]:
     if kind.idl == "float":
         return st.floats(width=32, allow_nan=False)
+    if kind.idl == "boolean":
+        return st.booleans()
     return st.integers(*_RANGES[kind.idl])
 
 
@@ -60,14 +64,20 @@ def _filled(kind: Struct, random: Random) -> Any:
 
 def messages(name: str, max_elements: int = 9) -> st.SearchStrategy[Any]:
     """Messages of one type with any values that it can hold (NaN left out: it equals nothing)."""
-    kind = STRUCTS[name]
+    kind = ALL[name]
     if any(member.is_structs for member in kind.fields):
         # hundreds of numbers take too long to draw one by one
         return st.integers(0, 2**32).map(lambda seed: _filled(kind, Random(seed)))
     fields: dict[str, st.SearchStrategy[Any]] = {}
     for member in kind.fields:
+        if member.is_text:
+            letters = st.characters(exclude_characters="\0", exclude_categories=["Cs"])
+            fields[member.name] = st.text(letters, max_size=max_elements)
+            continue
         values = _values(member.type)
-        if member.sequence:
+        if member.is_bytes:
+            fields[member.name] = st.binary(max_size=max_elements)
+        elif member.sequence:
             fields[member.name] = st.lists(values, max_size=max_elements)
         elif member.array is not None:
             fields[member.name] = st.tuples(*[values] * member.array)

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode, cyclone_type, type_hash
 from dexkit.messages import message_type
-from dexkit.messages.layout import STRUCTS, Struct
+from dexkit.messages.layout import ALL, Struct
 from tests.dds_helpers import free_domain  # skips this module where CycloneDDS is missing
-from tests.messages_helpers import NAMES, messages
+from tests.messages_helpers import NAMES, SERVICE_NAMES, messages
 from tests.unitree_sdk import sdk_class
 
 REFERENCES = ["dexkit", *(["sdk"] if find_spec("unitree_sdk2py") else [])]
@@ -41,6 +41,8 @@ def _cyclone(reference: str, struct: Struct, message: Any) -> Any:
                 if member.sequence or member.is_structs
                 else _cyclone(reference, inner, value)
             )
+        elif member.is_bytes and not member.is_text:
+            value = list(value)
         elif member.array is not None:
             # CycloneDDS reads bytes where the IDL has uint8, and takes lists, too
             value = bytes(value) if member.type.code == "B" else list(value)
@@ -49,13 +51,13 @@ def _cyclone(reference: str, struct: Struct, message: Any) -> Any:
 
 
 @pytest.mark.parametrize("reference", REFERENCES)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *SERVICE_NAMES])
 @settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(data=st.data())
 def test_same_bytes_as_cyclonedds(reference: str, name: str, data: st.DataObject) -> None:
     mt = message_type(name)
     message = data.draw(messages(name, 4))
-    theirs = _cyclone(reference, STRUCTS[name], message)
+    theirs = _cyclone(reference, ALL[name], message)
     serialised = theirs.serialize()
     assert mt.encode(message) == serialised
     assert mt.decode(serialised) == message
@@ -63,14 +65,14 @@ def test_same_bytes_as_cyclonedds(reference: str, name: str, data: st.DataObject
     assert _class(reference, name).deserialize(mt.encode(message)) == theirs
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *SERVICE_NAMES])
 @settings(max_examples=10, deadline=None)
 @given(data=st.data())
 def test_cyclonedds_big_endian_is_understood(name: str, data: st.DataObject) -> None:
     from cyclonedds.idl._support import Endianness
 
     message = data.draw(messages(name, 4))
-    theirs = _cyclone("dexkit", STRUCTS[name], message)
+    theirs = _cyclone("dexkit", ALL[name], message)
     serialised = theirs.__idl__.serialize(theirs, endianness=Endianness.Big)
     assert serialised[:2] == b"\x00\x00"
     assert message_type(name).decode(serialised) == message
@@ -104,7 +106,7 @@ def test_two_threads_may_be_the_first_to_use_a_type() -> None:
 
 
 @pytest.mark.skipif("sdk" not in REFERENCES, reason="needs the unitree-sdk2 package")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *SERVICE_NAMES])
 def test_unitree_sdk_announces_the_same_type(name: str) -> None:
     description = sdk_class(name).__idl__
     description.populate()

@@ -145,7 +145,7 @@ HEAD, TAIL = "module a { module msg { module dds_ { ", " }; }; };"
         ("struct X { uint8 a; };", "expected @"),
         ("@final struct X { };", "no members"),
         ("@final struct X { double a; };", "unknown type 'double'"),
-        ("@final struct X { sequence<uint8> a; };", "sequences of structs"),
+        ("@final struct X { sequence<uint16> a; };", "sequences of structs or bytes"),
         ("@final struct E { uint8 a; }; @final struct X { E a[2]; };", "uneven layout"),
         (
             "@final struct E { uint8 a[4]; }; @final struct X { uint8 z; E a[2]; };",

@@ -91,6 +91,11 @@ class SdkClient(JsonChild):
         """End a stream; returns how many messages it has written."""
         return int(self.call("stop", topic=topic)["written"])
 
+    def request(self, service: str, api: int, parameter: str) -> tuple[int, str | None]:
+        """Ask a service with the SDK's RPC client; returns its error code and data."""
+        answer = self.call("request", service=service, api=api, parameter=parameter)
+        return answer["code"], answer["data"]
+
     def wait(self, topic: str, count: int = 1, timeout: float = 60.0) -> list[SdkSample]:
         """Samples received since the last call, at least ``count`` of them.
 
@@ -110,6 +115,7 @@ class _Server:
         self._publishers: dict[str, Any] = {}
         self._received: dict[str, list[Any]] = {}
         self._arrived = threading.Condition()
+        self._clients: dict[str, Any] = {}
         self._streams: dict[str, tuple[threading.Event, threading.Thread, list[int]]] = {}
 
     def subscribe(self, topic: str, type: str) -> dict[str, Any]:
@@ -163,6 +169,17 @@ class _Server:
         stop.set()
         thread.join()
         return {"written": written[0]}
+
+    def request(self, service: str, api: int, parameter: str) -> dict[str, Any]:
+        from unitree_sdk2py.rpc.client import Client
+
+        if service not in self._clients:
+            self._clients[service] = Client(service)
+            self._clients[service].SetTimeout(60.0)
+        client = self._clients[service]
+        client._RegistApi(api, 0)  # as the clients of the services do
+        code, data = client._Call(api, parameter)
+        return {"code": code, "data": data}
 
     def wait(self, topic: str, count: int, timeout: float) -> dict[str, Any]:
         with self._arrived:

@@ -14,9 +14,21 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 from dexkit.errors import EncodeError, OversizeError, TruncatedError, WireError
-from dexkit.messages.layout import MAX_ELEMENTS, Primitive, Struct
+from dexkit.messages.layout import MAX_BYTES, MAX_ELEMENTS, Field, Primitive, Struct
 
-__all__ = ["HEADER", "ArrayLengthError", "Buffer", "check_count", "check_end", "explain", "is_big"]
+__all__ = [
+    "HEADER",
+    "ArrayLengthError",
+    "Buffer",
+    "check_count",
+    "check_end",
+    "explain",
+    "is_big",
+    "pack_bytes",
+    "pack_text",
+    "take_bytes",
+    "take_text",
+]
 
 Buffer: TypeAlias = "bytes | bytearray | memoryview"
 
@@ -89,6 +101,60 @@ def check_end(name: str, data: Buffer, end: int) -> None:
         raise OversizeError(f"{name}: {rest} bytes after the end of the message")
 
 
+def pack_bytes(value: Sequence[int]) -> bytes:
+    """A sequence of bytes after its length, without padding.
+
+    :raises ValueError: longer than :data:`~dexkit.messages.layout.MAX_BYTES`, or no bytes.
+    """
+    data = bytes(value)
+    if len(data) > MAX_BYTES:
+        raise ValueError("too many bytes")
+    return data
+
+
+def pack_text(value: str) -> bytes:
+    """The bytes of a string after its length, with the zero at its end.
+
+    :raises ValueError: it holds a zero, or is longer than
+        :data:`~dexkit.messages.layout.MAX_BYTES`.
+    """
+    if "\0" in value:
+        raise ValueError("a zero inside")
+    return pack_bytes(value.encode() + b"\0")
+
+
+def take_bytes(name: str, data: Buffer, at: int, big: bool) -> tuple[bytes, int]:
+    """The sequence of bytes whose length is at ``at`` or at the next multiple of 4, and its end.
+
+    :raises OversizeError: longer than :data:`~dexkit.messages.layout.MAX_BYTES`.
+    :raises TruncatedError: longer than the rest of the data.
+    """
+    at += -at % 4 + 4
+    if at > len(data):
+        raise truncated(name, at, len(data))
+    count = int.from_bytes(data[at - 4 : at], "big" if big else "little")
+    if count > MAX_BYTES:
+        raise OversizeError(f"{name}: {count} bytes, at most {MAX_BYTES} are accepted")
+    if at + count > len(data):
+        raise truncated(name, at + count, len(data))
+    return bytes(data[at : at + count]), at + count
+
+
+def take_text(name: str, data: Buffer, at: int, big: bool) -> tuple[str, int]:
+    """The string whose length is at ``at`` or at the next multiple of 4, and its end.
+
+    :raises WireError: as :func:`take_bytes`; it does not end with a zero, holds one inside, or is
+        not UTF-8.
+    """
+    raw, end = take_bytes(name, data, at, big)
+    if raw.find(b"\0") != len(raw) - 1 or not raw:
+        raise WireError(f"{name}: a string of {len(raw)} bytes whose only zero is not at its end")
+    try:
+        return raw[:-1].decode(), end
+    except UnicodeDecodeError as error:
+        raise WireError(f"{name}: a string that is not UTF-8") from error
+
+
 def explain(message: object, kind: Struct, error: Exception) -> EncodeError:
     """Find the member that cannot be encoded, and raise an error that names it."""
     problem = _find(message, kind, kind.name)
@@ -102,12 +168,25 @@ def _find(value: object, kind: Struct, path: str) -> str:
             item: Any = getattr(value, member.name)
         except AttributeError:
             return f"{path} is a {type(value).__name__} without {member.name}"
-        if member.array is None and not member.sequence:
+        if member.is_bytes:
+            problem = _check_bytes(item, member, where)
+        elif member.array is None and not member.sequence:
             problem = _check_item(item, member.type, where)
         else:
             problem = _check_items(item, member.type, member.array, where)
         if problem:
             return problem
+    return ""
+
+
+def _check_bytes(item: Any, member: Field, where: str) -> str:
+    kind = "string" if member.is_text else "sequence of bytes"
+    try:
+        (pack_text if member.is_text else pack_bytes)(item)
+    except (AttributeError, TypeError):
+        return f"{where} is a {type(item).__name__}, not a {kind}"
+    except ValueError as error:  # UnicodeEncodeError is one
+        return f"{where} cannot be sent as a {kind}: {error}"
     return ""
 
 

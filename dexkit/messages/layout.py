@@ -5,7 +5,7 @@ are all made from :data:`STRUCTS`, so a layout is written down once, in ``idl/*.
 
 The subset of IDL that is read: nested modules, ``@final`` structs of numeric members,
 one-dimensional arrays of them, members that are structs, unbounded sequences of structs, and (in
-structs that no other contains) one-dimensional arrays of structs.
+structs that no other contains) one-dimensional arrays of structs, strings and sequences of bytes.
 Anything else is refused when it is read, not when it is used.
 """
 
@@ -20,8 +20,11 @@ from importlib import resources
 from dexkit.errors import UsageError
 
 __all__ = [
+    "ALL",
+    "MAX_BYTES",
     "MAX_ELEMENTS",
     "PRIMITIVES",
+    "SERVICES",
     "STRUCTS",
     "Field",
     "IdlError",
@@ -36,6 +39,11 @@ MAX_ELEMENTS = 1024
 """Longest sequence that is encoded or decoded. The largest known has 35 elements
 (docs/sources/unitree-dex.md#a1); the bound is only there so that a hostile sample cannot ask for
 more than a fixed amount of work."""
+MAX_BYTES = 1 << 16
+"""Longest string or sequence of bytes that is encoded or decoded, for the same reason."""
+SERVICES = "unitree_api"
+"""The package of requests and responses. They hold text, so they have no columns, and recordings
+do not decode them."""
 
 
 class IdlError(UsageError):
@@ -68,8 +76,12 @@ PRIMITIVES: dict[str, Primitive] = {
         Primitive("int32", "i", 4, "int32", "long", "i4", "int"),
         Primitive("uint32", "I", 4, "uint32", "unsigned long", "u4", "int"),
         Primitive("float", "f", 4, "float32", "float", "f4", "float"),
+        Primitive("int64", "q", 8, "int64", "long long", "i8", "int"),
+        Primitive("boolean", "?", 1, "bool", "boolean", "?", "bool"),
     )
 }
+_CHARACTER = Primitive("string", "s", 1, "string", "string", "S1", "str")
+"""An element of a string, which is a sequence of these with a zero at its end."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +103,16 @@ class Field:
     def is_structs(self) -> bool:
         """Whether it is a fixed array of structs."""
         return self.array is not None and isinstance(self.type, Struct)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is a string."""
+        return self.type is _CHARACTER
+
+    @property
+    def is_bytes(self) -> bool:
+        """Whether it is a string or a sequence of bytes."""
+        return self.sequence and isinstance(self.type, Primitive)
 
     def places(self) -> list[str]:
         """The names of its values in a path: ``q``, or ``motor_cmd[0]`` to ``motor_cmd[19]``."""
@@ -172,7 +194,9 @@ def max_size(struct: Struct) -> int:
     """Bytes of the longest sample, encapsulation header included."""
     size = 4
     for member in struct.fields:
-        if member.sequence:
+        if member.is_bytes:
+            size += -size % 4 + 4 + MAX_BYTES
+        elif member.sequence:
             assert isinstance(member.type, Struct)
             size += 4 + MAX_ELEMENTS * member.type.end(0)
         else:
@@ -266,6 +290,7 @@ class _Parser:
         kind = self._type(scope)
         if sequence:
             self._next(">")
+        text = kind is _CHARACTER
         name = self._next()
         array = None
         if self._peek() == "[":
@@ -276,24 +301,32 @@ class _Parser:
             array = int(length)
             self._next("]")
         self._next(";")
-        if sequence and (array is not None or not isinstance(kind, Struct)):
-            raise IdlError(f"IDL line {line}: only plain sequences of structs are supported")
-        return Field(name, kind, array, sequence, self._docs.get(line, ""))
+        plain = isinstance(kind, Struct) or kind is PRIMITIVES["uint8"]
+        if (sequence and not plain) or ((sequence or text) and array is not None):
+            raise IdlError(f"IDL line {line}: only sequences of structs or bytes are supported")
+        return Field(name, kind, array, sequence or text, self._docs.get(line, ""))
 
     def _type(self, scope: tuple[str, ...]) -> Primitive | Struct:
         token = self._next()
         if token in PRIMITIVES:
             return PRIMITIVES[token]
+        if token == "string":
+            return _CHARACTER
         name = "::".join((*scope, token))
         if name not in self.structs:
             raise IdlError(f"IDL line {self._line()}: unknown type {token!r}")
         return self.structs[name]
 
     def _check(self, struct: Struct) -> None:
-        at = 0
+        at, varied = 0, False
         for member in struct.fields:
             where = f"{struct.name}.{member.name}"
             inner = member.type
+            if varied and not member.is_bytes:
+                raise IdlError(f"{where}: a member after a string or bytes")
+            varied = varied or member.is_bytes
+            if member.is_bytes and any(f.sequence and not f.is_bytes for f in struct.fields):
+                raise IdlError(f"{where}: bytes beside a sequence of structs")
             if isinstance(inner, Struct):
                 if not inner.is_fixed:
                     raise IdlError(f"{where}: nested sequences")
@@ -303,6 +336,8 @@ class _Parser:
                 # multiple of 4, all have one layout and can be packed as a block. So have those
                 # of an array, except that the first may start anywhere.
                 many = member.sequence or member.is_structs
+                if many and any(leaf.type.size > 4 for leaf in inner.leaves()):
+                    raise IdlError(f"{where}: elements with numbers of 8 bytes")
                 if many and (inner.end(0) % 4 or (member.is_structs and inner.end(at) % 4)):
                     raise IdlError(f"{where}: elements of uneven layout")
             at = 0 if member.sequence else Struct((), "", (member,)).end(at)
@@ -331,5 +366,7 @@ def load() -> dict[str, Struct]:
     return structs
 
 
-STRUCTS = load()
+ALL = load()
 """Every struct of ``idl/*.idl`` by DDS name."""
+STRUCTS = {name: kind for name, kind in ALL.items() if kind.scope[0] != SERVICES}
+"""Those of hands and robots, which consist of numbers: all but the requests and responses."""

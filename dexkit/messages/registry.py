@@ -121,7 +121,12 @@ class MessageType:
         return self._decode(data, is_big(data, self.max_size, self.layout.name))
 
     def columns(self, payloads: Sequence[bytes]) -> Columns:
-        """Many samples at once, as numpy columns; see :class:`~dexkit.messages.Columns`."""
+        """Many samples at once, as numpy columns; see :class:`~dexkit.messages.Columns`.
+
+        :raises UsageError: the type holds text or bytes.
+        """
+        if any(member.is_bytes for member in self.layout.fields):
+            raise UsageError(f"{self.name} holds text, which has no columns")
         return Columns(self.layout, payloads)
 
     @cached_property
@@ -137,12 +142,12 @@ class MessageType:
 
 @cache
 def _by_layout(name: str) -> MessageType:
-    return MessageType(layout.STRUCTS[name])
+    return MessageType(layout.ALL[name])
 
 
 _NAMES = {
     alias: name
-    for name, kind in layout.STRUCTS.items()
+    for name, kind in layout.ALL.items()
     for alias in (name, kind.ros_name, name.replace("::", "."))
 }
 
@@ -157,18 +162,18 @@ def message_type(name: str) -> MessageType:
     try:
         return _by_layout(_NAMES[name])
     except KeyError:
-        known = ", ".join(layout.STRUCTS)
+        known = ", ".join(layout.ALL)
         raise UsageError(f"unknown message type {name!r}", hint=f"known: {known}") from None
 
 
 def message_types() -> list[MessageType]:
-    """All known types."""
+    """The types of hands and robots; requests and responses of services are not among them."""
     return [_by_layout(name) for name in layout.STRUCTS]
 
 
 @cache
 def _by_class() -> dict[type[Any], MessageType]:
-    return {mt.cls: mt for mt in message_types()}
+    return {mt.cls: mt for mt in map(_by_layout, layout.ALL)}
 
 
 def encode(message: Any) -> bytes:

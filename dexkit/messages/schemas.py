@@ -15,7 +15,7 @@ def _ros_member(member: Field) -> str:
     else:
         package, _, name = member.type.ros_name.split("/")
         kind = f"{package}/{name}"
-    if member.sequence:
+    if member.sequence and not member.is_text:
         kind += "[]"
     elif member.array is not None:
         kind += f"[{member.array}]"
@@ -39,7 +39,7 @@ def ros2msg(struct: Struct) -> str:
 
 def _idl_member(member: Field) -> str:
     kind = member.type.classic if isinstance(member.type, Primitive) else member.type.dds_name
-    if member.sequence:
+    if member.sequence and not member.is_text:
         return f"  sequence<{kind}> {member.name};"
     array = f"[{member.array}]" if member.array is not None else ""
     return f"  {kind} {member.name}{array};"

@@ -12,13 +12,17 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE, PauseWatch, SampleAges
 from dexkit.dds import DdsNode, Endpoint, Reader, Writer
+from dexkit.emulators.robot import motion_switcher
 from dexkit.emulators.robot.mechanics import RobotMechanics
+from dexkit.emulators.robot.motion_switcher import MotionSwitcher
 from dexkit.emulators.robot.settings import Settings
-from dexkit.errors import DdsError, EmulatorError, TopicConflict
+from dexkit.errors import DdsError, EmulatorError, TopicConflict, WireError
+from dexkit.messages.unitree_api import Response_
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.service import Publisher
 from dexkit.single_publisher import NodeTopics, SolePublisher
@@ -28,6 +32,8 @@ __all__ = ["EmulatedRobot", "run_robot"]
 log = logging.getLogger("dexkit.robot")
 
 _DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
+_REQUESTS = 16  # of each client kept from one state to the next
+_RESPONSE_WAIT = 2.0  # seconds that a response waits for its client's reader to be discovered
 _LIVENESS_PERIOD = 0.2  # seconds between looks whether it still lives
 
 
@@ -39,6 +45,7 @@ class EmulatedRobot:
     :param force: start even if somebody else publishes the state.
 
     :ivar robot: the robot itself. It belongs to that thread: read it, and assign ``robot.remote``.
+    :ivar switcher: its MotionSwitcher service, of that thread, too.
 
     Troubles of clients are logged once each, as warnings of the logger ``dexkit.robot``, and
     counted in ``robot.counters``.
@@ -61,6 +68,7 @@ class EmulatedRobot:
         self.interface = node.interface if node is not None else interface
         self._clock: Clock = clock or RealClock()
         self.robot = RobotMechanics(model, settings, now=self._clock.now(), report=log.warning)
+        self.switcher = MotionSwitcher()
         self._failure: Exception | None = None
         self.missed = 0
         self._node = node
@@ -76,6 +84,9 @@ class EmulatedRobot:
         self._remote: Writer | None = None
         self._commands: Reader | None = None
         self._arm_commands: Reader | None = None
+        self._requests: Reader | None = None
+        self._responses: Writer | None = None
+        self._unsent: deque[tuple[float, Response_]] = deque()
 
     @property
     def failure(self) -> Exception | None:
@@ -136,6 +147,12 @@ class EmulatedRobot:
             sole.settle()
             self._arm_commands = node.reader(model.arm_topic, model.cmd_type, depth=_DEPTH)
             self._commands = node.reader(model.cmd_topic, model.cmd_type, depth=_DEPTH)
+            self._responses = node.writer(
+                motion_switcher.RESPONSE_TOPIC, motion_switcher.RESPONSE_TYPE
+            )
+            self._requests = node.reader(
+                motion_switcher.REQUEST_TOPIC, motion_switcher.REQUEST_TYPE, depth=_REQUESTS
+            )
             self._watch.restart()  # from here on commands may wait to be received
         except BaseException:
             self._close()
@@ -157,10 +174,12 @@ class EmulatedRobot:
     def _close(self) -> None:
         if self._sole is not None:
             self._sole.close()
-        for handle in (self._commands, self._arm_commands, self._remote, self._writer):
+        readers = self._commands, self._arm_commands, self._requests
+        for handle in (*readers, self._remote, self._responses, self._writer):
             if handle is not None:
                 handle.close()
-        self._commands = self._arm_commands = self._remote = self._writer = None
+        self._commands = self._arm_commands = self._requests = None
+        self._remote = self._responses = self._writer = None
         if self._own_node is not None:
             self._own_node.close()
             self._own_node = None
@@ -222,6 +241,31 @@ class EmulatedRobot:
         self._writer.write_raw(robot.state(now))
         if robot.counters.states % self._remote_every == 0:
             self._remote.write(robot.remote_message())
+        self._answer_requests(now)
+
+    def _answer_requests(self, now: float) -> None:
+        """Answer the MotionSwitcher's clients.
+
+        A client writes its request as soon as its writer has found our reader. Its own reader may
+        not have been discovered yet, and would miss a response that is written at once.
+        """
+        assert self._requests is not None
+        assert self._responses is not None
+        for sample in self._requests.take():
+            try:
+                response = self.switcher.answer(sample.message)
+            except WireError as error:
+                log.warning("%s: %s", motion_switcher.REQUEST_TOPIC, error)
+                continue
+            if response is not None:
+                self._unsent.append((now, response))
+        while self._unsent:
+            since, response = self._unsent[0]
+            complete = self._responses.matched >= max(1, self._requests.matched)
+            if not complete and now - since < _RESPONSE_WAIT:
+                return
+            self._unsent.popleft()
+            self._responses.write(response)
 
 
 def run_robot(

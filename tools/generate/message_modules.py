@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
@@ -10,6 +11,21 @@ from dexkit.messages.layout import Field, Leaf, Primitive, Struct, load
 from tools.generate import ROOT
 
 __all__ = ["files", "render"]
+
+# what generated codecs may take from dexkit.messages.codec, in the order of an import
+_CODEC_NAMES = (
+    *("HEADER", "ArrayLengthError", "Buffer", "check_count", "check_end"),
+    *("pack_bytes", "pack_text", "take_bytes", "take_text", "truncated"),
+)
+_ELEMENTS_LINES = {
+    False: [],
+    True: [
+        "from dexkit.messages.layout import MAX_ELEMENTS",
+        "",
+        "# blank objects, filled by plain assignments: faster than calling the constructor",
+        "new = object.__new__",
+    ],
+}
 
 
 def _padded(leaves: Iterable[Leaf | None], offset: int) -> tuple[str, int]:
@@ -51,6 +67,8 @@ def _segments(struct: Struct) -> list[tuple[list[Field], Field | None]]:
 
 
 def _annotation(member: Field) -> str:
+    if member.is_bytes:
+        return "str" if member.is_text else "bytes"
     name = member.type.python if isinstance(member.type, Primitive) else member.type.name
     if member.sequence or member.is_structs:
         return f"list[{name}]"
@@ -58,6 +76,8 @@ def _annotation(member: Field) -> str:
 
 
 def _default(member: Field) -> str:
+    if member.is_bytes:
+        return '""' if member.is_text else 'b""'
     if member.sequence:
         return "field(default_factory=list)"
     if isinstance(member.type, Struct):
@@ -65,7 +85,7 @@ def _default(member: Field) -> str:
             name = member.type.name
             return f"field(default_factory=lambda: [{name}() for _ in range({member.array})])"
         return f"field(default_factory={member.type.name})"
-    zero = "0.0" if member.type.python == "float" else "0"
+    zero = {"float": "0.0", "int": "0", "bool": "False"}[member.type.python]
     if member.array is None:
         return zero
     return f"({zero},)" if member.array == 1 else f"({zero},) * {member.array}"
@@ -131,7 +151,54 @@ def _assignments(leaves: list[Leaf], struct: Struct) -> tuple[str, list[str]]:
     return ", ".join(names) + ("," if len(names) == 1 else ""), lines
 
 
+def _text_codec(struct: Struct) -> list[str]:
+    """Codec of a struct that ends with strings and sequences of bytes, after fixed members."""
+    fixed = [member for member in struct.fields if not member.is_bytes]
+    varied = [member for member in struct.fields if member.is_bytes]
+    leaves = [leaf for m in fixed for leaf in _member_leaves(m)]
+    code, size = _padded(leaves, 0)
+    stem = f"_{struct.name.rstrip('_')}"
+    bound = _fold(leaves, "v", fixed)
+    encode, decode = [], []
+    for member in varied:
+        # not the bare name: a member may be called like an argument
+        name, kind = f"x_{member.name}", "text" if member.is_text else "bytes"
+        encode += [
+            f"    {name} = pack_{kind}(m.{member.name})",
+            "    out += bytes(-len(out) % 4)",
+            f'    out += len({name}).to_bytes(4, "little") + {name}',
+        ]
+        decode.append(f'    {name}, at = take_{kind}("{struct.name}.{member.name}", data, at, big)')
+        bound[member.name] = name
+    arguments = ", ".join(bound[m.name] for m in struct.fields)
+    return [
+        f'{stem}_0 = (Struct("<{code}"), Struct(">{code}"))',
+        "",
+        "",
+        f"def encode_{struct.name}(m: {struct.name}) -> bytes:",
+        f'    """Encapsulation header and little-endian data of a {struct.name}."""',
+        *_array_checks(leaves, "m", "    "),
+        f"    out = bytearray(HEADER + {stem}_0[0].pack({_values(leaves, 'm')}))",
+        *encode,
+        "    return bytes(out)",
+        "",
+        "",
+        f"def decode_{struct.name}(data: Buffer, big: bool) -> {struct.name}:",
+        f'    """The {struct.name} after the encapsulation header of ``data``."""',
+        f"    if len(data) < {4 + size}:",
+        f'        raise truncated("{struct.name}", {4 + size}, len(data))',
+        f"    v = {stem}_0[big].unpack_from(data, 4)",
+        f"    at = {4 + size}",
+        *decode,
+        "    if at != len(data):",
+        f'        check_end("{struct.name}", data, at)',
+        f"    return {struct.name}({arguments})",
+    ]
+
+
 def _codec(struct: Struct) -> list[str]:
+    if any(member.is_bytes for member in struct.fields):
+        return _text_codec(struct)
     constants: list[str] = []
     encode: list[str] = []
     decode: list[str] = []
@@ -259,6 +326,11 @@ def _codec(struct: Struct) -> list[str]:
 def render(package: str, structs: Iterable[Struct]) -> str:
     """The Python module of one IDL package."""
     mine = [s for s in structs if s.scope[0] == package]
+    bodies = ["\n".join(("", "", *_dataclass(s))) for s in mine]
+    bodies += ["\n".join(("", "", *_codec(s))) for s in mine]
+    text = "\n".join(bodies)
+    used = [name for name in _CODEC_NAMES if re.search(rf"\b{name}\b", text)]
+    fields = "dataclass, field" if "field(" in text else "dataclass"
     lines = [
         f'"""Messages of ``{package}``: dataclasses and their CDR codec.',
         "",
@@ -272,31 +344,19 @@ def render(package: str, structs: Iterable[Struct]) -> str:
         "",
         "from __future__ import annotations",
         "",
-        "from dataclasses import dataclass, field",
+        f"from dataclasses import {fields}",
         "from struct import Struct",
         "",
         "from dexkit.messages.codec import (",
-        "    HEADER,",
-        "    ArrayLengthError,",
-        "    Buffer,",
-        "    check_count,",
-        "    check_end,",
-        "    truncated,",
+        *(f"    {name}," for name in used),
         ")",
-        "from dexkit.messages.layout import MAX_ELEMENTS",
-        "",
-        "# blank objects, filled by plain assignments: faster than calling the constructor",
-        "new = object.__new__",
+        *_ELEMENTS_LINES["MAX_ELEMENTS" in text],
         "",
         "__all__ = [",
         *(f'    "{s.name}",' for s in sorted(mine, key=lambda s: s.name)),
         "]",
     ]
-    for struct in mine:
-        lines += ["", "", *_dataclass(struct)]
-    for struct in mine:
-        lines += ["", "", *_codec(struct)]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n" + text + "\n"
 
 
 def files() -> dict[Path, str]:
