@@ -508,3 +508,13 @@ def test_hand_on_every_address_prints_the_host_name() -> None:
     assert "0.0.0.0" not in text
     assert f"usbip attach -r {name} -b 1-1" in text
     assert f"usbip://{name}:3240" in text
+
+
+@each("option", ["--object=40", "--start=10", "--closed-at=100"])
+def test_a_bare_servo_has_no_gripper_to_set(option: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        command, ["mx64", "--bare", option, "--link", str(tmp_path / "servo")]
+    )
+    assert result.exit_code == 2
+    assert option.partition("=")[0] in result.output
+    assert "is of a gripper" in result.output

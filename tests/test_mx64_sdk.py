@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from importlib import resources
 
 import dynamixel_easy_sdk as easy
@@ -276,3 +277,28 @@ def test_sdk_transaction_is_not_faster_than_the_line(port: sdk.PortHandler) -> N
         assert PACKETS.readTxRx(port, 1, 126, 21)[1:] == OK
     # 27 bytes are the write and its status
     assert time.monotonic() - started >= 0.274e-3 + (2 * count - 1) * 1e-3
+
+
+def test_robotis_read_write_example_finishes_with_a_bare_servo() -> None:
+    """What ``read_write.py`` of DynamixelSDK does, with the range that it has for an MX-64.
+
+    It polls until the position is within 20 ticks of the goal, for ever if need be. With a gripper
+    on the shaft it never gets there.
+    """
+    with closing(EmulatedProcess(["--bare", "--baudrate=57600"])) as servo:
+        handler = sdk.PortHandler(servo.path)
+        assert handler.openPort()
+        assert handler.setBaudRate(57_600)
+        packets, torque, goal, present = sdk.PacketHandler(2.0), 64, 116, 132
+        assert packets.write1ByteTxRx(handler, 1, torque, 1) == OK
+        for end in (0, 4095):
+            assert packets.write4ByteTxRx(handler, 1, goal, end) == OK
+
+            def arrived(end: int = end) -> bool:
+                position, *rest = packets.read4ByteTxRx(handler, 1, present)
+                assert tuple(rest) == OK
+                return abs(end - position) <= 20
+
+            eventually(arrived)
+        assert packets.write1ByteTxRx(handler, 1, torque, 0) == OK
+        handler.closePort()

@@ -181,6 +181,27 @@ def test_target_is_mid_stroke_before_any_input() -> None:
     assert q_of(commands, RIGHT) == LEAD
 
 
+def test_it_leaves_an_end_that_targets_near_it_go_to() -> None:
+    """In unitree_hg the lead from an end alone would stay where it means that end."""
+    hg = DIALECTS["unitree_hg"]
+    (closed, opened), q_open = hg.ends, hg.q_open
+    for rest in (-0.02, 0.0, closed, opened, q_open, q_open + 0.05):
+        client = Dex1Client(hg, [LEFT])
+        pinch, goal = (PINCH_MAX, q_open) if rest <= closed else (PINCH_MIN, 0.0)
+        away = PINCH_MIN if rest <= closed else PINCH_MAX
+        here, now = rest, 0.0
+        for step in range(400):  # at rest for a while, then 1.5 s to the other end
+            now += client.period
+            wanted = pinch if step >= 100 else away
+            command = q_of(client.step(now, {LEFT: (here,)}, {LEFT: (wanted,)}), LEFT)
+            obeyed = 0.0 if command <= closed else q_open if command >= opened else command
+            # what its filter keeps of a rest lets it leave with the first command that it counts
+            assert step != 100 or abs(obeyed - rest) > 0.05
+            if step >= 100:
+                here += min(max(obeyed - here, -0.05), 0.05)
+        assert here == pytest.approx(goal, abs=1e-9)
+
+
 def test_only_q_and_the_gains_are_set() -> None:
     client = Dex1Client()
     ready(client)

@@ -45,10 +45,12 @@ from typing import Any
 from dexkit.hand import HandState, Side
 from dexkit.messages import MessageType, message_type, unitree_go, unitree_hg
 from dexkit.models import Dialect, dialect, model
-from dexkit.service.dialects import HG_CLOSED, HG_OPEN, StateView, dialect_map
+from dexkit.service.dialects import StateView, dialect_map
 
 __all__ = ["PartCodec", "Reachable", "Translator", "loses_gains", "translator"]
 
+_HG = dialect("unitree_hg")
+_DEX1 = model(_HG.model)
 _FLOAT_MAX = (2 - 2**-23) * 2.0**127
 # of the numbers of a motor, those that are acted upon
 _NUMBERS = {
@@ -135,7 +137,7 @@ class Reachable:
     is nearest to 5.4, and would do so for ever.
     """
 
-    GAPS = ((0.0, HG_CLOSED + 1e-3), (HG_OPEN - 1e-3, 2 * math.pi))
+    GAPS = ((0.0, _HG.ends[0] + 1e-3), (_HG.ends[1] - 1e-3, _HG.q_open))
     """Gaps in what can be commanded, rad of unitree_hg; their ends can be."""
     ELSEWHERE = 0.07
     """Rad of unitree_hg. Of xr_teleoperate's lead the filter lets half pass at least, 0.10 here;
@@ -182,8 +184,6 @@ def loses_gains(source: Dialect, target: Dialect) -> bool:
     return source.cmd_type != target.cmd_type == _HG.cmd_type
 
 
-_HG = dialect("unitree_hg")
-_DEX1 = model(_HG.model)
 _JOINT = _DEX1.joints[Side.LEFT][0]  # both sides' are alike
 _SCALE = _HG.q_open / _JOINT.q_max
 _MAP = dialect_map(_HG, {Side.LEFT: _DEX1.spec(Side.LEFT, io_rate=_DEX1.state_rate)})

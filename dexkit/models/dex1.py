@@ -49,6 +49,7 @@ DEX1_1 = HandModel(
             length=1,
             q_open=2 * math.pi,
             summary="the gripper's DDS interface specification: 0 closed .. 2 pi rad open",
+            ends=(0.1, 6.0),  # the interface specification, "Position Conversion"
             codec=Lazy("dexkit.service.dialects:InterfaceSpecificationMap"),
             interface_specification=True,
             has_client=False,

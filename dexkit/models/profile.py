@@ -56,6 +56,8 @@ class Dialect:
     :param length: motors in the sequence.
     :param q_open: q of a fully open gripper, rad, where 0 is closed; NaN for hands whose joints
         have no such scale.
+    :param ends: a gripper's targets from which on it closes or opens all the way: at or below the
+        first, at or above the second, rad; infinite where a target is where it goes.
     :param codec: translates its messages in ``dexkit serve``; None for a robot, which has none.
     :param mode_byte: what the mode byte of a motor holds.
     :param interface_specification: it is defined by the gripper's DDS interface specification:
@@ -78,6 +80,7 @@ class Dialect:
     length: int
     q_open: float
     summary: str
+    ends: tuple[float, float] = (-math.inf, math.inf)
     codec: Lazy[type[DialectMap]] | None = None
     mode_byte: ModeByte = ModeByte.UNUSED
     interface_specification: bool = False

@@ -73,8 +73,6 @@ from dexkit.models import Dialect, ModeByte, model
 from dexkit.service.finger_state import FingerStateEncoder
 
 __all__ = [
-    "HG_CLOSED",
-    "HG_OPEN",
     "DialectMap",
     "Fill",
     "FingerMap",
@@ -89,7 +87,6 @@ __all__ = [
 
 # what xr_teleoperate sends to a Dex1 (docs/sources/unitree-dex.md#b1)
 _KP, _KD = 5.0, 0.05
-HG_CLOSED, HG_OPEN = 0.1, 6.0  # rad; the interface specification, "Position Conversion"
 _HG_TEMPERATURE, _HG_VOL = 25, 12.0  # the interface specification, "MotorState_"
 _ROUNDING = 1e-6  # rad; more than float32 loses of a limit
 _U32 = 0xFFFFFFFF
@@ -300,9 +297,10 @@ class InterfaceSpecificationMap(DialectMap):
     def _q_in(self, q: float, joint: JointSpec) -> float:
         if not math.isfinite(q):
             return q  # for the gate to reject: minus infinity is not "closed"
-        if q <= HG_CLOSED:
+        closed, opened = self.dialect.ends
+        if q <= closed:
             return 0.0
-        if q >= HG_OPEN:
+        if q >= opened:
             return self._fully_open()
         return q / self._scale()
 

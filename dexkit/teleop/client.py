@@ -297,7 +297,8 @@ class Dex1Client(TeleopClient):
     """xr_teleoperate's ``Dex1_1_Gripper_Controller``; its input is a pinch value.
 
     In a dialect of another stroke (unitree_hg), which it does not speak, lead and stroke are
-    scaled alike.
+    scaled alike. If targets near an end go to the end there, its lead from such an end begins
+    behind them, or it would never leave.
 
     :param release: which one; None takes 1.1 where both grippers share a message, 1.4 elsewhere.
     :param simulated: what it does with ``--sim``: no clipping and no smoothing (1.1: clipping to
@@ -364,16 +365,27 @@ class Dex1Client(TeleopClient):
             pinches = {s: value[0] if value else 0.0 for s, value in given.items()}
             if any(pinch != 0.0 for pinch in pinches.values()):
                 self._targets = {s: self.target_of(pinch) for s, pinch in pinches.items()}
-        goals = tuple(
-            min(max(self._targets[s], latest[s][0] - self._lead), latest[s][0] + self._lead)
-            for s in self.sides
-        )
+        goals = []
+        for s in self.sides:
+            low, high = self._leads(latest[s][0])
+            goals.append(min(max(self._targets[s], low), high))
         if self._filter is not None:
-            goals = self._filter(goals)
+            goals = list(self._filter(tuple(goals)))
         return {
             s: (JointCommand(0, q, 0.0, 0.0, self._kp, self._kd),)
             for s, q in zip(self.sides, goals, strict=True)
         }
+
+    def _leads(self, q: float) -> tuple[float, float]:
+        """The lowest and highest goal for a gripper at ``q``, rad.
+
+        The filter keeps up to half of where the gripper rested. So beside an end the goal is as
+        far from the targets that go to the end as the end itself is, and a lead more.
+        """
+        closed, opened = self.dialect.ends
+        low = q if q < opened else 2.0 * opened - self.dialect.q_open
+        high = q if q > closed else 2.0 * closed
+        return low - self._lead, high + self._lead
 
 
 class FingerClient(TeleopClient):

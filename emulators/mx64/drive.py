@@ -154,10 +154,12 @@ class Drive:
         self.physics = physics
         mechanics = physics.gripper
         stroke = mx64.EZGRIPPER_STROKE * _TICK
-        walls = [
-            Wall(0.0, +1, mechanics.closed_stiffness, 0.6),
-            Wall(stroke, -1, mechanics.open_stiffness, 1.0),
-        ]
+        walls = []
+        if not mechanics.bare:
+            walls = [
+                Wall(0.0, +1, mechanics.closed_stiffness, 0.6),
+                Wall(stroke, -1, mechanics.open_stiffness, 1.0),
+            ]
         if mechanics.object_pct is not None:
             walls.append(
                 Wall(stroke * mechanics.object_pct / 100, +1, mechanics.object_stiffness, 1.0)

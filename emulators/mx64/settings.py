@@ -97,6 +97,8 @@ class GripperMechanics:
     :param object_stiffness: N·m/rad at the shaft.
     :param coulomb: tendon friction, N·m.
     :param spring: the opening springs, N·m/rad at the shaft.
+    :param bare: no gripper at all: a shaft that turns freely, any number of turns. See
+        :meth:`none`.
     """
 
     closed_at: int = 1510
@@ -109,12 +111,21 @@ class GripperMechanics:
     coulomb: float = 0.15
     viscous: float = 0.02
     spring: float = 0.008
+    bare: bool = False
+
+    @classmethod
+    def none(cls) -> GripperMechanics:
+        """A servo without a gripper, at rest at mid range."""
+        mid = mx64.TICKS_PER_TURN // 2
+        return cls(mid, start=0.0, inertia=0.0, coulomb=0.0, viscous=0.0, spring=0.0, bare=True)
 
     def __post_init__(self) -> None:
         if not 0 <= self.closed_at < mx64.TICKS_PER_TURN:
             raise UsageError(f"closed_at is an encoder tick, 0 to 4095, not {self.closed_at}")
         if not 0 <= self.start <= 100:
             raise UsageError(f"start is a percentage of opening, not {self.start}")
+        if self.bare and self.object_pct is not None:
+            raise UsageError("a servo without a gripper cannot touch an object")
         if self.object_pct is not None and not 0 < self.object_pct < 100:
             raise UsageError(
                 f"an object must be between the fingers: 0 < percent < 100, not {self.object_pct}"

@@ -46,6 +46,9 @@ __all__ = ["emulate_mx64"]
     metavar="B",
     help="Bits a second that the servo is set to.",
 )
+@click.option(
+    "--bare", is_flag=True, help="The servo without a gripper: its shaft turns freely all around."
+)
 @object_option("Percent of opening at which the fingers touch an object")
 @start_option("Opening at first.", 50.0)
 @click.option(
@@ -73,6 +76,7 @@ def emulate_mx64(
     link: str,
     ids: tuple[int, ...],
     baudrate: str,
+    bare: bool,
     object_pct: float | None,
     start: float,
     closed_at: int,
@@ -89,6 +93,9 @@ def emulate_mx64(
 ) -> None:
     """Emulate a DYNAMIXEL MX-64 (Protocol 2.0) with an EZGripper on its shaft.
 
+    With --bare nothing is on the shaft, as ROBOTIS' own examples expect it: they go to and fro
+    between ends of the range that no gripper reaches.
+
     Prints "ready: PATH ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
     link.
     """
@@ -97,7 +104,11 @@ def emulate_mx64(
     from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 
     plan = [parse_fault(spec) for spec in faults]
-    mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
+    if bare:
+        _refuse_gripper_options()
+        mechanics = GripperMechanics.none()
+    else:
+        mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
     physics = dataclasses.replace(Physics(), gripper=mechanics)
     firmware = Firmware(fast_reads=fast_reads, backup=backup)
     store = _EepromFile(eeprom) if eeprom is not None else None
@@ -149,6 +160,18 @@ def emulate_mx64(
         click.echo(f"stopped: {summary}")
         if bus.failure is not None:
             raise EmulatorError(f"the emulator failed inside: {bus.failure!r}", hint=A_MISTAKE)
+
+
+def _refuse_gripper_options() -> None:
+    """Refuse the options of a gripper beside ``--bare``.
+
+    :raises UsageError: one was given.
+    """
+    context = click.get_current_context()
+    for name in ("object_pct", "start", "closed_at"):
+        if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
+            option = next(p.opts[0] for p in context.command.params if p.name == name)
+            raise click.UsageError(f"{option} is of a gripper, and --bare has none")
 
 
 class _EepromFile:
