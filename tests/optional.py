@@ -85,7 +85,10 @@ OPTIONAL = (
     Optional(
         "the package unitree-sdk2",
         _package("unitree_sdk2py"),
-        ("dds_multicast", "dds_sdk", "dds_types", "service_sdk"),
+        (
+            *("dds_multicast", "dds_sdk", "dds_types", "motion_switcher"),
+            *("sdk_examples", "service_sdk"),
+        ),
     ),
     Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
