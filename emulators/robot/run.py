@@ -33,7 +33,7 @@ log = logging.getLogger("dexkit.robot")
 
 _DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
 _REQUESTS = 16  # of each client kept from one state to the next
-_RESPONSE_WAIT = 2.0  # seconds that a response waits for its client's reader to be discovered
+_RESPONSE_WAIT = 10.0  # seconds that a response waits for its client's reader to be discovered
 _LIVENESS_PERIOD = 0.2  # seconds between looks whether it still lives
 
 
